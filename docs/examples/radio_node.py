@@ -1,5 +1,6 @@
 """A node that replaces ``channel`` and drives hardware."""
 
+import dataclasses
 import itertools
 import sys
 
@@ -22,7 +23,7 @@ class Radio(Role):
     `carry` takes data and returns the number of bits that were received.
     """
 
-    SENDS = (m.FeedSignals, m.DeliveredData)
+    SENDS = (m.FeedSignals, m.Data)
     RECEIVES = (m.RhsConfiguration, m.Pilot, m.Data)
 
     def __init__(self, measure, carry):
@@ -41,11 +42,9 @@ class Radio(Role):
                 self._applied.put((event.cycle_id, event.band), event.analog)
             case m.Pilot():
                 self._waiting.put(next(self._serial), event)
-            case m.Data():
+            case m.Data(stage=m.Stage.OFFERED):
                 bits = self._carry(event)
-                return [Send(m.derive(
-                    m.DeliveredData, event, bits=bits, direction=event.direction,
-                    duration_s=event.duration_s))]
+                return [Send(dataclasses.replace(event, stage=m.Stage.DELIVERED, bits=bits))]
         return self._answer()
 
     def _answer(self):

@@ -9,7 +9,6 @@ from rhs_isac_msgs.msg import (
     Beacon,
     ComplexArray,
     Data,
-    DeliveredData,
     Grant,
     GroundTruth,
     Pilot,
@@ -29,8 +28,7 @@ class PlainUser(Node):
         # A depth alone stands for reliable and volatile, as all of these topics are.
         for kind, topic, callback in (
                 (Beacon, 'beacon', self._on_beacon), (Grant, 'grant', self._on_grant),
-                (PilotRequest, 'pilot_request', self._on_request),
-                (DeliveredData, 'delivered_data', self._on_data)):
+                (PilotRequest, 'pilot_request', self._on_request), (Data, 'data', self._on_data)):
             self.create_subscription(kind, topic, callback, 128)
         self._ack, self._truth, self._pilot, self._data = (
             self.create_publisher(kind, topic, 128) for kind, topic in (
@@ -60,9 +58,9 @@ class PlainUser(Node):
 
     def _on_data(self, data):
         if (data.user, data.cycle_id) == (USER, self._cycle) and (
-                data.direction == DeliveredData.DOWNLINK):
+                data.direction == Data.DOWNLINK and data.stage == Data.DELIVERED):
             self._data.publish(Data(
-                cycle_id=data.cycle_id, user=USER, direction=Data.UPLINK,
+                cycle_id=data.cycle_id, user=USER, direction=Data.UPLINK, stage=Data.OFFERED,
                 duration_s=data.duration_s, bits=data.bits))
 
 

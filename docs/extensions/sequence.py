@@ -112,8 +112,9 @@ def svg():
         y = _TOP + _ROW * (number + 1)
         label = NAMES[kind] + _detail([message for _, message in run])
         recipients = [name for name, kinds in RECEIVES.items() if kind in kinds and name != sender]
-        if kind is m.DeliveredData:
-            recipients = ['user' if run[0][1].direction is m.Direction.DOWNLINK else 'bs']
+        if kind is m.Data:
+            recipients = (['channel'] if run[0][1].stage is m.Stage.OFFERED else
+                      ['user' if run[0][1].direction is m.Direction.DOWNLINK else 'bs'])
         last = sender == list(RECEIVES)[-1]
         parts += _arrows(place[sender], [place[name] for name in recipients], y, label, last)
     return (f'<svg xmlns="http://www.w3.org/2000/svg" class="sequence" width="{width}" '
@@ -123,8 +124,8 @@ def svg():
 
 def _detail(messages):
     first = messages[0]
-    if isinstance(first, m.Data | m.DeliveredData):
-        return f' {first.direction.name.lower()}'
+    if isinstance(first, m.Data):
+        return f' {first.direction.name.lower()}, {first.stage.name.lower()}'
     if isinstance(first, m.ProtocolState):
         return f' {first.outcome or first.phase.name.lower()}'
     band = f' band {first.band}' if hasattr(first, 'band') else ''

@@ -202,8 +202,8 @@ class BaseStation(StateMachine):
     def _duplicate_signals(self, event: m.FeedSignals) -> bool:
         return event.band in self._cycle.signals
 
-    def _downlink(self, event: m.DeliveredData) -> bool:
-        return event.direction is m.Direction.DOWNLINK
+    def _not_delivered_uplink(self, event: m.Data) -> bool:
+        return event.stage is m.Stage.OFFERED or event.direction is m.Direction.DOWNLINK
 
     def _not_allowed(self, event: m.Ack) -> bool:
         return not self._allows(event.user)
@@ -414,8 +414,8 @@ class BaseStation(StateMachine):
         """Send as much data as the beam is expected to carry."""
         assert self._cycle.beam
         duration_s = self._settings.in_use.data_duration_s
-        self._send(m.Data, direction=m.Direction.DOWNLINK, duration_s=duration_s,
-                   bits=self._cycle.beam.expected_bps * duration_s // 1)
+        self._send(m.Data, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
+                   duration_s=duration_s, bits=self._cycle.beam.expected_bps * duration_s // 1)
 
     def _remove_user(self, event: Timeout) -> None:
         """Stop waiting for the user until it answers again."""
@@ -433,7 +433,7 @@ class BaseStation(StateMachine):
                      warning=True)
         self._apply_settings(event)
 
-    def _finish(self, event: m.DeliveredData) -> None:
+    def _finish(self, event: m.Data) -> None:
         """End the cycle with service; log that service begins, or which outages have ended."""
         cycle, n_users = self._cycle, len(self._users)
         self._report(m.Phase.BEACONING, 'served')
@@ -463,7 +463,7 @@ class BaseStation(StateMachine):
     _OF_CYCLE: Drops = {_wrong_cycle: Outcome.WRONG_CYCLE}
     _OF_USER: Drops = _OF_CYCLE | {_wrong_user: Outcome.WRONG_USER}
     _OF_CODEBOOK: Drops = {_wrong_codebook: Outcome.WRONG_CODEBOOK}
-    _UPLINK: Drops = {_downlink: None}
+    _DELIVERED: Drops = {_not_delivered_uplink: None}
 
     # Every event, in the order in which its rows are tried.
     TABLE = (
@@ -579,7 +579,7 @@ class BaseStation(StateMachine):
                 guard=_beam_applied),
             Row((State.STEERING,), (_store_beam,)),
             Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
-        *on(m.DeliveredData, 'delivered', _UPLINK | _OF_USER)(
+        *on(m.Data, 'delivered', _DELIVERED | _OF_USER)(
             Row((State.TRANSMITTING,), (_finish,), State.RESTING),
             Row((State.PAUSED, State.RESTING), outcome=Outcome.DUPLICATE)),
     )

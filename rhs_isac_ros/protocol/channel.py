@@ -134,7 +134,7 @@ class Channel(Role):
         cycle after they are offered.
     """
 
-    SENDS = (m.FeedSignals, m.DeliveredData)
+    SENDS = (m.FeedSignals, m.Data)
     RECEIVES = (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data)
 
     def __init__(self, scenario: Scenario, seed: int,
@@ -183,7 +183,7 @@ class Channel(Role):
                     (event.cycle_id, event.mode, event.band), event.analog))
             case m.Beam():
                 self._keep_beam(event)
-            case m.Pilot() | m.Data():
+            case m.Pilot() | m.Data(stage=m.Stage.OFFERED):
                 self.count(Outcome.OVERFLOW, self._pending.put(
                     (event.cycle_id, next(self._serial)), event))
         if self._cycle and isinstance(event, m.Message):
@@ -268,8 +268,7 @@ class Channel(Role):
             return None
         # What exceeds the capacity of the true channel is lost.
         bits = min(event.bits, cycle.rate_bps * event.duration_s // 1)
-        return m.derive(m.DeliveredData, event, stamp_ns=event.stamp_ns, bits=bits,
-                        direction=event.direction, duration_s=event.duration_s)
+        return dataclasses.replace(event, stage=m.Stage.DELIVERED, bits=bits)
 
     def _applied(self, cycle: _Cycle, mode: m.Mode, band: int) -> np.ndarray | None:
         """Return the coefficients that the surface applies in each frame, if they are known."""

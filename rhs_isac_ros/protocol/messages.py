@@ -133,6 +133,13 @@ class Direction(enum.IntEnum):
     UPLINK = 1
 
 
+class Stage(enum.IntEnum):
+    """Whether data enter or leave the channel."""
+
+    OFFERED = 0
+    DELIVERED = 1
+
+
 class Phase(enum.IntEnum):
     """Phase of a cycle, from the point of view of the base station."""
 
@@ -327,20 +334,11 @@ class Beam(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Data(Message):
-    """Payload of the transmission phase, offered to the channel."""
+    """Payload of the transmission phase."""
 
     user: int = number(1, _LAST_USER)
     direction: Direction
-    duration_s: float = number(0, 3600)
-    bits: float = number(0, _MAX_BITS)
-
-
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class DeliveredData(Message):
-    """The part of the payload that arrives at the other end of the channel."""
-
-    user: int = number(1, _LAST_USER)
-    direction: Direction
+    stage: Stage
     duration_s: float = number(0, 3600)
     bits: float = number(0, _MAX_BITS)
 

@@ -117,7 +117,7 @@ class User(StateMachine):
         return self.users[bisect.bisect_left(self.users, beacon.first_user):
                           bisect.bisect_right(self.users, beacon.last_user)]
 
-    def _other_user(self, event: m.Grant | m.PilotRequest | m.DeliveredData) -> bool:
+    def _other_user(self, event: m.Grant | m.PilotRequest | m.Data) -> bool:
         return event.user not in self._mobilities
 
     def _other_user_granted(self, event: m.Grant) -> bool:
@@ -135,11 +135,11 @@ class User(StateMachine):
         """Whether the cycle is granted to another user of this node."""
         return self.state is State.GRANTED and (event.cycle_id, event.user) not in self._truths
 
-    def _not_granted(self, event: m.DeliveredData) -> bool:
+    def _not_granted(self, event: m.Data) -> bool:
         """Whether the cycle was not granted to the user."""
         return (event.cycle_id, event.user) not in self._truths
 
-    def _wrong_cycle(self, event: m.Grant | m.PilotRequest | m.DeliveredData) -> bool:
+    def _wrong_cycle(self, event: m.Grant | m.PilotRequest | m.Data) -> bool:
         return event.cycle_id != self._cycle_id
 
     def _late_grant(self, event: m.Grant) -> bool:
@@ -149,8 +149,9 @@ class User(StateMachine):
     def _new_request(self, event: m.PilotRequest) -> bool:
         return self._sounded != (event.cycle_id, event.band, event.last_band)
 
-    def _uplink(self, event: m.DeliveredData) -> bool:
-        return event.direction is m.Direction.UPLINK
+    def _not_delivered_downlink(self, event: m.Data) -> bool:
+        """Whether data are anything other than downlink data delivered by the channel."""
+        return event.stage is m.Stage.OFFERED or event.direction is m.Direction.UPLINK
 
     # Steps
 
@@ -200,9 +201,9 @@ class User(StateMachine):
             self.send(m.derive(
                 m.Pilot, event, band=band, symbols=np.ones(event.n_frames, complex)))
 
-    def _send_uplink(self, event: m.DeliveredData) -> None:
+    def _send_uplink(self, event: m.Data) -> None:
         """Answer downlink data with the same amount of uplink data."""
-        self.send(m.derive(m.Data, event, direction=m.Direction.UPLINK,
+        self.send(m.derive(m.Data, event, direction=m.Direction.UPLINK, stage=m.Stage.OFFERED,
                            duration_s=event.duration_s, bits=event.bits))
 
     TABLE = (
@@ -251,10 +252,10 @@ class User(StateMachine):
             # The channel may have missed the pilots or the position.
             Row((State.GRANTED,), (_publish_position, _send_pilots), outcome=Outcome.ASKED_AGAIN,
                 restart_timeout=True)),
-        *on(m.DeliveredData, 'downlink', {_uplink: None,
-                                   _other_user: None,
-                                   _wrong_cycle: Outcome.WRONG_CYCLE,
-                                   _not_granted: None})(
+        *on(m.Data, 'downlink', {_not_delivered_downlink: None,
+                     _other_user: None,
+                     _wrong_cycle: Outcome.WRONG_CYCLE,
+                     _not_granted: None})(
             Row((State.GRANTED,), (_send_uplink,), State.LISTENING),
             Row((State.LISTENING,), (_send_uplink,), outcome=Outcome.ASKED_AGAIN)),
     )

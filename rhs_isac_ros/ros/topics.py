@@ -18,7 +18,6 @@ NAMES: Mapping[type[m.Message], str] = {
     m.NoFix: 'no_fix',
     m.Beam: 'beam',
     m.Data: 'data',
-    m.DeliveredData: 'delivered_data',
     m.Capacity: 'capacity',
     m.CapacityStatistics: 'capacity_statistics',
     m.GroundTruth: 'ground_truth',

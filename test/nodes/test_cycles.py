@@ -27,7 +27,7 @@ COMPLETE = {m.Grant: 1, m.ReceivedSignals: 1, m.PositionEstimate: 1, m.Beam: 1, 
          m.CapacityStatistics: 1, m.GroundTruth: 1, m.RhsCommand: SIZES['N_B'],
          m.RhsConfiguration: SIZES['N_B'] + 1,
          m.PilotRequest: 1, m.Pilot: SIZES['N_B'],
-         m.FeedSignals: SIZES['N_B'], m.Data: 2, m.DeliveredData: 2, m.ProtocolState: 4}
+         m.FeedSignals: SIZES['N_B'], m.Data: 4, m.ProtocolState: 4}
 # Parameters of the nodes, in another order than in test_start_and_stop.
 BASE = {'channel': {}, 'transmission': {}, 'bs': {'rest_s': 0.02, 'ack_timeout_s': 0.3},
         'positioner': {}, 'optimizer': {}, 'rhs_controller': {}}
@@ -182,8 +182,8 @@ def test_the_capacities_are_consistent_with_the_beam_and_the_data(cycles):
         assert report.loss_percent > -0.05
         for direction in m.Direction:
             offered, delivered = (
-                next(data for data in messages[kind] if data.direction is direction)
-                for kind in (m.Data, m.DeliveredData))
+                next(data for data in messages[m.Data]
+                     if (data.direction, data.stage) == (direction, stage)) for stage in m.Stage)
             assert 0 < delivered.bits <= min(
                 offered.bits, report.actual_bps * delivered.duration_s)
             assert offered.bits <= report.expected_bps * offered.duration_s

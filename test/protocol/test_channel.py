@@ -54,7 +54,7 @@ def applied(beam):
 @pytest.fixture
 def downlink():
     return m.Data(
-        cycle_id=3, user=1, direction=m.Direction.DOWNLINK, duration_s=1e-3,
+        cycle_id=3, user=1, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED, duration_s=1e-3,
         bits=1e9)
 
 
@@ -164,7 +164,7 @@ def test_the_channel_delivers_data_for_any_order_of_messages(
         scenario, truth, beam, applied, downlink):
     for order in itertools.permutations([truth, beam, applied, downlink]):
         sent = [s for batch in feed(Channel(scenario, 0), order) for s in batch]
-        assert [(type(s), s.bits) for s in sent] == [(m.DeliveredData, sent[0].bits)]
+        assert [(s.stage, s.bits) for s in sent] == [(m.Stage.DELIVERED, sent[0].bits)]
 
 
 def test_the_channel_delivers_the_capacity_at_the_true_position(
@@ -174,9 +174,9 @@ def test_the_channel_delivers_the_capacity_at_the_true_position(
     rate = capacity(scenario, Beam(beam.analog, beam.digital), PLACE[None])[0]
     ((delivered,),) = feed(channel, [downlink])
     assert delivered.bits == math.floor(rate * 1e-3)
-    assert (type(delivered), delivered.direction) == (m.DeliveredData, m.Direction.DOWNLINK)
+    assert (delivered.direction, delivered.stage) == (m.Direction.DOWNLINK, m.Stage.DELIVERED)
     few = m.Data(
-        cycle_id=3, user=1, direction=m.Direction.UPLINK, duration_s=1e-3,
+        cycle_id=3, user=1, direction=m.Direction.UPLINK, stage=m.Stage.OFFERED, duration_s=1e-3,
         bits=10.0)
     ((delivered,),) = feed(channel, [few])
     assert (delivered.direction, delivered.bits) == (m.Direction.UPLINK, 10.0)

@@ -20,7 +20,7 @@ PACKAGE = Path(rhs_isac_ros.__file__).parent
 OF_A_CYCLE = [m.Beacon, m.Ack, m.Grant, m.RhsCommand, m.RhsCommand, m.RhsConfiguration,
               m.RhsConfiguration, m.PilotRequest, m.Pilot, m.Pilot, m.FeedSignals, m.FeedSignals,
               m.ReceivedSignals, m.PositionEstimate, m.Beam, m.RhsConfiguration,
-              m.Data, m.DeliveredData, m.Data, m.DeliveredData]
+              m.Data, m.Data, m.Data, m.Data]
 BESIDES = (m.ProtocolState, m.GroundTruth, m.Capacity, m.CapacityStatistics)
 
 
@@ -130,9 +130,10 @@ def test_data_beyond_the_true_capacity_are_lost(network):
     net.run_cycles(5)
     limited = []
     for report in net.sent(m.Capacity):
-        data = [message for kind in (m.Data, m.DeliveredData)
-                for message in net.sent(kind, cycle_id=report.cycle_id)]
-        assert [d.direction for d in data] == [*m.Direction, *m.Direction]
+        ways = [(m.Direction.DOWNLINK, m.Stage.OFFERED), (m.Direction.DOWNLINK, m.Stage.DELIVERED),
+                (m.Direction.UPLINK, m.Stage.OFFERED), (m.Direction.UPLINK, m.Stage.DELIVERED)]
+        data = net.sent(m.Data, cycle_id=report.cycle_id)
+        assert [(d.direction, d.stage) for d in data] == ways
         assert {d.user for d in data} == {report.user}
         assert {d.duration_s for d in data} == {1e-3}
         bits = [d.bits for d in data]

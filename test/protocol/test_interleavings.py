@@ -23,8 +23,8 @@ STEP_S, ACK_S, REST_S = 0.2, 0.05, 0.08
 FAULTS_END_S, RECOVERY_S = 1.0, 3.0
 ROLES = ('bs', 'rhs_controller', 'channel', 'positioner', 'transmission', 'user1', 'user2')
 LOST = [(kind, recipient) for recipient, kinds in {
-    'bs': (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.Beam, m.DeliveredData),
-    'user': (m.Beacon, m.Grant, m.PilotRequest, m.DeliveredData),
+    'bs': (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.Beam, m.Data),
+    'user': (m.Beacon, m.Grant, m.PilotRequest, m.Data),
     'rhs_controller': (m.Grant, m.RhsCommand, m.Beam),
     'channel': (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data),
     'positioner': (m.ReceivedSignals,),

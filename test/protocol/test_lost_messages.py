@@ -16,6 +16,7 @@ pytestmark = pytest.mark.slow
 POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
 DOWN = {'direction': m.Direction.DOWNLINK}
 UP = {'direction': m.Direction.UPLINK}
+OFFERED, DELIVERED = {'stage': m.Stage.OFFERED}, {'stage': m.Stage.DELIVERED}
 # The result if the first message of a class does not reach one of its recipients: the outcome of
 # the cycle, and other counters by role. The user detects it by the next beacon or by a timeout.
 LOST = [
@@ -44,10 +45,10 @@ LOST = [
     (m.RhsConfiguration, {'mode': TRANSMISSION}, 'bs', 'transmission_silent', {}),
     (m.RhsConfiguration, {'mode': TRANSMISSION}, 'channel', 'data_lost', {}),
     (m.RhsConfiguration, {'mode': TRANSMISSION}, 'transmission', 'served', {}),
-    (m.Data, DOWN, 'channel', 'data_lost', {}),
-    (m.DeliveredData, DOWN, 'user1', 'data_lost', {}),
-    (m.Data, UP, 'channel', 'data_lost', {}),
-    (m.DeliveredData, UP, 'bs', 'data_lost', {}),
+    (m.Data, DOWN | OFFERED, 'channel', 'data_lost', {}),
+    (m.Data, DOWN | DELIVERED, 'user1', 'data_lost', {}),
+    (m.Data, UP | OFFERED, 'channel', 'data_lost', {}),
+    (m.Data, UP | DELIVERED, 'bs', 'data_lost', {}),
 ]
 IDS = [f'{kind.__name__}-{"-".join(map(str, fields.values()))}-{recipient}'
        for kind, fields, recipient, _, _ in LOST]

@@ -38,9 +38,9 @@ POSITIONING, TRANSMISSION = {'mode': m.Mode.POSITIONING}, {'mode': m.Mode.TRANSM
     (m.Beam, 'channel', {}),
     (m.Grant, 'user1', {}),
     (m.PilotRequest, 'user1', {}),
-    (m.DeliveredData, 'bs', {}),
+    (m.Data, 'bs', {}),
     (m.Data, 'channel', {}),
-    (m.DeliveredData, 'user1', {}),
+    (m.Data, 'user1', {}),
 ], ids=lambda value: getattr(value, '__name__', None))
 def test_a_message_may_be_late(network, kind, recipient, fields):
     net = network(transport=Delays(kind, recipient, 0.05, **fields))
@@ -110,8 +110,8 @@ def test_slow_steps_within_their_timeouts_lose_no_cycle(network, slow):
 def test_data_of_another_user_in_an_older_cycle_are_ignored(network):
     user = network()['user1']
     user.handle(m.Beacon(cycle_id=8, attempt=0), 0.0)
-    user.handle(m.DeliveredData(
-        cycle_id=7, user=2, direction=m.Direction.DOWNLINK,
+    user.handle(m.Data(
+        cycle_id=7, user=2, direction=m.Direction.DOWNLINK, stage=m.Stage.DELIVERED,
         duration_s=1e-3, bits=1e3), 0.1)
     assert user.state is State.ACKNOWLEDGED
     (send,) = user.handle(m.Grant(cycle_id=8, user=1), 0.2)

@@ -38,8 +38,8 @@ class Outages:
 
     def serve(self, user):
         """Return all messages but the one that service begins."""
-        data = m.DeliveredData(cycle_id=1, user=user, direction=m.Direction.UPLINK,
-                               duration_s=1e-3, bits=1.0)
+        data = m.Data(cycle_id=1, user=user, direction=m.Direction.UPLINK,
+                      stage=m.Stage.DELIVERED, duration_s=1e-3, bits=1.0)
         return [message for message in self.end(user, State.TRANSMITTING, data)
                 if not message.text.startswith('serving: ')]
 

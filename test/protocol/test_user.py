@@ -11,6 +11,7 @@ from rhs_isac_ros.protocol.events import LogMessage, PeersChanged, Send, Timeout
 from rhs_isac_ros.protocol.user import State, User
 
 DOWN, UP = m.Direction.DOWNLINK, m.Direction.UPLINK
+OFFERED, DELIVERED = m.Stage.OFFERED, m.Stage.DELIVERED
 
 
 @pytest.fixture
@@ -40,8 +41,8 @@ def test_a_beacon_is_answered(user):
 
 def test_a_late_beacon_or_grant_of_a_cycle_keeps_its_position(user):
     (truth,) = grant(user)
-    user.handle(m.DeliveredData(
-        cycle_id=7, user=4, direction=DOWN, duration_s=0.25, bits=123.0), 11.0)
+    user.handle(m.Data(
+        cycle_id=7, user=4, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=123.0), 11.0)
     assert answers(user, m.Grant(cycle_id=7, user=4), 11.5) == []
     assert user.counters == {'late_grant': 1}
     assert answers(user, m.Beacon(cycle_id=7, attempt=0), 11.5) == []
@@ -81,18 +82,19 @@ def test_a_pilot_request_is_answered_in_each_frame_and_restarts_the_timeout(user
 
 def test_the_downlink_is_answered_with_equal_uplink_and_ends_the_cycle(user):
     grant(user)
-    (data,) = answers(user, m.DeliveredData(
-        cycle_id=7, user=4, direction=DOWN, duration_s=0.25, bits=123.0), 11.0)
-    assert (data.cycle_id, data.user, data.direction, type(data)) == (7, 4, UP, m.Data)
+    (data,) = answers(user, m.Data(
+        cycle_id=7, user=4, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=123.0), 11.0)
+    assert (data.cycle_id, data.user, data.direction, data.stage) == (7, 4, UP, OFFERED)
     assert (data.duration_s, data.bits) == (0.25, 123.0)
     assert user.state is State.LISTENING
     assert user.next_deadline() == math.inf
 
 
-def test_uplink_data_are_ignored(user):
+@pytest.mark.parametrize(('direction', 'stage'), [(DOWN, OFFERED), (UP, OFFERED), (UP, DELIVERED)])
+def test_other_data_are_ignored(user, direction, stage):
     grant(user)
-    assert user.handle(m.DeliveredData(
-        cycle_id=7, user=4, direction=UP, duration_s=0.25,
+    assert user.handle(m.Data(
+        cycle_id=7, user=4, direction=direction, stage=stage, duration_s=0.25,
         bits=123.0), 11.0) == []
     assert user.state is State.GRANTED
     assert user.counters == {}
@@ -124,8 +126,8 @@ def test_a_grant_to_another_user_ends_the_wait(user):
 
 @pytest.mark.parametrize('other', [
     m.Grant(cycle_id=6, user=5), m.PilotRequest(
-        cycle_id=7, user=5, band=0, last_band=0, n_frames=2), m.DeliveredData(
-        cycle_id=6, user=5, direction=DOWN, duration_s=0.25, bits=1.0)],
+        cycle_id=7, user=5, band=0, last_band=0, n_frames=2), m.Data(
+        cycle_id=6, user=5, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=1.0)],
     ids=['grant of another cycle', 'request', 'data'])
 def test_other_messages_to_another_user_are_ignored(user, other):
     for event, state in ((m.Beacon(
@@ -228,12 +230,12 @@ def test_a_cycle_serves_the_user_of_the_node_that_is_granted_it(users, user):
         assert answers(
             users, m.PilotRequest(
         cycle_id=7, user=other, band=1, last_band=1, n_frames=2), 1.2) == []
-        assert answers(users, m.DeliveredData(
-            cycle_id=7, user=other, direction=DOWN, duration_s=0.25, bits=1.0),
+        assert answers(users, m.Data(
+            cycle_id=7, user=other, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=1.0),
             1.2) == []
     assert users.counters == {'wrong_user': 2}
-    (data,) = answers(users, m.DeliveredData(
-        cycle_id=7, user=user, direction=DOWN, duration_s=0.25, bits=1.0), 1.3)
+    (data,) = answers(users, m.Data(
+        cycle_id=7, user=user, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=1.0), 1.3)
     assert data.user == user
     assert users.state is State.LISTENING
 

@@ -11,6 +11,7 @@ from rhs_isac_ros.protocol import messages as m
 POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
 DOWN = {'direction': m.Direction.DOWNLINK}
 UP = {'direction': m.Direction.UPLINK}
+OFFERED, DELIVERED = {'stage': m.Stage.OFFERED}, {'stage': m.Stage.DELIVERED}
 
 
 def matches(message, kind, fields):
@@ -69,15 +70,15 @@ WRONG = [
     (m.Beam, {}, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
     (m.Beam, {}, 'bs', {'user': 2}, 'wrong_user'),
     (m.Beam, {}, 'bs', {'codebook_id': 'x'}, 'wrong_codebook'),
-    (m.DeliveredData, UP, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
-    (m.DeliveredData, UP, 'bs', {'user': 2}, 'wrong_user'),
+    (m.Data, UP | DELIVERED, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Data, UP | DELIVERED, 'bs', {'user': 2}, 'wrong_user'),
     (m.Grant, {}, 'user1', {'cycle_id': -1}, 'wrong_cycle'),
     (m.Grant, {}, 'user1', {}, ''),
     (m.Grant, {}, 'user1', {'user': 2, 'cycle_id': -1}, ''),
     (m.PilotRequest, {}, 'user1', {'cycle_id': -1}, 'wrong_cycle'),
     (m.PilotRequest, {}, 'user1', {'user': 2}, ''),
-    (m.DeliveredData, DOWN, 'user1', {'cycle_id': -1}, 'wrong_cycle'),
-    (m.DeliveredData, DOWN, 'user1', {'user': 2}, ''),
+    (m.Data, DOWN | DELIVERED, 'user1', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Data, DOWN | DELIVERED, 'user1', {'user': 2}, ''),
     (m.RhsCommand, {}, 'rhs_controller', {'codebook_id': 'x'}, 'wrong_codebook'),
     (m.Beam, {}, 'rhs_controller', {'cycle_id': -1}, 'wrong_cycle'),
     (m.Beam, {}, 'rhs_controller', {'codebook_id': 'x'}, 'wrong_codebook'),
@@ -88,8 +89,8 @@ WRONG = [
     (m.Pilot, {}, 'channel', {'user': 2}, 'wrong_user'),
     (m.Beam, {}, 'channel', {'cycle_id': -1}, ''),
     (m.Beam, {}, 'channel', {'user': 2}, ''),
-    (m.Data, DOWN, 'channel', {'cycle_id': -1}, 'stale'),
-    (m.Data, UP, 'channel', {'user': 2}, 'wrong_user'),
+    (m.Data, DOWN | OFFERED, 'channel', {'cycle_id': -1}, 'stale'),
+    (m.Data, UP | OFFERED, 'channel', {'user': 2}, 'wrong_user'),
     (m.ReceivedSignals, {}, 'positioner', {'codebook_id': 'x'}, 'wrong_codebook'),
     (m.PositionEstimate, {}, 'transmission', {'codebook_id': 'x'}, 'wrong_codebook'),
     (m.RhsConfiguration, {'mode': TRANSMISSION}, 'transmission', {'cycle_id': -1},

@@ -26,8 +26,7 @@ KINDS = list(topics.NAMES)
 FILES = Path(__file__).resolve().parents[2] / 'msg_defs' / 'msg'
 # Types that are parts of messages, and a message outside the protocol.
 OTHER_TYPES = {'Presence', 'RealArray', 'ComplexArray', 'Codebook'}
-ENUMS = {'RhsConfiguration': [m.Mode], 'Data': [m.Direction], 'DeliveredData': [m.Direction],
-         'ProtocolState': [m.Phase]}
+ENUMS = {'RhsConfiguration': [m.Mode], 'Data': [m.Direction, m.Stage], 'ProtocolState': [m.Phase]}
 
 
 def random_scalar(field, rng):
@@ -260,7 +259,7 @@ def test_a_value_without_a_shape_is_not_a_vector():
 
 
 @pytest.mark.parametrize(('kind', 'field', 'number'), [
-    (m.RhsConfiguration, 'mode', 2), (m.Data, 'direction', 2),
+    (m.RhsConfiguration, 'mode', 2), (m.Data, 'direction', 2), (m.Data, 'stage', 255),
     (m.ProtocolState, 'phase', 5)])
 def test_an_unknown_constant_is_rejected(kind, field, number):
     message = convert.to_ros(random_message(kind, np.random.default_rng(0)), STAMP)

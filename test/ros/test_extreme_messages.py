@@ -157,7 +157,7 @@ def test_channel_continues_after_positions_outside_the_model(channel, place):
     channel.send(truth(cycle, place), applied(scenario, cycle), pilot(cycle),
                  applied(scenario, cycle, m.Mode.TRANSMISSION), beam(scenario, cycle),
                  m.Data(cycle_id=cycle, user=1, direction=m.Direction.DOWNLINK,
-                     duration_s=1.0, bits=1.0))
+                     stage=m.Stage.OFFERED, duration_s=1.0, bits=1.0))
     send_plausible_pilot(channel)
 
 
@@ -168,11 +168,11 @@ def test_channel_continues_after_huge_numbers(channel, number):
         truth(first), applied(scenario, first), pilot(first, number),
         applied(scenario, first, m.Mode.TRANSMISSION), beam(scenario, first),
         m.Data(
-            cycle_id=first, user=1, direction=m.Direction.DOWNLINK,
+            cycle_id=first, user=1, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
             duration_s=number, bits=number),
         truth(second), applied(scenario, second, m.Mode.TRANSMISSION),
         beam(scenario, second, number),
-        m.Data(cycle_id=second, user=1, direction=m.Direction.DOWNLINK,
+        m.Data(cycle_id=second, user=1, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
             duration_s=1.0, bits=1.0))
     send_plausible_pilot(channel)
 
@@ -182,7 +182,7 @@ def test_channel_continues_after_messages_with_unknown_cycles(channel):
     for cycle_id in (0, last):
         channel.send(pilot(cycle_id), applied(channel.scenario, cycle_id), truth(cycle_id),
                      m.Data(cycle_id=cycle_id, user=0, direction=m.Direction.UPLINK,
-                         duration_s=-1.0, bits=-1.0))
+                         stage=m.Stage.DELIVERED, duration_s=-1.0, bits=-1.0))
     send_plausible_pilot(channel)
 
 

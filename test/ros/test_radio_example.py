@@ -137,10 +137,10 @@ def test_the_oldest_unanswered_pilots_are_discarded(radio):
 
 
 def test_data_are_delivered_as_far_as_the_radio_carries_them(radio):
-    offered = m.Data(cycle_id=5, user=1, direction=m.Direction.DOWNLINK,
+    offered = m.Data(cycle_id=5, user=1, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
         duration_s=1e-3, bits=100.0)
     (delivered,) = answers(radio, offered)
-    assert (type(delivered), delivered.bits) == (m.DeliveredData, 3.0)
+    assert (delivered.stage, delivered.bits) == (m.Stage.DELIVERED, 3.0)
     assert (delivered.cycle_id, delivered.user, delivered.direction) == (
         5, 1, m.Direction.DOWNLINK)
     assert answers(radio, delivered) == []

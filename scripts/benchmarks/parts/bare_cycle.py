@@ -52,8 +52,8 @@ STEPS = (
     Step(m.Beam, 'transmission', 1324, (17,)),
     Step(m.RhsConfiguration, 'rhs_controller', 908, (18,)),
     Step(m.Data, 'bs', 84, (19,)), Step(m.ProtocolState, 'bs', 116, (19,)),
-    Step(m.DeliveredData, 'channel', 84, (20,)), Step(m.Data, 'user_1', 84, (22,)),
-    Step(m.DeliveredData, 'channel', 84, (23,)))
+    Step(m.Data, 'channel', 84, (20,)), Step(m.Data, 'user_1', 84, (22,)),
+    Step(m.Data, 'channel', 84, (23,)))
 PROCESSES = ('rhs_controller', 'channel', 'user_1', 'user_2', 'positioner', 'transmission',
              'observer')
 

@@ -15,8 +15,7 @@ from rhs_isac_ros.ros.endpoints import OBSERVATION
 
 # The messages of the chain. Others are sent in parallel with them.
 KINDS = (m.Beacon, m.Ack, m.RhsCommand, m.RhsConfiguration, m.PilotRequest, m.Pilot, m.FeedSignals,
-         m.ReceivedSignals, m.PositionEstimate, m.Beam, m.Data, m.DeliveredData,
-         m.ProtocolState)
+         m.ReceivedSignals, m.PositionEstimate, m.Beam, m.Data, m.ProtocolState)
 
 
 class Link(NamedTuple):
@@ -118,7 +117,7 @@ _SENDERS = {
 
 def _sender_of(message: m.Message) -> str:
     match message:
-        case m.DeliveredData():
+        case m.Data(stage=m.Stage.DELIVERED):
             return 'channel'
         case m.Data():
             return 'bs' if message.direction is m.Direction.DOWNLINK else 'user'
@@ -136,6 +135,6 @@ def _step(message: m.Message) -> str | None:
         case m.RhsCommand() | m.RhsConfiguration() if message.band > 0:
             # Sent in parallel with those of the first band.
             return None
-        case m.Data() | m.DeliveredData():
-            return f'{name} {message.direction.name.lower()}'
+        case m.Data():
+            return f'{name} {message.direction.name.lower()} {message.stage.name.lower()}'
     return name

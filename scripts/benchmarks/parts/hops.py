@@ -19,7 +19,7 @@ from rhs_isac_ros.ros.run import run
 # Messages of a cycle in order. Those of all bands are sent in parallel and count once.
 CHAIN = ('beacon', 'ack', 'rhs/command', 'rhs/configuration', 'pilot_request', 'pilot',
          'feed_signals', 'received_signals', 'position_estimate', 'beam', 'rhs/configuration',
-         'data', 'delivered_data', 'data', 'delivered_data')
+         'data', 'data', 'data', 'data')
 ROUND_TRIPS = 2000
 
 
