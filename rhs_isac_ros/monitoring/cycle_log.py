@@ -99,7 +99,8 @@ class CycleRecord(CycleTimes):
 class CycleLog:
     """Collects the cycles of one network, also across restarts of its base station.
 
-    All that have `ended` are in order, and those that were served and received completely as well.
+    `ended` lists all cycles that have ended, in order, and `complete` those that were served and
+    received completely.
     """
 
     def __init__(self) -> None:

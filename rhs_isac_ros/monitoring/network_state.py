@@ -44,9 +44,9 @@ class NodeStatus(NamedTuple):
 class Overview:
     """Phase, cycles, users and nodes of one network; what is unknown is 0, empty or None.
 
-    The `phase` is that of the base station, `RESTING` between cycles, and the codebook that of the
-    latest signals. Of each user, the latest complete cycle is kept by id, of each node the status
-    by name. Names and ids come from messages, so that their numbers are limited.
+    The `phase` is that of the base station, `RESTING` between cycles, and the codebook is that of
+    the latest signals. `users` holds the latest complete cycle of each user by id, and `nodes` the
+    status of each node by name. Both are limited in number, because they come from messages.
     """
 
     def __init__(self) -> None:

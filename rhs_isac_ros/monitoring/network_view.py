@@ -189,7 +189,7 @@ class TrackPoint(NamedTuple):
 class NetworkView:
     """Converts the messages of a network to entries, in the order in which they arrive.
 
-    It counts the cycles observed, and those received completely or given up.
+    `n_cycles` counts the observed cycles, and `n_ended` those received completely or given up.
     """
 
     def __init__(self, scenario: Scenario) -> None:

@@ -117,8 +117,8 @@ class UserRegistry:
 
         A user that was invited to this cycle and has not answered in time loses its turn.
         Otherwise, the range of a user that is always late would be invited in every cycle, and
-        the users of the other ranges never. The result is a warning at the first ack of the owner
-        after one of another instance was rejected, and otherwise empty.
+        other ranges would never be. Returns a warning at the first ack of the owner after the
+        rejection of another instance; otherwise an empty text.
         """
         user = self._users.get(number)
         # A new user comes after all that wait and before the one served last, so that users that

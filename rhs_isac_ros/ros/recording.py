@@ -176,8 +176,8 @@ def read(
 ) -> Iterator[tuple[str, Any, float]]:
     """Yield topic, ROS message and time [s] of what a recording contains, in the order of writing.
 
-    Topics have full names; those to read are `names`, or all if None. Raises RecordingError if the
-    file cannot be read, or a message had other fields when it was recorded.
+    `names` selects topics by their full names; None selects all. Raises RecordingError if the file
+    cannot be read, or a message had other fields when it was recorded.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
     checked: set[int] = set()

@@ -121,7 +121,7 @@ class CodebookClient:
             self._use(values)
 
     def _use(self, values: Sequence[ParameterValue]) -> None:
-        """Use the codebook of a response, if it is the announced one, or that itself."""
+        """Use the codebook of a response if it was announced, otherwise the announced one."""
         self._fetched = self._announced
         assert self._announcement
         codebook = self._announcement
