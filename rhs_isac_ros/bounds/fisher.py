@@ -104,19 +104,12 @@ def inverse_information(information: np.ndarray) -> np.ndarray:
     return inverse
 
 
-@one_blas_thread
-def fisher_information(
-        scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> np.ndarray:
+def fisher_information(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
     """Implements Eq. (12). Fisher information of the received signals about the position.
 
     Takes positions of the user, float64 [N, 3] [m]. Returns I_FIM, float64 [N, 3, 3] [1/m^2].
     """
-    return fisher_information_of(MeasurementModel(scenario, codebook), positions)
-
-
-def fisher_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
-    """Compute `fisher_information` for a model, whose whitener is shared by all calls."""
-    return _information(model, positions, np.empty((0, *model.shape)))
+    return joint_information_of(model, positions)[:, :3, :3]
 
 
 def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
@@ -125,23 +118,16 @@ def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.n
     Returns float64 [N, 3 + Q, 3 + Q]; the nuisance parameters are scaled to a standard normal
     prior.
     """
-    return _information(model, positions, nuisance_of(model.scenario).scaled_patterns)
-
-
-def _information(
-        model: MeasurementModel, positions: np.ndarray, patterns: np.ndarray) -> np.ndarray:
-    """Information about the position and the Q parameters of patterns [Q, N_B, N_SB F]."""
     positions = checked_positions(positions)
-    information = np.zeros((len(positions), *[3 + len(patterns)] * 2))
+    patterns = nuisance_of(model.scenario).scaled_patterns
+    information = np.empty((len(positions), *[3 + len(patterns)] * 2))
 
     def fill(block: slice) -> None:
-        if len(patterns):
-            directions = patterns * model.mean(positions[block])[:, None]
-        for band, whitener in enumerate(model.whitener):
-            rows = model.band_jacobian(positions[block], band)
-            if len(patterns):
-                rows = np.concatenate([rows, directions[:, :, band]], axis=1)
-            information[block] += quadratic_form(rows @ whitener.T)
+        mean, slopes = model.mean_and_jacobian(positions[block])
+        rows = np.concatenate([slopes, patterns * mean[:, None]], axis=1)
+        whitened = np.matmul(np.swapaxes(rows, 1, 2), np.swapaxes(model.whitener, 1, 2))
+        information[block] = np.sum([
+            quadratic_form(whitened[:, band]) for band in range(len(model.whitener))], axis=0)
 
     map_blocks(fill, position_blocks(model.scenario, len(positions)))
     return information

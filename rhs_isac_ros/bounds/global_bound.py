@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import fisher_information_of
+from rhs_isac_ros.bounds.fisher import fisher_information
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import blocks
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
@@ -243,7 +243,7 @@ def _steps(model: MeasurementModel, rng: np.random.Generator) -> tuple[np.ndarra
     for axis in (1, 2):
         slopes[:, 0, axis] = -distance * sight[:, axis] / sight[:, 0]
         slopes[:, axis, axis] = distance
-    information = fisher_information_of(model, positions)
+    information = fisher_information(model, positions)
     diagonal = np.einsum('nap,nab,nbp->np', slopes, information, slopes).mean(axis=0)
     low, high = _polar_box(model.scenario)
     extent = high - low

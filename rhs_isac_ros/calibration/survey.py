@@ -247,8 +247,8 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     """
     whitener = np.linalg.inv(np.linalg.cholesky(total))
     nuisance = nuisance_of(model.scenario).scaled_patterns
-    slopes = np.concatenate(
-        [model.jacobian(positions), nuisance * model.mean(positions)[:, None]], axis=1)
+    mean, by_position = model.mean_and_jacobian(positions)
+    slopes = np.concatenate([by_position, nuisance * mean[:, None]], axis=1)
     white = np.einsum('irs,nis->nir', whitener, residuals)
     columns = np.einsum('irs,nais->nair', whitener, slopes)
     # The inverse of total - e e^H is a change of rank one; the share of e in total is below 1.

@@ -10,7 +10,7 @@ from rhs_isac_ros.bounds import AverageCrlb, rows
 from rhs_isac_ros.bounds.rows import CompressedRows, Evaluation, ExactRows, rows_within
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.los import los_derivative, los_gain
+from rhs_isac_ros.model.los import los_and_derivative, los_gain
 
 N_ITEMS = 60
 DIMENSIONS = 144
@@ -40,7 +40,8 @@ def items(request, wide):
     firsts, seconds = wide.sample_positions(
         2 * N_ITEMS, np.random.default_rng(1)).reshape(2, -1, 3)
     if request.param == 'derivatives':
-        return np.stack([los_derivative(wide, firsts, i) for i in range(2)], axis=2)
+        return np.stack(
+            [los_and_derivative(wide, firsts, i)[1] for i in range(2)], axis=2)
     return np.stack(
         [(los_gain(wide, firsts, i) - los_gain(wide, seconds, i))[:, None] for i in range(2)],
         axis=2)

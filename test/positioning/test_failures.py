@@ -79,7 +79,7 @@ def test_the_likelihood_has_the_moments_of_surfaces_with_a_given_set(codebook, m
             shares.append(share)
             mean = mean + share * means[-1]
             scattered = scattered + share * surface.covariance()
-            slopes = slopes + share * surface.jacobian(POSITION[None])[0]
+            slopes = slopes + share * surface.mean_and_jacobian(POSITION[None])[1][0]
     covariance = real_covariance(scattered)
     for share, one in zip(shares, means, strict=True):
         deviation = real(one - mean)
