@@ -141,7 +141,7 @@ class Candidate:
 
 @dataclasses.dataclass(frozen=True)
 class BandPlan:
-    """Result of `optimize_band_plan`: the scenario with its bands, and its codebook.
+    """Result of `best_of`: the scenario with its bands, and its codebook.
 
     `candidates` are the plans that `choose_bands` compared, the best one first, and `error_m2` is
     the expected squared error, NaN if the optimisation of the codebook was interrupted.
@@ -151,21 +151,6 @@ class BandPlan:
     result: OptimizeResult
     candidates: tuple[Candidate, ...]
     error_m2: float
-
-
-def optimize_band_plan(
-        scenario: Scenario, spectrum_hz: Sequence[tuple[float, float]], n_bands: int, *,
-        raster_hz: float = DEFAULT_RASTER_HZ, min_gap_hz: float | None = None, seed: int = 0,
-        max_steps: int | None = None) -> BandPlan:
-    """Choose centre frequencies and a codebook for them with `choose_bands` and `best_of`.
-
-    `max_steps` limits the full optimisations, for which `optimize` describes the default.
-    """
-    candidates = choose_bands(
-        scenario, spectrum_hz, n_bands, raster_hz=raster_hz, min_gap_hz=min_gap_hz, seed=seed)
-    return best_of(
-        scenario, candidates,
-        lambda plan: optimize(plan, objective='error', seed=seed, max_steps=max_steps), seed)
 
 
 def best_of(

@@ -9,7 +9,7 @@ import numpy as np
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.geometry import element_positions, feed_positions
-from rhs_isac_ros.model.los import los_gain_at
+from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import onboard_matrix
@@ -89,7 +89,8 @@ class BandLink:
         Raise ValueError if the position is not a finite [3] array.
         """
         onboard, fixed = arrays(scenario, surface)
-        los = los_gain_at(scenario, position, [bands] if isinstance(bands, int) else bands)
+        listed, place = np.atleast_1d(bands).tolist(), np.asarray(position)[None]
+        los = np.concatenate([los_gain(scenario, place, band) for band in listed])
         if isinstance(bands, int):
             los = los[0]
         index = band_index(bands)

@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.model.arrays import check_arrays, read_only
+from rhs_isac_ros.model.external import ArrayFile
 from rhs_isac_ros.support.files import (
     ArchiveError,
-    ArrayFile,
     read_archive,
     read_arrays,
     write_archive,
@@ -75,8 +75,6 @@ class MultipathEstimate(ArrayFile):
         ``level_std_db``, the standard deviation of the power among users [dB];
         ``coverage``, the expected share of positions in the 95 % region, with its interval;
         ``warnings``; ``codebook``, its id; ``version``.
-    path
-        File from which it was read.
 
     Raises
     ------
@@ -91,7 +89,7 @@ class MultipathEstimate(ArrayFile):
     excess: np.ndarray
     conditions: dict[str, Any]
     about: dict[str, Any] = dataclasses.field(default_factory=dict)
-    path: str = ''
+    origin: str = ''
 
     def __post_init__(self) -> None:
         """Check sizes and numbers, and make the arrays read-only."""
@@ -142,7 +140,7 @@ class MultipathEstimate(ArrayFile):
             content: dict[str, Any] = {name: float(about[name]) for name in FIELDS}
             content |= {name: array.astype(complex) for name, array in arrays.items()}
             content |= {name: dict(about[name]) for name in ('conditions', 'about')}
-            return cls(**content, path=str(path))
+            return cls(**content, origin=str(path))
         except (KeyError, TypeError, ValueError) as error:
             raise ArchiveError(f'{path}: {error}') from None
 
@@ -169,8 +167,6 @@ class PathChannel(ArrayFile):
     gains
         Factors of the paths at each element, complex128 [N, P, N_E], for objects that only a part
         of the surface sees; None if all are 1.
-    path
-        File from which the paths were read.
 
     Raises
     ------
@@ -184,7 +180,7 @@ class PathChannel(ArrayFile):
     n: np.ndarray
     f0: float
     gains: np.ndarray | None = None
-    path: str = ''
+    origin: str = ''
 
     def __post_init__(self) -> None:
         """Check sizes and numbers, and make the arrays read-only."""
@@ -314,6 +310,6 @@ class PathChannel(ArrayFile):
                     raise ArchiveError(f'{name}: missing, expected an array of this name')
             content: dict[str, Any] = {
                 name: arrays[name].astype(kind) for name, kind in _TYPES.items() if name in arrays}
-            return cls(**content | {'f0': float(arrays['f0'])}, path=str(path))
+            return cls(**content | {'f0': float(arrays['f0'])}, origin=str(path))
         except (TypeError, ValueError) as error:
             raise ArchiveError(f'{path}: {error}') from None

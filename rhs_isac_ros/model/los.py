@@ -56,13 +56,6 @@ def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
     return total
 
 
-def los_gain_at(scenario: Scenario, position: np.ndarray, bands: Sequence[int]) -> np.ndarray:
-    """Compute `los_gain` at one position [3] [m] in n bands, complex128 [n, N_SB, N_E]."""
-    offsets, distances = _separation(scenario, np.asarray(position)[None])
-    amplitude = _amplitude(scenario, offsets)
-    return np.concatenate([_gain(scenario, distances, band, amplitude) for band in bands])
-
-
 def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
              weights: np.ndarray) -> np.ndarray:
     """Sum the gains of `los_gain` over the elements in n bands, complex128 [n, N, N_SB].

@@ -266,7 +266,7 @@ class MeasurementModel:
     def mean_and_jacobian(
             self, positions: np.ndarray, by_coordinate: np.ndarray | None = None, *,
             whitened: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Implements Eq. (13). Mean and its derivative, complex128 [N, 3, N_B, N_SB F] [1/m].
+        """Compute the mean and its derivative, complex128 [N, 3, N_B, N_SB F] [1/m]: Eq. (13).
 
         The mean is that of `mean`, computed faster and with different rounding. Both results may
         be `whitened`. With derivatives of the positions with respect to Q other coordinates,
@@ -332,7 +332,7 @@ class MeasurementModel:
 
 
 class ElementSums:
-    """Weights of the elements for the mean signals and their derivative.
+    """Implements Eq. (13). Sums over the elements for the mean signals and their derivative.
 
     Each sum over elements of a T_i (p - p_m) is p times the sum of a T_i, minus the sum of
     a T_i p_m: sums of N_E terms that need no array of N_E by 3. `block` is the number of positions

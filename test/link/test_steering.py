@@ -14,7 +14,7 @@ from rhs_isac_ros.link import (
     capacity,
     capacity_report,
     choose_beam,
-    expected_capacity,
+    expected_capacities,
     prepare_steering,
     search,
     steer,
@@ -211,7 +211,7 @@ def test_the_choice_is_the_best_band_steered_to_the_mean(table1):
     expected = []
     for band in range(scenario.n_bands):
         beam = steer(scenario, POSITION, band)
-        expected.append(expected_capacity(scenario, beam, POSITION, covariance))
+        expected += expected_capacities(scenario, [beam], POSITION, covariance).tolist()
     assert choice.expected_bps == max(expected)
     assert choice.beam.band == np.argmax(expected)
     best = steer(scenario, POSITION, choice.beam.band)

@@ -271,7 +271,7 @@ class TestIdentity:
         assert first != second
         assert yaml.safe_load(yaml.safe_dump(first)) == first
         with pytest.raises(
-                ScenarioError, match='element_gain: .* not a plug-in, expected a number'):
+                ScenarioError, match='element_gain: .* without an origin, expected a number'):
             Scenario(**first)
 
     def test_a_pattern_with_a_function_of_a_module_can_be_pickled(self):
@@ -324,9 +324,9 @@ def broken(angles):
 
     def test_a_pattern_with_another_digest_is_an_error(self):
         with pytest.raises(ScenarioError, match=(
-                r'element_gain: .*antennas:patch of antennas: digest \w+, expected 0123: the '
-                'pattern has changed')):
-            Scenario(element_gain='patch@0123')
+                r'element_gain: patch: digest \w+, expected 0123456789abcdef: the content has '
+                'changed')):
+            Scenario(element_gain='patch@0123456789abcdef')
 
     @pytest.mark.parametrize(('name', 'words'), [
         ('absent', r"'absent', expected a plug-in of .*; installed: broken, complex_, minus"),

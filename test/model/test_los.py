@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.los import (
     checked_positions,
     los_and_derivative,
     los_gain,
-    los_gain_at,
     los_sums,
 )
 
@@ -86,15 +84,6 @@ def test_checked_positions_accepts_lists():
     positions = checked_positions([[1, 2, 3]])
     assert positions.dtype == float
     assert positions.tolist() == [[1.0, 2.0, 3.0]]
-
-
-@pytest.mark.parametrize('gain', [1.0, GainPattern(lambda angles: np.cos(angles / 2))])
-def test_gains_at_one_position_are_those_of_each_band(gain):
-    scenario, position = Scenario(element_gain=gain), np.array([8.0, -2.0, 0.5])
-    found = los_gain_at(scenario, position, [1, 0])
-    for by_band, band in zip(found, [1, 0], strict=True):
-        expected = los_gain(scenario, position[None], band)[0]
-        np.testing.assert_allclose(by_band, expected, rtol=1e-9)
 
 
 def test_sums_over_the_elements_are_those_of_the_gains(table1):
