@@ -48,9 +48,9 @@ class Misspecified(NamedTuple):
     covariance
         Covariance of the errors about the pseudo-true position, float64 [N, 3, 3] [m^2].
     valid
-        Whether the result describes the estimator: ambiguities of the range are improbable, the
-        mean is linear over the errors, the border of the region is far away, and estimators
-        do not refuse the signals for their residual, bool [N].
+        Whether the result describes the estimator, bool [N]: ambiguities of the range are
+        improbable, the mean is linear over the errors, the border of the region is far away, and
+        estimators accept the residual of the signals.
     """
 
     bias: np.ndarray

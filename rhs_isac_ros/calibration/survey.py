@@ -1,17 +1,18 @@
 """Covariance of the multipath in one hall from signals at known positions.
 
-The residuals of N positions have the sample covariance S. With an inverse Wishart prior of the
-weight nu, whose mean L_0 is the covariance that three fields declare, the posterior mean is
+The residuals of N positions have the sample covariance S. With an inverse Wishart prior of weight
+nu, whose mean L_0 is the covariance that three fields declare, the posterior mean is
 
     L = t (nu L_0 + N S) / (nu + N).
 
-Fields and nu maximise the evidence, so that few positions yield almost the fields, and many the
-sample covariance. Multipath of few strong paths is not Gaussian: errors of positions then exceed
-the bound of L for t = 1. Each position is therefore left out in turn, and t makes the 95 % region
-of the local bound contain 95 % of the positions left out, and the test of the residual pass 99 %.
+Fields and nu maximise the evidence, so that L is close to the declared covariance for few
+positions, and to the sample covariance for many. Multipath that consists of a few strong paths is
+not Gaussian: positioning errors then exceed the bound for t = 1. Each position is therefore left
+out in turn, and t is chosen so that 95 % of these positions lie in the 95 % region of the local
+bound, and 99 % pass the test of the residual.
 
-Positions whose signals are more probable without a direct path, as multipath of an unknown level,
-are left out.
+Positions are excluded if their signals are more probable without a direct path, as multipath of an
+unknown level.
 """
 
 import dataclasses

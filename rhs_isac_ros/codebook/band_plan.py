@@ -129,7 +129,7 @@ class Candidate:
     Attributes
     ----------
     screening_m2
-        Squared error by confusion of ranges, from the range ambiguity function.
+        Squared error from confusing ranges, according to the range ambiguity function.
     error_m2
         Expected squared error with an optimised codebook, see `expected_error`.
     """
@@ -281,7 +281,7 @@ def expected_error(
 
     The estimate is the global bound, a few percent below the error. This bound ignores nuisance
     parameters: if the scenario declares any, the estimate is the average local bound with the
-    region as prior, plus the squared error by confusion of ranges.
+    region as prior, plus the squared error from confusing ranges.
     """
     rng = streams.generator(seed, streams.PLANS, 1)
     if not len(nuisance_of(scenario)):

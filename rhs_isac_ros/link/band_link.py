@@ -21,7 +21,7 @@ _MIN_GAIN = 1e-300
 def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
     """Divide power [W] among channels so that the sum of log(1 + gain * share) is highest.
 
-    The gains are relative to noise, float64 [..., N] [1/W]; each row is a problem of its own. The
+    The gains are relative to noise, float64 [..., N] [1/W]; each row is a separate problem. The
     shares, float64 [..., N] [W], are not negative, and those of a row have the sum `power_w`. If
     no gain of a row is positive, its shares are equal.
     """

@@ -1,4 +1,4 @@
-"""Search for configurations from which to start an ascent, for all bands at a time."""
+"""Search for the configurations from which an ascent starts, in all bands at once."""
 
 import functools
 from typing import NamedTuple

@@ -2,10 +2,10 @@
 
 A survey measures the covariance. Gains g of the elements in all measurements of a band are
 Gaussian with the covariance C_0 that three fields of the scenario declare. A survey with the
-radiation matrix T replaces the covariance L_0 of its signals T g + noise by a measured one, L, and
-leaves the distribution of g given these signals as it is. Of all covariances whose signals have
-the covariance L, the following one of g is then the closest to C_0 in the sense of Kullback and
-Leibler, apart from the noise:
+radiation matrix T replaces the covariance L_0 of its signals T g + noise with a measured one, L,
+and keeps the distribution of g given these signals. Among all covariances of g for which the
+signals have the covariance L, the result has the smallest Kullback-Leibler divergence from C_0,
+apart from the noise:
 
     C = C_0 + C_0 T^H M T C_0    with    M = L_0^-1 (L - L_0) L_0^-1.
 

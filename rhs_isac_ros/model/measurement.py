@@ -299,8 +299,8 @@ class MeasurementModel:
 
         Multipath and noise are drawn together, with the covariance Lambda_i. `simulate_received`
         draws the gain of every element instead; the distribution is the same, but the call takes
-        a hundred times as long. Impairments that the scenario declares are drawn as described
-        there, and so are the signals of a channel file.
+        a hundred times as long. As there, impairments that the scenario declares are drawn too,
+        and the paths of a channel file replace direct path and random multipath.
         """
         scenario = self.scenario
         surface, factors = draw_impairments(scenario, len(positions), rng)
