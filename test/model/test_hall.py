@@ -369,6 +369,13 @@ def test_numbers_that_are_not_finite_are_refused(estimate, name):
         dataclasses.replace(estimate, **{name: np.nan * getattr(estimate, name)})
 
 
+def test_arrays_are_read_only(mirror, estimate):
+    for array in (mirror.users, mirror.a, mirror.src, mirror.n, estimate.radiation,
+                  estimate.excess):
+        with pytest.raises(ValueError, match='read-only'):
+            array[0] = 1
+
+
 def test_sizes_that_disagree_are_refused(estimate):
     with pytest.raises(ArchiveError, match=r'^excess: shape \(2, 5, 6\)'):
         dataclasses.replace(estimate, excess=estimate.excess[:, 1:])
