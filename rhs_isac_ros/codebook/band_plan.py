@@ -185,7 +185,6 @@ def best_of(
 def choose_bands(
         scenario: Scenario, spectrum_hz: Sequence[tuple[float, float]], n_bands: int, *,
         raster_hz: float = DEFAULT_RASTER_HZ, min_gap_hz: float | None = None, seed: int = 0,
-        n_candidates: int = _CANDIDATES,
         report: Callable[[Candidate], None] | None = None) -> tuple[Candidate, ...]:
     """Choose centre frequencies with which users are located accurately.
 
@@ -199,10 +198,8 @@ def choose_bands(
         Smallest distance of two centre frequencies [Hz]; by default, the width of a band.
     seed
         Seed of the samples and of the optimisations.
-    n_candidates
-        Number of plans for which codebooks are compared.
     report
-        Called with each of these.
+        Called with each plan for which a codebook is optimised.
 
     Returns
     -------
@@ -214,8 +211,6 @@ def choose_bands(
     ValueError
         If an argument is out of range, or no plan has the gap.
     """
-    if n_candidates < 1:
-        raise ValueError(f'n_candidates: {n_candidates}, expected at least 1')
     if n_bands < 1 or scenario.n_bands * scenario.n_frames % n_bands:
         raise ValueError(
             f'bands: {n_bands}, expected a divisor of {scenario.n_bands * scenario.n_frames}, '
@@ -230,7 +225,7 @@ def choose_bands(
     candidates = []
     for plan, screening in _proposals(
             scenario, frequencies_hz, n_bands, gap_hz, _MIN_DIFFERENCE * raster_hz,
-            n_candidates, streams.generator(seed, streams.PLANS)):
+            streams.generator(seed, streams.PLANS)):
         world = with_bands(scenario, plan)
         short = optimize(world, objective='error', seed=seed, n_positions=_SHORT_POSITIONS,
                          max_steps=_SHORT_STEPS)
@@ -250,9 +245,9 @@ def with_bands(scenario: Scenario, frequencies_hz: Sequence[float]) -> Scenario:
 
 def _proposals(
         scenario: Scenario, frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
-        difference_hz: float, n: int, rng: np.random.Generator
+        difference_hz: float, rng: np.random.Generator
 ) -> list[tuple[tuple[float, ...], float]]:
-    """Return up to n different plans, from the energy levels in turn, with screening values."""
+    """Return different plans, from the energy levels in turn, with screening values."""
     spread = np.linspace(frequencies_hz[0], frequencies_hz[-1], n_bands)
     energies = _energies(with_bands(scenario, spread.tolist()))
     low, high = scenario.roi_bounds_m
@@ -265,7 +260,7 @@ def _proposals(
         order = np.argsort(values, kind='stable')
         ranked.append(iter(zip(plans[order], values[order], strict=True)))
     chosen: list[tuple[tuple[float, ...], float]] = []
-    while ranked and len(chosen) < n:
+    while ranked and len(chosen) < _CANDIDATES:
         source = ranked.pop(0)
         for plan, value in source:
             if all(np.abs(plan - other).max() >= difference_hz for other, _ in chosen):
