@@ -12,7 +12,6 @@ import numpy as np
 from rhs_isac_ros.bounds.fisher import (
     inverse_information,
     quadratic_form,
-    region_information,
     without_nuisance,
 )
 from rhs_isac_ros.bounds.rows import (
@@ -33,6 +32,7 @@ from rhs_isac_ros.model.elements import (
     error_radiation,
     error_terms,
 )
+from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions, los_and_derivative
 from rhs_isac_ros.model.multipath import (

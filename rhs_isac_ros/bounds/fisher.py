@@ -4,17 +4,15 @@ import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.gaussian import marginalise
+from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.measurement import position_blocks
-from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
 # A normalised matrix with a smaller pivot is singular up to rounding.
 _MIN_PIVOT = 1e-14
-# A region thinner than this, in wavelengths, determines the coordinate.
-_NO_EXTENT = 1e-5
 
 
 @one_blas_thread
@@ -62,15 +60,6 @@ def without_nuisance(joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     prior = np.diag(np.repeat([0.0, 1.0], [3, joint.shape[1] - 3]))
     marginal = marginalise(joint + prior, np.zeros(joint.shape[:2]))
     return marginal.information, marginal.regression
-
-
-def region_information(scenario: Scenario) -> np.ndarray:
-    """Return the information of a Gaussian as wide as the region, float64 [3, 3] [1/m^2].
-
-    Its covariance is that of the uniform distribution, size^2 / 12.
-    """
-    shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
-    return np.diag(12 / np.maximum(scenario.roi_size_m, _NO_EXTENT * shortest)**2)
 
 
 def inverse_information(information: np.ndarray) -> np.ndarray:

@@ -27,6 +27,7 @@ from rhs_isac_ros.calibration.estimate import Alignment, Pilots
 from rhs_isac_ros.model import Beamforming, MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
+from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.hall import CONDITIONS, FIELDS, MultipathEstimate
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.measurement import Surface
@@ -257,8 +258,9 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     products = np.einsum('nair,nir->nai', columns.conj(), white)
     information = np.einsum('nair,nbir->nab', columns.conj(), columns) + np.einsum(
         'nai,nbi,ni->nab', products, products.conj(), own)
-    information = 2 * n_others * information.real + np.diag(np.concatenate(
-        [12 / np.array(model.scenario.roi_size_m)**2, np.ones(len(nuisance))]))
+    prior = np.eye(information.shape[1])
+    prior[:3, :3] = region_information(model.scenario)
+    information = 2 * n_others * information.real + prior
     gradient = 2 * n_others * np.einsum('nai,ni->na', products[:, :3], own).real
     covariance = np.linalg.inv(information)[:, :3, :3]
     return _LeftOut(np.einsum('na,nab,nb->n', gradient, covariance, gradient),

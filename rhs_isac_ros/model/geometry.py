@@ -11,6 +11,9 @@ import numpy as np
 from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
+# A region thinner than this, in wavelengths, determines the coordinate.
+_NO_EXTENT = 1e-5
+
 
 def mean_wavelength_m(scenario: Scenario) -> float:
     """Return lambda_avr [m], the mean wavelength of the bands' centres (Section V)."""
@@ -105,3 +108,12 @@ def polar_bounds(bounds: np.ndarray) -> np.ndarray:
             others = np.delete(nearest if outward else farthest, axis)
             limits[side, axis] = bound / np.hypot(bound, np.linalg.norm(others))
     return limits
+
+
+def region_information(scenario: Scenario) -> np.ndarray:
+    """Return the information of a Gaussian as wide as the region, float64 [3, 3] [1/m^2].
+
+    Its covariance is that of the uniform distribution, size^2 / 12.
+    """
+    shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
+    return np.diag(12 / np.maximum(scenario.roi_size_m, _NO_EXTENT * shortest)**2)
