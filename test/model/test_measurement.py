@@ -246,6 +246,8 @@ def test_beamforming_of_another_size_is_an_error(small):
     scenario = dataclasses.replace(small.scenario, elements_per_side=3)
     with pytest.raises(ValueError, match='^analog: shape '):
         MeasurementModel(scenario, small.codebook)
+    with pytest.raises(ValueError, match='^digital: shape '):
+        MeasurementModel(dataclasses.replace(small.scenario, n_feeds=1), small.codebook)
 
 
 N_PHASES = 1500
