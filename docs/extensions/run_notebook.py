@@ -1,6 +1,6 @@
 """Execute a notebook in MyST Markdown and write it in Jupyter's format, with its outputs.
 
-    python docs/extensions/run_notebook.py docs/notebooks/first_fix.md first_fix.ipynb
+    python3 docs/extensions/run_notebook.py docs/notebooks/first_fix.md first_fix.ipynb
 
 Jupyter itself is not needed. Outputs are those of Jupyter: printed text, the value of a cell's
 last expression unless a semicolon follows, and the figures that are open at its end. A warning in
@@ -106,7 +106,7 @@ def _figures():
 def main(arguments=None):
     """Run the command line and return its exit code."""
     parser = argparse.ArgumentParser(
-        prog='python docs/extensions/run_notebook.py', description='Execute a notebook.')
+        prog='python3 docs/extensions/run_notebook.py', description='Execute a notebook.')
     parser.add_argument('source', type=Path, help='notebook in MyST Markdown')
     parser.add_argument('output', type=Path, help='file to write, in the format of Jupyter')
     options = parser.parse_args(arguments)

@@ -30,7 +30,7 @@ from rhs_isac_ros.support.progress import progress_bar
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 2 if an argument or a file is invalid, or 130 after Ctrl-C."""
     parser = ArgumentParser(
-        prog='python -m rhs_isac_ros.positioning', description=__doc__,
+        prog='python3 -m rhs_isac_ros.positioning', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     add = parser.add_argument
     add('--codebook', type=input_file, required=True, help='codebook file')

@@ -153,7 +153,7 @@ class NeuralEstimator:
         if model_file == '':
             raise ModelError(
                 'model_file: none, expected a model of this codebook, trained with '
-                'python -m rhs_isac_ros.positioning')
+                'python3 -m rhs_isac_ros.positioning')
         if isinstance(model_file, Network):
             self._network, source = model_file, 'model'
         else:

@@ -177,7 +177,7 @@ def test_several_impairments_are_integrated_out(codebook, changes):
     mean, covariance = model.mean(grid()), model.covariance_at(grid())
     noise = scenario.noise_power_w * np.eye(covariance.shape[-1])
     nuisance = nuisance_of(scenario)
-    line = np.linspace(-4, 4, 31)
+    line = np.linspace(-4, 4, 21)
     values = np.stack(np.meshgrid(*[line] * len(nuisance)), axis=-1).reshape(-1, len(nuisance))
     for phase, signals in enumerate(received):
         terms = []

@@ -63,7 +63,7 @@ def crlb_of_range(model, truth):
 
 @pytest.mark.slow
 def test_squared_errors_have_the_mean_of_the_bound():
-    scenario, _, bound = bound_and_codebook(256, roi_size_m=(4.0, 4.0, 1.0))
+    scenario, _, bound = bound_and_codebook(128, roi_size_m=(4.0, 4.0, 1.0))
     spread = np.std(bound.squared_errors) / np.sqrt(len(bound.squared_errors))
     assert abs(bound.squared_errors.mean() - bound.value) < 4 * np.hypot(
         spread, bound.standard_error)
@@ -83,10 +83,9 @@ def test_too_few_phases_are_an_error():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('height', [0.0, 1.2])
-def test_a_flat_region_is_the_limit_of_thin_ones(height):
+def test_a_flat_region_is_the_limit_of_thin_ones():
     flat, thin = (bound_and_codebook(
-        1024, multipath_to_los_db=-20.0, roi_center_m=(5.0, 0.0, height),
+        512, multipath_to_los_db=-20.0, roi_center_m=(5.0, 0.0, 1.2),
         roi_size_m=(1.0, 1.0, size))[2] for size in (0.0, 2e-2))
     spread = np.hypot(flat.standard_error, thin.standard_error)
     assert flat.value == pytest.approx(thin.value, abs=4 * spread + 0.05 * thin.value)

@@ -40,8 +40,8 @@ def test_without_a_wrong_assumption_it_is_the_bound(plan, positions):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('field', 'value', 'has_bias'), [
-    ('angular_spread_deg', 14.0, False), ('angular_spread_deg', 5.0, False),
-    ('multipath_to_los_db', -28.0, False), ('refractive_index', 2.102, True)])
+    ('angular_spread_deg', 14.0, False), ('multipath_to_los_db', -28.0, False),
+    ('refractive_index', 2.102, True)])
 def test_where_valid_it_is_the_error_of_the_estimator(plan, positions, field, value, has_bias):
     scenario, codebook = plan
     true = dataclasses.replace(scenario, **{field: value})
@@ -50,13 +50,13 @@ def test_where_valid_it_is_the_error_of_the_estimator(plan, positions, field, va
     assert (np.linalg.norm(result.bias, axis=1) > 1e-4).any() == has_bias
     estimator, model = make_estimator('ml', scenario, codebook), MeasurementModel(true, codebook)
     chosen = np.flatnonzero(result.valid)[:15]
-    places = np.repeat(positions[chosen], 200, axis=0)
+    places = np.repeat(positions[chosen], 80, axis=0)
     estimate = estimator.estimate(model.sample(places, np.random.default_rng(1)))
     assert estimate.fix.mean() > 0.99
     squares = np.sum((estimate.mean - places)[estimate.fix]**2, axis=1)
     assert np.mean(squares) == pytest.approx(result.mse_m2[chosen].mean(), rel=0.1)
-    bias = (estimate.mean - places).reshape(len(chosen), 200, 3)
-    own = np.sqrt(np.trace(result.covariance[chosen], axis1=1, axis2=2) / 200)
+    bias = (estimate.mean - places).reshape(len(chosen), 80, 3)
+    own = np.sqrt(np.trace(result.covariance[chosen], axis1=1, axis2=2) / 80)
     error = np.linalg.norm(np.nanmean(bias, axis=1) - result.bias[chosen], axis=1)
     assert np.mean(error / own) < 1.5
 

@@ -99,12 +99,12 @@ def test_estimates_after_a_survey_are_in_their_regions(shipped):
 @pytest.mark.slow
 def test_positions_behind_obstacles_are_left_out(beams):
     """A third of the positions receives multipath alone, 6 dB weaker than that of the others."""
-    positions, received = send(HALL, beams, 60)
+    positions, received = send(HALL, beams, 30)
     model = MeasurementModel(HALL, beams)
     received[::3] = (received[::3] - model.mean(positions[::3])) / 2
     estimate = survey(DECLARED, beams, positions, received)
-    assert estimate.about['blocked'] == 20
-    seen = np.arange(60) % 3 > 0
+    assert estimate.about['blocked'] == 10
+    seen = np.arange(30) % 3 > 0
     alone = survey(DECLARED, beams, positions[seen], received[seen])
     np.testing.assert_allclose(
         estimate.excess, alone.excess, atol=1e-3 * np.abs(alone.excess).max())
@@ -141,7 +141,7 @@ def test_a_calibrated_surface_takes_part(beams):
     rng = np.random.default_rng(0)
     gains = 1 + 0.3 * rng.normal(size=(25, 2)) @ [1, 1j]
     surface = ElementErrors(gains, np.full(25, np.nan))
-    positions = HALL.sample_positions(40, rng)
+    positions = HALL.sample_positions(25, rng)
     received = MeasurementModel(HALL, beams, surface).sample(positions, rng)
     levels = [survey(DECLARED, beams, positions, received, known).multipath_to_los_db
               for known in (surface, None)]
@@ -156,17 +156,16 @@ def test_a_calibration_holds_in_every_hall(estimate, beams, tmp_path):
     assert make_estimator('bayes', measured, beams, surface=surface).surface is surface
 
 
-@pytest.mark.parametrize('n', [1, 3])
-def test_few_positions_yield_nearly_the_fields_and_a_warning(beams, n):
+def test_one_position_yields_nearly_the_fields_and_a_warning(beams):
     with pytest.warns(SurveyWarning, match='expected at least 20'):
-        estimate = survey(DECLARED, beams, *send(HALL, beams, n))
-    assert f'positions: {n}' in estimate.about['warnings'][0]
+        estimate = survey(DECLARED, beams, *send(HALL, beams, 1))
+    assert 'positions: 1' in estimate.about['warnings'][0]
     assert np.isfinite(estimate.excess).all()
     assert 1.2 < estimate.about['inflation'] < 2
 
 
 def test_a_survey_in_a_corner_causes_a_warning(beams):
-    positions, received = send(HALL, beams, 200)
+    positions, received = send(HALL, beams, 120)
     corner = (positions[:, 1] < -2)
     with pytest.warns(SurveyWarning, match='along y, expected at least half of the 10 m'):
         estimate = survey(DECLARED, beams, positions[corner], received[corner])

@@ -332,14 +332,11 @@ def test_the_picture_is_drawn(call, files):
     assert (files / 'picture.png').read_bytes().startswith(b'\x89PNG')
 
 
-@pytest.mark.slow
-def test_the_package_is_executable(files):
-    done = subprocess.run(
-        [sys.executable, '-m', 'rhs_isac_ros.codebook', '--scenario', files / 'scenario.yaml',
-         '--method', 'random', '--positions', '4', '--output', files / 'codebook.yaml'],
-        capture_output=True, text=True, timeout=60)
+def test_the_package_is_executable():
+    done = subprocess.run([sys.executable, '-m', 'rhs_isac_ros.codebook', '--help'],
+                          capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
-    assert 'average CRLB' in done.stdout
+    assert '--objective' in done.stdout
 
 
 def test_options_can_be_added_to_another_parser():

@@ -57,7 +57,7 @@ def reference(setting):
     user = np.array([[7.0, 2.0, 1.0]])
     signals = model.whiten(model.sample(user, rng))[0]
     ranges = alternatives._ranges(scenario)[[0, -1]]
-    n = 400_000
+    n = 200_000
     direction = rng.normal(size=(n, 3))
     direction[:, 0] = np.abs(direction[:, 0])
     direction /= np.linalg.norm(direction, axis=1)[:, None]
@@ -185,7 +185,7 @@ def test_users_around_the_region_get_no_fix_or_a_probability_outside(name, shipp
         found.outside_probability[found.fix] <= 0.05)
 
 
-N_USERS = 200
+N_USERS = 120
 DECLARED = dataclasses.replace(Scenario(), blocked_probability=0.3)
 
 
@@ -230,12 +230,12 @@ def test_blocked_users_have_the_multipath_alone(shipped):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('reject_outside', [False, True])
-@pytest.mark.parametrize(('name', 'change'), [
-    ('bayes', {}), ('ml', {}), ('bayes', {'user_gain_std_db': 3.0}),
-    ('bayes', {'carrier_offset_std_hz': 500.0, 'phase_std_rad': 6.3}),
-    ('bayes', {'element_error_rms': 0.05})], ids=['bayes', 'ml', 'gain', 'carrier', 'elements'])
-def test_the_probability_of_blocked_users_is_calibrated(name, reject_outside, change, shipped):
+@pytest.mark.parametrize(('name', 'change', 'reject_outside'), [
+    ('bayes', {}, True), ('ml', {}, False), ('bayes', {'user_gain_std_db': 3.0}, False),
+    ('bayes', {'carrier_offset_std_hz': 500.0, 'phase_std_rad': 6.3}, False),
+    ('bayes', {'element_error_rms': 0.05}, True)],
+    ids=['bayes', 'ml', 'gain', 'carrier', 'elements'])
+def test_the_probability_of_blocked_users_is_calibrated(name, change, reject_outside, shipped):
     scenario = dataclasses.replace(DECLARED, **change)
     _, received, blocked = signals_of(scenario, shipped, 2)
     estimate = make_estimator(

@@ -294,8 +294,8 @@ def test_a_full_disk_ends_the_recording_with_one_error(bench, probe, tmp_path):
     bench.until(publisher.get_subscription_count, 'the recorder')
 
     def failed():
-        for _ in range(100):
-            publisher.publish(ros.Ack(cycle_id=1, user=1, scenario_id=1000 * 'x'))
+        for _ in range(5):
+            publisher.publish(ros.Ack(cycle_id=1, user=1, scenario_id=200_000 * 'x'))
         return recorder.failure
     assert 'run.mcap.part: cannot be written: No space left on device; the recording ends after ' \
         in bench.until(failed, 'the failure')
