@@ -25,7 +25,7 @@ _STEPS = 40
 
 
 class PairwiseErrorCost(Average):
-    """Mean squared error caused by the confusion of pairs of positions.
+    """Mean squared error from confusing pairs of positions.
 
     A maximum-likelihood decision between two positions is wrong with probability Q(sqrt(q / 2)),
     where q = sum_i dmu_i^H Lambda_i^-1 dmu_i and dmu is the difference of the mean signals. The

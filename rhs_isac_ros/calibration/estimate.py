@@ -137,7 +137,7 @@ class Alignment:
 
     def step(self, whiten: Callable[[np.ndarray], np.ndarray], signals: np.ndarray,
              mean: np.ndarray, values: np.ndarray) -> None:
-        """Improve the values for signals with a mean, both [N, N_B, N_SB F]."""
+        """Improve the values for signals and their mean, both [N, N_B, N_SB F]."""
         aligned = self.aligned(signals, values)
         slopes = whiten(self.slopes(aligned, mean))
         residual = whiten(aligned) - whiten(mean)

@@ -315,7 +315,7 @@ def _level_std_db(left_out: _LeftOut, n_measurements: int) -> float:
 
 
 def _radius() -> float:
-    """Squared Mahalanobis radius of the region of the probability `COVERAGE`."""
+    """Squared Mahalanobis radius of the region of probability `COVERAGE`."""
     from scipy.special import chdtri
 
     return float(chdtri(3, 1 - COVERAGE))

@@ -159,10 +159,10 @@ def best_of(
         report: Callable[[Candidate], None] | None = None) -> BandPlan:
     """Optimise codebooks for the first candidates, and return the plan with the lowest error.
 
-    The best of the candidates comes first. It is also the result unless the error of another one
-    is clearly lower. Candidates with much larger errors are left out. An interrupted `search` for
-    a codebook ends the comparison with the best plan so far. `report` is called with each other
-    plan and its error with the codebook.
+    The candidates are in ascending order of their errors. The first one is the result unless the
+    error of another one is clearly lower; candidates with much larger errors are skipped. If a
+    `search` for a codebook is interrupted, the best plan so far is the result. `report` is called
+    with each plan that has a codebook, and its error.
     """
     best: BandPlan | None = None
     for candidate in candidates[:_FINALISTS]:

@@ -67,7 +67,7 @@ def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray)
 @one_blas_thread
 def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray,
                     blocked: np.ndarray | None = None) -> np.ndarray:
-    """Compute the capacity on the paths of a channel file; without one, that of `capacity`.
+    """Compute the capacity on the paths of a channel file, or `capacity` if there is no file.
 
     With a channel file, `blocked`, bool [N], marks the users without line of sight.
     """

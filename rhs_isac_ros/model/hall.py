@@ -69,7 +69,7 @@ class MultipathEstimate(ArrayFile):
     excess
         M_i, complex128 [N_B, N_SB F, N_SB F] [1/W].
     conditions
-        Fields of the scenario of the survey on which it depends.
+        Fields of the survey's scenario on which the covariance depends.
     about
         How it was made: ``positions``, their number; ``prior_weight`` nu, ``inflation`` t and
         ``level_std_db``, the standard deviation of the power among users [dB];

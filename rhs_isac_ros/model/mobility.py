@@ -156,7 +156,7 @@ class RandomWalk(StraightMobility):
 
 
 class Traced:
-    """User of a channel file who is nearest to the position of another mobility.
+    """The user of a channel file who is nearest to the position of another mobility.
 
     The velocity is that of the other mobility.
     """

@@ -139,7 +139,7 @@ def spatial_covariance(scenario: Scenario) -> SpatialCovariance:
 
 @functools.lru_cache(maxsize=16)
 def declared_covariance(scenario: Scenario) -> SpatialCovariance:
-    """Return V_i of all bands as fields declare it, the same in all measurements."""
+    """Return V_i of all bands as the fields declare it; it is the same in all measurements."""
     lattice, shape = _lattice(scenario), (scenario.n_rows, scenario.n_columns)
     is_real = not lattice.imag.any()
     power = np.repeat(lattice[:, shape[0] - 1, shape[1] - 1, None].real, scenario.n_elements, 1)
@@ -315,7 +315,7 @@ def coupling(scenario: Scenario, radiation: np.ndarray, other: np.ndarray) -> np
 
 
 def scattered_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
-    """Compute the covariance of the multipath in the received signals, as `signal_covariance`."""
+    """Compute the multipath part of `signal_covariance`."""
     covariance = coupling(scenario, radiation, radiation)
     if measured := scenario.multipath:
         to_survey = coupling(scenario, radiation, measured.radiation)
