@@ -166,7 +166,8 @@ class SearchEstimator(abc.ABC):
         aligned = self._alignment.values_of_each(signals.received)
         extra = self._failures.search_margin if self._failures else 0.0
         modes = find_modes(likelihood, self._grid, signals, aligned, extra_margin=extra)
-        conditionals: list[Sequence[Conditional]] = [[likelihood]] * len(aligned)
+        conditionals: list[Sequence[Conditional]] = [
+            [self._dispersed or likelihood]] * len(aligned)
         if self._dispersed:
             modes = ascend(self._dispersed, likelihood, modes.starts(), signals, 1, np.inf)
         if self._failures:
