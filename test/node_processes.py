@@ -15,6 +15,7 @@ import pytest
 import rclpy
 import yaml
 from ament_index_python.packages import get_package_prefix
+from forked import Forked
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -49,14 +50,19 @@ EXECUTABLES = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros'
 class Process:
     """A process of an executable, whose output goes to a file."""
 
-    def __init__(self, executable, options, arguments, log):
+    def __init__(self, executable, options, arguments, log, as_program):
         self._log = log
+        command = [str(EXECUTABLES / executable), *map(str, options), '--ros-args',
+                   *map(str, arguments)]
+        environment = {**os.environ, 'ROS_LOG_DIR': str(log.parent)}
+        log.touch()
+        if not as_program:
+            self._popen = Forked(command, log, environment)
+            return
         with open(log, 'wb') as stream:
             self._popen = subprocess.Popen(
-                [EXECUTABLES / executable, *options, '--ros-args', *arguments],
-                stdin=subprocess.DEVNULL, stdout=stream, stderr=stream,
-                env={**os.environ, 'ROS_LOG_DIR': str(log.parent),
-                     PARENT_ID: str(os.getpid())})
+                command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream,
+                env={**environment, PARENT_ID: str(os.getpid())})
 
     @property
     def log(self):
@@ -95,8 +101,12 @@ class Processes:
         self._folder = folder
         self._all = []
 
-    def start(self, executable, *arguments, name='', namespace='/', options=(), **parameters):
-        """Start an executable with command line options and ROS parameters."""
+    def start(self, executable, *arguments, name='', namespace='/', options=(),
+              as_program=False, **parameters):
+        """Start an executable with command line options and ROS parameters.
+
+        By default, it is a copy of a process that has imported it; a program takes longer.
+        """
         for key, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             arguments += ('-p', f'{key}:={text}')
@@ -105,7 +115,7 @@ class Processes:
         if namespace != '/':
             arguments += ('-r', f'__ns:={namespace}')
         log = self._folder / f'{len(self._all)}_{name or executable}.log'
-        process = Process(executable, options, arguments, log)
+        process = Process(executable, options, arguments, log, as_program)
         self._all.append(process)
         return process
 

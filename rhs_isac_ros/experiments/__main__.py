@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from rhs_isac_ros.codebook import OBJECTIVES, CodebookError
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.experiments.command import add_run_options, markdown_table, run_command
+from rhs_isac_ros.experiments.jobs import add_run_options, markdown_table, run_command
 from rhs_isac_ros.experiments.sweep import KINDS, OPTIMIZE, Point, Sweep, run_sweep, table
 from rhs_isac_ros.experiments.sweep_picture import draw, shown
 from rhs_isac_ros.experiments.sweep_settings import (

@@ -230,13 +230,10 @@ def _key(point: Point, axes: Sequence[Axis]) -> tuple[Any, ...]:
     return tuple(point.setting.varied[axis.fields[0]] for axis in axes)
 
 
-def _unit(name: str) -> str:
-    return str(FIELDS[name].metadata['declared'].unit) if name in FIELDS else ''
-
-
 def _label(axis: Axis) -> str:
     """Return name and symbol of the first field of an axis, and its unit unless values have it."""
     name = axis.fields[0]
-    label = str(FIELDS[name].metadata['label']) if name in FIELDS else name
-    unit = _unit(name)
-    return f'{label} [{unit}]' if unit and name != 'center_frequencies_hz' else label
+    if name not in FIELDS:
+        return name
+    label, unit = FIELDS[name].metadata['label'], FIELDS[name].metadata['declared'].unit
+    return f'{label} [{unit}]' if unit and name != 'center_frequencies_hz' else str(label)

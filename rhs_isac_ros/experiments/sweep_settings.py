@@ -76,9 +76,9 @@ class Interval(NamedTuple):
 def measured(measure: Measure, results: np.ndarray) -> Interval:
     """Return a measure of results, float64 [codebooks, positions], with its interval.
 
-    The interval is a bootstrap over codebooks and positions. A share of a single codebook or of
-    equal results has Wilson's interval, because the bootstrap of equal results has no width. The
-    value is NaN if a result is, and the interval of an infinite mean is NaN.
+    The interval is a bootstrap over codebooks and positions. A share has Wilson's interval if
+    there is one codebook or if all results are equal, because their bootstrap has no width. The
+    value is NaN if a result is NaN, and the interval of an infinite mean is NaN.
     """
     if np.isnan(results).any():
         return Interval(np.nan, np.nan, np.nan)

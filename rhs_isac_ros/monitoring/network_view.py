@@ -291,6 +291,8 @@ class NetworkView:
                     self._origins.put(message.cycle_id, message.position)
                 yield f'{path}/true_path', shapes.path(
                     message.user, self._scene.users[message.user].true_path)
+                if self._scenario.channel:
+                    yield f'{path}/traced', shapes.traced(self._scenario, message)
             case m.PositionEstimate():
                 path = f'{_path(message.user)}/estimate'
                 point, ellipsoid = shapes.estimate(message)

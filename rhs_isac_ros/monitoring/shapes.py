@@ -11,8 +11,6 @@ from collections.abc import Iterable
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
 
 from rhs_isac_ros.link import Beam, BeamPattern, beam_pattern
 from rhs_isac_ros.model import Scenario
@@ -126,7 +124,7 @@ _TRUTH_RADIUS_M, _ESTIMATE_RADIUS_M = 0.18, 0.12
 _MODE_RADIUS_M = 0.2
 # Modes of a smaller probability are not shown.
 _MIN_PROBABILITY = 0.005
-_LINE_WIDTH = 2.0
+_LINE_WIDTH, _PATH_WIDTH = 2.0, 0.8
 # Brightness of true paths, so that other entities in front of them stand out.
 _DIM = 0.45
 # Height of the name above the user; a name on the user hides the estimate.
@@ -143,6 +141,11 @@ def user_colour(user: int) -> Colour:
     return colorsys.hsv_to_rgb(_HUE_STEP * user % 1.0, 0.8, 0.9)
 
 
+def _dimmed(user: int) -> Colour:
+    red, green, blue = user_colour(user)
+    return _DIM * red, _DIM * green, _DIM * blue
+
+
 def distance_95(n: int) -> float:
     """Return the distance, in standard deviations, that contains 95 % of a Gaussian.
 
@@ -151,6 +154,8 @@ def distance_95(n: int) -> float:
     n
         Number of dimensions.
     """
+    from scipy.special import chdtri
+
     return math.sqrt(chdtri(n, 0.05))
 
 
@@ -251,9 +256,27 @@ def modes(user: int, found: WeightedModes) -> tuple[Points, Ellipsoids]:
 
 def path(user: int, positions: Iterable[np.ndarray]) -> Lines:
     """Return positions, float64 [3] [m] each, as a dim line in the colour of a user."""
-    red, green, blue = user_colour(user)
-    return Lines((np.array(list(positions)).reshape(-1, 3),),
-                 (_DIM * red, _DIM * green, _DIM * blue), _LINE_WIDTH)
+    return Lines((np.array(list(positions)).reshape(-1, 3),), _dimmed(user), _LINE_WIDTH)
+
+
+def traced(scenario: Scenario, message: m.GroundTruth) -> Lines:
+    """Return the propagation paths from a user to the surface if the scenario has a file of them.
+
+    They are those of the nearest traced position. The virtual source of a path with a single
+    reflection determines the wall, which is halfway between the source and the user. Paths with
+    more reflections are left out.
+    """
+    strips: list[np.ndarray] = []
+    if channel := scenario.channel:
+        (nearest,) = channel.nearest(message.position[None]).tolist()
+        user = channel.users[nearest]
+        for source, n_reflections, amplitude in zip(
+                channel.sources[nearest], channel.n[nearest], channel.a[nearest], strict=True):
+            if amplitude and n_reflections <= 1:
+                offset = source - user
+                share = offset @ (source + user) / 2 / (offset @ source) if n_reflections else 1.0
+                strips.append(np.stack([user, share * source, np.zeros(3)]))
+    return Lines(tuple(strips), _dimmed(message.user), _PATH_WIDTH)
 
 
 def track(
@@ -292,6 +315,9 @@ def lobe(shown: BeamPattern, user: int) -> Mesh:
 
 def _ellipsoids(
         centres: np.ndarray, covariances_m2: np.ndarray, colours: np.ndarray) -> Ellipsoids:
+    # The import takes as long as that of the rest of a program, which may never need it.
+    from scipy.spatial.transform import Rotation
+
     shapes = [axes_95(covariance) for covariance in covariances_m2]
     return Ellipsoids(
         centres, np.maximum([half_m for half_m, _ in shapes], _MIN_HALF_SIZE_M),

@@ -78,13 +78,16 @@ class VisualizerNode(Node):
 
     def _show_markers(self, stamp: Time) -> None:
         state = self._scene
-        bodies: dict[tuple[str, int], shapes.Points | shapes.Ellipsoids | shapes.Boxes] = {
+        bodies: dict[tuple[str, int], shapes.Points | shapes.Ellipsoids | shapes.Boxes
+                     | shapes.Lines] = {
             ('region', 0): shapes.region(self._scenario),
             ('board', 0): shapes.board(
                 self._scenario, state.configuration.analog if state.configuration else None)}
         for number, user in state.users.items():
             if user.truth:
                 bodies['truth', number], _ = shapes.truth(user.truth)
+                if self._scenario.channel:
+                    bodies['traced', number] = shapes.traced(self._scenario, user.truth)
             if user.estimate:
                 _, bodies['estimate', number] = shapes.estimate(user.estimate)
         array = [scene.marker(*key, body, stamp) for key, body in bodies.items()]

@@ -158,6 +158,15 @@ _DESTRUCTION_S = 10
 _POLL_S = 0.1
 
 
+def collect_signals() -> list[int]:
+    """Handle SIGINT and SIGTERM by adding their numbers to a list, which is returned."""
+    # A handler may interrupt the other one and must not take a lock.
+    signals: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: signals.append(number))
+    return signals
+
+
 def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         done: Callable[[], bool] = lambda: False) -> int:
     """Create nodes, spin them in this thread until a signal arrives, and destroy them.
@@ -179,10 +188,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         invalid.
     """
     program = os.path.basename(args[0]) if args else ''
-    # A list, because a handler may interrupt the other one and must not take a lock.
-    signals: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: signals.append(number))
+    signals = collect_signals()
     use_discovery_profile()
     try:
         if not ok():

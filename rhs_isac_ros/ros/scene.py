@@ -4,6 +4,7 @@ Markers are in metres in the frame of the surface; `place` moves them to the fra
 messages.
 """
 
+import itertools
 from collections.abc import Iterable
 
 import numpy as np
@@ -22,7 +23,7 @@ from rclpy.node import Node
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
 
-from rhs_isac_ros.monitoring.shapes import Boxes, Ellipsoids, Mesh, Points
+from rhs_isac_ros.monitoring.shapes import Boxes, Ellipsoids, Lines, Mesh, Points
 from rhs_isac_ros.ros import endpoints
 from rhs_isac_ros.ros.endpoints import create_publisher
 from rhs_isac_ros.ros.frames import Frame, to_ros
@@ -30,12 +31,14 @@ from rhs_isac_ros.ros.topics import RHS_FRAME, TF, TF_STATIC
 
 # Opacity of bodies through which others remain visible.
 _ELLIPSOID, _OUTLINE, _MESH = 0.35, 0.15, 0.25
+# Width of a line for a point of the screen [m].
+_LINE_M = 0.02
 
 
 def marker(
-        namespace: str, number: int, shape: Points | Ellipsoids | Boxes | Mesh, stamp: Time
+        namespace: str, number: int, shape: Points | Ellipsoids | Boxes | Lines | Mesh, stamp: Time
 ) -> Marker:
-    """Return a ball, an ellipsoid, cuboids or a mesh as a marker.
+    """Return a ball, an ellipsoid, cuboids, lines or a mesh as a marker.
 
     Rerun draws an ellipsoid and a box that is not solid as outlines; here they are translucent.
     """
@@ -59,6 +62,12 @@ def marker(
             found.points = [to_ros(Point, centre) for centre in shape.centres]
             found.colors = [_colour(colour, 1.0 if shape.solid else _OUTLINE)
                             for colour in shape.colours]
+        case Lines():
+            found = _marker(namespace, number, Marker.LINE_LIST, stamp)
+            found.scale.x = _LINE_M * shape.width
+            found.points = [to_ros(Point, end) for strip in shape.strips
+                            for pair in itertools.pairwise(strip) for end in pair]
+            found.color = _colour(shape.colour, 1.0)
         case Mesh():
             found = _marker(namespace, number, Marker.TRIANGLE_LIST, stamp)
             found.scale = Vector3(x=1.0, y=1.0, z=1.0)

@@ -16,8 +16,8 @@ class MissingLibraryError(ImportError):
 def optional_import(purpose: str, extra: str = '') -> Iterator[None]:
     """Replace an ImportError inside the block by a MissingLibraryError with instructions.
 
-    `purpose`, the task that needs the library, is the beginning of the message. `extra` is the
-    extra of this package that installs the library.
+    The message begins with `purpose`, the task that needs the library. `extra` is the extra of
+    this package that installs it.
     """
     try:
         yield

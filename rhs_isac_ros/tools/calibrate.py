@@ -57,7 +57,7 @@ _N_COMPARED = 200
 
 
 class PilotLog:
-    """Collects received signals of one user or, if 0, all, their true positions, and codebooks.
+    """Collects the signals, true positions and codebooks of one user, or of all users for 0.
 
     Unlike in a `CycleLog`, cycles without a fix count: before a calibration, there may be no
     others.
@@ -80,7 +80,7 @@ class PilotLog:
                 self._signals.setdefault(found.cycle_id, found)
 
     def has_pilots(self, n: int) -> bool:
-        """Return whether position and codebook of a number of pilots are known."""
+        """Return whether the positions and codebooks of `n` pilots are known."""
         # There are at most as many as signals, which are quicker to count.
         return len(self._signals) >= n and self.n_pilots >= n
 
@@ -167,7 +167,13 @@ def _collected(
                 options.file, options.namespace, scenario, [*RECEIVES, Codebook]):
             log.add(found)
     else:
-        _listen(options, scenario, log, arguments)
+        end_s = time.monotonic() + options.timeout
+        command.observe(
+            lambda: CalibratorNode(log, scenario), arguments,
+            lambda _: log.has_pilots(options.cycles) or time.monotonic() > end_s)
+        if not log.has_pilots(options.cycles):
+            raise command.none_within(
+                f'{log.n_pilots} of {options.cycles} pilots', options.timeout)
     if options.codebook:
         codebook = Codebook.load(options.codebook)
         codebook.check(scenario)
@@ -181,17 +187,6 @@ def _collected(
             f'{source}: no received signals with a true position, expected at least one in the '
             f'namespace {options.namespace}')
     return pilots
-
-
-def _listen(options: argparse.Namespace, scenario: Scenario, log: PilotLog,
-            arguments: Sequence[str]) -> None:
-    """Collect pilots of a running network, or raise ToolError if there are not enough in time."""
-    end_s = time.monotonic() + options.timeout
-    command.observe(
-        lambda: CalibratorNode(log, scenario), arguments,
-        lambda _: log.has_pilots(options.cycles) or time.monotonic() > end_s)
-    if not log.has_pilots(options.cycles):
-        raise command.none_within(f'{log.n_pilots} of {options.cycles} pilots', options.timeout)
 
 
 def _survey(scenario: Scenario, pilots: Sequence[Pilots], options: argparse.Namespace) -> None:
@@ -244,18 +239,13 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add('file', type=input_file, nargs='?',
         help='recording made with record, or .npz file with the arrays positions [N, 3] (m) and '
-        'received [N, N_B, N_SB F]')
+        'received [N, N_B, N_SB F], by default received with the default codebook')
     add('--multipath', action='store_true',
-        help='estimate the multipath of the hall instead of the surface')
-    add('--calibration', type=input_file, metavar='FILE',
-        help='calibrated surface to assume with --multipath')
+        help='estimate the multipath of the hall instead of the surface, which --calibration '
+        'describes')
     add('--output', type=output_file, default=Path('calibration.npz'), metavar='FILE',
         help='calibration or multipath to write (default: calibration.npz)')
-    add('--config', type=input_file, metavar='FILE',
-        help="scenario file; by default the recorded scenario, or the paper's Table I")
-    add('--codebook', type=input_file, metavar='FILE',
-        help='codebook to assume if the recording contains none; of arrays, by default the '
-        'default one')
+    command.add_files(parser, 'config', 'codebook', 'calibration')
     add('--user', type=integer(0), default=0, metavar='ID',
         help='use only the signals of this user (default: of all users)')
     add('--namespace', default='/', help='namespace of the recorded network (default: /)')

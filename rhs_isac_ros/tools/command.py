@@ -39,7 +39,7 @@ from rhs_isac_ros.ros.startup import (
     use_discovery_profile,
 )
 from rhs_isac_ros.support import plugins
-from rhs_isac_ros.support.arguments import check_distinct
+from rhs_isac_ros.support.arguments import check_distinct, input_file
 from rhs_isac_ros.support.optional import MissingLibraryError
 
 # Changes of the graph do not wake the executor, so the graph is polled with this period [s].
@@ -53,6 +53,10 @@ INVALID = (RecordingError, ScenarioError, CodebookError, CalibrationError, Model
 # End of the error that messages do not match the scenario.
 OTHER_SCENARIO = '; if the network uses another scenario, pass it with --config FILE'
 _NodeT = TypeVar('_NodeT', bound=Node)
+_FILES = {
+    'config': "scenario file; by default that of the recording, or the paper's Table I",
+    'codebook': 'codebook to assume; by default the recorded one',
+    'calibration': 'calibration of the surface; by default that of the scenario'}
 
 
 class ToolError(RuntimeError):
@@ -106,6 +110,12 @@ def run_command(
         return 2
 
 
+def add_files(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add options for files of what is known of a network: keys of `_FILES`."""
+    for name in names:
+        parser.add_argument(f'--{name}', type=input_file, metavar='FILE', help=_FILES[name])
+
+
 def print_now(*values: object, end: str = '\n') -> None:
     """Print and flush, so that a pipe receives the text at once."""
     print(*values, end=end, flush=True)
@@ -121,7 +131,7 @@ def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) 
 
 
 def none_within(what: str, timeout_s: float) -> ToolError:
-    """Return the error that a network did not provide something within a time [s]."""
+    """Return the error for what a network did not provide within a time [s]."""
     return ToolError(f'{what} within {timeout_s:g} s, in the domain '
                      f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace')
 

@@ -291,7 +291,7 @@ def _run(
         'prior': options.prior, 'track_speed_mps': max(scenario.max_user_speed_mps, 0.01)}
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         # The log of the cycles is complete when the processes are about to end.
-        with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
+        with Processes(Path(logs), {'ROS_LOG_DIR': logs}, fork=True) as processes:
             problem = ''
             try:
                 with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
@@ -316,11 +316,11 @@ def _observe(
         log: CycleLog, processes: Processes, recorder: Recorder | None, cycles: int,
         parts: list[tuple[str, float]]) -> str:
     """Observe a number of cycles, and return the error that ended them; empty if none did."""
-    # The network needs a moment to start.
-    prepare_drawing()
     rclpy.init(args=prepare(['demo']))
     with one_line():
         observer = CycleObserver(recorder, log=log, **WITHOUT_SERVICES)
+    # The network needs a moment to start.
+    prepare_drawing()
     discovered_s: list[float] = []
     try:
         return watch(observer, processes, cycles, _show_progress,

@@ -34,7 +34,7 @@ _REGION: dict[str, Any] = {'facecolor': '0.95', 'edgecolor': '0.4', 'linestyle':
 
 
 def prepare_drawing() -> None:
-    """Import what the pictures need, while there is nothing else to do."""
+    """Import what the pictures need, so that drawing does not have to wait for it."""
     # Not at the start of the program, which has more urgent imports.
     from matplotlib import figure, patches, style
     from matplotlib.backends import backend_agg

@@ -30,7 +30,7 @@ class RecorderNode(Node):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Record until a signal arrives, see `run_command`; 1 if the file cannot be completed."""
+    """Record until a signal arrives; return the exit code of `run_command`."""
     return run_command(_record, _parser(), arguments, ['--config'], ['file'])
 
 

@@ -417,12 +417,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--track', action='store_true', help='also track the users with the estimator bayes')
     add('--track-speed', type=positive_float, default=Motion.speed_mps, metavar='MPS',
         help='typical speed of the users (default: 1 m/s)')
-    add('--codebook', type=input_file, metavar='FILE',
-        help='codebook to assume; by default the recorded one')
-    add('--config', type=input_file, metavar='FILE',
-        help='scenario file; by default the recorded scenario')
-    add('--calibration', type=input_file, metavar='FILE',
-        help='calibration of the surface; by default that of the scenario')
+    command.add_files(parser, 'codebook', 'config', 'calibration')
     add('--model', type=input_file, metavar='FILE', help='model of the estimator neural')
     add('--namespace', default='/', help='namespace of the recorded network (default: /)')
     add = parser.add_argument_group(

@@ -16,12 +16,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user_registry import join_users
 from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
-from rhs_isac_ros.support.arguments import (
-    ArgumentParser,
-    input_file,
-    nonnegative_float,
-    picture_file,
-)
+from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float, picture_file
 from rhs_isac_ros.support.pictures import write_picture
 from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.command import ToolError
@@ -64,8 +59,8 @@ class SnapshotNode(Node):
     def is_ready(self, wait_s: float) -> bool:
         """Return whether to draw the scene.
 
-        Every user has had time to report, and the scene is complete or has been incomplete for
-        longer than the given time [s].
+        This is the case when every user has had time to report and the scene is complete, or has
+        been incomplete for longer than `wait_s` [s].
         """
         now_s, scene = time.monotonic(), self.scene
         return now_s > self._began_s + _REPORT_PERIOD_S and (
@@ -138,8 +133,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--timeout', type=nonnegative_float, default=30.0, metavar='S',
         help='maximum wait in all; the scene is then drawn as far as it is known '
         '(default: 30 s)')
-    add('--config', type=input_file, metavar='FILE',
-        help="scenario file of the network; by default the paper's Table I")
+    command.add_files(parser, 'config')
     return parser
 
 

@@ -7,6 +7,7 @@ import argparse
 import array
 import collections
 import importlib
+import operator
 import sys
 import time
 from collections.abc import Sequence
@@ -112,7 +113,10 @@ def echo(session: Session, options: argparse.Namespace) -> None:
         # With --once, further messages may be waiting already.
         if options.once and printed:
             return
-        value = _select(message, options.field)
+        try:
+            value = operator.attrgetter(options.field)(message) if options.field else message
+        except AttributeError as error:
+            raise ToolError(f"Invalid field '{options.field}': {error}") from None
         text = (as_yaml(value, max_length) if hasattr(value, 'get_fields_and_field_types')
                 else f'{value}\n')
         print_now(f'{text}---')
@@ -125,16 +129,6 @@ def echo(session: Session, options: argparse.Namespace) -> None:
         session.spin_until(lambda: bool(options.once and printed), options.timeout)
     finally:
         session.node.destroy_subscription(subscription)
-
-
-def _select(message: Any, field: str) -> Any:
-    """Return a field of a message; dots select nested fields, and '' the message itself."""
-    for part in filter(None, field.split('.')):
-        try:
-            message = getattr(message, part)
-        except AttributeError as error:
-            raise ToolError(f"Invalid field '{field}': {error}") from None
-    return message
 
 
 def show_rate(session: Session, options: argparse.Namespace) -> None:

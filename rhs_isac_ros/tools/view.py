@@ -6,7 +6,6 @@ import functools
 import itertools
 import math
 import os
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -46,6 +45,7 @@ from rhs_isac_ros.ros.endpoints import (
     subscribe_messages,
 )
 from rhs_isac_ros.ros.recording import RecordingError
+from rhs_isac_ros.ros.run import collect_signals
 from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
@@ -366,10 +366,7 @@ def _show_live(
 def _show_recording(
         stream: RerunStream, scenario: Scenario, posteriors: Posteriors,
         options: argparse.Namespace) -> int:
-    # A list, because a handler must not take a lock.
-    signals: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: signals.append(number))
+    signals = collect_signals()
     stream.write(itertools.takewhile(lambda _: not signals, entries(
         options.file, options.namespace or '/', scenario, posteriors,
         (options.track_speed or Motion.speed_mps) if options.track else None,
@@ -390,11 +387,7 @@ def _parser() -> argparse.ArgumentParser:
         help='write a file for Rerun, *.rrd, instead of serving the viewer')
     add('--cycles', type=positive_int, default=0, metavar='N',
         help='show N cycles; the view of a running network then ends')
-    add('--config', type=input_file, metavar='FILE',
-        help="scenario file; by default that of the recording, or the paper's Table I")
-    add('--calibration', type=input_file, metavar='FILE',
-        help='calibration of the surface, for the modes of the posterior; by default that of '
-        'the scenario')
+    command.add_files(parser, 'config', 'calibration')
     add = parser.add_argument_group('browser').add_argument
     add('--port', type=integer(1, 65533), default=_PORT, metavar='P',
         help=f'port of the viewer; its data use the next two (default: {_PORT})')

@@ -73,18 +73,26 @@ def _table(title: str, justify: Literal['left', 'right'], *heads: str) -> 'Table
 
 def _users(overview: Overview, now_s: float) -> 'RenderableType':
     table = _table('Users', 'right', 'user', 'position\n[m]', 'error\n[m]', 'sigma\n[m]',
-                   'capacity\n[Mbit/s]', 'loss\n[%]', 'age\n[s]')
+                   'out/blk\n[%]', 'capacity\n[Mbit/s]', 'loss\n[%]', 'age\n[s]')
     # In order of their numbers, so that each user keeps its row.
     for user, cycle in sorted(overview.users.items())[:_MAX_USERS]:
         table.add_row(str(user), *(_results(cycle, now_s) if cycle else ['no fix yet']))
-    if len(overview.users) > _MAX_USERS:
-        table.caption = f'and {len(overview.users) - _MAX_USERS} more'
+    notes = [f'and {len(overview.users) - _MAX_USERS} more'] * (len(overview.users) > _MAX_USERS)
+    if any(map(_probabilities, overview.users.values())):
+        notes.append('out/blk: probability of being outside of the region/blocked')
+    table.caption = '; '.join(notes) or None
     return table
+
+
+def _probabilities(cycle: CompleteCycle | None) -> str:
+    percent = (100 * cycle.estimate.outside_probability, 100 * cycle.estimate.blocked_probability
+              ) if cycle else ()
+    return '{:.0f}/{:.0f}'.format(*percent) if any(percent) else ''
 
 
 def _results(cycle: CompleteCycle, now_s: float) -> list[str]:
     position = ' '.join(f'{x:6.2f}' for x in cycle.estimate.position)
-    return [position, f'{cycle.error_m:.2f}', f'{cycle.sigma_m:.2f}',
+    return [position, f'{cycle.error_m:.2f}', f'{cycle.sigma_m:.2f}', _probabilities(cycle),
             _number(cycle.capacity.actual_bps / 1e6, 2),
             _number(cycle.capacity.loss_percent, 3), f'{now_s - cycle.ended_s:.1f}']
 

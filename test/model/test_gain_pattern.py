@@ -278,22 +278,23 @@ def broken(angles):
 
     @pytest.fixture(autouse=True)
     def installed(self, install):
-        names = ('patch', 'sharp', 'number', 'short', 'minus', 'complex_', 'none', 'broken')
-        install('antennas', self.CODE, {plugins.GAIN_PATTERNS: {name: name for name in names}})
+        names = ('sharp', 'number', 'short', 'minus', 'complex_', 'none', 'broken')
+        install('antennas', self.CODE, {plugins.GAIN_PATTERNS: {
+            'panel': 'patch', **{name: name for name in names}}})
 
     def test_a_file_may_name_a_pattern(self, tmp_path):
-        (tmp_path / 'my.yaml').write_text('element_gain: patch\nuser_gain: sharp\n')
+        (tmp_path / 'my.yaml').write_text('element_gain: panel\nuser_gain: sharp\n')
         scenario = Scenario.from_yaml(tmp_path / 'my.yaml')
         assert scenario.element_gain == GainPattern(patch)
         np.testing.assert_allclose(scenario.user_gain.slope(np.array([0.5])), -np.exp(-0.25))
         assert Scenario(**scenario.changes()) == scenario
-        assert scenario.changes()['element_gain'] == f'patch@{GainPattern(patch).digest}'
+        assert scenario.changes()['element_gain'] == f'panel@{GainPattern(patch).digest}'
 
     def test_a_pattern_with_another_digest_is_an_error(self):
         with pytest.raises(ScenarioError, match=(
-                r'element_gain: patch: digest \w+, expected 0123456789abcdef: the content has '
+                r'element_gain: panel: digest \w+, expected 0123456789abcdef: the content has '
                 'changed')):
-            Scenario(element_gain='patch@0123456789abcdef')
+            Scenario(element_gain='panel@0123456789abcdef')
 
     @pytest.mark.parametrize(('name', 'words'), [
         ('absent', r"'absent', expected a plug-in of .*; installed: broken, complex_, minus"),

@@ -5,8 +5,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rhs_isac_ros.link import BeamPattern
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions
-from rhs_isac_ros.monitoring.shapes import axes_95, board, estimate, lobe, user_colour
+from rhs_isac_ros.model.hall import PathChannel
+from rhs_isac_ros.monitoring.shapes import (
+    axes_95,
+    board,
+    estimate,
+    lobe,
+    traced,
+    user_colour,
+)
 from rhs_isac_ros.protocol import messages as m
 
 # From tables of the chi-square distribution with two and three degrees of freedom.
@@ -59,6 +68,23 @@ def test_the_board_is_to_scale_or_enlarged(small):
         assert shown.colours[:, 0] == pytest.approx(configuration.mean(axis=0))
         assert 0 < 2 * shown.half_sizes_m[0, 1] < np.diff(np.unique(shown.centres[:, 1])).min()
     assert len(np.unique(board(small.scenario, None).colours[:, 0])) == 1
+
+
+def test_the_paths_of_a_traced_scenario_are_straight_or_bend_at_the_wall():
+    user, wall_y, f0 = np.array([6.0, 1.0, 0.5]), 3.0, 2.75e9
+    image = np.array([6.0, 2 * wall_y - 1.0, 0.5])
+    sources = np.stack([user, image, image + 9.0])
+    a = 1e-3 / np.linalg.norm(sources, axis=1)
+    scenario = Scenario(channel=PathChannel(
+        user[None], a[None] + 0j, sources[None], np.array([[0, 1, 2]]), f0))
+    near = m.GroundTruth(cycle_id=0, user=1, position=user + 0.1, velocity=np.zeros(3))
+    direct, reflected = traced(scenario, near).strips
+    assert direct == pytest.approx(np.stack([user, user, np.zeros(3)]))
+    assert reflected[[0, 2]] == pytest.approx(np.stack([user, np.zeros(3)]))
+    assert reflected[1, 1] == pytest.approx(wall_y)
+    assert np.linalg.norm(np.diff(reflected, axis=0), axis=1).sum() == pytest.approx(
+        np.linalg.norm(image))
+    assert traced(Scenario(), near).strips == ()
 
 
 def test_users_have_different_colours():

@@ -189,7 +189,7 @@ def test_a_foreign_entry_of_a_file_is_ignored_with_a_warning(files, never_spins,
 @pytest.fixture(scope='module')
 def started(module_processes, files):
     """The processes of all cases, which run concurrently."""
-    return {name: module_processes.start(CASES[name][0], *arguments(name, files))
+    return {name: module_processes.start(CASES[name][0], *arguments(name, files), as_program=True)
             for name in PROCESSES}
 
 

@@ -29,8 +29,8 @@ def ended_network(request, module_processes, make_watch, small_files):
     running = {}
     for name in order:
         running[name] = module_processes.start(
-            name, namespace=namespace, scenario_file=small_files / 'scenario.yaml',
-            **parameters.get(name, {}))
+            name, namespace=namespace, as_program=True,
+            scenario_file=small_files / 'scenario.yaml', **parameters.get(name, {}))
         if len(running) == 2:
             # The first two are running before the others start.
             watch.wait_for_nodes(*running)
@@ -60,7 +60,7 @@ def test_a_signal_ends_each_process_with_exit_code_0(ended_network, crashed, exe
 
 
 def test_repeated_signals_end_the_process_with_exit_code_0(processes, make_watch):
-    process = processes.start('rhs_controller', namespace='/repeated')
+    process = processes.start('rhs_controller', namespace='/repeated', as_program=True)
     make_watch('/repeated').wait_for_nodes('rhs_controller')
     while process.running:
         process.signal(signal.SIGINT)

@@ -310,7 +310,7 @@ def test_a_plug_in_moves_the_user(bench, install, position, place):
 @pytest.mark.parametrize(('name', 'words'), [
     ('fly', "mobility: 'fly', expected one of static, waypoints, random_walk, odometry, tf or a "
             'plug-in of '
-            'rhs_isac_ros.mobilities; installed: climb, nothing'),
+            'rhs_isac_ros.mobilities; installed: (.*, )?climb, (.*, )?nothing'),
     ('nothing', 'mobility: entry point .*: nothing = moves:nothing of moves: returned None'),
 ])
 def test_an_invalid_mobility_is_rejected(bench, install, name, words):

@@ -27,6 +27,28 @@ with Processes(Path(sys.argv[1]), {'ROS_LOG_DIR': sys.argv[1]}) as children:
     print(*(child.pid for child in children._running.values()), flush=True)
     signal.pause()
 """
+# Forks a node, which it kills, and one that ends by itself; prints their exit codes.
+FORKS = """
+import os, sys
+from pathlib import Path
+from rhs_isac_ros.ros.processes import Processes
+with Processes(Path(sys.argv[1]), {'ROS_LOG_DIR': sys.argv[1]}, fork=True) as children:
+    children.start('visualizer', 'viewer')
+    viewer = children._running['viewer']
+    while 'serving' not in children.log('viewer'):
+        assert viewer.poll() is None, children.log('viewer')
+    print(Path(f'/proc/{viewer.pid}/comm').read_text().strip(),
+          os.getsid(viewer.pid) == viewer.pid)
+    viewer.send_signal(9)
+    children.start('bs', rest_s=-1.0)
+    children.start('user', unknown=1)
+    children.start('channel')
+    while len(children.ended()) < 3:
+        assert children.ended().get('channel') is None
+    print(children.ended())
+    channel = children._running['channel']
+print(channel.poll())
+"""
 
 
 def until_ended(descriptors):
@@ -59,6 +81,15 @@ def test_no_node_survives_a_demonstration_that_is_killed(tmp_path):
         assert len(children) == len(UNIQUE) + 2
         demo.send_signal(signal.SIGKILL)
         until_ended(children)
+
+
+def test_a_fork_is_a_process_with_its_own_name_session_log_and_exit_code(tmp_path):
+    done = subprocess.run([sys.executable, '-c', FORKS, tmp_path],
+                          capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    assert done.stdout.splitlines() == [
+        'visualizer True', "{'viewer': -9, 'bs': 2, 'user': 2}", '0'], done.stderr
+    assert (tmp_path / 'bs.log').read_text().startswith('bs: error: rest_s: ')
+    assert 'argument -p: unknown: unknown parameter' in (tmp_path / 'user.log').read_text()
 
 
 def test_a_child_whose_parent_has_already_died_ends_before_it_starts(tmp_path):

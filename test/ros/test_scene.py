@@ -66,6 +66,15 @@ def test_each_user_has_one_hue_for_truth_and_estimate():
     assert len(hues) == 3
 
 
+def test_lines_join_the_points_of_each_strip():
+    strips = np.arange(9.0).reshape(3, 3), np.arange(6.0).reshape(2, 3)
+    marker = scene.marker('traced', 1, shapes.Lines(strips, (0.5, 0.25, 1.0), 1.0), STAMP)
+    assert marker.type == Marker.LINE_LIST
+    assert np.array([of(point) for point in marker.points]).tolist() == [
+        *strips[0][[0, 1, 1, 2]].tolist(), *strips[1].tolist()]
+    assert rgb(marker.color) == (0.5, 0.25, 1.0) and marker.scale.x > 0
+
+
 def test_the_plates_of_the_board_keep_places_and_colours(small):
     board = shapes.board(small.scenario, np.linspace(0, 1, small.scenario.n_elements)[None])
     marker = scene.marker('board', 0, board, STAMP)

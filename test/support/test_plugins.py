@@ -7,7 +7,8 @@ import pytest
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.plugins import PluginError
 
-GROUP = plugins.MOBILITIES
+# A group that no installed package has.
+GROUP = 'rhs_isac_ros.strolls'
 
 
 def test_names_are_those_of_the_installed_packages(install):

@@ -23,7 +23,8 @@ def test_once_prints_a_cycle_and_every_node(network, run_script):
     text = run_script(f'env COLUMNS=200 {SCRIPT} --once')
     codebook = Codebook.load(ROOT / 'config' / 'codebook_quick.yaml')
     assert f'codebook {codebook.id}' in text
-    row = r'^ +[12] +(-?\d+\.\d\d +){3}\d+\.\d\d +\d+\.\d\d +\d+\.\d\d +\d+\.\d{3} +\d+\.\d *$'
+    row = (r'^ +[12] +(-?\d+\.\d\d +){3}\d+\.\d\d +\d+\.\d\d +(\d+/\d+ +)?\d+\.\d\d +\d+\.\d{3} '
+           r'+\d+\.\d *$')
     assert re.search(row, text, re.MULTILINE), text
     for node in ('bs', 'channel', 'optimizer', 'positioner', 'rhs_controller', 'transmission',
                  'user_1', 'user_2'):

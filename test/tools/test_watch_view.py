@@ -1,5 +1,6 @@
 """The live view of an overview."""
 
+import dataclasses
 import os
 import re
 
@@ -60,6 +61,23 @@ def test_users_keep_their_rows(network_class, scenario, codebooks, places):
             rows.append(re.findall(r'^ +(\d+) ', text_of(overview, sent.time_s), re.MULTILINE))
     assert rows[-1] == ['1', '2', '3']
     assert all(row == sorted(row) for row in rows)
+
+
+def test_probabilities_fit_into_80_columns(network_class, scenario, codebooks, places):
+    net = network_class(scenario, codebooks[0], {1: places[0]})
+    net.run_cycles(1)
+    overview = Overview()
+    for sent in net.log:
+        if isinstance(sent.message, RECEIVES):
+            overview.add(sent.message, sent.time_s)
+    cycle = overview.users[1]
+    far = {'position': np.array([-10.34, -12.2, 1.1]), 'outside_probability': 0.123}
+    overview.users[12] = dataclasses.replace(
+        cycle, estimate=dataclasses.replace(cycle.estimate, **far))
+    text = text_of(overview, cycle.ended_s)
+    assert re.search(r'^ +12 +-10.34 -12.20   1.10 +[.\d]+ +[.\d]+ +12/0 ', text, re.MULTILINE)
+    assert 'out/blk: probability of being outside of the region/blocked' in text
+    assert '…' not in text
 
 
 def test_the_view_shows_a_pause():

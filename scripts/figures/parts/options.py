@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Callable, Sequence
 
-from rhs_isac_ros.experiments.command import add_run_options
+from rhs_isac_ros.experiments.jobs import add_run_options
 from rhs_isac_ros.support.arguments import ArgumentParser, integer
 from rhs_isac_ros.support.pictures import PICTURE_FORMATS
 
