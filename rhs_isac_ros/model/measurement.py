@@ -293,6 +293,14 @@ class MeasurementModel:
         map_blocks(fill, blocks(n, weights.block))
         return mean, jacobian
 
+    def fast_mean(self, positions: np.ndarray) -> np.ndarray:
+        """Compute `mean` with the rounding of `mean_and_jacobian`, in a third of the time."""
+        positions, weights = checked_positions(positions), self._weights
+        mean = np.empty((len(positions), *self.shape), complex)
+        for block in blocks(len(positions), weights.block):
+            mean[block] = np.swapaxes(weights.terms(positions[block], slopes=False)[:, :, 0], 0, 1)
+        return mean
+
     @one_blas_thread
     def sample(self, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Draw signals of independent phases, one at each position, complex128 [N, N_B, N_SB F].
@@ -360,18 +368,21 @@ class ElementSums:
         # T_i times 1 and the coordinates of the element [m], complex128 [N_B, N_SB, N_E, G F].
         self._moments = moments.reshape(*self._frames.shape[:3], -1)
 
-    def terms(self, positions: np.ndarray) -> np.ndarray:
+    def terms(self, positions: np.ndarray, slopes: bool = True) -> np.ndarray:
         """Compute the mean and the terms of its derivative, complex128 [N_B, N, 1 + G, N_SB F].
 
-        The first row is the mean; `weights` multiply the others.
+        The first row is the mean; `weights` multiply the others, which are absent on request.
         """
         n, (n_bands, n_subbands, _, n_frames) = len(positions), self._frames.shape
-        n_terms = 2 + len(self._axes) + self._has_pattern
+        n_terms = 2 + len(self._axes) + self._has_pattern if slopes else 1
         terms = np.empty((n_bands, n, n_terms, n_subbands, n_frames), complex)
-        gains = self._gains_with_pattern if self._has_pattern else self._gains
-        for band, (gain, radial, boresight_term) in enumerate(gains(positions)):
+        gains = (self._gains_with_pattern(positions) if self._has_pattern
+                 else self._gains(positions, slopes))
+        for band, (gain, radial, boresight_term) in enumerate(gains):
             frames, rows = self._frames[band], np.moveaxis(terms[band], 2, 0)
             rows[:, :, 0] = np.matmul(gain, frames)
+            if not slopes:
+                continue
             sums = np.matmul(radial, self._moments[band])
             rows[:, :, 1:2 + len(self._axes)] = sums.reshape(n_subbands, n, -1, n_frames)
             if self._has_pattern:
@@ -388,8 +399,11 @@ class ElementSums:
             weights[:, 0, -1] = 1
         return weights
 
-    def _gains(self, positions: np.ndarray) -> Iterator[_Terms]:
-        """Yield `los_derivative_terms` of each band over the constant part, sub-bands first."""
+    def _gains(self, positions: np.ndarray, slopes: bool) -> Iterator[_Terms]:
+        """Yield `los_derivative_terms` of each band over the constant part, sub-bands first.
+
+        Without slopes, the radial factor is the gain.
+        """
         distances = np.sqrt(sum(
             (positions[:, axis, None] - self._elements[:, axis])**2 for axis in range(3)))
         inverse = 1 / distances
@@ -399,11 +413,15 @@ class ElementSums:
         step = _phasors(-spacing * distances)
         shape = len(self._wavenumbers[0]), *distances.shape
         for wavenumbers in self._wavenumbers:
-            gain, radial = np.empty(shape, complex), np.empty(shape, complex)
+            gain = np.empty(shape, complex)
             gain[0] = _phasors(-wavenumbers[0] * distances)
             gain[0] *= inverse
             for subband in range(1, len(gain)):
                 np.multiply(gain[subband - 1], step, out=gain[subband])
+            if not slopes:
+                yield gain, gain, None
+                continue
+            radial = np.empty(shape, complex)
             radial.real = minus_square
             np.multiply(-wavenumbers[:, None, None], inverse, out=radial.imag)
             radial *= gain

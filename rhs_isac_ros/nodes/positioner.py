@@ -15,6 +15,7 @@ from rhs_isac_ros import positioning
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
+from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
@@ -29,6 +30,9 @@ from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.fields import ParameterError
 
+# Interval between reports of the progress of a table.
+_LOG_PERIOD_S = 5.0
+
 
 class PositionerNode(RoleNode[Positioner]):
     """The positioner; it subscribes to received signals once its first estimator is built."""
@@ -36,7 +40,7 @@ class PositionerNode(RoleNode[Positioner]):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('positioner', **node_options)
         settings = self.make_settings(self.values)
-        self._worker = BackgroundWorker(self)
+        self._worker, self._table = BackgroundWorker(self), ''
         self._frame = Frame.of(self, self.values)
         self._pose = create_publisher(
             self, PoseWithCovarianceStamped, topics.POSITION, EXCHANGE, overridable=True)
@@ -88,6 +92,7 @@ class PositionerNode(RoleNode[Positioner]):
             settings.model_file)
         if settings.estimator in positioning.REGION_ESTIMATORS:
             options['reject_outside'] = settings.reject_outside
+            options['progress'] = self._on_progress
         if settings.calibration_file:
             options['surface'] = load_surface(settings.calibration_file, self.scenario)
         estimator = positioning.make_estimator(
@@ -97,6 +102,21 @@ class PositionerNode(RoleNode[Positioner]):
         estimator.estimate(simulate_received(
             self.scenario, codebook, center, np.random.default_rng(0))[0])
         return estimator
+
+    def _on_progress(self, share: float) -> None:
+        """Log the progress of a table that takes long, in the background thread."""
+        self._table = f'{100 * share:.0f} %' if share < 1 else ''
+        self.get_logger().info(  # type: ignore[no-untyped-call]
+            f'table of templates: {100 * share:.0f} % computed',
+            throttle_duration_sec=_LOG_PERIOD_S, skip_first=True)
+
+    def report(self) -> Report:
+        """Return the diagnostics, with the progress of a table that is being computed."""
+        report = super().report()
+        if not self._table:
+            return report
+        return dataclasses.replace(
+            report, values={**report.values, 'table.progress': self._table})
 
     def execute(self, action: events.Action) -> None:
         """Build an estimator in the background, or publish the odometry of a track."""

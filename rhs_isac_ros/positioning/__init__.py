@@ -13,8 +13,8 @@ The modules, in the order in which they are best read:
 * `likelihood`, of positions and nuisance parameters
 * `grid`, which finds starts; `search`, which ascends from them to the modes; and `failures`, which
   finds the modes if elements have failed
-* `posterior`, from modes to samples; `alternatives` to a user in the region; and `diagnosis`,
-  whether the signals fit the model
+* `posterior`, from modes to samples, and `draws`, without modes; `alternatives` to a user in the
+  region; and `diagnosis`, whether the signals fit the model
 * `tracking`; `neural`, the paper's network; and `store`, which keeps tables in files
 """
 
@@ -56,9 +56,9 @@ def make_estimator(
     """Create an estimator by its name.
 
     The options of `REGION_ESTIMATORS` are ``table_folder``, a folder for tables,
-    ``reject_outside``, whether users outside of the region get no fix, and ``surface``, what is
-    known of the surface. `neural` requires ``model_file``, a `Network` or its file. Plug-ins
-    define their own options.
+    ``reject_outside``, whether users outside of the region get no fix, ``surface``, what is known
+    of the surface, and ``progress``, called with the computed share of a table. `neural` requires
+    ``model_file``, a `Network` or its file. Plug-ins define their own options.
 
     Raises
     ------

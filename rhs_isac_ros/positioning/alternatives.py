@@ -7,17 +7,19 @@ users are inside, and none of them should lose a fix.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Protocol
 
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import blocks
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, log_sum, to_positions
 from rhs_isac_ros.positioning.lattice import Resolution, groups
 from rhs_isac_ros.positioning.likelihood import NuisancePrior
+from rhs_isac_ros.support.threads import map_blocks
 
 # Probabilities of a user outside, and of a blocked one, above which there is no fix.
 OUTSIDE_LIMIT = 0.99
@@ -49,6 +51,8 @@ _GAIN_REACH = 4.0
 _MAX_PHASE_ERROR = 0.5
 # Error of a residual due to the grid, as a share of the template's energy.
 _GRID_ERROR = 0.25
+# Number of templates to compute at a time.
+_BLOCK = 512
 # Largest sine of the angle from boresight on the grid.
 _MAX_SINE = 0.998
 # Directions in which the log-likelihood is lower by more at all ranges do not matter.
@@ -111,7 +115,8 @@ class Blocked:
         return energy <= max_residual * 10**(_LEVEL_REACH * BLOCKED_STD_DB / 10)
 
 
-def tabulate_outside(model: MeasurementModel) -> dict[str, np.ndarray]:
+def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] | None = None
+                     ) -> dict[str, np.ndarray]:
     """Compute the arrays of `Outside`: templates of the half space in front of the surface.
 
     A template is a whitened mean times range and carrier, which depends on the direction and, via
@@ -126,14 +131,22 @@ def tabulate_outside(model: MeasurementModel) -> dict[str, np.ndarray]:
     nodes, index = _template_ranges(scenario, ranges)
     weights = _prior(scenario, ranges, directions)
     points = _points(nodes, directions).reshape(-1, 3)
-    carrier = np.exp(1j * carrier_wavenumbers(scenario) * points[:, :1]) * points[:, :1]
-    # With its derivative, the mean takes less time than without.
-    templates = model.whiten(model.mean_and_jacobian(to_positions(points))[0])
-    templates *= carrier[..., None]
-    energy = np.sum(np.abs(templates)**2, axis=(1, 2)).reshape(len(nodes), -1)
+    n_bands, n_rows = model.shape
+    filters = np.empty((n_bands, len(points), n_rows), np.complex64)
+    energy = np.empty(len(points), np.float32)
+
+    def fill(block: slice) -> None:
+        part = points[block]
+        carrier = np.exp(1j * carrier_wavenumbers(scenario) * part[:, :1]) * part[:, :1]
+        templates = model.whiten(model.fast_mean(to_positions(part)))
+        templates *= carrier[..., None]
+        filters[:, block] = np.swapaxes(templates, 0, 1).conj()
+        energy[block] = np.sum(np.abs(templates)**2, axis=(1, 2))
+
+    map_blocks(fill, blocks(len(points), _BLOCK), progress)
     return {
-        'outer_filters': np.swapaxes(templates, 0, 1).conj().astype(np.complex64),
-        'outer_energy': energy.astype(np.float32),
+        'outer_filters': filters,
+        'outer_energy': energy.reshape(len(nodes), -1),
         'outer_index': index,
         'outer_weights': weights,
     }

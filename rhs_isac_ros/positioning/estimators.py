@@ -2,7 +2,7 @@
 
 import abc
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from rhs_isac_ros.positioning.alternatives import (
 )
 from rhs_isac_ros.positioning.coordinates import concatenate, jacobian, symmetric, to_positions
 from rhs_isac_ros.positioning.diagnosis import FitTest
+from rhs_isac_ros.positioning.draws import DrawnPosterior
 from rhs_isac_ros.positioning.estimate import (
     Estimate,
     Estimator,
@@ -29,7 +30,7 @@ from rhs_isac_ros.positioning.estimate import (
     estimate_each,
 )
 from rhs_isac_ros.positioning.failures import FailedElements, can_enumerate
-from rhs_isac_ros.positioning.grid import TemplateTable, first_of_each, standard_normal
+from rhs_isac_ros.positioning.grid import Query, TemplateTable, standard_normal
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import (
     Alignment,
@@ -41,7 +42,6 @@ from rhs_isac_ros.positioning.likelihood import (
 from rhs_isac_ros.positioning.posterior import (
     BandPhases,
     Posterior,
-    Samples,
     WeightedSamples,
     draw_broad_samples,
     draw_samples,
@@ -61,15 +61,16 @@ _N_INFORMATIVE = 512
 _DOUBT_LIMIT = 0.05
 
 
-class _Search(NamedTuple):
-    """The result of a search for several phases."""
+class _Fit(NamedTuple):
+    """What the signals of one phase reveal of a user inside the region."""
 
-    modes: Modes
-    samples: Samples
-    # Whitened signals without the parameters that they reveal, complex128 [N, N_B, N_SB F].
-    whitened: np.ndarray
-    # Logarithm of the prior odds of each alternative times its evidence, float64 [N, A].
-    log_weights: np.ndarray
+    mean: np.ndarray  # Float64 [3] [m].
+    covariance: np.ndarray  # Float64 [3, 3] [m^2].
+    log_evidence: float  # Logarithm of the likelihood averaged over the region.
+    residual: float  # Energy of the whitened residual at the best position.
+    expected: float  # Its mean for signals that match the model.
+    gain: complex  # Of the signals at the best position [nepers].
+    modes: Modes | None = None  # None if positions were drawn instead.
 
 
 class SearchEstimator(abc.ABC):
@@ -87,16 +88,21 @@ class SearchEstimator(abc.ABC):
         probability, while position and covariance remain those of a user inside.
     surface
         What is known of the surface, as in `MeasurementModel`; for example a calibration.
+    progress
+        Called with the share of the table that is computed, from any thread; not if it is loaded.
     """
+
+    averages = True  # Whether positions are averages over the posterior.
 
     @one_blas_thread
     def __init__(
             self, scenario: Scenario, codebook: Codebook,
             table_folder: Path | None = None, *, reject_outside: bool = False,
-            surface: Surface | None = None) -> None:
+            surface: Surface | None = None,
+            progress: Callable[[float], None] | None = None) -> None:
         self.scenario, self.surface = scenario, surface
         self._likelihood = likelihood = Likelihood(scenario, codebook, surface)
-        arrays = load_table(likelihood.model, codebook.id, table_folder)
+        arrays = load_table(likelihood.model, codebook.id, table_folder, progress)
         self._grid = TemplateTable(scenario, arrays)
         self._alternatives: list[Alternative] = []
         if reject_outside:
@@ -114,6 +120,7 @@ class SearchEstimator(abc.ABC):
         # Twice an energy has two degrees of freedom for each complex measurement, less one for
         # each fitted parameter.
         n_fitted = _N_COORDINATES + len(prior)
+        self._n_measurements = n_measurements
         self._mean_residual = max(n_measurements - n_fitted / 2, 0.5)
         # Points that represent a standard Gaussian, float64 [128, 3].
         self.normal = self._grid.normal
@@ -122,6 +129,8 @@ class SearchEstimator(abc.ABC):
         # The likelihood of positions; None if it also depends on other unknowns.
         self.exact_likelihood = None if (
             len(prior) or self._failures or self._dispersed) else likelihood
+        self._drawn = (DrawnPosterior(scenario, self._grid)
+                       if self.averages and self.exact_likelihood else None)
 
     @one_blas_thread
     def estimate(self, received: np.ndarray) -> Estimate:
@@ -133,7 +142,7 @@ class SearchEstimator(abc.ABC):
         """Compute the posterior for the signals of one phase, complex128 [N_B, N_SB F]."""
         batch = checked_received(self._likelihood.codebook, received)
         signals = self._likelihood.signals(batch)
-        ((located, modes),) = self._locate_block(signals)
+        ((located, modes),) = self._locate_block(signals, draws=False)
         return Posterior(Estimate(*located), modes, signals)
 
     @abc.abstractmethod
@@ -143,85 +152,111 @@ class SearchEstimator(abc.ABC):
     def _locate(self, batch: np.ndarray) -> Iterable[Located]:
         signals = self._likelihood.signals(batch)
         blocks = map_blocks(
-            lambda start: self._locate_block(signals.take(slice(start, start + _BLOCK))),
+            lambda start: self._locate_block(
+                signals.take(slice(start, start + _BLOCK)), draws=True),
             range(0, len(batch), _BLOCK))
         return (located for located, _ in itertools.chain.from_iterable(blocks))
 
-    def _locate_block(self, signals: Signals) -> list[tuple[Located, Modes | None]]:
-        """Locate phases together: position or reason, and modes if there is a position."""
+    def _locate_block(self, signals: Signals, draws: bool
+                      ) -> list[tuple[Located, Modes | None]]:
+        """Locate phases together: position or reason, and modes if there is a position.
+
+        With `draws`, phases that have too many modes have positions without them.
+        """
         energies = np.sum(np.abs(signals.received)**2, axis=(1, 2)) / self.scenario.noise_power_w
         reasons = [self._test.min_energy_test(energy) for energy in energies.tolist()]
         results: list[tuple[Located, Modes | None]] = [
             ((*_no_fix(), reason), None) for reason in reasons]
         (usable,) = np.nonzero([not reason for reason in reasons])
         if len(usable):
-            found = self._search(signals.take(usable))
-            for row, result in zip(usable.tolist(), self._judge(found), strict=True):
-                results[row] = result
+            signals = signals.take(usable)
+            aligned = self._alignment.values_of_each(signals.received)
+            fits = self._search(signals, aligned, draws)
+            for row, *phase in zip(usable.tolist(), fits, self._likelihood.whitened(
+                    aligned, signals), aligned, strict=True):
+                results[row] = self._judge(*phase)
         return results
 
-    def _search(self, signals: Signals) -> _Search:
-        """Search for the modes of N phases."""
-        likelihood = self._likelihood
-        aligned = self._alignment.values_of_each(signals.received)
+    def _search(self, signals: Signals, aligned: np.ndarray, draws: bool) -> list[_Fit]:
+        """Find the posteriors of N phases, by draws where it has too many modes."""
+        likelihood, fits = self._likelihood, dict[int, _Fit]()
         extra = self._failures.search_margin if self._failures else 0.0
-        modes = find_modes(likelihood, self._grid, signals, aligned, extra_margin=extra)
-        conditionals: list[Sequence[Conditional]] = [
-            [self._dispersed or likelihood]] * len(aligned)
+
+        def draw(query: Query, row: int) -> bool:
+            found = self._drawn.of(query, row) if self._drawn else None
+            if found is not None:
+                energy, phase = float(query.energies[row]), query.first + row
+                fits[phase] = _Fit(
+                    found.mean, symmetric(found.covariance),
+                    found.log_total - energy - np.log(likelihood.resolution.volume_m3),
+                    energy - found.highest, self._n_measurements + found.average - found.highest,
+                    0.0)
+            return found is not None
+
+        modes = find_modes(
+            likelihood, self._grid, signals, aligned, extra, draw if draws else None)
+        if modes:
+            rows = [phase for phase in range(len(aligned)) if phase not in fits]
+            fits.update(zip(rows, self._fit(modes, signals, rows), strict=True))
+        return [fits[phase] for phase in range(len(aligned))]
+
+    def _fit(self, modes: Modes, signals: Signals, rows: list[int]) -> Iterator[_Fit]:
+        """Yield the posterior of each phase in `rows`, ascending, from its modes."""
+        likelihood = self._likelihood
+        conditionals: dict[int, Sequence[Conditional]] = dict.fromkeys(
+            rows, [self._dispersed or likelihood])
         if self._dispersed:
             modes = ascend(self._dispersed, likelihood, modes.starts(), signals, 1, np.inf)
         if self._failures:
-            refined = [self._failures.refine(modes.of_phase(phase), signals.repeated(phase))
-                       for phase in range(len(aligned))]
-            # Each part counts its phases from 0.
-            modes = concatenate(*(one._replace(phases=np.full(len(one.phases), phase))
-                                  for phase, (one, _) in enumerate(refined)))
-            conditionals = [sets for _, sets in refined]
+            parts = []
+            for phase in rows:
+                one, conditionals[phase] = self._failures.refine(
+                    modes.of_phase(phase), signals.repeated(phase))
+                # Each part counts its phases from 0.
+                parts.append(one._replace(phases=np.full(len(one.phases), phase)))
+            modes = concatenate(*parts)
         if likelihood.nuisance.is_coarse:
-            samples = concatenate(*(
+            drawn = concatenate(*(
                 draw_broad_samples(likelihood, conditionals[phase], self._phases,
                                    signals.repeated(phase), modes.of_phase(phase), self._normal)
-                for phase in range(len(aligned))))
+                for phase in rows))
         else:
-            samples = draw_samples(modes, self._normal, self._bounds)
-        whitened = likelihood.whitened(aligned, signals)
-        best = np.minimum.reduceat(modes.residual, first_of_each(modes.phases))
-        log_weights = np.array([
-            [one.log_odds + one.log_evidence_of(*phase, likelihood.nuisance)
-             for one in self._alternatives]
-            for phase in zip(whitened, aligned, best.tolist(), strict=True)])
-        return _Search(modes, samples, whitened, log_weights)
-
-    def _judge(self, found: _Search) -> Iterator[tuple[Located, Modes | None]]:
-        """Yield the position of each phase, or why there is none, and its modes."""
-        modes = found.modes
-        samples = WeightedSamples.of(found.samples, modes)
-        log_weights = np.column_stack([
-            samples.log_evidence(self._likelihood.resolution.volume_m3), found.log_weights])
-        probabilities = shares(log_weights)
+            drawn = draw_samples(modes, self._normal, self._bounds)
+        samples = WeightedSamples.of(drawn, modes)
         means, covariances = self._moments(modes, samples)
+        log_evidence = samples.log_evidence(likelihood.resolution.volume_m3)
         # Averaged over the posterior, the energy of a model that holds has the mean of a
         # chi-square variable. At the best of several modes it is smaller, by the difference from
         # the average.
         expected = self._mean_residual - samples.average(modes.residual)
-        likelihood = modes.roi_log_likelihood
+        value = modes.roi_log_likelihood
         ends = [*samples.starts[1:].tolist(), len(modes.phases)]
         for row, (start, end) in enumerate(zip(samples.starts.tolist(), ends, strict=True)):
-            best = start + int(np.argmax(likelihood[start:end]))
+            best = start + int(np.argmax(value[start:end]))
             residual = float(modes.residual[best])
-            gain = modes.values[best] @ self._likelihood.nuisance.gain
-            reason = self._reason(found.whitened[row] * np.exp(-gain), residual, log_weights[row])
-            moments = _no_fix() if reason else (means[row], covariances[row])
-            # Of signals without a fix, only a residual that nothing explains is evidence against
-            # the scenario.
-            counts = (reason == self._test.residual_test(residual) if reason
-                      else probabilities[row, 0] >= 1 - _DOUBT_LIMIT)
-            by_name = {one.name: float(share) for one, share in zip(
-                self._alternatives, probabilities[row, 1:], strict=True)}
-            outside, blocked = (by_name.get(kind.name, np.nan) for kind in ALTERNATIVES)
-            yield ((*moments, reason, residual, expected[row] + residual if counts else np.nan,
-                    outside, blocked),
-                   None if reason else modes.select(slice(start, end)))
+            yield _Fit(means[row], covariances[row], float(log_evidence[row]), residual,
+                       expected[row] + residual, modes.values[best] @ likelihood.nuisance.gain,
+                       modes.select(slice(start, end)))
+
+    def _judge(self, fit: _Fit, whitened: np.ndarray, aligned: np.ndarray
+               ) -> tuple[Located, Modes | None]:
+        """Return the position of one phase, or why there is none, and its modes."""
+        log_weights = np.array([fit.log_evidence, *(
+            one.log_odds + one.log_evidence_of(
+                whitened, aligned, fit.residual, self._likelihood.nuisance)
+            for one in self._alternatives)])
+        probabilities = shares(log_weights[None])[0]
+        reason = self._reason(whitened * np.exp(-fit.gain), fit.residual, log_weights)
+        moments = _no_fix() if reason else (fit.mean, fit.covariance)
+        # Of signals without a fix, only a residual that nothing explains is evidence against
+        # the scenario.
+        counts = (reason == self._test.residual_test(fit.residual) if reason
+                  else probabilities[0] >= 1 - _DOUBT_LIMIT)
+        by_name = {one.name: float(share) for one, share in zip(
+            self._alternatives, probabilities[1:], strict=True)}
+        outside, blocked = (by_name.get(kind.name, np.nan) for kind in ALTERNATIVES)
+        return ((*moments, reason, fit.residual, fit.expected if counts else np.nan,
+                 outside, blocked), None if reason else fit.modes)
 
     def _reason(self, whitened: np.ndarray, residual: float, log_weights: np.ndarray) -> str:
         """Return why there is no fix, empty if there is one."""
@@ -258,7 +293,7 @@ class BayesEstimator(SearchEstimator):
 class MlEstimator(SearchEstimator):
     """The most likely position in the region, with the inverse curvature as its covariance."""
 
-    name = 'ml'
+    name, averages = 'ml', False
 
     def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
         order = np.lexsort((-modes.roi_log_likelihood, modes.phases))

@@ -11,7 +11,7 @@ All lengths of the grid follow from the scenario; see `lattice`.
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -47,6 +47,8 @@ _STEPS_PER_WAVELENGTH = 8
 _N_OUTPUTS = 1 << 18
 # Cells of a phase that are examined first. They show how likely others have to be.
 _N_FIRST = 48
+# Number of further cells that may matter from which positions are drawn instead.
+_MAX_CELLS = 100
 # Largest number of peaks of a phase that are examined further, which limits memory and time. Only
 # signals below the noise have more; the rest of them have little weight.
 _MAX_PEAKS = 8192
@@ -61,7 +63,8 @@ _TABLE_ERROR = 0.015
 _STEP_ERROR = 0.5
 
 
-def tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
+def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None = None
+             ) -> dict[str, np.ndarray]:
     """Compute the arrays of a `TemplateTable`, for G templates and C pairs with a range cell.
 
     They are ``filters``, the conjugate templates, complex64 [N_B, N_SB, G, F]; ``slope_filters``,
@@ -108,7 +111,7 @@ def tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
             table['curvature'][part] = form[:, 1:, 1:]
         return spread
 
-    blocks = map_blocks(fill, range(0, len(grid.nodes), _BLOCK))
+    blocks = map_blocks(fill, range(0, len(grid.nodes), _BLOCK), progress)
     table['spread'] = np.sum(blocks, axis=0) / n_cells
     return table
 
@@ -130,7 +133,7 @@ class TemplateTable:
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
         self.normal, self.spread = arrays['normal'], arrays['spread']
-        self._grid = grid = lay_grid(scenario)
+        self.grid = grid = lay_grid(scenario)
         self._resolution = Resolution.of(scenario)
         self._filters, self._slope_filters = arrays['filters'], arrays['slope_filters']
         self._whitener = arrays['whitener']
@@ -148,15 +151,16 @@ class TemplateTable:
 
     def _set_windows(self, scenario: Scenario) -> None:
         """Divide range cells into windows of one width, with the same fine steps."""
-        grid, wavelength_m = self._grid, self._resolution.wavelength_m
+        grid, wavelength_m = self.grid, self._resolution.wavelength_m
         counts = np.ceil(grid.widths_m / grid.widths_m.min() - 1e-9).astype(int)
         self._first_window, self._n_windows = np.cumsum(counts) - counts, counts
         place = np.arange(counts.sum()) - np.repeat(self._first_window, counts)
         width_m = np.repeat(grid.widths_m / counts, counts)
         low_m = np.repeat(grid.ranges_m - grid.widths_m / 2, counts)
-        self._window_ranges_m = low_m + (place + 0.5) * width_m
+        self._window_ranges_m, self._window_widths_m = low_m + (place + 0.5) * width_m, width_m
         self._window_turns = self._turns(self._window_ranges_m).astype(np.complex64)
         n_fine = int(np.ceil(width_m.max() / wavelength_m * _STEPS_PER_WAVELENGTH))
+        self.window_m = width_m.max()
         # One step more at either end, so that a maximum is within some window.
         self._step_m = width_m.max() / n_fine
         self._offsets_m = (np.arange(n_fine + 2) - (n_fine + 1) / 2) * self._step_m
@@ -168,23 +172,28 @@ class TemplateTable:
         """Factors of the templates' conjugates at ranges [R], complex128 [N_B, N_SB, R]."""
         return np.exp(1j * self._wavenumbers[..., None] * ranges_m) / ranges_m
 
-    def starts(self, whitened: np.ndarray, prior: NuisancePrior, margin: float) -> 'Starts':
+    def starts(self, whitened: np.ndarray, prior: NuisancePrior, margin: float,
+               draw: Callable[['Query', int], bool] | None = None) -> 'Starts':
         """Find the most likely separate points, to the accuracy of one Gauss-Newton step.
 
         Takes whitened signals of N phases, complex128 [N, N_B, N_SB F], without the offsets of
         carrier and timing; and the negative logarithm of the share of the posterior that points
-        may leave out. The points of a phase do not depend on the other phases.
+        may leave out. The points of a phase do not depend on the other phases. A phase in which
+        very many cells matter has none if `draw`, called with its row in a query, returns True.
         """
-        weighted = np.swapaxes(np.matmul(np.swapaxes(whitened, 0, 1), self._whitener.conj()), 0, 1)
-        energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
         n = max(1, _N_OUTPUTS // (len(self._energy) * len(self._wavenumbers)))
         parts = []
         for first in range(0, len(whitened), n):
-            block = slice(first, first + n)
-            query = self._query(weighted[block], energies[block], prior, margin, self._energy)
-            part = self._starts(query)
+            query = self.query(whitened[first:first + n], prior, margin)._replace(first=first)
+            part = self._starts(query, draw=draw)
             parts.append(part._replace(phases=part.phases + first))
         return concatenate(*parts)
+
+    def query(self, whitened: np.ndarray, prior: NuisancePrior, margin: float) -> 'Query':
+        """Filter the whitened signals of a few phases, complex128 [N, N_B, N_SB F]."""
+        weighted = np.swapaxes(np.matmul(np.swapaxes(whitened, 0, 1), self._whitener.conj()), 0, 1)
+        energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
+        return self._query(weighted, energies, prior, margin, self._energy)
 
     def starts_under(self, whitened: np.ndarray, prior: NuisancePrior, factor: np.ndarray,
                      margin: float) -> 'Starts':
@@ -196,7 +205,7 @@ class TemplateTable:
         root = np.matmul(np.conj(np.swapaxes(self._whitener, 1, 2)), factor)
         signals = np.einsum('isr,is->ir', factor.conj(), whitened)
         weighted = np.einsum('isr,ir->is', root, signals)
-        grid = self._grid
+        grid = self.grid
         turns = np.repeat(self._cell_turns, self._filters.shape[3], axis=1)
         energy = np.zeros(len(grid.node), np.float32)
         for band, filters in enumerate(self._filters):
@@ -209,18 +218,20 @@ class TemplateTable:
                             steps=False)
 
     def _query(self, weighted: np.ndarray, energies: np.ndarray, prior: NuisancePrior,
-               margin: float, template_energy: np.ndarray) -> '_Query':
+               margin: float, template_energy: np.ndarray) -> 'Query':
         """Filter signals [N, N_B, N_SB F], weighted with the inverse covariance."""
         n, n_bands = weighted.shape[:2]
         signals = weighted.reshape(n, n_bands, -1, self._filters.shape[3]).astype(np.complex64)
         outputs = np.ascontiguousarray(np.moveaxis(np.matmul(
             self._filters, np.moveaxis(signals, 0, 3)), 3, 0))
-        return _Query(signals, outputs, energies, template_energy, prior, margin)
+        query = Query(0, signals, outputs, energies, template_energy, np.empty(0), prior, margin)
+        return query._replace(bound=self._bound(query))
 
-    def _starts(self, query: '_Query', steps: bool = True) -> 'Starts':
+    def _starts(self, query: 'Query', steps: bool = True,
+                draw: Callable[['Query', int], bool] | None = None) -> 'Starts':
         """Find the starts of a query."""
         prior, margin = query.prior, query.margin
-        peaks = self._peaks(query)
+        peaks = self._peaks(query, draw)
         points = self._points(peaks)
         values = np.zeros((len(points), len(prior)))
         if len(prior):
@@ -241,9 +252,9 @@ class TemplateTable:
                           self._curvature[peaks.cell[order]])
         return Starts(phases[chosen], points[chosen], values[chosen])
 
-    def _peaks(self, query: '_Query') -> '_Peaks':
+    def _peaks(self, query: 'Query', draw: Callable[['Query', int], bool] | None) -> '_Peaks':
         """Find the probable peaks along the range for all phases."""
-        bound = self._bound(query)
+        bound = query.bound
         n, n_first = len(bound), min(_N_FIRST, bound.shape[1])
         first = np.sort(np.argpartition(bound, -n_first, axis=1)[:, -n_first:], axis=1)
         rows = np.repeat(np.arange(n), n_first)
@@ -251,27 +262,34 @@ class TemplateTable:
         best = np.full(n, -np.inf)
         np.maximum.at(best, peaks.phases, peaks.value)
         limit = best - query.margin
-        bound[rows, first.ravel()] = -np.inf
-        rows, others = np.nonzero(bound + self._loss >= limit[:, None])
+        likely = bound + self._loss >= limit[:, None]
+        likely[rows, first.ravel()] = False
+        if draw:
+            many = np.count_nonzero(likely, axis=1) > _MAX_CELLS
+            drawn = [row for row in np.flatnonzero(many).tolist() if draw(query, row)]
+            if drawn:
+                likely[drawn] = False
+                peaks = peaks.select(~np.isin(peaks.phases, drawn))
+        rows, others = np.nonzero(likely)
         if len(rows):
             peaks = concatenate(peaks, self._peaks_of(rows, others, query))
-        likely = np.flatnonzero(peaks.value + self._loss[peaks.cell] >= limit[peaks.phases])
-        likely = likely[np.lexsort((-peaks.value[likely], peaks.phases[likely]))]
-        phases = peaks.phases[likely]
-        place = np.arange(len(likely)) - np.searchsorted(phases, phases)
-        peaks = peaks.select(likely[place < _MAX_PEAKS])
+        order = np.flatnonzero(peaks.value + self._loss[peaks.cell] >= limit[peaks.phases])
+        order = order[np.lexsort((-peaks.value[order], peaks.phases[order]))]
+        phases = peaks.phases[order]
+        place = np.arange(len(order)) - np.searchsorted(phases, phases)
+        peaks = peaks.select(order[place < _MAX_PEAKS])
         radii = self._resolution.separation(query.prior.is_coarse)
         return peaks.select(separate(peaks.phases, self._points(peaks), radii))
 
     def _points(self, peaks: '_Peaks') -> np.ndarray:
         """Points (r [m], u, v) of peaks, float64 [P, 3]."""
-        points: np.ndarray = self._grid.nodes[self._grid.node[peaks.cell]]
+        points: np.ndarray = self.grid.nodes[self.grid.node[peaks.cell]]
         points[:, 0] = peaks.range_m
         return points
 
-    def _bound(self, query: '_Query') -> np.ndarray:
+    def _bound(self, query: 'Query') -> np.ndarray:
         """Bound the log-likelihood in all cells: that of outputs in phase, float32 [N, C]."""
-        grid, outputs = self._grid, query.outputs
+        grid, outputs = self.grid, query.outputs
         amplitude = np.empty((len(outputs), len(grid.node)), np.float32)
         turns = np.swapaxes(self._cell_turns, 1, 2)
         for nodes, cells, pairs in grid.segments:
@@ -287,13 +305,10 @@ class TemplateTable:
                   for one, energy in zip(amplitude, query.energies.tolist(), strict=True)]
         return np.stack(bounds) - query.template_energy
 
-    def _peaks_of(self, phases: np.ndarray, cells: np.ndarray, query: '_Query') -> '_Peaks':
+    def _peaks_of(self, phases: np.ndarray, cells: np.ndarray, query: 'Query') -> '_Peaks':
         """Find all peaks along the range in pairs [K] of the grid, for a phase each, ascending."""
-        grid, outputs, prior = self._grid, query.outputs, query.prior
-        counts = self._n_windows[grid.cell[cells]]
-        pair = np.repeat(np.arange(len(cells)), counts)
-        place = np.arange(len(pair)) - np.repeat(np.cumsum(counts) - counts, counts)
-        window = self._first_window[grid.cell[cells]][pair] + place
+        grid, outputs, prior = self.grid, query.outputs, query.prior
+        pair, window = self._windows_of(cells)
         phases, cells = phases[pair], cells[pair]
         # Complex64 [W, N_B, N_SB], then the outputs of the bands, [N_B, W].
         by_subband = outputs[phases, :, :, grid.node[cells]]
@@ -337,10 +352,41 @@ class TemplateTable:
             phases[column], cells[column], range_m, value,
             np.zeros(len(step)) if gain is None else gain[step, column], at_peak)
 
-    def _step(self, query: '_Query', peaks: '_Peaks', points: np.ndarray, values: np.ndarray
+    def _windows_of(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Windows of range in pairs [K] of the grid: indices into the pairs and windows, [W]."""
+        ranges = self.grid.cell[cells]
+        counts = self._n_windows[ranges]
+        pair = np.repeat(np.arange(len(cells)), counts)
+        place = np.arange(len(pair)) - np.repeat(np.cumsum(counts) - counts, counts)
+        return pair, self._first_window[ranges][pair] + place
+
+    def windows(self, query: 'Query', phase: int, cells: np.ndarray, directions: np.ndarray
+                ) -> 'Windows':
+        """Evaluate windows of range at directions (u, v), [K, 2], in pairs [K] of the grid.
+
+        Means are linear in the distance from the template's direction, and energies quadratic.
+        """
+        grid, curvature = self.grid, self._curvature[cells][:, 1:, 1:]
+        node, slope, cell_m = grid.node[cells], self._energy_slope[cells], self._cell_ranges(cells)
+        node_m, offset = grid.nodes[node, 0], directions - grid.nodes[node, 1:]
+        change = np.column_stack([node_m * (1 - node_m / cell_m), offset]).astype(np.float32)
+        by_subband = np.moveaxis(query.outputs[phase][:, :, node], 2, 0) + np.einsum(
+            'iskqf,isf,kq->kis', self._slope_filters[:, :, node], query.signals[phase], change,
+            optimize=True)
+        energy = (self._energy[cells] + np.sum(slope[:, 1:] * offset, axis=1)
+                  + likelihood_loss(offset, curvature))
+        pair, window = self._windows_of(cells)
+        outputs = np.einsum('wis,isw->iw', by_subband[pair], self._window_turns[:, :, window])
+        range_m = self._window_ranges_m[window]
+        along = (slope[:, 0] + 2 * self._energy[cells] / cell_m)[pair]
+        energy = (cell_m[pair] / range_m)**2 * (energy[pair] + along * (range_m - cell_m[pair]))
+        return Windows(
+            pair, range_m, self._window_widths_m[window], outputs, energy.astype(np.float32))
+
+    def _step(self, query: 'Query', peaks: '_Peaks', points: np.ndarray, values: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:
         """Gauss-Newton steps from peaks, [P, 3], and the likelihood that they predict, [P]."""
-        grid, prior, node = self._grid, query.prior, self._grid.node[peaks.cell]
+        grid, prior, node = self.grid, query.prior, self.grid.node[peaks.cell]
         pairs, index = np.unique(peaks.phases * len(grid.nodes) + node, return_inverse=True)
         phase, its_node = np.divmod(pairs, len(grid.nodes))
         # By band, sub-band, pair and coordinate.
@@ -374,7 +420,7 @@ class TemplateTable:
 
     def _cell_ranges(self, cells: np.ndarray) -> np.ndarray:
         """Ranges of the cells of pairs [K], float64 [K] [m]."""
-        return self._grid.ranges_m[self._grid.cell[cells]]
+        return self.grid.ranges_m[self.grid.cell[cells]]
 
     def _loss_outside(self, phases: np.ndarray, points: np.ndarray, cells: np.ndarray,
                       value: np.ndarray, margin: np.ndarray) -> np.ndarray:
@@ -400,18 +446,36 @@ class Starts(NamedTuple):
     values: np.ndarray  # Nuisance parameters, float64 [M, Q].
 
 
-class _Query(NamedTuple):
+class Query(NamedTuple):
     """Signals of N phases, and the hypotheses with which the grid compares them."""
 
+    first: int  # Number of its first phase.
     signals: np.ndarray  # Weighted with the inverse covariance, complex64 [N, N_B, N_SB, F].
     outputs: np.ndarray  # Of the filters of all templates, complex64 [N, N_B, N_SB, G].
     energies: np.ndarray  # Of the whitened signals, float64 [N].
     template_energy: np.ndarray  # Of the whitened means, float32 [C].
+    bound: np.ndarray  # Of the log-likelihood in each cell, float32 [N, C].
     prior: NuisancePrior
     margin: float
 
     def over_gain(self, amplitude: np.ndarray, energy: float) -> tuple[np.ndarray, np.ndarray]:
+        """Maximise over the gain, as `NuisancePrior.over_gain` describes."""
         return self.prior.over_gain(amplitude, energy, self.signals[0].size)
+
+
+class Windows(NamedTuple):
+    """W windows of range, in which only the phases of the carriers change."""
+
+    pair: np.ndarray  # Index of the pair to which it belongs, int [W], ascending.
+    range_m: np.ndarray  # Centre, float64 [W] [m].
+    width_m: np.ndarray  # Float64 [W] [m].
+    outputs: np.ndarray  # Of the bands' matched filters at the centre, complex64 [N_B, W].
+    energy: np.ndarray  # Of the whitened mean, float32 [W].
+
+    def select(self, chosen: np.ndarray | slice) -> 'Windows':
+        """Return the windows with the given indices."""
+        return Windows(self.pair[chosen], self.range_m[chosen], self.width_m[chosen],
+                       self.outputs[:, chosen], self.energy[chosen])
 
 
 class _Peaks(NamedTuple):
@@ -461,6 +525,8 @@ def separate(phases: np.ndarray, points: np.ndarray, radii: np.ndarray,
     from scipy.spatial import cKDTree
 
     scaled, chosen, reach = points / radii, np.ones(len(points), bool), 1.0
+    if not len(points):
+        return chosen
     if curvature is not None:
         variance = np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2) / radii**2
         reach = float(np.clip(np.sqrt(_SAME_MODE * variance.max()), 1.0, _MAX_REACH))

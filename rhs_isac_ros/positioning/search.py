@@ -5,6 +5,7 @@ Gaussian, so that the marginal of the position has the Schur complement of the i
 mass contains the determinant of the parameters' information: Laplace's method.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from rhs_isac_ros.model.gaussian import Marginal, marginalise
 from rhs_isac_ros.positioning.coordinates import likelihood_loss, offset_to_roi
 from rhs_isac_ros.positioning.grid import (
+    Query,
     Starts,
     TemplateTable,
     first_of_each,
@@ -22,8 +24,8 @@ from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Local, 
 
 # Negative logarithms of the share of the posterior that modes may leave out: on the grid, which is
 # accurate to one Gauss-Newton step, and after exact steps.
-GRID_MARGIN = 10.0
-EXACT_MARGIN = 8.0
+GRID_MARGIN = 8.0
+EXACT_MARGIN = 7.0
 # A mode has converged when its last step gained less log-likelihood than this.
 _MIN_GAIN = 0.05
 # Maximum number of exact steps. Few modes need more than two, unless signals are strong.
@@ -74,15 +76,19 @@ class Modes(NamedTuple):
 
 
 def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
-               aligned: np.ndarray, extra_margin: float = 0.0) -> Modes:
+               aligned: np.ndarray, extra_margin: float = 0.0,
+               draw: Callable[[Query, int], bool] | None = None) -> Modes | None:
     """Find the modes of each of N phases with a substantial weight in the posterior.
 
     Each phase has at least one mode, and its most likely one comes first. Takes the parameters
     that the signals alone reveal, float64 [N, Q], 0 for the others. Modes may be less likely than
-    the best by the `extra_margin` more than usual.
+    the best by the `extra_margin` more than usual. With `draw`, phases may have
+    none, as `TemplateTable.starts` describes; the result is None if no phase has any.
     """
-    starts = grid.starts(
-        likelihood.whitened(aligned, signals), likelihood.nuisance, GRID_MARGIN + extra_margin)
+    starts = grid.starts(likelihood.whitened(aligned, signals), likelihood.nuisance,
+                         GRID_MARGIN + extra_margin, draw)
+    if not len(starts.phases):
+        return None
     starts = starts._replace(values=starts.values + aligned[starts.phases])
     return ascend(likelihood, likelihood, starts, signals, MAX_STEPS, EXACT_MARGIN + extra_margin)
 

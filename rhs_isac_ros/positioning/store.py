@@ -5,7 +5,7 @@ import hashlib
 import os
 import tokenize
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -28,22 +28,22 @@ def default_folder() -> Path:
     return (Path(base) if os.path.isabs(base) else Path.home() / '.cache') / 'rhs_isac_ros'
 
 
-def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = None
-               ) -> Mapping[str, np.ndarray]:
+def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = None,
+               progress: Callable[[float], None] | None = None) -> Mapping[str, np.ndarray]:
     """Load the table of a model from a folder, or compute it and store it there.
 
     The result contains the arrays of `tabulate` and `tabulate_outside`; from a folder, they are
     read-only and mapped into memory. Without a folder, or with a `RuntimeWarning` if it cannot be
-    written, the table is in memory only.
+    written, the table is in memory only. `progress` is called with the computed share.
     """
     if folder is None:
-        return _tabulate(model)
+        return _tabulate(model, progress)
     key = table_key(model, codebook_id)
     path = folder / f'{_PREFIX}{key}.npy'
     table = _read(path, key)
     if table is not None:
         return table
-    table = _tabulate(model)
+    table = _tabulate(model, progress)
     try:
         _write(path, key, table)
     except OSError as error:
@@ -52,8 +52,11 @@ def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = 
     return _read(path, key) or table
 
 
-def _tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
-    return grid.tabulate(model) | alternatives.tabulate_outside(model)
+def _tabulate(model: MeasurementModel, progress: Callable[[float], None] | None
+              ) -> dict[str, np.ndarray]:
+    report = progress or (lambda _: None)
+    return (grid.tabulate(model, lambda share: report(share / 2))
+            | alternatives.tabulate_outside(model, lambda share: report((1 + share) / 2)))
 
 
 def table_key(model: MeasurementModel, codebook_id: str) -> str:

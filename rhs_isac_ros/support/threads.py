@@ -7,6 +7,7 @@ divided into blocks that run side by side (`map_blocks`).
 """
 
 import contextlib
+import itertools
 import os
 import threading
 from collections.abc import Callable, Iterable, Sequence
@@ -125,13 +126,23 @@ if hasattr(os, 'register_at_fork'):
 
 
 def map_blocks(
-        function: Callable[[_Item], _Result], blocks: Sequence[_Item]) -> list[_Result]:
+        function: Callable[[_Item], _Result], blocks: Sequence[_Item],
+        progress: Callable[[float], None] | None = None) -> list[_Result]:
     """Call a function with each block, on as many threads as BLAS may use, up to all cores.
 
     The results have the order of the blocks and do not depend on the number of threads. A limit of
     BLAS, such as ``OPENBLAS_NUM_THREADS``, also applies here. The function must not change data
-    that other blocks use.
+    that other blocks use. `progress` is called with the completed share, from any thread.
     """
+    if progress:
+        done = itertools.count(1)
+
+        def reported(block: _Item) -> _Result:
+            result = function(block)
+            progress(next(done) / len(blocks))
+            return result
+
+        return map_blocks(reported, blocks)
     with one_blas_thread:
         is_serial = len(blocks) < 2 or getattr(_worker, 'busy', False)
         n_threads = 1 if is_serial else min(one_blas_thread.allowed(), _n_cores(), len(blocks))

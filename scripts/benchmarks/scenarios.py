@@ -38,9 +38,8 @@ from rhs_isac_ros.positioning import Estimate, make_estimator, simulate_pairs
 from rhs_isac_ros.support.arguments import positive_int
 
 FOLDER = Path(__file__).parents[2] / 'config' / 'scenarios'
-# Scenarios whose codebook is directional, and those with fewer positions.
+# Scenarios whose codebook is directional.
 DIRECTIONAL = {'mmwave_64x64', 'weak_signal'}
-FEW_POSITIONS = {'mmwave_64x64': 300}
 # Squared Mahalanobis radius of the 95 % region.
 REGION_RADIUS = float(chdtri(3, 0.05))
 # Excess of a residual over the true position's from which a mode counts as missed.
@@ -107,8 +106,7 @@ def scenario_of(name: str) -> Scenario:
 def measure(scenario: Scenario, codebook: Codebook, options: argparse.Namespace
             ) -> dict[str, Any]:
     """Measure one scenario."""
-    n = min(options.positions, FEW_POSITIONS.get(options.one, options.positions))
-    positions, received = simulate_pairs(scenario, codebook, n, options.seed)
+    positions, received = simulate_pairs(scenario, codebook, options.positions, options.seed)
     begin_s = time.process_time()
     estimator = make_estimator(
         'bayes', scenario, codebook, reject_outside=not options.inside)

@@ -16,7 +16,7 @@ from rhs_isac_ros.model.los import los_and_derivative
 from rhs_isac_ros.model.measurement import receive_feeds, received_signal
 from rhs_isac_ros.model.multipath import multipath_covariance
 
-POSITION_METHODS = ('mean', 'mean_and_jacobian')
+POSITION_METHODS = ('mean', 'fast_mean', 'mean_and_jacobian')
 N_PHASES = 20_000
 
 
@@ -140,6 +140,8 @@ def test_mean_and_jacobian_are_sums_over_the_elements(faded, random_beams, gains
     scenario = dataclasses.replace(faded[0], n_frames=n_frames, **gains)
     model = MeasurementModel(scenario, random_beams(scenario, np.random.default_rng(0)))
     positions = scenario.sample_positions(n, np.random.default_rng(3))
+    np.testing.assert_array_equal(
+        model.fast_mean(positions), model.mean_and_jacobian(positions)[0])
     for actual, expected in zip(model.mean_and_jacobian(positions),
                                 by_elements(model, positions), strict=True):
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * np.abs(expected).max())

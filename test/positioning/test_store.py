@@ -28,9 +28,9 @@ def computed(monkeypatch):
     """Ids of the codebooks for which tables were computed."""
     ids, original = [], grid.tabulate
 
-    def tabulate(model):
+    def tabulate(model, progress=None):
         ids.append(model.beams.id)
-        return original(model)
+        return original(model, progress)
     monkeypatch.setattr(grid, 'tabulate', tabulate)
     return ids
 
@@ -162,3 +162,11 @@ def test_default_folder_follows_the_xdg_convention(monkeypatch, variable, expect
     monkeypatch.setenv('HOME', '/me')
     monkeypatch.setenv('XDG_CACHE_HOME', variable)
     assert store.default_folder() == Path(expected)
+
+
+def test_the_progress_of_a_table_is_reported_up_to_the_end(model, tmp_path):
+    shares = []
+    for _ in range(2):
+        store.load_table(model, model.beams.id, tmp_path, shares.append)
+    # Templates inside and outside of the region; a stored table takes no time.
+    assert shares == [0.5, 1.0]

@@ -76,6 +76,21 @@ def test_the_estimate_equals_that_of_the_library(bench, node, send, codebooks, t
     assert len(list((tmp_path / 'tables').iterdir())) == 1
 
 
+def test_the_diagnostics_contain_the_progress_of_a_table(bench, node, codebooks, monkeypatch):
+    released, original = threading.Event(), positioner.positioning.make_estimator
+
+    def half(name, scenario, codebook, *, progress, **options):
+        progress(0.5)
+        released.wait(30)
+        return original(name, scenario, codebook, progress=progress, **options)
+
+    monkeypatch.setattr(positioner.positioning, 'make_estimator', half)
+    node.dispatch(CodebookOffered(codebooks[0]))
+    bench.until(lambda: node.report().values.get('table.progress') == '50 %', 'the progress')
+    released.set()
+    bench.until(lambda: 'table.progress' not in node.report().values, 'the end')
+
+
 @pytest.fixture
 def second_estimate(bench, node, send, codebooks):
     """Function that returns the second estimate of user 1 and its message on another topic."""

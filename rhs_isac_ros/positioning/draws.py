@@ -1,0 +1,184 @@
+"""The posterior of weak signals: positions drawn all over the grid, instead of modes.
+
+Below the noise, thousands of beams and range steps explain the signals. To find all of these modes
+takes long, and they are not Gaussian. A draw is a direction within a cell of the grid; along the
+range, the likelihood is integrated. Cells are drawn with the probabilities that the bounds of
+their likelihood imply, and the weight of a draw is its integral over the expected number of draws
+of its cell: importance sampling. The weights show how many draws are effective. As long as these
+are too few, further draws follow the weights so far; peaks of strong signals are too narrow.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, concatenate
+from rhs_isac_ros.positioning.grid import Query, TemplateTable, Windows
+from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution
+
+# Draws at a time, largest number of times, and number of effective draws that suffices: the mean
+# squared error increases by its inverse.
+_N_DRAWS = 500
+_MAX_ROUNDS = 4
+_N_EFFECTIVE = 150.0
+# Share of further draws that follow the bounds instead of the weights.
+_SHARE_OF_BOUNDS = 0.1
+# Windows of range whose log-likelihood is lower than the best average by more have no effect.
+_MARGIN = 12.0
+# Range steps per wavelength, at least; a Gaussian peak then has one for each two deviations.
+_MIN_STEPS = 8
+# Number of range steps to evaluate at a time.
+_BLOCK = 1 << 20
+# Multiples of these numbers modulo 1 cover the unit square evenly: powers of the inverse root of
+# x^3 = x + 1.
+_SEQUENCE = 1.324717957244746**-np.array([1.0, 2.0])
+# Components of directions below it count as positive, so that they have a finite inverse.
+_TINY = 1e-12
+
+
+class Draws(NamedTuple):
+    """The posterior of one phase."""
+
+    mean: np.ndarray  # Float64 [3] [m].
+    covariance: np.ndarray  # Float64 [3, 3] [m^2], with the uncertainty of the mean.
+    log_total: float  # Logarithm of the integral of the likelihood over the region [m^3].
+    highest: float  # Log-likelihood at the best position.
+    average: float  # Log-likelihood averaged over the posterior.
+
+
+class _Rays(NamedTuple):
+    """Integrals of the likelihood over ranges in R directions, from one draw each."""
+
+    draw: np.ndarray  # Number of the draw, int [R].
+    direction: np.ndarray  # Unit vector, float64 [R, 3].
+    log_mass: np.ndarray  # Logarithm of the integral, float64 [R]; -inf outside of the region.
+    range_m: np.ndarray  # Mean range, float64 [R] [m].
+    variance_m2: np.ndarray  # Variance of the range, float64 [R] [m^2].
+    average: np.ndarray  # Mean log-likelihood, float64 [R].
+    highest: np.ndarray  # Highest log-likelihood, float64 [R].
+
+
+class DrawnPosterior:
+    """The posterior of positions without nuisance parameters, from the table alone."""
+
+    def __init__(self, scenario: Scenario, table: TemplateTable) -> None:
+        self._table, resolution = table, Resolution.of(scenario)
+        self._wavelength_m, self._bounds = resolution.wavelength_m, resolution.bounds_m
+        self._wavenumbers = carrier_wavenumbers(scenario)
+        grid, points = table.grid, table.grid.points
+        # Directions of each cell: lowest (u, v) and extent, float64 [C, 2].
+        self._low, high = (np.clip(points[:, 1:] + sign * PHASE_ERROR * resolution.direction,
+                                   *resolution.directions.T) for sign in (-1, 1))
+        self._extent = high - self._low
+        with np.errstate(divide='ignore'):
+            self._log_area = np.log(self._extent).sum(axis=1)
+        volume = points[:, 0]**2 * grid.widths_m[grid.cell] / _boresight(points[:, 1:])
+        self._log_volume = np.log(volume) + self._log_area
+
+    def of(self, query: Query, phase: int) -> Draws | None:
+        """Draw positions of a phase of a query; None if too few of them are effective."""
+        bounds = self._probabilities(query, phase)
+        expected, probability = np.zeros(len(bounds)), bounds
+        cells, parts = np.empty(0, int), []
+        for _ in range(_MAX_ROUNDS):
+            expected += _N_DRAWS * probability
+            drawn = np.searchsorted(
+                np.cumsum(probability), (np.arange(_N_DRAWS) + 0.5) / _N_DRAWS)
+            places = (len(cells) + np.arange(_N_DRAWS))[:, None] * _SEQUENCE
+            rays = self._rays(query, phase, drawn, places % 1)
+            parts.append(rays._replace(draw=rays.draw + len(cells)))
+            cells, rays = np.append(cells, drawn), concatenate(*parts)
+            log_weights = rays.log_mass - np.log(expected[cells[rays.draw]])
+            highest = log_weights.max(initial=-np.inf)
+            if np.isneginf(highest):
+                return None
+            weights = np.exp(log_weights - highest)
+            total = weights.sum()
+            weights /= total
+            by_draw = np.bincount(rays.draw, weights, len(cells))
+            variance = np.sum(by_draw**2)
+            if variance <= 1 / _N_EFFECTIVE:
+                break
+            found = np.bincount(cells, by_draw, len(bounds))
+            probability = (1 - _SHARE_OF_BOUNDS) * found + _SHARE_OF_BOUNDS * bounds
+        else:
+            return None
+        places = rays.range_m[:, None] * rays.direction
+        mean = weights @ places
+        offsets, along = places - mean, weights * rays.variance_m2
+        covariance = ((weights[:, None] * offsets).T @ offsets
+                      + (along[:, None] * rays.direction).T @ rays.direction)
+        return Draws(
+            mean, covariance * (1 + variance), float(highest + np.log(total)),
+            float(rays.highest[weights > 0].max()), float(weights @ rays.average))
+
+    def _probabilities(self, query: Query, phase: int) -> np.ndarray:
+        """Share of each cell in the posterior if the bands had random phases, roughly, [C]."""
+        # The average of exp(2 A cos(phase)) is nearly exp(2 A) / sqrt(1 + 4 pi A).
+        n_bands, bound = len(self._wavenumbers), query.bound[phase]
+        amplitude = (bound + query.template_energy) / (2 * n_bands)
+        value = bound - n_bands / 2 * np.log1p(4 * np.pi * amplitude) + self._log_volume
+        shares: np.ndarray = np.exp(value - value.max(), dtype=float)
+        return shares / shares.sum()
+
+    def _rays(self, query: Query, phase: int, cells: np.ndarray, places: np.ndarray) -> _Rays:
+        """Integrate along directions at places in the unit square, [K, 2], of cells [K]."""
+        directions = np.empty((len(cells), 3))
+        directions[:, 1:] = self._low[cells] + places * self._extent[cells]
+        directions[:, 0] = _boresight(directions[:, 1:])
+        windows = self._table.windows(query, phase, cells, directions[:, 1:])
+        amplitude = np.abs(windows.outputs).sum(axis=0)
+        bound = 2 * amplitude - windows.energy
+        best = int(np.argmax(bound))
+        limit = bound[best] - np.log1p(4 * np.pi * amplitude[best]) / 2 - _MARGIN
+        windows = windows.select(np.flatnonzero(bound >= limit))
+        per_wavelength = max(_MIN_STEPS, np.pi * np.sqrt(2 * amplitude[best]))
+        n_steps = int(np.ceil(self._table.window_m / self._wavelength_m * per_wavelength))
+        low, high = self._inside(directions)
+        rows, n = windows.pair, max(_BLOCK // n_steps, 1)
+        parts = [self._integrate(windows.select(slice(k, k + n)), low, high, n_steps)
+                 for k in range(0, len(rows), n)]
+        log_mass, *moments = (np.concatenate(fields) for fields in zip(*parts, strict=True))
+        log_mass += (self._log_area[cells] - np.log(directions[:, 0]))[rows]
+        return _Rays(rows, directions[rows], log_mass, *moments)
+
+    def _integrate(self, windows: Windows, low: np.ndarray, high: np.ndarray, n_steps: int
+                   ) -> tuple[np.ndarray, ...]:
+        """Integrate over the ranges of windows; return the last fields of `_Rays`.
+
+        Takes the ends of the region in the direction of each draw [m].
+        """
+        step_m, range_m = self._table.window_m / n_steps, windows.range_m
+        offsets_m = ((np.arange(n_steps) - (n_steps - 1) / 2) * step_m).astype(np.float32)
+        phase = np.exp(1j * self._wavenumbers[:, None] * offsets_m)
+        rotation = (2 * np.concatenate([phase.real, -phase.imag])).astype(np.float32)
+        outputs = windows.outputs
+        value = np.concatenate([outputs.real, outputs.imag]).T @ rotation
+        value -= windows.energy[:, None]
+        highest = value.max(axis=1)
+        value -= highest[:, None]
+        density = np.exp(value)
+        nearest = np.maximum(low[windows.pair] - range_m, -windows.width_m / 2)
+        farthest = np.minimum(high[windows.pair] - range_m, windows.width_m / 2)
+        density *= offsets_m >= nearest.astype(np.float32)[:, None]
+        density *= offsets_m <= farthest.astype(np.float32)[:, None]
+        moments = (density @ np.stack([np.ones_like(offsets_m), offsets_m, offsets_m**2], axis=1)
+                   ).astype(float)
+        mass = np.maximum(moments[:, 0], np.finfo(np.float32).tiny)
+        mean, square = moments[:, 1] / mass, moments[:, 2] / mass
+        average = highest + np.einsum('wn,wn->w', density, value) / mass
+        log_mass = highest + np.log(mass * step_m * range_m**2)
+        log_mass[moments[:, 0] == 0] = -np.inf
+        return (log_mass, range_m + mean, np.maximum(square - mean**2, 0.0), average, highest)
+
+    def _inside(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Range at which directions [K, 3] enter and leave the region, float64 [K] [m]."""
+        directions = np.where(np.abs(directions) < _TINY, _TINY, directions)
+        ends = np.sort(self._bounds[:, None] / directions, axis=0)
+        return ends[0].max(axis=1), ends[1].min(axis=1)
+
+
+def _boresight(directions: np.ndarray) -> np.ndarray:
+    """Cosine of the angle from boresight for (u, v), float64 [K, 2]; at least 1e-6."""
+    return np.sqrt(np.maximum(1 - np.sum(directions**2, axis=1), 1e-12))

@@ -1,0 +1,87 @@
+"""Posteriors from positions that are drawn all over the grid."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.stats import qmc
+
+from rhs_isac_ros.model import Scenario, simulate_received
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning.coordinates import log_sum
+from rhs_isac_ros.positioning.draws import DrawnPosterior
+from rhs_isac_ros.positioning.grid import TemplateTable, tabulate
+from rhs_isac_ros.positioning.likelihood import Likelihood
+
+# The noise hides most users; many positions explain the signals.
+WEAK = Scenario(elements_per_side=6, multipath_to_los_db=-30.0, noise_psd_dbm_hz=-95.0,
+                roi_center_m=(6, 0, 0), roi_size_m=(6, 6, 1))
+N = 12
+
+
+@pytest.fixture(scope='module')
+def codebook(random_beams):
+    return random_beams(WEAK, np.random.default_rng(0))
+
+
+def found_and_exact(scenario, codebook):
+    """Draws for N phases, and mean, covariance and logarithm of the integral from 2^17 points."""
+    likelihood = Likelihood(scenario, codebook)
+    table = TemplateTable(scenario, tabulate(likelihood.model))
+    drawn, rng = DrawnPosterior(scenario, table), np.random.default_rng(1)
+    received = simulate_received(scenario, codebook, scenario.sample_positions(N, rng), rng)
+    whitened = likelihood.signals(received).whitened
+    query = table.query(whitened, likelihood.nuisance, 8.0)
+    found = [drawn.of(query, phase) for phase in range(N)]
+    low, high = likelihood.resolution.bounds_m
+    positions = low + (high - low) * qmc.Sobol(3, seed=0).random(1 << 17)
+    means = likelihood.model.whiten(likelihood.model.mean(positions)).reshape(len(positions), -1)
+    values = (2 * (whitened.reshape(N, -1).conj() @ means.T).real
+              - np.sum(np.abs(means)**2, axis=1))
+    exact = []
+    for value in values:
+        weights = np.exp(value - log_sum(value))
+        mean = weights @ positions
+        offset = positions - mean
+        exact.append((mean, (weights[:, None] * offset).T @ offset,
+                      log_sum(value) + np.log(np.prod(high - low) / len(positions))))
+    return found, exact
+
+
+@pytest.mark.parametrize('changes', [{}, {'roi_size_m': (6, 6, 0)}])
+def test_draws_have_the_moments_of_the_posterior(changes, codebook):
+    """The mean of 150 random draws would have an error of 0.08 standard deviations."""
+    found, exact = found_and_exact(dataclasses.replace(WEAK, **changes), codebook)
+    errors, spreads = [], []
+    for draws, (mean, covariance, log_total) in zip(found, exact, strict=True):
+        errors.append(np.sum((draws.mean - mean)**2) / np.trace(covariance))
+        spreads.append(np.trace(draws.covariance) / np.trace(covariance))
+        assert draws.log_total == pytest.approx(log_total, abs=0.2)
+        assert draws.average < draws.highest
+    assert np.mean(errors) < 0.08**2
+    assert np.mean(spreads) == pytest.approx(1, abs=0.1)
+
+
+def test_strong_signals_leave_too_few_effective_draws(codebook):
+    scenario = dataclasses.replace(WEAK, noise_psd_dbm_hz=-174.0, multipath_to_los_db=-60.0)
+    likelihood = Likelihood(scenario, codebook)
+    table = TemplateTable(scenario, tabulate(likelihood.model))
+    query = table.query(
+        likelihood.model.whiten(likelihood.model.mean(np.array([[6.0, 1.0, 0.2]]))),
+        likelihood.nuisance, 8.0)
+    assert DrawnPosterior(scenario, table).of(query, 0) is None
+
+
+def test_estimates_from_draws_agree_with_those_from_modes(codebook):
+    """Laplace's method is rough below the noise, but the modes are at the right places."""
+    estimator, rng = make_estimator('bayes', WEAK, codebook), np.random.default_rng(2)
+    received = simulate_received(WEAK, codebook, WEAK.sample_positions(N, rng), rng)
+    drawn, by_modes = estimator.estimate(received), [
+        estimator.posterior(one) for one in received]
+    assert all(one.modes is not None for one in by_modes)
+    errors = [np.sum((mean - one.estimate.mean)**2) / np.trace(one.estimate.covariance)
+              for mean, one in zip(drawn.mean, by_modes, strict=True)]
+    assert 1e-6 < np.mean(errors) < 0.5**2
+    single = estimator.estimate(received[3])
+    np.testing.assert_allclose(single.mean, drawn.mean[3], atol=0.02)
+    np.testing.assert_allclose(single.residual, drawn.residual[3], rtol=1e-3)
