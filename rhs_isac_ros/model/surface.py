@@ -31,23 +31,25 @@ class AppliedBeams(NamedTuple):
     digital: np.ndarray
 
 
-def element_signals(los: np.ndarray, multipath: np.ndarray, symbol: complex) -> np.ndarray:
+def element_signals(
+        los: np.ndarray, multipath: np.ndarray, symbol: complex | np.ndarray) -> np.ndarray:
     """Implements Eq. (1). Element signals tau for line-of-sight and multipath gains.
 
-    Returns complex128 [..., N_E] for gains of the same shape.
+    Returns complex128 [..., N_E] for gains of this shape, or shapes that broadcast to it.
     """
     return (los + multipath) * symbol
 
 
 def feed_signals(
         scenario: Scenario, band: int, analog: np.ndarray, elements: np.ndarray) -> np.ndarray:
-    """Implements Eq. (5). Signals that the feeds receive from the elements, [N_SB, K].
+    """Implements Eq. (5). Signals that the feeds receive from the elements, [..., N_SB, K].
 
-    Takes the configuration c of the frame, float64 [N_E], and the element signals tau, complex128
-    [N_SB, N_E]. The elements apply their radiation coefficients here; the paper introduces them
-    with Eq. (9).
+    Takes the configuration c of each frame, float64 [..., N_E], and the element signals tau,
+    complex128 [..., N_SB, N_E]. The elements apply their radiation coefficients here; the paper
+    introduces them with Eq. (9).
     """
-    return np.einsum('jm,jkm->jk', analog * elements, onboard_matrix(scenario)[band])
+    return np.einsum('...jm,jkm->...jk', analog[..., None, :] * elements,
+                     onboard_matrix(scenario)[band])
 
 
 def onboard_gain(

@@ -17,27 +17,15 @@ RECEIVES = (m.Beacon, m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Ca
 
 @dataclasses.dataclass
 class CycleTimes:
-    """The times of one cycle: arrivals of messages at a subscriber [s], NaN before.
-
-    Attributes
-    ----------
-    user
-        Id of the user that was granted the cycle; 0 before the grant.
-    began_s
-        Arrival of the last beacon before the grant [s].
-    phase_s
-        Arrival of the first message of each later phase [s].
-    ended_s
-        Arrival of the outcome [s].
-    state
-        The latest state, which contains the times of the base station; None before the first.
-    """
+    """The times of one cycle: arrivals of messages at a subscriber [s], NaN before."""
 
     cycle_id: int
-    user: int = 0
-    began_s: float = math.nan
+    user: int = 0  # 0 before the grant
+    began_s: float = math.nan  # last beacon before the grant
+    # First message of each later phase.
     phase_s: dict[m.Phase, float] = dataclasses.field(default_factory=dict)
-    ended_s: float = math.nan
+    ended_s: float = math.nan  # outcome
+    # The latest state, which contains the times of the base station.
     state: m.ProtocolState | None = None
 
     @property
@@ -81,17 +69,10 @@ class CompleteCycle(CycleTimes):
 
 @dataclasses.dataclass
 class CycleRecord(CycleTimes):
-    """A cycle that is still running, was given up, or lacks messages, which are None.
+    """A cycle that is still running, was given up, or lacks messages, which are None."""
 
-    Attributes
-    ----------
-    outcome
-        ``served``, or the reason why the cycle was given up; empty while it runs.
-    truths
-        True positions by the instance of the user that sent them.
-    """
-
-    outcome: str = ''
+    outcome: str = ''  # served, or the reason why it was given up; empty while it runs
+    # True positions by the instance of the user that sent them.
     truths: dict[int, m.GroundTruth] = dataclasses.field(default_factory=dict)
     signals: m.ReceivedSignals | None = None
     estimate: m.PositionEstimate | None = None
@@ -118,10 +99,7 @@ class CycleRecord(CycleTimes):
 class CycleLog:
     """Collects the cycles of one network, also across restarts of its base station.
 
-    Attributes
-    ----------
-    complete, ended
-        Cycles that were served and received completely, and all that have ended, in order.
+    All that have `ended` are in order, and those that were served and received completely as well.
     """
 
     def __init__(self) -> None:

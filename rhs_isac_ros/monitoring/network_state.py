@@ -44,27 +44,9 @@ class NodeStatus(NamedTuple):
 class Overview:
     """Phase, cycles, users and nodes of one network; what is unknown is 0, empty or None.
 
-    Attributes
-    ----------
-    phase
-        Phase of the base station, `RESTING` between cycles.
-    phase_began_s
-        Time at which the phase began [s].
-    cycle_id, user
-        Current cycle and its user.
-    codebook_id
-        Codebook of the latest signals.
-    served, given_up
-        Numbers of cycles that ended.
-    last_failure
-        Description of the last cycle that was given up.
-    began_s
-        Arrival of the first message [s]; infinite before.
-    users
-        Latest complete cycle of each user by id.
-    nodes
-        Status of each node by name. As it and the ids of users come from messages, their numbers
-        are limited.
+    The `phase` is that of the base station, `RESTING` between cycles, and the codebook that of the
+    latest signals. Of each user, the latest complete cycle is kept by id, of each node the status
+    by name. Names and ids come from messages, so that their numbers are limited.
     """
 
     def __init__(self) -> None:
@@ -76,6 +58,7 @@ class Overview:
         self.nodes: dict[str, NodeStatus] = {}
         self._log = CycleLog()
         self._served_s: collections.deque[float] = collections.deque()
+        # Arrival of the first message [s].
         self.began_s = math.inf
 
     def add(self, message: m.Message, now_s: float) -> None:
@@ -148,20 +131,10 @@ def new_path() -> collections.deque[np.ndarray]:
 
 @dataclasses.dataclass
 class UserState:
-    """Position, estimate and paths of one user.
-
-    Attributes
-    ----------
-    updated_s
-        Arrival of the latest message about the user [s].
-    truth, estimate
-        The latest true position and estimate; None before the first.
-    true_path, estimated_path
-        True positions and estimates, float64 [3] [m] each, the latest last.
-    """
+    """Position, estimate and paths of one user; the latest position of a path is its last."""
 
     user: int
-    updated_s: float
+    updated_s: float  # arrival of the latest message about the user [s]
     truth: m.GroundTruth | None = None
     estimate: m.PositionEstimate | None = None
     true_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=new_path)
@@ -192,15 +165,10 @@ class UserState:
 
 
 class SceneState:
-    """The surface, its beam, and the users.
+    """What the surface applies, the latest beam of a transmission, and the users by id.
 
-    Attributes
-    ----------
-    configuration, beam
-        What the surface applies, and the latest beam of a transmission; None before the first.
-    users
-        Users by id, at most `MAX_USERS`, because the ids come from messages. Further users are
-        ignored until others are discarded.
+    There are at most `MAX_USERS`, because the ids come from messages. Further users are ignored
+    until others are discarded.
     """
 
     def __init__(self) -> None:

@@ -72,15 +72,10 @@ Sample: TypeAlias = tuple[str, float, Series]
 
 
 class Charts:
-    """Computes the samples of the charts.
-
-    Attributes
-    ----------
-    bounds_m
-        Root of the global bound [m] by the id of the codebook, as far as it is known.
-    """
+    """Computes the samples of the charts."""
 
     def __init__(self) -> None:
+        # Root of the global bound [m] by the id of the codebook, as far as it is known.
         self.bounds_m: dict[str, float] = {}
         self._drawn: set[str] = set()
         self._square_m2 = 0.0
@@ -165,13 +160,7 @@ def mode_axes() -> tuple[Lines, Points]:
 
 
 def mode_bars(user: int, found: WeightedModes, origin: np.ndarray) -> Lines:
-    """Return the modes as bars in the colour of a user, at the errors of their ranges.
-
-    Parameters
-    ----------
-    origin
-        Position whose range is the origin, float64 [3] [m].
-    """
+    """Return the modes as bars in the colour of a user, at their ranges minus the origin's."""
     errors = np.linalg.norm(found.positions, axis=1) - np.linalg.norm(origin)
     return Lines(tuple(_line(error, HEIGHT_M * probability) for error, probability in zip(
         errors.tolist(), found.probabilities.tolist(), strict=True)),
@@ -200,10 +189,7 @@ class TrackPoint(NamedTuple):
 class NetworkView:
     """Converts the messages of a network to entries, in the order in which they arrive.
 
-    Attributes
-    ----------
-    n_cycles, n_ended
-        Numbers of cycles that were observed, and that were received completely or given up.
+    It counts the cycles observed, and those received completely or given up.
     """
 
     def __init__(self, scenario: Scenario) -> None:

@@ -44,15 +44,10 @@ class Report:
 
 
 class RoleStatistics:
-    """Collects the statistics of a role from its events and the resulting actions.
-
-    Attributes
-    ----------
-    missing
-        Descriptions of the roles that are missing.
-    """
+    """Collects the statistics of a role from its events and the resulting actions."""
 
     def __init__(self) -> None:
+        # Descriptions of the roles that are missing.
         self.missing: tuple[str, ...] = ()
         # Messages by section of the report and type, and faults until the last report.
         self._messages: dict[str, collections.Counter[str]] = {
@@ -60,7 +55,6 @@ class RoleStatistics:
         self._faults: collections.Counter[str] = collections.Counter()
         self._served = 0
         self._codebook_id = ''
-        self._cycle_began_s: float | None = None
         self._durations_s: dict[str, collections.deque[float]] = collections.defaultdict(
             lambda: collections.deque(maxlen=_MAX_DURATIONS))
 
@@ -68,52 +62,28 @@ class RoleStatistics:
         """Count a received message, even if it is dropped later."""
         self._messages['received'][kind.__name__] += 1
 
-    def record(
-            self, event: Event, actions: Sequence[Action], now_s: float,
-            handling_s: float) -> None:
-        """Record an event and the actions with which the role responded.
-
-        Parameters
-        ----------
-        now_s
-            Time of the event, on the clock of the role [s].
-        handling_s
-            Time that the role took [s].
-        """
+    def record(self, event: Event, actions: Sequence[Action], handling_s: float) -> None:
+        """Record an event, the actions that it caused, and the time taken [s]."""
         if isinstance(event, CodebookOffered):
             self._codebook_id = event.codebook.id
         self._durations_s['handling_ms'].append(handling_s)
         for action in actions:
             if isinstance(action, Send):
                 self._messages['sent'][type(action.message).__name__] += 1
-                self._record_message(action.message, now_s)
-
-    def _record_message(self, message: m.Message, now_s: float) -> None:
-        match message:
-            case m.Beacon():
-                self._cycle_began_s = now_s
-            case m.PositionEstimate():
-                self._durations_s['estimate_ms'].append(message.latency_s)
-            case m.ProtocolState(outcome='served'):
-                self._served += 1
-                if self._cycle_began_s is not None:
-                    self._durations_s['cycle_ms'].append(now_s - self._cycle_began_s)
+            match action:
+                case Send(m.PositionEstimate() as estimate):
+                    self._durations_s['estimate_ms'].append(estimate.latency_s)
+                case Send(m.ProtocolState(outcome='served') as state):
+                    self._served += 1
+                    self._durations_s['cycle_ms'].append(state.elapsed_s)
 
     def report(
             self, phase: str, counters: Mapping[str, int], blocked: bool = False,
             status: Mapping[str, str] = types.MappingProxyType({})) -> Report:
         """Create a report; new faults are those since the previous call.
 
-        Parameters
-        ----------
-        phase
-            State of the role; empty if it has none.
-        counters
-            Counters of the role by reason.
-        blocked
-            Whether the role lacks something that it needs in this state.
-        status
-            Settings in use and pending, and lasting faults, by name.
+        A role is `blocked` if its state, the `phase`, shows that something is missing. The
+        `counters` are by reason; `status` is that of the role, with conflicts of the node.
         """
         values = {'phase': phase} if phase else {}
         values |= self._codebook_ids(status.get('codebook_id', ''))
@@ -131,8 +101,11 @@ class RoleStatistics:
         faults = collections.Counter(
             {reason: count for reason, count in counters.items() if reason not in _NO_FAULTS})
         new_faults, self._faults = faults - self._faults, faults
-        warnings = [text for name, text in status.items() if name.startswith('warning.')]
-        if self.missing:
+        conflicts, warnings = ([text for name, text in status.items() if name.startswith(kind)]
+                               for kind in ('conflict.', 'warning.'))
+        if conflicts:
+            summary = '; '.join(conflicts)
+        elif self.missing:
             summary = f'waiting for {", ".join(self.missing)}'
         elif blocked:
             summary = f'blocked: {phase}'

@@ -1,6 +1,6 @@
 """The shapes of a network: in space, in planes and in charts.
 
-Rerun, RViz and Matplotlib show the same shapes; `tools.rerun_stream`, `ros.scene` and
+Rerun, RViz and Matplotlib show the same shapes; `tools.rerun_stream`, `nodes.visualizer` and
 `tools.pictures` translate them. Lengths are in metres, positions float64 [N, 3], or [N, 2] in a
 plane; colours are red, green and blue from 0 to 1, float64 [N, 3] for N shapes.
 """
@@ -147,13 +147,7 @@ def _dimmed(user: int) -> Colour:
 
 
 def distance_95(n: int) -> float:
-    """Return the distance, in standard deviations, that contains 95 % of a Gaussian.
-
-    Parameters
-    ----------
-    n
-        Number of dimensions.
-    """
+    """Return the distance, in standard deviations, within which 95 % of an n-D Gaussian lie."""
     from scipy.special import chdtri
 
     return math.sqrt(chdtri(n, 0.05))
@@ -162,16 +156,8 @@ def distance_95(n: int) -> float:
 def axes_95(covariance_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the axes of the ellipse or ellipsoid that contains 95 % of a Gaussian.
 
-    Parameters
-    ----------
-    covariance_m2
-        Covariance of the Gaussian, float64 [n, n] [m^2].
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        Half the lengths of the axes, float64 [n] [m], and a rotation, float64 [n, n], whose
-        columns are their directions.
+    For a covariance [n, n] [m^2], these are half their lengths, float64 [n] [m], and a rotation,
+    float64 [n, n], whose columns are their directions.
     """
     variances_m2, axes = np.linalg.eigh(covariance_m2)
     # The eigenvectors may form a reflection.
@@ -282,14 +268,9 @@ def traced(scenario: Scenario, message: m.GroundTruth) -> Lines:
 def track(
         user: int, positions: Iterable[np.ndarray], velocity: np.ndarray,
         covariance_m2: np.ndarray) -> tuple[Lines, Ellipsoids]:
-    """Return a track, the distance of the next second, and its 95 % ellipsoid.
+    """Return a track, the distance covered in the next second, and its 95 % ellipsoid.
 
-    Parameters
-    ----------
-    positions
-        Tracked positions, float64 [3] [m] each, the latest last.
-    velocity
-        Float64 [3] [m/s].
+    The latest position, float64 [3] [m], comes last.
     """
     places = np.array(list(positions))
     colour = user_colour(user)

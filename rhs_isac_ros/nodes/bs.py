@@ -1,24 +1,151 @@
 """The executable ``bs``: the base station."""
 
+import dataclasses
 import functools
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
+from rclpy.node import Node
+from rclpy.task import Future
 from std_srvs.srv import Trigger
 
+from rhs_isac_msgs.action import Locate
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import create_or_refuse
+from rhs_isac_ros.ros.endpoints import create_or_refuse, steady_timer
 from rhs_isac_ros.ros.frames import Frame
-from rhs_isac_ros.ros.locate import LocateServer
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import streams
+
+_DEFAULT_TIMEOUT_S = 10.0
+_MAX_TIMEOUT_S = 3600.0
+# Maximum number of goals in progress: each takes memory and a timer.
+_MAX_GOALS = 100
+
+
+@dataclasses.dataclass(eq=False)
+class _Goal:
+    """A goal in progress, and the cycle that serves its user; 0 before it."""
+
+    handle: Any
+    future: Future
+    cycle_id: int = 0
+
+
+class LocateServer:
+    """Serves the action, from the messages that the base station sends and receives.
+
+    It calls `request` with the user of each accepted goal, and `pose` with the estimate of a
+    position.
+    """
+
+    def __init__(
+            self, node: Node, request: Callable[[int], None],
+            pose: Callable[[m.PositionEstimate], PoseWithCovarianceStamped],
+            max_users: int) -> None:
+        self._node, self._request, self._pose = node, request, pose
+        self._max_users = max_users
+        self._goals: list[_Goal] = []
+        self._server = create_or_refuse(node, f'action {topics.LOCATE}', lambda: ActionServer(
+            node, Locate, topics.LOCATE, self._execute, goal_callback=self._accept,
+            cancel_callback=self._cancel))
+
+    def observe(self, message: m.ProtocolState | m.PositionEstimate | m.NoFix) -> None:
+        """Process a message of the base station."""
+        phase = message.phase if isinstance(message, m.ProtocolState) else None
+        for goal in [one for one in self._goals if one.handle.request.user == message.user]:
+            if phase is m.Phase.POSITIONING:
+                goal.cycle_id = message.cycle_id
+            if goal.cycle_id != message.cycle_id:
+                continue
+            if phase is m.Phase.BEACONING:
+                # The next cycle of the user tries again.
+                goal.cycle_id = 0
+                self._request(message.user)
+            match message:
+                case m.ProtocolState():
+                    self._feed_back(goal, message.phase)
+                case m.PositionEstimate():
+                    self._end(goal, '', Locate.Result(
+                        pose=self._pose(message), cycle_id=message.cycle_id))
+                case m.NoFix():
+                    self._end(goal, f'no fix: {message.reason}')
+
+    def destroy(self, delay_s: float = 0.0) -> None:
+        """Abort all goals, and withdraw the action.
+
+        The node sends the results of the goals within `delay_s`; without it, it sends none.
+        """
+        for goal in list(self._goals):
+            self._end(goal, 'the base station ends or stands by')
+        server, self._server = self._server, None
+        if server and delay_s:
+            self._later(delay_s, server.destroy)
+        elif server:
+            server.destroy()
+
+    def _accept(self, request: Locate.Goal) -> GoalResponse:
+        valid = 1 <= request.user <= self._max_users and 0 <= request.timeout_s <= _MAX_TIMEOUT_S
+        if valid and len(self._goals) < _MAX_GOALS:
+            return GoalResponse.ACCEPT
+        self._node.get_logger().warning(
+            f'{topics.LOCATE}: {_MAX_GOALS} goals are in progress' if valid else
+            f'{topics.LOCATE}: user {request.user}, timeout_s {request.timeout_s:g}, expected a '
+            f'user from 1 to {self._max_users} and a timeout from 0 to {_MAX_TIMEOUT_S:g} s',
+            throttle_duration_sec=1.0)
+        return GoalResponse.REJECT
+
+    def _cancel(self, handle: Any) -> CancelResponse:
+        for goal in self._goals:
+            if goal.handle.goal_id == handle.goal_id:
+                # Afterwards, when the handle has the state CANCELING.
+                self._later(0.0, functools.partial(self._end, goal, 'canceled'))
+        return CancelResponse.ACCEPT
+
+    async def _execute(self, handle: Any) -> Locate.Result:
+        goal = _Goal(handle, Future())
+        self._goals.append(goal)
+        timeout_s = handle.request.timeout_s or _DEFAULT_TIMEOUT_S
+        timer = self._later(timeout_s, functools.partial(
+            self._end, goal, f'no position within {timeout_s:g} s'))
+        self._feed_back(goal, m.Phase.BEACONING)
+        self._request(handle.request.user)
+        result = await goal.future
+        self._node.destroy_timer(timer)
+        return result
+
+    def _later(self, delay_s: float, callback: Callable[[], None]) -> Any:
+        def once() -> None:
+            self._node.destroy_timer(timer)
+            callback()
+        timer = steady_timer(self._node, max(delay_s, 1e-3), once)
+        return timer
+
+    def _feed_back(self, goal: _Goal, phase: m.Phase) -> None:
+        goal.handle.publish_feedback(Locate.Feedback(phase=int(phase), cycle_id=goal.cycle_id))
+
+    def _end(self, goal: _Goal, reason: str, result: Locate.Result | None = None) -> None:
+        """End a goal: with a result, canceled if that was requested, or aborted."""
+        if goal not in self._goals:
+            return
+        self._goals.remove(goal)
+        if goal.handle.is_cancel_requested:
+            goal.handle.canceled()
+        elif result:
+            goal.handle.succeed()
+        else:
+            goal.handle.abort()
+        goal.future.set_result(result or Locate.Result(reason=reason))
+
 
 # Time in which a node that stands by sends the results of its goals [s].
 _FAREWELL_S = 0.5

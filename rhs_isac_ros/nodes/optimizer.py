@@ -77,12 +77,8 @@ class PushError(RuntimeError):
 def push(node: Node, codebook: Codebook, timeout_s: float = 10.0) -> None:
     """Set a codebook as the parameters of the optimizer in the namespace of the node.
 
-    This function blocks and spins the node, so it must not be called from a callback.
-
-    Raises
-    ------
-    PushError
-        If there is no optimizer, if it does not respond, or if it rejects the codebook.
+    This function blocks and spins the node, so it must not be called from a callback. It raises
+    PushError if there is no optimizer, if it does not respond, or if it rejects the codebook.
     """
     optimizer = f'{node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
     client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)

@@ -132,7 +132,7 @@ class PositionerNode(RoleNode[Positioner]):
                 super().execute(action)
 
     def _publish_track(self, track: events.PublishTrack) -> None:
-        if self.is_standing_by:
+        if self.stands_by:
             return
         odometry = convert.odometry(
             track.user, track.estimate, convert.stamp_of(track, self), self._frame)
@@ -148,9 +148,10 @@ class PositionerNode(RoleNode[Positioner]):
         """Publish a message, and poses for an estimate; return False if it is invalid."""
         is_published = super().publish(message)
         if is_published and isinstance(message, m.PositionEstimate):
-            pose = convert.pose(message, convert.stamp_of(message, self), self._frame)
             for publisher in (self._pose, *self._user_poses.publishers(message.user)):
-                publisher.publish(pose)
+                if publisher.get_subscription_count():
+                    publisher.publish(convert.pose(
+                        message, convert.stamp_of(message, self), self._frame))
         return is_published
 
     def destroy_node(self) -> None:

@@ -250,7 +250,7 @@ class BaseStation(StateMachine):
         self._missing = event.missing
 
     def _forget_peers(self, event: events.StoodBy) -> None:
-        """Forget which roles are missing, so that no cycle begins until they are known again."""
+        """Forget which roles are missing; no cycle begins until that is known again."""
         self._missing = None
 
     def _skip_cycles(self, event: events.Resumed) -> None:
@@ -278,7 +278,7 @@ class BaseStation(StateMachine):
                 self.log(f'waiting for {", ".join(lacking)}', warning=True)
 
     def fill(self, text: str) -> str:
-        """Fill the id of the cycle, and what the next one lacks, into a text."""
+        """Insert the id of the cycle, and what the next cycle lacks, into a text."""
         lacking = ', '.join(self._lacking())
         return text.format(cycle=self._cycle.cycle_id, lacking=lacking,
                            waiting=f'; waiting for {lacking}' if lacking else '')
@@ -340,7 +340,7 @@ class BaseStation(StateMachine):
         self.log(self._users.add_answer(event.user, event.sender, self.now_s), warning=True)
 
     def _register_user(self, event: m.Ack) -> None:
-        """Register a user, for which the next cycle waits as well."""
+        """Register a user, so that the next cycle waits for it as well."""
         self.log(self._users.register(event.user, event.sender, self.now_s), warning=True)
 
     def _grant(self, event: m.Ack | Timeout) -> None:

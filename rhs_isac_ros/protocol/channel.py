@@ -74,16 +74,11 @@ class Fading:
 
 
 class Air:
-    """Loses, duplicates and delays messages at random.
-
-    Attributes
-    ----------
-    in_flight
-        Time of arrival [s], serial number as a tie-break, and message, as a heap.
-    """
+    """Loses, duplicates and delays messages at random."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng, self._serial = rng, itertools.count()
+        # A heap of times of arrival [s], serial numbers as tie-breaks, and messages.
         self.in_flight: list[tuple[float, int, m.Message]] = []
 
     def send(self, message: m.Message, impairments: Impairments, now_s: float) -> str:
@@ -107,7 +102,7 @@ class Air:
         return messages
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class _Cycle:
     """The true position of a cycle and the channel that results from it."""
 
@@ -119,6 +114,8 @@ class _Cycle:
     los: list[np.ndarray]
     # Factors of all signals, complex128 [N_B, N_SB, F]; None if all are 1.
     factors: np.ndarray | None
+    # Capacity of the applied beam [bit/s]; None as long as no beam is applied.
+    rate_bps: float | None = None
 
 
 class Channel(Role):
@@ -190,6 +187,9 @@ class Channel(Role):
                 self.count(Outcome.OVERFLOW, self._pending.put(
                     (event.cycle_id, next(self._serial)), event))
         if self._cycle and isinstance(event, m.Message):
+            if isinstance(event, m.Beam | m.RhsConfiguration):
+                # Both directions have the same capacity, which is known before data arrive.
+                self._cycle.rate_bps = self._rate_bps(self._cycle)
             self._answer_pending(self._cycle)
         for message in self._air.arrived(self.now_s):
             self.send(message)
@@ -223,6 +223,7 @@ class Channel(Role):
         for store in stores:
             for stale in [key for key in store if key[0] != truth.cycle_id]:
                 del store[stale]
+        self._cycle.rate_bps = self._rate_bps(self._cycle)
 
     def _draw(self, truth: m.GroundTruth, multipath: list[np.ndarray]) -> _Cycle:
         """Draw what depends on the seed, the user and the cycle alone: a user keeps its gain.
@@ -260,47 +261,51 @@ class Channel(Role):
 
     def _answer(self, event: m.Pilot | m.Data, cycle: _Cycle) -> m.Message | None:
         """Return the answer to a message of the cycle, or None if something is missing."""
-        beam = self._beams.get((cycle.truth.cycle_id, cycle.truth.user))
-        mode, transmitter = ((m.Mode.POSITIONING, event) if isinstance(event, m.Pilot)
-                             else (m.Mode.TRANSMISSION, beam))
-        applied = None if transmitter is None else self._configurations.get(
-            (cycle.truth.cycle_id, mode, transmitter.band))
-        if applied is None:
-            return None
-        if self._surface is not None:
-            applied = self._surface.applied(applied)
         if isinstance(event, m.Pilot):
-            return self._propagate(event, cycle, applied)
-        assert beam
-        return self._deliver(event, cycle, beam, applied[0])
+            applied = self._applied(cycle, m.Mode.POSITIONING, event.band)
+            return None if applied is None else self._propagate(event, cycle, applied)
+        if cycle.rate_bps is None:
+            return None
+        # What exceeds the capacity of the true channel is lost.
+        bits = min(event.bits, cycle.rate_bps * event.duration_s // 1)
+        return dataclasses.replace(event, stage=m.Stage.DELIVERED, bits=bits)
+
+    def _applied(self, cycle: _Cycle, mode: m.Mode, band: int) -> np.ndarray | None:
+        """Return the coefficients that the surface applies in each frame, if they are known."""
+        reported = self._configurations.get((cycle.truth.cycle_id, mode, band))
+        if reported is None or self._surface is None:
+            return reported
+        return self._surface.applied(reported)
 
     def _propagate(self, pilot: m.Pilot, cycle: _Cycle, applied: np.ndarray) -> m.FeedSignals:
         """Return the signals at the feeds for the configurations applied in each frame."""
         band = pilot.band
-        feeds = np.stack([
-            feed_signals(self._scenario, band, configuration, element_signals(
-                cycle.los[band], cycle.multipath[band][:, frame], symbol))
-            for frame, (configuration, symbol) in enumerate(
-                zip(applied, pilot.symbols, strict=True))])
+        elements = element_signals(
+            cycle.los[band][:, None], cycle.multipath[band], pilot.symbols[:, None])
+        feeds = feed_signals(self._scenario, band, applied, elements.swapaxes(0, 1))
         if cycle.factors is not None:
             feeds = feeds * cycle.factors[band].T[:, :, None]
         return m.derive(m.FeedSignals, pilot, stamp_ns=pilot.stamp_ns, user_instance=pilot.sender,
                         signals=feeds)
 
-    def _deliver(self, data: m.Data, cycle: _Cycle, beam: m.Beam, applied: np.ndarray) -> m.Data:
-        """Return the data within the capacity of the true channel; the rest is lost."""
+    def _rate_bps(self, cycle: _Cycle) -> float | None:
+        """Return the capacity of the true channel, once the beam and its configuration arrived."""
+        beam = self._beams.get((cycle.truth.cycle_id, cycle.truth.user))
+        if beam is None:
+            return None
+        applied = self._applied(cycle, m.Mode.TRANSMISSION, beam.band)
+        if applied is None:
+            return None
         digital = beam.digital
         if cycle.factors is not None:
             # Only the magnitude, the gain of the user, changes the capacity.
             digital = digital * np.abs(cycle.factors[beam.band, 0, 0])
-        rate_bps = float(actual_capacity(
-            self._scenario, Beam(applied, digital, beam.band), cycle.truth.position[None],
+        return float(actual_capacity(
+            self._scenario, Beam(applied[0], digital, beam.band), cycle.truth.position[None],
             cycle.blocked)[0])
-        bits = min(data.bits, rate_bps * data.duration_s // 1)
-        return dataclasses.replace(data, stage=m.Stage.DELIVERED, bits=bits)
 
 
 def _is_from_other_instance(event: m.Pilot | m.Data, truth: m.GroundTruth) -> bool:
-    """Return whether another node than the one at the true position transmits."""
+    """Return whether a node other than the one at the true position transmits."""
     is_downlink = isinstance(event, m.Data) and event.direction is m.Direction.DOWNLINK
     return not is_downlink and not m.same_instance(event.sender, truth.sender)

@@ -71,7 +71,7 @@ class LocateRequested:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EstimatorBuilt:
-    """The estimator of `BuildEstimator` was built in `elapsed_s`, or is None for a `failure`."""
+    """The estimator of `BuildEstimator`, built in `elapsed_s`; None after a `failure`."""
 
     codebook: Codebook
     estimator: Estimator | None

@@ -60,12 +60,7 @@ def optional_float() -> Any:
 
 
 def check(message: 'Message', sizes: Mapping[str, int]) -> None:
-    """Check the arrays, indices and numbers of a message.
-
-    Parameters
-    ----------
-    sizes
-        Sizes by symbol, as in `Scenario.sizes`.
+    """Check the arrays, indices and numbers of a message with the sizes of `Scenario.sizes`.
 
     Raises
     ------

@@ -67,19 +67,10 @@ class Tracks:
     def locate(
             self, received: m.ReceivedSignals, estimator: Estimator, speed_mps: float,
             now_s: float) -> Estimate:
-        """Estimate the position of a user; a `TrackEstimate` if the signals continue its track.
+        """Estimate the position of a user from signals that were measured at `now_s` [s].
 
-        Parameters
-        ----------
-        speed_mps
-            Typical speed of the users [m/s], for new tracks.
-        now_s
-            Time of the signals [s].
-
-        Raises
-        ------
-        SignalError
-            If the signals cannot be used.
+        The result is a `TrackEstimate` if they continue its track; a new track begins with the
+        typical speed [m/s]. Raises SignalError if the signals cannot be used.
         """
         signals = _stacked(received)
         # The oldest track comes first.
@@ -144,16 +135,11 @@ class ResidualWatch:
         self._warning = ''
 
     def status(self) -> dict[str, str]:
-        """Return the values for the diagnostics.
+        """Return the values for the diagnostics, those of `Diagnosis.status` among them.
 
-        Returns
-        -------
-        dict
-            ``residual.ratio``, the mean energy of the residuals relative to the expectation;
-            ``residual.spread``, the variance of the energy relative to the expectation;
-            ``residual.fixes``, the number of fixes in the mean; and ``warning.residual`` during a
-            warning. Before the first residual, only the values of `Diagnosis.status`, which are
-            always present.
+        With the first residual come ``residual.ratio`` and ``residual.spread``, mean and variance
+        of their energy relative to the expectation, and ``residual.fixes``, the number of fixes in
+        the mean; during a warning also ``warning.residual``.
         """
         values = self._diagnosis.status(bool(self._warning))
         if self._all.n_fixes:
@@ -178,7 +164,7 @@ def _deviation(prefix: str, monitor: InnovationTest) -> str:
 
 
 class _Loss(enum.Enum):
-    """Why the signals of a user yield no position, with the text when they do so again."""
+    """Why the signals of a user yield no position, and the text for when they do again."""
 
     NO_FIX = 'has a position again'
     BLOCKED = 'is in sight again'
@@ -392,15 +378,7 @@ class Positioner(Role):
 def build_estimator(
         codebook: Codebook, make: Callable[[Codebook], Estimator],
         stopwatch: Callable[[], float]) -> EstimatorBuilt:
-    """Build the estimator that `BuildEstimator` requests; this may run in another thread.
-
-    Parameters
-    ----------
-    make
-        Callable that takes a codebook and returns an estimator.
-    stopwatch
-        Callable that returns a time [s].
-    """
+    """Build the estimator that `BuildEstimator` requests; this may run in another thread."""
     begin = stopwatch()
     try:
         estimator = make(codebook)

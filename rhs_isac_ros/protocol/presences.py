@@ -15,29 +15,19 @@ _MAX_OTHERS = 64
 _MAX_LOGGED = 16
 # Maximum length of the listed differences in the log.
 _MAX_LENGTH = 500
-# Maximum deviation of the clocks of two hosts; an instance that starts later is a forgery [ns].
+# Maximum difference between the clocks of two hosts [ns]; instances with later starts are ignored.
 _MAX_AHEAD_NS = 3600 * 10**9
 
 
 @dataclasses.dataclass(frozen=True)
 class Presence:
-    """The announcement of a node.
+    """The announcement of a node."""
 
-    Attributes
-    ----------
-    sender
-        Instance of the node: its start in nanoseconds since 1970.
-    node
-        Fully qualified name.
-    scenario
-        Fields of the scenario, as `Scenario.fields` returns them.
-    """
-
-    sender: int
+    sender: int  # instance of the node: its start [ns since 1970]
     scenario_id: str
     role: str
-    node: str
-    scenario: Mapping[str, Any]
+    node: str  # fully qualified name
+    scenario: Mapping[str, Any]  # as `Scenario.fields` returns it
 
     def __str__(self) -> str:
         """Return name and start of the node, for log messages."""
@@ -50,11 +40,6 @@ class Presences:
     Of the nodes with the same role and scenario, the one that started last serves, as with the
     fencing tokens of leases: a restarted node serves at once, and the older node resumes when the
     newer one has gone. Nodes of another scenario are reported and otherwise ignored.
-
-    Parameters
-    ----------
-    own
-        Announcement of the node itself.
     """
 
     def __init__(self, own: Presence) -> None:
@@ -85,14 +70,9 @@ class Presences:
     def gone(self, announcing: Mapping[str, int]) -> set[str]:
         """Return the names of nodes in conflict that have gone.
 
-        If several nodes have the name, it is unknown which of them has gone. All are to be
-        forgotten; those that are present announce themselves again.
-
-        Parameters
-        ----------
-        announcing
-            Number of nodes that announce themselves, by fully qualified name; by an empty name
-            those whose name is unknown.
+        If several nodes share a name, it is unknown which of them has gone. The caller forgets all
+        of them; those that are still present announce themselves again. `announcing` counts the
+        nodes that announce themselves by fully qualified name, which is empty if it is unknown.
         """
         known = collections.Counter(other.node for other in self._others.values())
         return {name for name, count in known.items()

@@ -15,15 +15,6 @@ class Role:
     """A role of the protocol. It maps events to actions and does not read a clock.
 
     A subclass defines `react`, which appends actions with `send`, `log` and `act`.
-
-    Attributes
-    ----------
-    counters
-        Number of occurrences of each outcome and of each kind of unexpected event.
-    now_s
-        Time of the latest event [s].
-    state
-        Current state; None if the role has no state machine.
     """
 
     # Messages that the role sends, and those that it handles.
@@ -35,8 +26,11 @@ class Role:
     WORLD_STATES: ClassVar[frozenset[enum.Enum]] = frozenset()
 
     def __init__(self) -> None:
+        # Number of occurrences of each outcome and of each kind of unexpected event.
         self.counters: collections.Counter[str] = collections.Counter()
+        # Time of the latest event [s].
         self.now_s = 0.0
+        # None if the role has no state machine.
         self.state: enum.Enum | None = None
         self._actions: list[Action] = []
 
@@ -73,11 +67,7 @@ class Role:
         return None
 
     def status(self) -> Mapping[str, str]:
-        """Return the values in use and those pending by name, for the diagnostics.
-
-        Examples of names are ``parameter.policy``, ``pending.policy`` and ``codebook_id``; the
-        result is empty if the role has no settings.
-        """
+        """Return values for the diagnostics by name, such as ``parameter.policy``."""
         return {}
 
 
@@ -89,17 +79,9 @@ Value = TypeVar('Value')
 
 
 class NewestDict(dict[Key, Value]):
-    """A dictionary that keeps only its newest entries; `put` adds them.
+    """A dictionary that keeps only its newest `max_size` entries; `put` adds them.
 
-    Parameters
-    ----------
-    max_size
-        Number of entries that it keeps.
-
-    Attributes
-    ----------
-    pinned
-        Key of an entry that is neither discarded nor counted towards the limit, or None.
+    The entry with the key `pinned`, if any, is neither discarded nor counted.
     """
 
     def __init__(self, max_size: int) -> None:
@@ -195,13 +177,6 @@ class StateMachine(Role):
 
     `handle` takes the first row of `TABLE` whose source, event class and guard match. An event
     without a matching row changes nothing and counts as ``unexpected_<name>``.
-
-    Attributes
-    ----------
-    repeats
-        Number of times that the timeout was restarted since the current state was entered.
-    outcome
-        Outcome of the row that was taken last, or None.
     """
 
     STATES: ClassVar[type[enum.Enum]]
@@ -223,7 +198,9 @@ class StateMachine(Role):
     def __init__(self, initial: enum.Enum) -> None:
         super().__init__()
         self.state: enum.Enum = initial
+        # Number of times that the timeout was restarted since the state was entered.
         self.repeats = 0
+        # Outcome of the row that was taken last.
         self.outcome: Outcome | None = None
         self._deadline_s: float | None = None
 
@@ -236,13 +213,7 @@ class StateMachine(Role):
         return self._deadline_s
 
     def react(self, event: Event) -> None:
-        """Take the first matching row.
-
-        Raises
-        ------
-        TypeError
-            If no row of the table names the class of the event.
-        """
+        """Take the first matching row; raise TypeError for an event that the table lacks."""
         kind = type(event)
         try:
             rows = self._rows[self.state, kind]

@@ -21,14 +21,9 @@ REGION, TRACK = PRIORS = ('region', 'track')
 def setting(
         default: bool | int | float | str, text: str, *, dynamic: bool = True, **declared: Any
 ) -> Any:
-    """Return a dataclass field with the declaration of its parameter as metadata.
+    """Declare a setting and its parameter, with further attributes of `Field`.
 
-    Parameters
-    ----------
-    dynamic
-        Whether the parameter may change while the node runs.
-    **declared
-        Further attributes of `Field`.
+    Only a `dynamic` parameter may change while the node runs.
     """
     return dataclasses.field(default=default, metadata={
         'declared': Field(type(default), text, **declared), 'dynamic': dynamic})
@@ -36,13 +31,7 @@ def setting(
 
 @dataclasses.dataclass(frozen=True)
 class BaseStationSettings:
-    """Settings of the base station.
-
-    Raises
-    ------
-    ValueError
-        If `parse_users` cannot parse ``allowed_users``.
-    """
+    """Settings of the base station; ValueError if `parse_users` rejects ``allowed_users``."""
 
     policy: str = setting(
         'round_robin', 'Policy that selects among the users that answer.', choices=POLICIES)
@@ -82,13 +71,7 @@ def _calibration_file() -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class PositionerSettings:
-    """Settings of the positioner.
-
-    Raises
-    ------
-    ValueError
-        If the estimator cannot use the prior.
-    """
+    """Settings of the positioner; ValueError if the estimator cannot use the prior."""
 
     estimator: str = setting(
         'bayes', 'Position estimator.', choices=tuple(ESTIMATORS), plugins=plugins.ESTIMATORS)
@@ -121,28 +104,6 @@ class TransmissionSettings:
     calibration_file: str = _calibration_file()
 
 
-def changes(old: Any, new: Any) -> dict[str, Any]:
-    """Return the values of `new`, by name, that differ from those of `old`."""
-    names = [field.name for field in dataclasses.fields(old)]
-    return {name: getattr(new, name) for name in names
-            if getattr(new, name) != getattr(old, name)}
-
-
-def describe_settings(in_use: Any, latest: Any) -> dict[str, str]:
-    """Return settings as text for the diagnostics.
-
-    Returns
-    -------
-    dict
-        ``parameter.<name>`` for each value in use and ``pending.<name>`` for each newer value
-        that is not in use yet.
-    """
-    described = {f'parameter.{name}': shown(value)
-                 for name, value in dataclasses.asdict(in_use).items()}
-    return described | {f'pending.{name}': shown(value)
-                        for name, value in changes(in_use, latest).items()}
-
-
 def shown(value: Any) -> str:
     """Return a parameter value as ROS prints it."""
     return str(value).lower() if isinstance(value, bool) else str(value)
@@ -161,7 +122,7 @@ def _of_scenario(name: str) -> Any:
 class Impairments:
     """Impairments of the air interface, and deviations from the model of the signals.
 
-    The network does not learn of deviations that replace those of the scenario.
+    Deviations that replace those of the scenario are unknown to the other roles.
     """
 
     loss_probability: float = setting(
@@ -193,31 +154,32 @@ class Impairments:
             name: value for name, value in values.items() if name in known and value >= 0})
 
 
-SettingsT = TypeVar('SettingsT')
+SettingsT = TypeVar('SettingsT', bound=Any)
 
 
 class PendingSettings(Generic[SettingsT]):
-    """Holds new settings back until the role may apply them.
-
-    Attributes
-    ----------
-    in_use
-        The settings in use.
-    latest
-        The settings received last.
-    """
+    """Holds the `latest` settings back until the role may use them instead of those `in_use`."""
 
     def __init__(self, settings: SettingsT) -> None:
         self.in_use = settings
         self.latest = settings
 
     def apply(self) -> list[LogMessage]:
-        """Put the latest settings into use; return a message that lists changes, if any."""
-        changed = changes(self.in_use, self.latest)
+        """Put the latest settings into use; return a message that lists the changes, if any."""
+        described = ', '.join(f'{name} {text!r}' for name, text in self._pending().items())
         self.in_use = self.latest
-        described = ', '.join(f'{name} {shown(value)!r}' for name, value in changed.items())
         return [LogMessage(f'settings applied: {described}')] if described else []
 
     def describe(self) -> dict[str, str]:
-        """Return the values in use and the pending ones, as `settings.describe_settings` does."""
-        return describe_settings(self.in_use, self.latest)
+        """Return ``parameter.<name>`` for each value in use, ``pending.<name>`` for newer ones."""
+        in_use = {f'parameter.{name}': shown(value)
+                  for name, value in dataclasses.asdict(self.in_use).items()}
+        return in_use | {f'pending.{name}': text for name, text in self._pending().items()}
+
+    def _pending(self) -> dict[str, str]:
+        """Return the values that are not in use yet, by name."""
+        if self.latest == self.in_use:
+            return {}
+        latest = dataclasses.asdict(self.latest)
+        return {name: shown(latest[name]) for name, value in dataclasses.asdict(
+            self.in_use).items() if latest[name] != value}

@@ -41,7 +41,6 @@ class _Steered(NamedTuple):
 
     estimate: m.PositionEstimate
     beam: m.Beam
-    at_estimate_bps: float
     bands: Sequence[int]
     surface: SurfaceEstimate | None
 
@@ -150,10 +149,7 @@ class Transmission(Role):
         sent = m.derive(
             m.Beam, estimate, band=beam.band, analog=beam.analog, digital=beam.digital,
             expected_bps=choice.expected_bps)
-        at_estimate_bps = float(capacity(
-            self._scenario, applied_beam(beam, surface), estimate.position[None])[0])
-        self._steered.put(
-            estimate.cycle_id, _Steered(estimate, sent, at_estimate_bps, bands, surface))
+        self._steered.put(estimate.cycle_id, _Steered(estimate, sent, bands, surface))
         self.send(sent)
 
     def _await_report(self, applied: m.RhsConfiguration) -> None:
@@ -177,10 +173,13 @@ class Transmission(Role):
             used = Beam(applied.analog[0], beam.digital, beam.band)
             result = capacity_report(
                 self._scenario, used, truth.position, steered.bands, steered.surface)
+        steering = applied_beam(Beam(beam.analog, beam.digital, beam.band), steered.surface)
+        at_estimate_bps = float(capacity(
+            self._scenario, steering, steered.estimate.position[None])[0])
         report = m.derive(
             m.Capacity, beam, expected_bps=beam.expected_bps, actual_bps=result.actual_bps,
             perfect_bps=result.perfect_bps, loss_bps=result.loss_bps,
-            loss_percent=result.loss_percent, at_estimate_bps=steered.at_estimate_bps)
+            loss_percent=result.loss_percent, at_estimate_bps=at_estimate_bps)
         self.send(report)
         self._summarize(report)
 

@@ -43,21 +43,8 @@ class _User:
 class UserRegistry:
     """Registers the users that answer beacons and selects the next one to serve.
 
-    Each number belongs to one node: the first to answer, until it is silent.
-
-    Parameters
-    ----------
-    policy
-        ``round_robin``: the user served longest ago; ``first``: the first to answer; ``random``.
-    rng
-        Source of randomness, for ``random``.
-
-    Attributes
-    ----------
-    all_invited
-        Whether the latest beacon invited all users.
-    answered
-        Users that answered in this cycle, in order; the values have no meaning.
+    Each number belongs to one node: the first to answer, until it is silent. The policy selects
+    the user served longest ago (``round_robin``), the ``first`` to answer, or one at ``random``.
     """
 
     def __init__(self, policy: str, rng: np.random.Generator) -> None:
@@ -72,7 +59,9 @@ class UserRegistry:
         # Users that are served before others once, in the order of the requests.
         self._requested: dict[int, None] = {}
         self._turn = 0
+        # Whether the latest beacon invited all users.
         self.all_invited = True
+        # Users that answered in this cycle, in order; the values have no meaning.
         self.answered: dict[int, None] = {}
 
     def __len__(self) -> int:
@@ -128,13 +117,8 @@ class UserRegistry:
 
         A user that was invited to this cycle and has not answered in time loses its turn.
         Otherwise, the range of a user that is always late would be invited in every cycle, and
-        the users of the other ranges never.
-
-        Returns
-        -------
-        str
-            A warning at the first ack of the owner after one of another instance was rejected,
-            otherwise empty.
+        the users of the other ranges never. The result is a warning at the first ack of the owner
+        after one of another instance was rejected, and otherwise empty.
         """
         user = self._users.get(number)
         # A new user comes after all that wait and before the one served last, so that users that
@@ -225,10 +209,7 @@ _RANGE = re.compile(r'\s*(\d+)\s*(?:-\s*(\d+)\s*)?')
 def parse_users(text: str) -> tuple[range, ...]:
     """Parse a list of user numbers from 1 and ranges, such as ``1, 4, 10-20``; may be empty.
 
-    Raises
-    ------
-    ValueError
-        If a part is neither a number nor an ascending range.
+    Raises ValueError if a part is neither a number nor an ascending range.
     """
     return tuple(_parse_range(part) for part in text.split(',')) if text.strip() else ()
 

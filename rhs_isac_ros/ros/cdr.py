@@ -29,16 +29,9 @@ class Type(NamedTuple):
     decode: Callable[[Sequence[Any]], Any]
 
 
-_REAL, _COMPLEX = np.dtype('<f8'), np.dtype('<c16')
-
-
-def _encode_real(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.array(values.shape, '<u4'), np.asarray(values, _REAL).ravel()
-
-
 def _encode_complex(values: np.ndarray) -> tuple[np.ndarray, ...]:
     # Radios often return complex64.
-    flat = np.asarray(values, _COMPLEX).ravel()
+    flat = np.asarray(values, '<c16').ravel()
     return np.array(values.shape, '<u4'), flat.real, flat.imag
 
 
@@ -69,14 +62,6 @@ def _numbers(n: int) -> Type:
     return Type(('d',) * n, lambda values: values.ravel().tolist(), np.array)
 
 
-def _encode_integers(values: np.ndarray) -> tuple[np.ndarray]:
-    return (values.astype('<u4'),)
-
-
-def _decode_integers(items: Sequence[np.ndarray]) -> np.ndarray:
-    return items[0].astype(int)
-
-
 def _decode_mapping(items: Sequence[str]) -> dict[str, Any]:
     # JSON is YAML without the references that let a short text describe an enormous value.
     try:
@@ -97,8 +82,11 @@ TYPES = {
     'double[3]': _numbers(3),
     'double[4]': _numbers(4),
     'double[9]': _numbers(9)._replace(decode=lambda items: np.array(items).reshape(3, 3)),
-    'sequence<uint32>': Type(('*I',), _encode_integers, _decode_integers),
-    'rhs_isac_msgs/RealArray': Type(('*I', '*d'), _encode_real, _decode_real),
+    'sequence<uint32>': Type(
+        ('*I',), lambda values: (values.astype('<u4'),), lambda items: items[0].astype(int)),
+    'rhs_isac_msgs/RealArray': Type(
+        ('*I', '*d'), lambda values: (
+            np.array(values.shape, '<u4'), np.asarray(values, '<f8').ravel()), _decode_real),
     'rhs_isac_msgs/ComplexArray': Type(('*I', '*d', '*d'), _encode_complex, _decode_complex),
     # A string, in which the class of the messages has a mapping.
     'mapping': Type(('s',), lambda mapping: (json.dumps(dict(mapping)),), _decode_mapping),
@@ -185,10 +173,7 @@ class Codec:
             self, message: Any, frame: str, stamp_ns: int, sender: int, scenario_id: str) -> bytes:
         """Return the bytes of a message; the arguments replace its own values.
 
-        Raises
-        ------
-        MessageError
-            If a string has no UTF-8 encoding.
+        Raises MessageError if a string has no UTF-8 encoding.
         """
         items: list[Any] = [*divmod(stamp_ns, _NANOSECONDS), frame]
         for name, _, _, encode, _ in self._fields:

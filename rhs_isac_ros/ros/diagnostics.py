@@ -1,4 +1,4 @@
-"""The diagnostics of the nodes, published as `diagnostic_msgs/DiagnosticArray`, and errors."""
+"""The diagnostics of the nodes, published as `diagnostic_msgs/DiagnosticArray`."""
 
 import socket
 from collections.abc import Callable, Iterator
@@ -60,22 +60,3 @@ class Diagnostics:
         stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(
             to_ros(self._report(), self._node.get_fully_qualified_name(), stamp))
-
-
-class LogOnce:
-    """Logs the first error of each subject, so that a faulty sender cannot fill the disk."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._logged: dict[str, str] = {}
-
-    def error(self, subject: str, text: str, *, repeat_if_changed: bool = False) -> None:
-        """Log the first error of a subject, and on request each that differs from the last."""
-        last = self._logged.get(subject)
-        if last is None or repeat_if_changed and text != last:
-            self._logged[subject] = text
-            self._node.get_logger().error(text)
-
-    def clear(self, subject: str) -> None:
-        """Allow the next error of a subject to be logged again."""
-        self._logged.pop(subject, None)

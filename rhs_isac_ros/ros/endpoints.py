@@ -71,7 +71,7 @@ def refusals(node: Node) -> dict[str, str]:
 
 
 def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> _CreatedT | None:
-    """Return what `create` returns; None, with one log line, if the middleware refuses it."""
+    """Return what `create` returns, or log its refusal by the middleware once and return None."""
     try:
         return create()
     # Of an action, rclpy raises a ValueError.
@@ -151,14 +151,9 @@ def create_publisher(
 def subscribe(
         node: Node, kind: type, name: str, callback: Callable[[Any], None], profile: QoSProfile,
         raw: bool = False, overridable: bool = False) -> None:
-    """Subscribe to a topic of a ROS type.
+    """Subscribe to a topic of a ROS type; a `raw` callback takes serialized bytes (CDR).
 
-    Parameters
-    ----------
-    callback
-        Called with each message, or with its serialized bytes (CDR) if `raw`.
-    overridable
-        Whether parameters ``qos_overrides.*`` change the quality of service.
+    Parameters ``qos_overrides.*`` change the quality of service if it is `overridable`.
     """
     create_or_refuse(node, f'subscription to {name}', lambda: node.create_subscription(
         kind, name, callback, profile, raw=raw,
@@ -210,15 +205,10 @@ def subscribe_messages(
 
 
 class UserTopics:
-    """Publishers for each user, created on first use.
+    """Publishers for each user up to a highest number, created on first use.
 
-    Parameters
-    ----------
-    kinds
-        Types by name of the topic, which contains ``{user}``.
-    max_users
-        Highest number of a user with topics. The numbers come from messages, and every topic takes
-        time in discovery.
+    The names of the topics contain ``{user}``. The numbers are limited, because they come from
+    messages and every topic takes time in discovery.
     """
 
     def __init__(self, node: Node, kinds: Mapping[str, type], max_users: int) -> None:
@@ -265,11 +255,7 @@ class BackgroundWorker:
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=node.get_name())
 
     def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
-        """Queue a job.
-
-        The thread that spins the node calls `on_result` with the result, or raises the exception
-        of the job.
-        """
+        """Queue a job; the thread that spins the node gets its result, or its exception."""
         def hand_over(future: Future[_Result]) -> None:
             self._done.append((future, on_result))
             executor = self._node.executor

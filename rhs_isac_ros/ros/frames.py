@@ -42,31 +42,19 @@ def to_ros(kind: Any, values: np.ndarray) -> Any:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Frame:
-    """The frame of standard messages.
-
-    Attributes
-    ----------
-    prefix
-        Namespace of the network with a slash at its end, or empty; precedes the names of the
-        frames of the surface and of the users.
-    origin, orientation
-        Pose of the surface in the frame: position, float64 [3] [m], and quaternion x, y, z, w.
-    """
+    """The frame of standard messages, and the pose of the surface in it."""
 
     name: str = MAP_FRAME
+    # Namespace of the network with a slash at its end, or empty; precedes the names of the frames
+    # of the surface and of the users.
     prefix: str = ''
+    # Position, float64 [3] [m], and quaternion x, y, z, w.
     origin: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
     orientation: np.ndarray = dataclasses.field(default_factory=lambda: np.array([0., 0., 0., 1.]))
 
     @classmethod
     def of(cls, node: Node, values: types.SimpleNamespace) -> 'Frame':
-        """Return the frame of the parameters ``frame_id`` and ``surface_pose``.
-
-        Raises
-        ------
-        ParameterError
-            If the frame has no name or the pose has another number of elements.
-        """
+        """Check the parameters ``frame_id`` and ``surface_pose``, and return their frame."""
         pose = values.surface_pose or [0.0] * 6
         if len(pose) != 6:
             raise ParameterError(f'surface_pose: {len(pose)} numbers, expected six, x, y, z [m], '

@@ -184,10 +184,7 @@ CODEBOOK: Mapping[str, str] = {
 def declare(node: Node, executable: str) -> types.SimpleNamespace:
     """Declare the parameters of an executable, and return their values by name.
 
-    Raises
-    ------
-    ParameterError
-        If a value has the wrong type, is out of range or is not one of the choices.
+    Raises ParameterError for a wrong type, or a value out of range or not among the choices.
     """
     return types.SimpleNamespace(
         **{parameter.name: _declare_one(node, parameter) for parameter in NODES[executable]})
@@ -280,17 +277,8 @@ def same_value(one: RosParameter, other: RosParameter) -> bool:
 class ParameterizedNode(Node):
     """A node that checks each change of its parameters as a whole and converts it to settings.
 
-    The executable determines the parameters; its name is by default that of the node.
-
-    Attributes
-    ----------
-    values
-        Initial values of the parameters, by name.
-
-    Raises
-    ------
-    ParameterError
-        If a parameter is invalid.
+    The executable determines the parameters; its name is by default that of the node. The initial
+    `values` are by name. Raises ParameterError if one is invalid.
     """
 
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:

@@ -48,13 +48,13 @@ def new_instance() -> int:
 
 
 class Peers:
-    """Polls the ROS graph for all that a node needs to know about others.
+    """Polls the ROS graph for what a node needs to know about the others.
 
     A role is missing if no node has all `identifying_endpoints`, and present once two polls in a
     row have found them, which gives it time to discover this node as well. A node of a unique role
-    also announces its instance on a latched topic: of two with the same role, the newer serves,
-    until the graph lacks it. Endpoints that cannot exchange messages, because one requests a
-    quality of service that the other does not offer, are logged.
+    also announces its instance on a latched topic: of two with the same role, the newer serves
+    until it disappears from the graph. Endpoints that cannot exchange messages, because one
+    requests a quality of service that the other does not offer, are logged.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ class Peers:
             self._set_period(_POLL_S)
 
     def _look_for_rivals(self) -> None:
-        """Forget nodes in conflict that two polls in a row lack."""
+        """Forget nodes in conflict that are absent in two polls in a row."""
         infos = self._node.get_publishers_info_by_topic(self._publisher.topic_name)
         present = collections.Counter(
             '' if info.node_name == _UNNAMED else _full_name(info) for info in infos)

@@ -101,19 +101,7 @@ class Recorder:
     """Writes the messages of a network, and its scenario, to a file.
 
     The file is ``<name>.part`` until it is closed, so that an interrupted run does not lose its
-    messages.
-
-    Attributes
-    ----------
-    count
-        Number of messages written.
-    failure
-        Why the rest is not recorded, as when the disk is full; empty if nothing failed.
-
-    Raises
-    ------
-    RecordingError
-        If mcap is not installed, or the file cannot be written.
+    messages. Raises RecordingError if mcap is not installed, or the file cannot be written.
     """
 
     def __init__(self, path: str | Path, scenario: Scenario) -> None:
@@ -131,6 +119,7 @@ class Recorder:
         self._writer = Writer(self._stream)
         self._writer.start(profile='ros2', library='rhs_isac_ros')
         self._writer.add_metadata(_SCENARIO, {'yaml': yaml.safe_dump(scenario.changes())})
+        # Number of messages written, and why the rest is not recorded, as when the disk is full.
         self.count, self.failure = 0, ''
 
     def record_topics(
@@ -185,22 +174,10 @@ class Recorder:
 def read(
         path: str | Path, names: Collection[str] | None = None
 ) -> Iterator[tuple[str, Any, float]]:
-    """Yield the messages of a recording in the order in which they were written.
+    """Yield topic, ROS message and time [s] of what a recording contains, in the order of writing.
 
-    Parameters
-    ----------
-    names
-        Full names of the topics to read; None: all.
-
-    Yields
-    ------
-    tuple
-        Full name of the topic, ROS message and time of recording [s].
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read, or a message had other fields when it was recorded.
+    Topics have full names; those to read are `names`, or all if None. Raises RecordingError if the
+    file cannot be read, or a message had other fields when it was recorded.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
     checked: set[int] = set()
@@ -232,12 +209,7 @@ def _fields(text: str) -> list[str]:
 def read_scenario(path: str | Path) -> Scenario | None:
     """Return the scenario of a recording; None if there is none, as when ``ros2 bag`` made it.
 
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read.
-    ScenarioError
-        If the scenario is invalid.
+    Raises RecordingError if the file cannot be read, ScenarioError if the scenario is invalid.
     """
     with _opened(path) as reader:
         for metadata in reader.iter_metadata():

@@ -1,31 +1,139 @@
 """The adapter between a role of the protocol and ROS 2."""
 
-import dataclasses
+import contextlib
+import functools
+import math
 import time
+from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeVar
 
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
 from rclpy.publisher import Publisher
 
-from rhs_isac_ros.codebook import Codebook
+import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.role_statistics import Report, RoleStatistics
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.codebook_client import CodebookClient
-from rhs_isac_ros.ros.diagnostics import Diagnostics, LogOnce
+from rhs_isac_ros.ros.diagnostics import Diagnostics
 from rhs_isac_ros.ros.endpoints import (
+    LATCHED,
+    create_or_refuse,
     create_publisher,
     profile_for,
     steady_timer,
+    subscribe,
     subscribe_messages,
 )
 from rhs_isac_ros.ros.frames import surface_frame
-from rhs_isac_ros.ros.parameters import ParameterizedNode, scenario_of
+from rhs_isac_ros.ros.parameters import CODEBOOK, ParameterizedNode, scenario_of
 from rhs_isac_ros.ros.peers import Peers, new_instance
 from rhs_isac_ros.ros.roster import ROSTER
+
+_NAMES = list(CODEBOOK)
+_RETRY_S = 0.1
+_RESPONSE_TIMEOUT_S = 2.0
+
+
+class CodebookClient:
+    """Fetches the codebook from the parameters of the optimizer whenever it changes.
+
+    A message on the latched topic announces the codebook and triggers a request to the parameter
+    service. Two optimizers have the same services, and either may answer. The announced codebook,
+    whose id proves its content, therefore replaces a response with another codebook or a missing
+    response. The optimizers agree on which of them announces; see `Presences`. The `codebook_id`
+    is that of the latest codebook, and empty before the first.
+    """
+
+    def __init__(
+            self, node: Node, scenario: Scenario, on_codebook: Callable[[Codebook], None]
+    ) -> None:
+        self._node, self._scenario, self._on_codebook = node, scenario, on_codebook
+        # Only one of the parameter services, so that a security policy need not allow the others.
+        name = f'{topics.OPTIMIZER_NODE}/get_parameters'
+        self._client = create_or_refuse(
+            node, f'client of {name}', lambda: node.create_client(GetParameters, name))
+        # Serial numbers of announcements. A response is stale if its request was sent before the
+        # latest announcement.
+        self._announced, self._requested, self._fetched = 0, 0, 0
+        self._announced_s = math.inf
+        self._announcement: Codebook | None = None
+        # Why the latest codebook was rejected.
+        self._problem = ''
+        self.codebook_id = ''
+        subscribe(
+            node, ros.Codebook, topics.CODEBOOK, self._on_announcement, LATCHED, raw=True)
+        self._timer = steady_timer(node, _RETRY_S, self._request)
+
+    def _on_announcement(self, content: bytes) -> None:
+        try:
+            message = convert.from_bytes(convert.CodebookMessage, content)
+            codebook = message.codebook()
+        # Anything may be published on the topic.
+        except ValueError:
+            return
+        if message.codebook_id != codebook.id or not self._fits(message, codebook):
+            return
+        # Send the request even if the id is unchanged, because a response with a withdrawn
+        # codebook may be in transit.
+        self._announcement = codebook
+        self._announced += 1
+        self._announced_s = time.monotonic()
+        self._timer.reset()
+        self._request()
+
+    def _fits(self, message: convert.CodebookMessage, codebook: Codebook) -> bool:
+        """Return whether a codebook fits the scenario, or log once that it does not."""
+        before, self._problem = self._problem, ''
+        try:
+            codebook.check(self._scenario)
+            if message.scenario_id not in ('', self._scenario.id):
+                raise CodebookError(
+                    f'scenario {message.scenario_id}, expected {self._scenario.id}')
+        except CodebookError as error:
+            self._problem = f'codebook of the optimizer rejected: {error}'
+            if self._problem != before:
+                self._node.get_logger().error(self._problem)
+        return not self._problem
+
+    def _request(self) -> None:
+        if self._fetched == self._announced:
+            self._timer.cancel()
+            return
+        if time.monotonic() - self._announced_s > _RESPONSE_TIMEOUT_S:
+            self._use(())
+        elif (self._client is not None and self._requested != self._announced
+                and self._client.service_is_ready()):
+            self._requested = self._announced
+            future = self._client.call_async(GetParameters.Request(names=_NAMES))
+            future.add_done_callback(functools.partial(self._on_response, self._announced))
+
+    def _on_response(self, serial: int, future: Any) -> None:
+        values = future.result().values if future.exception() is None else ()
+        if serial == self._announced:
+            self._use(values)
+
+    def _use(self, values: Sequence[ParameterValue]) -> None:
+        """Use the codebook of a response, if it is the announced one, or that itself."""
+        self._fetched = self._announced
+        assert self._announcement
+        codebook = self._announcement
+        # An invalid or incomplete response is not the announced codebook.
+        with contextlib.suppress(CodebookError, ValueError):
+            fetched = Codebook.from_parameters(
+                dict(zip(_NAMES, map(parameter_value_to_python, values), strict=True)))
+            codebook = fetched if fetched.id == codebook.id else codebook
+        if codebook.id != self.codebook_id:
+            self.codebook_id = codebook.id
+            self._on_codebook(codebook)
+
 
 # Period at which the end of a state of the emulated world is awaited [s].
 _WORLD_POLL_S = 0.002
@@ -83,19 +191,9 @@ class Clocks:
 class RoleNode(ParameterizedNode, Generic[_RoleT]):
     """A node that passes messages to a role and performs the actions that it returns.
 
-    A subclass makes its `role` from the parameters and passes it to `start`.
-
-    Attributes
-    ----------
-    scenario
-        Scenario of the parameter ``scenario_file``.
-    instance
-        Instance of the node; see `Message.sender`.
-
-    Raises
-    ------
-    ParameterError, ScenarioError
-        If a parameter or the scenario file is invalid.
+    A subclass makes its `role` from the parameters and the `scenario` and passes it to `start`.
+    `Message.sender` describes the `instance`. Raises ParameterError or ScenarioError if a
+    parameter or the scenario file is invalid.
     """
 
     role: _RoleT
@@ -111,11 +209,14 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._missing: dict[str, str] | None = None
         self._lacking = ''
         self._foreign: set[int] = set()
-        self._is_advertised = self._stands_by = False
+        self._is_advertised = False
+        # Whether a newer node has the role.
+        self.stands_by = False
         self._has_optimizer = True
         self._sending: dict[type[m.Message], Publisher] = {}
         self._receiving: set[type[m.Message]] = set()
-        self._log_once = LogOnce(self)
+        # Errors that were logged, so that a faulty sender cannot fill the disk.
+        self._logged: set[str] = set()
         self._statistics = RoleStatistics()
         # One timer serves all deadlines. It is set again only if it would expire too late, or
         # when it has expired too early.
@@ -127,12 +228,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             self, role: _RoleT, *, subscribe: bool = True, needs_codebook: bool = False) -> None:
         """Connect the role to its topics and publish its diagnostics.
 
-        Parameters
-        ----------
-        subscribe
-            Whether to subscribe now; a role that is not ready yet calls `subscribe` later.
-        needs_codebook
-            Whether to advertise and to subscribe when the first codebook arrives.
+        A role that is not ready yet calls `subscribe` later; one that needs a codebook advertises
+        and subscribes when the first one arrives.
         """
         self.role, self._needs_codebook = role, needs_codebook
         if not needs_codebook:
@@ -152,7 +249,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         A node that stands by creates them when it resumes.
         """
         self._is_advertised = True
-        for kind in () if self._stands_by else self.role.SENDS:
+        for kind in () if self.stands_by else self.role.SENDS:
             if kind not in self._sending:
                 self._sending[kind] = create_publisher(
                     self, convert.ros_type(kind), topics.NAMES[kind], profile_for(kind))
@@ -168,29 +265,19 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def report(self) -> Report:
         """Return the diagnostics of the role, which count the faults since the last report."""
         state = self.role.state
-        report = self._statistics.report(
+        return self._statistics.report(
             '' if state is None else state.value, self.role.counters,
-            state in self.role.BLOCKED_STATES, self.role.status())
-        values = {**report.values, **self._peers.conflicts()}
-        conflicts = [text for key, text in values.items() if key.startswith('conflict.')]
-        if not conflicts:
-            return report
-        return dataclasses.replace(
-            report, fault=True, summary='; '.join(conflicts), values=values)
-
-    @property
-    def is_standing_by(self) -> bool:
-        """Whether a newer node has the role."""
-        return self._stands_by
+            state in self.role.BLOCKED_STATES,
+            {**self.role.status(), **self._peers.conflicts()})
 
     def stand_by(self) -> None:
-        """Handle that a newer node has the role; nodes with more than a role override this."""
+        """React to a newer node in the same role; a node with further tasks overrides this."""
 
     def resume(self) -> None:
-        """Handle that the node serves again."""
+        """React when the node serves again."""
 
     def _on_missing(self, missing: dict[str, str]) -> None:
-        if self._stands_by:
+        if self.stands_by:
             return
         self._missing = missing
         self._report_missing(missing)
@@ -206,7 +293,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 f'{self._codebook_client.codebook_id or "none"}')
 
     def set_lacking(self, text: str) -> None:
-        """Set what the role lacks besides other roles; empty: nothing."""
+        """Describe what the role lacks besides other roles; an empty text means nothing."""
         if text != self._lacking:
             self._lacking = text
             # What is missing is not known before discovery.
@@ -222,9 +309,9 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 *lacking)))
 
     def _on_rival(self, stands_by: bool) -> None:
-        if stands_by == self._stands_by:
+        if stands_by == self.stands_by:
             return
-        self._stands_by = stands_by
+        self.stands_by = stands_by
         if stands_by:
             self.stand_by()
             # Subscriptions remain: the executor may hold messages for them. They are ignored.
@@ -270,7 +357,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
         A node that stands by publishes nothing.
         """
-        if self._stands_by:
+        if self.stands_by:
             return False
         stamp_ns = message.stamp_ns or self.get_clock().now().nanoseconds
         try:
@@ -288,7 +375,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         raise TypeError(f'{type(action).__name__} is not an action of {self.get_name()}')
 
     def _on_message(self, message: m.Message) -> None:
-        if not self._stands_by:
+        if not self.stands_by:
             self.dispatch(message)
 
     def _on_malformed(self, error: m.MessageError) -> None:
@@ -307,7 +394,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def _handle(self, event: events.Event, now_s: float) -> None:
         start_s = time.perf_counter()
         actions = self.role.handle(event, now_s)
-        self._statistics.record(event, actions, now_s, time.perf_counter() - start_s)
+        self._statistics.record(event, actions, time.perf_counter() - start_s)
         for action in actions:
             self._perform(action)
 
@@ -326,8 +413,11 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def _log_error(self, consequence: str, error: m.MessageError) -> None:
         """Log an error once for each field, whose name comes first in the text of the error."""
-        field = str(error).partition(':')[0]
-        self._log_once.error(f'{consequence} {field}', f'{consequence}: {error}')
+        subject = f'{consequence} {str(error).partition(":")[0]}'
+        if subject not in self._logged:
+            self._logged.add(subject)
+            self.get_logger().error(  # type: ignore[no-untyped-call]
+                f'{consequence}: {error}')
 
     def _set_timer(self, delay_s: float, due_s: float) -> None:
         # The timer is steady, and the pace of a simulation is unknown.

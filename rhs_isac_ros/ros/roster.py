@@ -25,30 +25,14 @@ from rhs_isac_ros.ros import topics
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Member:
-    """Declaration of a role.
+    """Declaration of a role."""
 
-    Attributes
-    ----------
-    role
-        Class of the role, which lists its messages; None: it has no messages of the protocol.
-    settings
-        Dataclass of the settings that are parameters; None: there are none.
-    requires
-        Roles without which it does not start to serve.
-    is_unique
-        Whether only one node may serve in the role, so that others stand by.
-    has_codebook
-        Whether it follows the codebook of the optimizer.
-    publishes
-        Further topics; ``{user}`` stands for the number of a user.
-    """
-
-    role: Any = None
-    settings: type | None = None
-    requires: tuple[str, ...] = ()
-    is_unique: bool = True
-    has_codebook: bool = False
-    publishes: tuple[str, ...] = ()
+    role: Any = None  # class that lists its messages, if it has any of the protocol
+    settings: type | None = None  # dataclass of the settings that are parameters, if any
+    requires: tuple[str, ...] = ()  # roles without which it does not start to serve
+    is_unique: bool = True  # whether only one node may serve in the role; others stand by
+    has_codebook: bool = False  # whether it follows the codebook of the optimizer
+    publishes: tuple[str, ...] = ()  # further topics; {user} stands for the number of a user
 
     @property
     def sent(self) -> tuple[str, ...]:

@@ -213,6 +213,8 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         gc.collect()
         gc.freeze()
         while ok() and not signals and not done():
+            # Returns after each message. Other ways of spinning never return while the queue is
+            # not empty, so that a busy node would not see signals.
             executor.spin_once(timeout_sec=_POLL_S)
     except ExternalShutdownException:
         pass

@@ -11,6 +11,7 @@ receivers and pauses, show how much of a cycle is not due to the nodes. The 10th
 sensitive than the median to other programs on the machine.
 """
 
+import faulthandler
 import os
 import sys
 import tempfile
@@ -44,6 +45,9 @@ COMPUTED = ('position_estimate', 'beam')
 WARM_UP = 10
 # Maximum time between two served cycles.
 TIMEOUT_S = 60.0
+# Maximum time of a measurement, and what a cycle adds to it. Fast DDS 2.14 can wait for itself for
+# ever when an endpoint is destroyed; the program then ends with the place where it waits.
+HANG_S, HANG_CYCLE_S = 150.0, 0.5
 WHERE = {'processes': 'one process per node', 'composed': 'all nodes in one process'}
 
 
@@ -70,6 +74,7 @@ def main() -> int:
 def measure(users: int, cycles: int, composed: bool) -> dict:
     """Run ping-pong, the network, and ping-pong again; return the figures."""
     scenario = Scenario()
+    faulthandler.dump_traceback_later(HANG_S + HANG_CYCLE_S * cycles, exit=True)
     rclpy.init(args=[])
     try:
         before_s = ping_pong(scenario, composed)
@@ -78,6 +83,7 @@ def measure(users: int, cycles: int, composed: bool) -> dict:
         after_s = ping_pong(scenario, composed)
     finally:
         rclpy.try_shutdown()
+        faulthandler.cancel_dump_traceback_later()
     hops_s = np.concatenate([before_s, after_s]) / 2
     hop_s, n_hops = float(np.median(hops_s)), len(CHAIN)
     cycles_s = np.array([chain.duration_s for chain in chains])

@@ -41,27 +41,26 @@ def test_settings_in_use_and_pending_are_reported(codebooks):
         return {name: value for name, value in report.values.items() if 'handling' not in name}
     first, second, _ = (codebook.id for codebook in codebooks)
     assert values_with('') == settings
-    statistics.record(CodebookOffered(codebooks[0]), [], 0.0, 0.0)
+    statistics.record(CodebookOffered(codebooks[0]), [], 0.0)
     assert values_with('') == values_with(first) == {'codebook_id': first, **settings}
-    statistics.record(CodebookOffered(codebooks[1]), [], 0.0, 0.0)
+    statistics.record(CodebookOffered(codebooks[1]), [], 0.0)
     assert values_with(first) == {'codebook_id': first, 'pending.codebook_id': second, **settings}
     assert values_with(second) == {'codebook_id': second, **settings}
 
 
 def test_messages_and_served_cycles_are_counted(codebooks):
     statistics = RoleStatistics()
-    statistics.record(CodebookOffered(codebooks[1]), [], 0.0, 0.0)
+    statistics.record(CodebookOffered(codebooks[1]), [], 0.0)
     for cycle_id, outcome in enumerate(['served', 'rhs_silent', 'served'], 1):
-        begin_s = 10.0 * cycle_id
         beacon = m.Beacon(cycle_id=cycle_id, attempt=0)
-        statistics.record(Timeout(), [Send(beacon), LogMessage('x')], begin_s, 0.0)
-        statistics.record(Timeout(), [state('', cycle_id)], begin_s, 0.0)
-        statistics.record(Timeout(), [state(outcome, cycle_id)], begin_s + 0.25, 0.0)
+        statistics.record(Timeout(), [Send(beacon), LogMessage('x')], 0.0)
+        statistics.record(Timeout(), [state('', cycle_id)], 0.0)
+        statistics.record(Timeout(), [state(outcome, cycle_id)], 0.0)
     values = statistics.report('', {'rhs_silent': 1}).values
     assert values['codebook_id'] == codebooks[1].id
     assert (values['cycles.served'], values['cycles.rhs_silent']) == ('2', '1')
     assert (values['sent.Beacon'], values['sent.ProtocolState']) == ('3', '6')
-    assert {values[f'cycle_ms.p{percent}'] for percent in (50, 95, 99)} == {'250.000'}
+    assert {values[f'cycle_ms.p{percent}'] for percent in (50, 95, 99)} == {'500.000'}
 
 
 def test_latencies_are_percentiles_of_the_latest_durations(example):
@@ -69,7 +68,7 @@ def test_latencies_are_percentiles_of_the_latest_durations(example):
     times_s = np.random.default_rng(0).exponential(size=2000)
     for time_s in times_s:
         estimate = example(m.PositionEstimate, latency_s=2 * time_s)
-        statistics.record(Timeout(), [Send(estimate)], 0.0, time_s)
+        statistics.record(Timeout(), [Send(estimate)], time_s)
     values = statistics.report('', {}).values
     for percent in (50, 95, 99):
         expected = 1e3 * np.percentile(times_s[-512:], percent)
@@ -115,7 +114,7 @@ def test_statistics_of_a_base_station_match_its_messages(network):
 
     def recorded(event, now_s):
         actions = handle(event, now_s)
-        statistics.record(event, actions, now_s, 0.0)
+        statistics.record(event, actions, 0.0)
         return actions
     role.handle = recorded
     net.run_cycles(4)
@@ -124,6 +123,14 @@ def test_statistics_of_a_base_station_match_its_messages(network):
     assert (values['cycles.served'], values['cycles.positioner_silent']) == ('3', '1')
     assert int(values['sent.Beacon']) == len(net.sent(m.Beacon)) - 1
     assert 10 < float(values['cycle_ms.p50']) < 50
+
+
+def test_a_conflict_is_reported_before_all_other_faults():
+    statistics = RoleStatistics()
+    statistics.missing = ('channel',)
+    status = {'conflict.role': 'two nodes', 'warning.residual': 'signals deviate'}
+    report = statistics.report('', {'no_fix': 1}, status=status)
+    assert (report.fault, report.summary) == (True, 'two nodes')
 
 
 def test_a_lasting_fault_of_the_role_is_in_every_summary():

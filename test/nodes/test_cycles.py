@@ -17,8 +17,8 @@ from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import check
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.codebook_client import CodebookClient
 from rhs_isac_ros.ros.endpoints import EXCHANGE
+from rhs_isac_ros.ros.role_node import CodebookClient
 
 SCENARIO = Scenario()
 SIZES = SCENARIO.sizes

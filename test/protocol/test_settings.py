@@ -1,7 +1,5 @@
 """Settings of roles, and their description."""
 
-import dataclasses
-
 import pytest
 
 from rhs_isac_ros.protocol.events import LogMessage
@@ -9,26 +7,18 @@ from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
     PendingSettings,
     PositionerSettings,
-    changes,
-    describe_settings,
     shown,
 )
 
 
-def test_changes_are_the_new_values_of_changed_settings():
-    old = BaseStationSettings()
-    assert changes(old, dataclasses.replace(old, policy='first', retries=0)) == {
-        'policy': 'first', 'retries': 0}
-    assert changes(old, BaseStationSettings()) == {}
-
-
 def test_settings_in_use_and_pending_are_described():
-    described = describe_settings(
-        PositionerSettings('bayes', 'a'), PositionerSettings('neural', 'a'))
-    assert described == {'parameter.estimator': 'bayes', 'parameter.model_file': 'a',
-                    'parameter.reject_outside': 'true', 'parameter.calibration_file': '',
-                    'parameter.prior': 'region', 'parameter.track_speed_mps': '1.0',
-                    'pending.estimator': 'neural'}
+    pending = PendingSettings(PositionerSettings('bayes', 'a'))
+    pending.latest = PositionerSettings('neural', 'a')
+    assert pending.describe() == {
+        'parameter.estimator': 'bayes', 'parameter.model_file': 'a',
+        'parameter.reject_outside': 'true', 'parameter.calibration_file': '',
+        'parameter.prior': 'region', 'parameter.track_speed_mps': '1.0',
+        'pending.estimator': 'neural'}
 
 
 def test_values_are_written_as_in_ros():

@@ -10,7 +10,7 @@ from rclpy.parameter import Parameter
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
-from rhs_isac_ros.ros.codebook_client import CodebookClient
+from rhs_isac_ros.ros.role_node import CodebookClient
 
 
 @pytest.fixture

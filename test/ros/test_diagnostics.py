@@ -1,7 +1,6 @@
-"""The diagnostics of the nodes, and errors that are logged once."""
+"""The diagnostics of the nodes."""
 
 import socket
-import types
 
 import pytest
 from builtin_interfaces.msg import Time
@@ -9,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import topics
-from rhs_isac_ros.ros.diagnostics import Diagnostics, LogOnce, from_ros, to_ros
+from rhs_isac_ros.ros.diagnostics import Diagnostics, from_ros, to_ros
 from rhs_isac_ros.ros.endpoints import EXCHANGE
 
 
@@ -44,37 +43,3 @@ def test_a_report_is_published_once_a_second(bench, probe):
     stamps = [message.header.stamp for message in received]
     stamps_s = [stamp.sec + 1e-9 * stamp.nanosec for stamp in stamps]
     assert 0.5 < stamps_s[1] - stamps_s[0] < 10
-
-
-@pytest.fixture
-def logged():
-    """List that collects the errors that `log_once` logs."""
-    return []
-
-
-@pytest.fixture
-def log_once(logged):
-    logger = types.SimpleNamespace(error=logged.append)
-    return LogOnce(types.SimpleNamespace(get_logger=lambda: logger))
-
-
-def test_only_the_first_error_of_each_subject_is_logged(log_once, logged):
-    for subject, text in (('a', 'one'), ('a', 'one'), ('a', 'two'), ('b', 'one')):
-        log_once.error(subject, text)
-    assert logged == ['one', 'one']
-
-
-def test_a_changed_text_is_logged_on_request(log_once, logged):
-    for text in ('one', 'one', 'two', 'two', 'one'):
-        log_once.error('a', text, repeat_if_changed=True)
-    assert logged == ['one', 'two', 'one']
-
-
-def test_a_cleared_subject_is_logged_again(log_once, logged):
-    log_once.error('a', 'one')
-    log_once.error('b', 'two')
-    log_once.clear('a')
-    log_once.clear('never logged')
-    log_once.error('a', 'one')
-    log_once.error('b', 'two')
-    assert logged == ['one', 'two', 'one']

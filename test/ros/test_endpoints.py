@@ -11,8 +11,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
+from rhs_isac_ros.nodes import bs
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import endpoints, locate, topics
+from rhs_isac_ros.ros import endpoints, topics
 from rhs_isac_ros.ros.endpoints import BackgroundWorker, UserTopics
 from rhs_isac_ros.ros.roster import ROSTER
 
@@ -42,7 +43,7 @@ def refused(monkeypatch):
     def refuse_action(node, kind, name, *_, **__):
         names.append(name)
         raise ValueError(f'{name} not found in allow rule, at a.cpp:1')
-    monkeypatch.setattr(locate, 'ActionServer', refuse_action)
+    monkeypatch.setattr(bs, 'ActionServer', refuse_action)
     return names
 
 

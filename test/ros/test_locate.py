@@ -10,10 +10,11 @@ from rclpy.action.client import ActionClient
 from rclpy.node import Node
 
 from rhs_isac_msgs.action import Locate
+from rhs_isac_ros.nodes import bs
+from rhs_isac_ros.nodes.bs import LocateServer
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, locate
+from rhs_isac_ros.ros import convert
 from rhs_isac_ros.ros.frames import Frame
-from rhs_isac_ros.ros.locate import LocateServer
 from rhs_isac_ros.ros.topics import LOCATE
 
 PHASES = (m.Phase.POSITIONING, m.Phase.ESTIMATING)
@@ -128,7 +129,7 @@ def test_a_goal_ends_after_its_timeout(bench, action):
 
 
 def test_the_number_of_goals_and_of_timers_is_limited(bench, action, monkeypatch):
-    monkeypatch.setattr(locate, '_MAX_GOALS', 3)
+    monkeypatch.setattr(bs, '_MAX_GOALS', 3)
     node = action.server._node
     for _ in range(2):
         goals = [action.send(1) for _ in range(3)]

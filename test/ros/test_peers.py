@@ -21,10 +21,9 @@ from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, peers, topics
-from rhs_isac_ros.ros.codebook_client import CodebookClient
 from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES
 from rhs_isac_ros.ros.peers import Peers, new_instance
-from rhs_isac_ros.ros.role_node import RoleNode
+from rhs_isac_ros.ros.role_node import CodebookClient, RoleNode
 from rhs_isac_ros.ros.roster import ROSTER, identifying_endpoints
 
 TYPES = {name: convert.ros_type(kind) for kind, name in topics.NAMES.items()} | {
@@ -422,7 +421,7 @@ def test_of_three_nodes_with_the_same_name_the_newest_serves_until_it_has_gone(b
     topic = f'/{topics.NAMES[m.FeedSignals]}'
 
     def serving():
-        return [node.is_standing_by for node in nodes] == [True] * (len(nodes) - 1) + [False] and (
+        return [node.stands_by for node in nodes] == [True] * (len(nodes) - 1) + [False] and (
             len(probe.get_publishers_info_by_topic(topic)) == 1)
     while nodes:
         bench.until(serving, 'the newest node')

@@ -8,10 +8,10 @@ from nav_msgs.msg import Odometry
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node as Node_
 
+from rhs_isac_ros.nodes.user import RobotMobility, follow_frame, follow_odometry
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import refusals
 from rhs_isac_ros.ros.frames import Frame, rotation_matrix
-from rhs_isac_ros.ros.robot import RobotMobility, follow_frame, follow_odometry
 from rhs_isac_ros.support.fields import ParameterError
 
 # Turned by 90 degrees about z, and moved.

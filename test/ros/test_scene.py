@@ -15,9 +15,10 @@ from visualization_msgs.msg import Marker
 from rhs_isac_ros.link import beam_pattern, steer
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring import shapes
+from rhs_isac_ros.nodes import visualizer as scene
 from rhs_isac_ros.nodes.visualizer import VisualizerNode
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, scene, topics
+from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED
 from rhs_isac_ros.ros.frames import Frame
 
