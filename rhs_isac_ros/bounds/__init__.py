@@ -1,13 +1,12 @@
 """Local and global bounds of positioning, and gradients of the local ones."""
 
 from rhs_isac_ros.bounds.average import AverageCrlb, average_crlb
-from rhs_isac_ros.bounds.fisher import crlb, crlb_of, fisher_information, fisher_information_of
+from rhs_isac_ros.bounds.fisher import crlb, crlb_of, fisher_information
 from rhs_isac_ros.bounds.global_bound import GlobalBound, global_bound
-from rhs_isac_ros.bounds.misspecified import Misspecified, misspecified, misspecified_of
+from rhs_isac_ros.bounds.misspecified import Misspecified, misspecified
 from rhs_isac_ros.bounds.pairwise_error import PairwiseErrorCost
 
 __all__ = [
     'AverageCrlb', 'GlobalBound', 'Misspecified', 'PairwiseErrorCost', 'average_crlb', 'crlb',
-    'crlb_of', 'fisher_information', 'fisher_information_of', 'global_bound', 'misspecified',
-    'misspecified_of',
+    'crlb_of', 'fisher_information', 'global_bound', 'misspecified',
 ]

@@ -12,7 +12,6 @@ import numpy as np
 from rhs_isac_ros.bounds.fisher import (
     inverse_information,
     quadratic_form,
-    region_information,
     without_nuisance,
 )
 from rhs_isac_ros.bounds.rows import (
@@ -33,6 +32,7 @@ from rhs_isac_ros.model.elements import (
     error_radiation,
     error_terms,
 )
+from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions, los_and_derivative
 from rhs_isac_ros.model.multipath import (
@@ -49,9 +49,10 @@ Loss = Callable[[slice, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Gradient(NamedTuple):
-    """An average with its gradients: d/dC, float64 [N_B, F, N_E], and the one by S.
+    """An average and its gradients.
 
-    The latter is d/dRe(S) + i d/dIm(S), complex128 [N_B, N_SB, F, K].
+    `by_analog` is d/dC, float64 [N_B, F, N_E]; `by_digital` is d/dRe(S) + i d/dIm(S), complex128
+    [N_B, N_SB, F, K].
     """
 
     value: float
@@ -82,8 +83,8 @@ class Average:
     """Mean loss of items, each of which depends on a codebook through a quadratic form.
 
     The form of an item is 2 Re sum_i D_i^H Lambda_i^-1 D_i, where the G = `n_rows` columns of D_i
-    are the means of the item's rows. With derivatives as rows it is the Fisher information; with
-    differences, it is twice the squared distance of two mean signals.
+    are the means of the item's rows. If the rows are derivatives, the form is the Fisher
+    information; if they are differences, it is twice the squared distance between mean signals.
 
     Parameters
     ----------
@@ -198,7 +199,7 @@ class AverageCrlb(Average):
             patterns or PLAIN, combination, tick)
 
     def _bounds(self, _: slice, joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds [n] and their negative derivatives with respect to the forms."""
+        """Return the bounds [n] and their negative derivatives with respect to the forms."""
         information, regression = without_nuisance(joint)
         inverse = inverse_information(information + self._prior)
         values = np.trace(inverse, axis1=1, axis2=2)
@@ -216,10 +217,10 @@ class AverageCrlb(Average):
 
 
 def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
-    """Rows of position and nuisance parameters from rows of the derivative and of the gain.
+    """Return how the rows of all parameters follow from those of the gain and its derivative.
 
-    A parameter whose pattern is constant in each band multiplies the row of the gain; any other
-    one has a row of its own. Without parameters, the derivative is sufficient.
+    A parameter whose pattern is constant in each band shares the row of the gain, scaled; each
+    other parameter has a separate row. Without nuisance parameters, the derivative is sufficient.
     """
     scaled = nuisance_of(scenario).scaled_patterns
     if not len(scaled):

@@ -4,17 +4,15 @@ import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.gaussian import marginalise
+from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.measurement import position_blocks
-from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
 # A normalised matrix with a smaller pivot is singular up to rounding.
 _MIN_PIVOT = 1e-14
-# A region thinner than this, in wavelengths, determines the coordinate.
-_NO_EXTENT = 1e-5
 
 
 @one_blas_thread
@@ -64,15 +62,6 @@ def without_nuisance(joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return marginal.information, marginal.regression
 
 
-def region_information(scenario: Scenario) -> np.ndarray:
-    """Return the information of a Gaussian as wide as the region, float64 [3, 3] [1/m^2].
-
-    Its covariance is that of the uniform distribution, size^2 / 12.
-    """
-    shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
-    return np.diag(12 / np.maximum(scenario.roi_size_m, _NO_EXTENT * shortest)**2)
-
-
 def inverse_information(information: np.ndarray) -> np.ndarray:
     """Invert Fisher information matrices, float64 [N, 3, 3] [1/m^2].
 
@@ -104,19 +93,12 @@ def inverse_information(information: np.ndarray) -> np.ndarray:
     return inverse
 
 
-@one_blas_thread
-def fisher_information(
-        scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> np.ndarray:
+def fisher_information(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
     """Implements Eq. (12). Fisher information of the received signals about the position.
 
     Takes positions of the user, float64 [N, 3] [m]. Returns I_FIM, float64 [N, 3, 3] [1/m^2].
     """
-    return fisher_information_of(MeasurementModel(scenario, codebook), positions)
-
-
-def fisher_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
-    """Compute `fisher_information` for a model, whose whitener is shared by all calls."""
-    return _information(model, positions, np.empty((0, *model.shape)))
+    return joint_information_of(model, positions)[:, :3, :3]
 
 
 def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
@@ -125,23 +107,16 @@ def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.n
     Returns float64 [N, 3 + Q, 3 + Q]; the nuisance parameters are scaled to a standard normal
     prior.
     """
-    return _information(model, positions, nuisance_of(model.scenario).scaled_patterns)
-
-
-def _information(
-        model: MeasurementModel, positions: np.ndarray, patterns: np.ndarray) -> np.ndarray:
-    """Information about the position and the Q parameters of patterns [Q, N_B, N_SB F]."""
     positions = checked_positions(positions)
-    information = np.zeros((len(positions), *[3 + len(patterns)] * 2))
+    patterns = nuisance_of(model.scenario).scaled_patterns
+    information = np.empty((len(positions), *[3 + len(patterns)] * 2))
 
     def fill(block: slice) -> None:
-        if len(patterns):
-            directions = patterns * model.mean(positions[block])[:, None]
-        for band, whitener in enumerate(model.whitener):
-            rows = model.band_jacobian(positions[block], band)
-            if len(patterns):
-                rows = np.concatenate([rows, directions[:, :, band]], axis=1)
-            information[block] += quadratic_form(rows @ whitener.T)
+        mean, slopes = model.mean_and_jacobian(positions[block])
+        rows = np.concatenate([slopes, patterns * mean[:, None]], axis=1)
+        whitened = np.matmul(np.swapaxes(rows, 1, 2), np.swapaxes(model.whitener, 1, 2))
+        information[block] = np.sum([
+            quadratic_form(whitened[:, band]) for band in range(len(model.whitener))], axis=0)
 
     map_blocks(fill, position_blocks(model.scenario, len(positions)))
     return information

@@ -20,9 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import fisher_information_of
+from rhs_isac_ros.bounds.fisher import fisher_information
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import blocks
+from rhs_isac_ros.model.geometry import jacobian, polar_bounds, to_polar
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -104,9 +105,7 @@ class _Lattice:
 
     def __init__(self, model: MeasurementModel, steps: np.ndarray, point: np.ndarray) -> None:
         self._model, scenario = model, model.scenario
-        distance = np.linalg.norm(point)
-        given = distance, point[1] / distance, point[2] / distance
-        box = _polar_box(scenario)
+        given, box = to_polar(point), polar_bounds(scenario.roi_bounds_m)
         ranges, *directions = (
             np.arange(q - np.ceil((q - low) / step) * step, high + step, step)
             for q, low, high, step in zip(given, *box, steps, strict=True))
@@ -217,35 +216,13 @@ def _weights(nodes: np.ndarray, angles: np.ndarray, points: np.ndarray) -> np.nd
     return terms / terms.sum(axis=0)
 
 
-def _polar_box(scenario: Scenario) -> np.ndarray:
-    """Lower and upper limits of (r, u, v) in the region of interest, float64 [2, 3]."""
-    low, high = scenario.roi_bounds_m
-    nearest = np.clip(0.0, low, high)
-    farthest = np.maximum(np.abs(low), np.abs(high))
-    limits = np.empty((2, 3))
-    limits[:, 0] = np.linalg.norm(nearest), np.linalg.norm(farthest)
-    for axis in (1, 2):
-        # A cosine is the largest where the other coordinates are the smallest, if it is positive.
-        for side, bound in enumerate((low, high)):
-            outward = bound[axis] > 0 if side else bound[axis] < 0
-            others = np.delete(nearest if outward else farthest, axis)
-            limits[side, axis] = bound[axis] / np.hypot(bound[axis], np.linalg.norm(others))
-    return limits
-
-
 def _steps(model: MeasurementModel, rng: np.random.Generator) -> tuple[np.ndarray, float]:
     """Steps of the lattice in (r [m], u, v), from local deviations, and their coarseness."""
     positions = model.scenario.sample_positions(256, rng)
-    distance = np.linalg.norm(positions, axis=1)
-    sight = positions / distance[:, None]
-    slopes = np.zeros((len(positions), 3, 3))
-    slopes[:, :, 0] = sight
-    for axis in (1, 2):
-        slopes[:, 0, axis] = -distance * sight[:, axis] / sight[:, 0]
-        slopes[:, axis, axis] = distance
-    information = fisher_information_of(model, positions)
+    slopes = jacobian(to_polar(positions))
+    information = fisher_information(model, positions)
     diagonal = np.einsum('nap,nab,nbp->np', slopes, information, slopes).mean(axis=0)
-    low, high = _polar_box(model.scenario)
+    low, high = polar_bounds(model.scenario.roi_bounds_m)
     extent = high - low
     steps = np.minimum(
         _STEPS / np.sqrt(np.maximum(diagonal, 1e-30)),

@@ -15,12 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.bounds.fisher import inverse_information
-from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
-from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import one_blas_thread
 
 _MAX_STEPS, _HALVINGS = 60, 12
@@ -49,9 +48,9 @@ class Misspecified(NamedTuple):
     covariance
         Covariance of the errors about the pseudo-true position, float64 [N, 3, 3] [m^2].
     valid
-        Whether the result describes the estimator: ambiguities of the range are improbable, the
-        mean is linear over the errors, the border of the region is far away, and estimators
-        do not refuse the signals for their residual, bool [N].
+        Whether the result describes the estimator, bool [N]: ambiguities of the range are
+        improbable, the mean is linear over the errors, the border of the region is far away, and
+        estimators accept the residual of the signals.
     """
 
     bias: np.ndarray
@@ -65,21 +64,14 @@ class Misspecified(NamedTuple):
                 + np.trace(self.covariance, axis1=1, axis2=2))
 
 
-def misspecified(assumed: Scenario, true: Scenario, codebook: Beamforming,
-                 positions: np.ndarray) -> Misspecified:
-    """Compute the errors of an estimator that assumes one scenario while another one is true.
+@one_blas_thread
+def misspecified(
+        assumed: MeasurementModel, true: MeasurementModel, positions: np.ndarray) -> Misspecified:
+    """Compute the errors of an estimator that assumes one model while another one is true.
 
-    Takes positions of the user, float64 [N, 3] [m], and scenarios of equal sizes without nuisance
+    Takes positions of the user, float64 [N, 3] [m], and models of equal sizes without nuisance
     parameters, such as phases; raises ValueError for others.
     """
-    return misspecified_of(
-        MeasurementModel(assumed, codebook), MeasurementModel(true, codebook), positions)
-
-
-@one_blas_thread
-def misspecified_of(assumed: MeasurementModel, true: MeasurementModel, positions: np.ndarray
-                    ) -> Misspecified:
-    """Compute `misspecified` for two models, for example of different surfaces."""
     positions = checked_positions(positions)
     if assumed.shape != true.shape:
         raise ValueError(f'true: N_B, N_SB F = {true.shape}, expected {assumed.shape}')
@@ -88,7 +80,8 @@ def misspecified_of(assumed: MeasurementModel, true: MeasurementModel, positions
             raise ValueError(f'{name}: a scenario with nuisance parameters, expected none')
     target = assumed.whiten(true.mean(positions))
     places = _pseudo_true(assumed, positions, target)
-    slopes, residual = _slopes(assumed, places), target - assumed.whiten(assumed.mean(places))
+    mean, slopes = assumed.mean_and_jacobian(places, whitened=True)
+    residual = target - mean
     # L^-1 of the assumed model turns the true covariance into W Lambda W^H.
     white = np.matmul(assumed.whitener @ true.covariance(), adjoint(assumed.whitener))
     gradients = 2 * np.einsum('nair,irs,nbis->nab', slopes.conj(), white, slopes,
@@ -103,11 +96,6 @@ def misspecified_of(assumed: MeasurementModel, true: MeasurementModel, positions
     valid[finite] = _is_valid(
         assumed, places[finite], bias[finite], covariance[finite], residual[finite], white)
     return Misspecified(bias, covariance, valid)
-
-
-def _slopes(model: MeasurementModel, places: np.ndarray) -> np.ndarray:
-    """Whitened derivative of the mean, complex128 [N, 3, N_B, N_SB F] [1/m]."""
-    return model.whiten(model.jacobian(places))
 
 
 def _products(slopes: np.ndarray) -> np.ndarray:
@@ -129,9 +117,8 @@ def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndar
     places = positions.copy()
     costs = cost(positions)
     for _ in range(_MAX_STEPS):
-        slopes = _slopes(model, places)
-        information = _products(slopes)
-        gradient = _projections(slopes, target - model.whiten(model.mean(places)))
+        mean, slopes = model.mean_and_jacobian(places, whitened=True)
+        information, gradient = _products(slopes), _projections(slopes, target - mean)
         ridge = 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         step = np.linalg.solve(information + ridge, gradient[..., None])[..., 0]
         for _ in range(_HALVINGS):
@@ -154,9 +141,9 @@ def _bending(model: MeasurementModel, places: np.ndarray, residual: np.ndarray) 
     bending = np.empty((len(places), 3, 3))
     for axis in range(3):
         step = _DIFFERENCE_M * np.eye(3)[axis]
-        second = (_slopes(model, places + step) - _slopes(model, places - step)) / (
-            2 * _DIFFERENCE_M)
-        bending[:, axis] = 2 * _projections(second, residual)
+        after, before = (model.mean_and_jacobian(places + offset, whitened=True)[1]
+                         for offset in (step, -step))
+        bending[:, axis] = _projections(after - before, residual) / _DIFFERENCE_M
     return (bending + np.swapaxes(bending, 1, 2)) / 2
 
 
@@ -174,7 +161,7 @@ def _is_valid(model: MeasurementModel, places: np.ndarray, bias: np.ndarray,
         'nir,irs,nis->n', residual.conj(), white, residual).real
     limit = gammainccinv(np.prod(model.shape), _FALSE_ALARM)
     valid &= energy + _QUANTILE * np.sqrt(spread) <= limit
-    mean, slopes = model.whiten(model.mean(places)), _slopes(model, places)
+    mean, slopes = model.mean_and_jacobian(places, whitened=True)
     values, vectors = np.linalg.eigh(covariance)
     for axis in range(3):
         step = vectors[:, :, axis] * np.sqrt(np.maximum(values[:, axis], 0))[:, None]

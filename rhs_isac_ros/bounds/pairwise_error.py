@@ -1,7 +1,7 @@
-"""Error by confusion of distant positions, which the local Cramer-Rao bound does not include.
+"""Error from confusing distant positions, which the local Cramer-Rao bound does not include.
 
 The phases of the bands may be unknown: theta = A z, with standard normal z. The distance of two
-signals is then the smallest over z of ``sum_i 2 |a_i exp(i theta_i) - b_i|^2 + |z|^2``. For small
+signals is then the minimum over z of ``sum_i 2 |a_i exp(i theta_i) - b_i|^2 + |z|^2``. For small
 deviations it agrees with the marginal Fisher information; for large ones it vanishes if the
 signals differ in the phases of their bands alone.
 """
@@ -25,7 +25,7 @@ _STEPS = 40
 
 
 class PairwiseErrorCost(Average):
-    """Mean squared error caused by the confusion of pairs of positions.
+    """Mean squared error from confusing pairs of positions.
 
     A maximum-likelihood decision between two positions is wrong with probability Q(sqrt(q / 2)),
     where q = sum_i dmu_i^H Lambda_i^-1 dmu_i and dmu is the difference of the mean signals. The

@@ -26,7 +26,7 @@ _BLOCK = 128
 
 def range_confusion_error(
         frequencies_hz: np.ndarray, energies: np.ndarray, max_lag_m: float) -> np.ndarray:
-    """Estimate the squared error by confusion of ranges for many band plans, float64 [P] [m^2].
+    """Estimate the squared error from confusing ranges for many band plans, float64 [P] [m^2].
 
     Each minimum r of the mismatch has the weight w = (1 - r / r_max) Q(sqrt(q / 2)), with
     q = 2 E sum_i (1 - cos(2 pi f_i r / v_0)) / N_B and the share 1 - r / r_max of the positions
@@ -68,7 +68,7 @@ def range_confusion_error(
 
 def range_confusion_error_of(
         model: MeasurementModel, positions: np.ndarray, rng: np.random.Generator) -> float:
-    """Estimate the squared error by confusion of ranges with a codebook [m^2].
+    """Estimate the squared error from confusing ranges with a codebook [m^2].
 
     This is the error of the posterior mean if the user is at one of N positions, float64 [N, 3]
     [m], or at one that can be confused with it: the lags are the minima of the mismatch along the

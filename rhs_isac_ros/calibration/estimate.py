@@ -4,7 +4,7 @@ The mean signals are linear in gains and offsets of the elements, and in a band'
 and noise are the noise of this linear model; their covariance contains the multipath that leaks
 through the errors of the elements. With better estimates less of it leaks, and the nulls
 of the beams, in which the errors are visible, gain weight: the estimation alternates between the
-posterior for a covariance, and the covariance for a posterior.
+posterior given a covariance, and the covariance given a posterior.
 """
 
 import dataclasses
@@ -126,7 +126,7 @@ class Alignment:
         return self.patterns * np.where(self._moves_multipath, aligned[:, None], mean[:, None])
 
     def start(self, white: np.ndarray, white_mean: np.ndarray, values: np.ndarray) -> None:
-        """Set the values that turn whole bands to the most likely ones, one after the other."""
+        """Set each value that only turns whole bands to its most likely one, in order."""
         outputs = np.sum(np.conj(white_mean) * white, axis=2)
         for q in np.flatnonzero(self._phases.any(axis=0)):
             turns = self._phases[:, q]
@@ -137,7 +137,7 @@ class Alignment:
 
     def step(self, whiten: Callable[[np.ndarray], np.ndarray], signals: np.ndarray,
              mean: np.ndarray, values: np.ndarray) -> None:
-        """Improve the values for signals with a mean, both [N, N_B, N_SB F]."""
+        """Improve the values for signals and their mean, both [N, N_B, N_SB F]."""
         aligned = self.aligned(signals, values)
         slopes = whiten(self.slopes(aligned, mean))
         residual = whiten(aligned) - whiten(mean)
@@ -153,10 +153,10 @@ class Alignment:
 
 
 def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
-    """RMS of real and imaginary parts of the bands' relative errors in a round [2, N_B].
+    """Return the RMS of real and imaginary parts of the bands' relative errors [2, N_B].
 
-    Pilots of one user reveal only the sum of its random gain or phase and the one of the bands,
-    which is then fixed.
+    Pilots cannot separate a random gain or phase of the user from those of the bands. The gains or
+    phases of as many bands are then fixed.
     """
     rms = np.full((2, scenario.n_bands), prior.band_gain_rms / np.sqrt(2))
     nuisance = nuisance_of(scenario)
@@ -170,7 +170,10 @@ def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
 
 
 def _change(before: Posterior, after: Posterior, n_bands: int) -> float:
-    """Largest change of a parameter, in standard deviations; the bands' are changes already."""
+    """Return the largest change of a parameter, in standard deviations.
+
+    The parameters of the bands are changes already.
+    """
     moved = np.abs(after.complex_mean() - before.complex_mean())
     moved[-n_bands:] = np.abs(after.complex_mean()[-n_bands:])
     std = np.sqrt(np.maximum(np.diagonal(after.complex_covariance()).real, 1e-300))

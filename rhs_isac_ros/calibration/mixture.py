@@ -1,10 +1,9 @@
 """The posterior of elements that work or have failed, from a Gaussian likelihood.
 
-Each element has a gain if it works, or an offset if it has failed; the other number is zero. Given
-which elements have failed, the posterior is Gaussian. The search starts with the elements that are
-taken to work, and changes the state of one element at a time while that increases the
-evidence. The posterior that it returns averages over the states of every single element, given
-those of the others; without data, this is the prior.
+A working element has a gain, a failed one an offset; the other number is zero. Given the states of
+all elements, the posterior is Gaussian. The search changes the state of one element at a time as
+long as that increases the evidence. The resulting posterior averages over both states of each
+element, given the states of the others; without data, it is the prior.
 """
 
 import dataclasses

@@ -1,17 +1,18 @@
 """Covariance of the multipath in one hall from signals at known positions.
 
-The residuals of N positions have the sample covariance S. With an inverse Wishart prior of the
-weight nu, whose mean L_0 is the covariance that three fields declare, the posterior mean is
+The residuals of N positions have the sample covariance S. With an inverse Wishart prior of weight
+nu, whose mean L_0 is the covariance that three fields declare, the posterior mean is
 
     L = t (nu L_0 + N S) / (nu + N).
 
-Fields and nu maximise the evidence, so that few positions yield almost the fields, and many the
-sample covariance. Multipath of few strong paths is not Gaussian: errors of positions then exceed
-the bound of L for t = 1. Each position is therefore left out in turn, and t makes the 95 % region
-of the local bound contain 95 % of the positions left out, and the test of the residual pass 99 %.
+Fields and nu maximise the evidence, so that L is close to the declared covariance for few
+positions, and to the sample covariance for many. Multipath that consists of a few strong paths is
+not Gaussian: positioning errors then exceed the bound for t = 1. Each position is therefore left
+out in turn, and t is chosen so that 95 % of these positions lie in the 95 % region of the local
+bound, and 99 % pass the test of the residual.
 
-Positions whose signals are more probable without a direct path, as multipath of an unknown level,
-are left out.
+Positions are excluded if their signals are more probable without a direct path, as multipath of an
+unknown level.
 """
 
 import dataclasses
@@ -26,6 +27,7 @@ from rhs_isac_ros.calibration.estimate import Alignment, Pilots
 from rhs_isac_ros.model import Beamforming, MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
+from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.hall import CONDITIONS, FIELDS, MultipathEstimate
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.measurement import Surface
@@ -247,8 +249,8 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     """
     whitener = np.linalg.inv(np.linalg.cholesky(total))
     nuisance = nuisance_of(model.scenario).scaled_patterns
-    slopes = np.concatenate(
-        [model.jacobian(positions), nuisance * model.mean(positions)[:, None]], axis=1)
+    mean, by_position = model.mean_and_jacobian(positions)
+    slopes = np.concatenate([by_position, nuisance * mean[:, None]], axis=1)
     white = np.einsum('irs,nis->nir', whitener, residuals)
     columns = np.einsum('irs,nais->nair', whitener, slopes)
     # The inverse of total - e e^H is a change of rank one; the share of e in total is below 1.
@@ -256,8 +258,9 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     products = np.einsum('nair,nir->nai', columns.conj(), white)
     information = np.einsum('nair,nbir->nab', columns.conj(), columns) + np.einsum(
         'nai,nbi,ni->nab', products, products.conj(), own)
-    information = 2 * n_others * information.real + np.diag(np.concatenate(
-        [12 / np.array(model.scenario.roi_size_m)**2, np.ones(len(nuisance))]))
+    prior = np.eye(information.shape[1])
+    prior[:3, :3] = region_information(model.scenario)
+    information = 2 * n_others * information.real + prior
     gradient = 2 * n_others * np.einsum('nai,ni->na', products[:, :3], own).real
     covariance = np.linalg.inv(information)[:, :3, :3]
     return _LeftOut(np.einsum('na,nab,nb->n', gradient, covariance, gradient),
@@ -312,7 +315,7 @@ def _level_std_db(left_out: _LeftOut, n_measurements: int) -> float:
 
 
 def _radius() -> float:
-    """Squared Mahalanobis radius of the region of the probability `COVERAGE`."""
+    """Squared Mahalanobis radius of the region of probability `COVERAGE`."""
     from scipy.special import chdtri
 
     return float(chdtri(3, 1 - COVERAGE))

@@ -49,6 +49,7 @@ from rhs_isac_ros.support.arguments import (
 )
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.optional import MissingLibraryError
+from rhs_isac_ros.support.pictures import write_picture
 from rhs_isac_ros.support.progress import progress_bar
 
 # Positions for the average bound of the result, drawn independently of the samples.
@@ -188,7 +189,7 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     print(f'{output}: average CRLB {average:.5f} m^2 (standard error {error:.5f}) over '
           f'{HELD_OUT_POSITIONS} held-out positions; {result.reason}')
     if options.plot:
-        plot_optimization(scenario, codebook, result.history, options.plot)
+        write_picture(options.plot, plot_optimization(scenario, codebook, result.history))
     return codebook, result.reason
 
 

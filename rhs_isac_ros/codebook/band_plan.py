@@ -129,7 +129,7 @@ class Candidate:
     Attributes
     ----------
     screening_m2
-        Squared error by confusion of ranges, from the range ambiguity function.
+        Squared error from confusing ranges, according to the range ambiguity function.
     error_m2
         Expected squared error with an optimised codebook, see `expected_error`.
     """
@@ -141,7 +141,7 @@ class Candidate:
 
 @dataclasses.dataclass(frozen=True)
 class BandPlan:
-    """Result of `optimize_band_plan`: the scenario with its bands, and its codebook.
+    """Result of `best_of`: the scenario with its bands, and its codebook.
 
     `candidates` are the plans that `choose_bands` compared, the best one first, and `error_m2` is
     the expected squared error, NaN if the optimisation of the codebook was interrupted.
@@ -153,31 +153,16 @@ class BandPlan:
     error_m2: float
 
 
-def optimize_band_plan(
-        scenario: Scenario, spectrum_hz: Sequence[tuple[float, float]], n_bands: int, *,
-        raster_hz: float = DEFAULT_RASTER_HZ, min_gap_hz: float | None = None, seed: int = 0,
-        max_steps: int | None = None) -> BandPlan:
-    """Choose centre frequencies and a codebook for them with `choose_bands` and `best_of`.
-
-    `max_steps` limits the full optimisations, for which `optimize` describes the default.
-    """
-    candidates = choose_bands(
-        scenario, spectrum_hz, n_bands, raster_hz=raster_hz, min_gap_hz=min_gap_hz, seed=seed)
-    return best_of(
-        scenario, candidates,
-        lambda plan: optimize(plan, objective='error', seed=seed, max_steps=max_steps), seed)
-
-
 def best_of(
         scenario: Scenario, candidates: Sequence[Candidate],
         search: Callable[[Scenario], OptimizeResult], seed: int = 0,
         report: Callable[[Candidate], None] | None = None) -> BandPlan:
     """Optimise codebooks for the first candidates, and return the plan with the lowest error.
 
-    The best of the candidates comes first. It is also the result unless the error of another one
-    is clearly lower. Candidates with much larger errors are left out. An interrupted `search` for
-    a codebook ends the comparison with the best plan so far. `report` is called with each other
-    plan and its error with the codebook.
+    The candidates are in ascending order of their errors. The first one is the result unless the
+    error of another one is clearly lower; candidates with much larger errors are skipped. If a
+    `search` for a codebook is interrupted, the best plan so far is the result. `report` is called
+    with each plan that has a codebook, and its error.
     """
     best: BandPlan | None = None
     for candidate in candidates[:_FINALISTS]:
@@ -200,7 +185,6 @@ def best_of(
 def choose_bands(
         scenario: Scenario, spectrum_hz: Sequence[tuple[float, float]], n_bands: int, *,
         raster_hz: float = DEFAULT_RASTER_HZ, min_gap_hz: float | None = None, seed: int = 0,
-        n_candidates: int = _CANDIDATES,
         report: Callable[[Candidate], None] | None = None) -> tuple[Candidate, ...]:
     """Choose centre frequencies with which users are located accurately.
 
@@ -214,10 +198,8 @@ def choose_bands(
         Smallest distance of two centre frequencies [Hz]; by default, the width of a band.
     seed
         Seed of the samples and of the optimisations.
-    n_candidates
-        Number of plans for which codebooks are compared.
     report
-        Called with each of these.
+        Called with each plan for which a codebook is optimised.
 
     Returns
     -------
@@ -229,8 +211,6 @@ def choose_bands(
     ValueError
         If an argument is out of range, or no plan has the gap.
     """
-    if n_candidates < 1:
-        raise ValueError(f'n_candidates: {n_candidates}, expected at least 1')
     if n_bands < 1 or scenario.n_bands * scenario.n_frames % n_bands:
         raise ValueError(
             f'bands: {n_bands}, expected a divisor of {scenario.n_bands * scenario.n_frames}, '
@@ -245,7 +225,7 @@ def choose_bands(
     candidates = []
     for plan, screening in _proposals(
             scenario, frequencies_hz, n_bands, gap_hz, _MIN_DIFFERENCE * raster_hz,
-            n_candidates, streams.generator(seed, streams.PLANS)):
+            streams.generator(seed, streams.PLANS)):
         world = with_bands(scenario, plan)
         short = optimize(world, objective='error', seed=seed, n_positions=_SHORT_POSITIONS,
                          max_steps=_SHORT_STEPS)
@@ -265,9 +245,9 @@ def with_bands(scenario: Scenario, frequencies_hz: Sequence[float]) -> Scenario:
 
 def _proposals(
         scenario: Scenario, frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
-        difference_hz: float, n: int, rng: np.random.Generator
+        difference_hz: float, rng: np.random.Generator
 ) -> list[tuple[tuple[float, ...], float]]:
-    """Return up to n different plans, from the energy levels in turn, with screening values."""
+    """Return different plans, from the energy levels in turn, with screening values."""
     spread = np.linspace(frequencies_hz[0], frequencies_hz[-1], n_bands)
     energies = _energies(with_bands(scenario, spread.tolist()))
     low, high = scenario.roi_bounds_m
@@ -280,7 +260,7 @@ def _proposals(
         order = np.argsort(values, kind='stable')
         ranked.append(iter(zip(plans[order], values[order], strict=True)))
     chosen: list[tuple[tuple[float, ...], float]] = []
-    while ranked and len(chosen) < n:
+    while ranked and len(chosen) < _CANDIDATES:
         source = ranked.pop(0)
         for plan, value in source:
             if all(np.abs(plan - other).max() >= difference_hz for other, _ in chosen):
@@ -296,7 +276,7 @@ def expected_error(
 
     The estimate is the global bound, a few percent below the error. This bound ignores nuisance
     parameters: if the scenario declares any, the estimate is the average local bound with the
-    region as prior, plus the squared error by confusion of ranges.
+    region as prior, plus the squared error from confusing ranges.
     """
     rng = streams.generator(seed, streams.PLANS, 1)
     if not len(nuisance_of(scenario)):

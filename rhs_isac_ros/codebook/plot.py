@@ -1,7 +1,6 @@
 """A plot of an optimisation and of the resulting codebook."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from rhs_isac_ros.support.pictures import (
     look,
     new_figure,
     paper_style,
-    write_picture,
 )
 
 # Points of the map of the bound along each axis, and of a beam over azimuth.
@@ -30,19 +28,13 @@ _N_AZIMUTHS = 361
 _N_COLUMNS = 3
 
 
+@paper_style('plotting')
 def plot_optimization(
-        scenario: Scenario, codebook: Codebook, history: Sequence[Progress],
-        path: str | Path) -> None:
+        scenario: Scenario, codebook: Codebook, history: Sequence[Progress]) -> Any:
     """Plot convergence, the bound over the region of interest, and the beam patterns.
 
-    Errors are those of `paper_style` and `write_picture`.
+    Returns a `matplotlib.figure.Figure`; errors are those of `paper_style`.
     """
-    write_picture(path, compose(scenario, codebook, history))
-
-
-@paper_style('plotting')
-def compose(scenario: Scenario, codebook: Codebook, history: Sequence[Progress]) -> Any:
-    """Return the `matplotlib.figure.Figure` of `plot_optimization`."""
     rows = -(-scenario.n_bands // _N_COLUMNS)
     figure = new_figure(PAGE_IN, 2.7 + 2.3 * rows)
     above, below = figure.add_gridspec(2, 1, height_ratios=(2.7, 2.3 * rows))

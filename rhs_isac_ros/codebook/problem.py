@@ -41,12 +41,15 @@ class Problem:
         return np.concatenate(
             [codebook.analog.ravel(), digital.real.ravel(), digital.imag.ravel()])
 
-    def unpack(self, variables: np.ndarray) -> Codebook:
+    def unpack(self, variables: np.ndarray, *, relaxed: bool = False) -> Codebook:
         """Return the codebook of variables from `pack`; it satisfies all constraints.
 
-        Configurations are rounded to the amplitudes that the elements can take.
+        Unless relaxed, configurations are rounded to the amplitudes that the elements can take.
         """
-        return self._codebook(variables, relaxed=False)
+        analog, raw, norm = self._split(variables)
+        if not relaxed:
+            analog = on_levels(self.scenario, analog)
+        return Codebook(analog, raw * (np.sqrt(self.scenario.max_power_w) / norm))
 
     @property
     def n_pairs(self) -> int:
@@ -66,24 +69,14 @@ class Problem:
 
     def value_and_gradient(
             self, variables: np.ndarray, *, relaxed: bool = False) -> tuple[float, np.ndarray]:
-        """Return the objective [m^2] and its gradient, float64, shaped like `variables`.
-
-        They belong to the codebook of `unpack` or, if relaxed, to configurations that are not
-        rounded.
-        """
+        """Return the objective [m^2] of `unpack` and its gradient, shaped like `variables`."""
         _, raw, norm = self._split(variables)
-        value, by_analog, by_digital = self.objective(self._codebook(variables, relaxed=relaxed))
+        value, by_analog, by_digital = self.objective(self.unpack(variables, relaxed=relaxed))
         # d(raw / norm) has no component along raw.
         radial = np.sum((np.conj(raw) * by_digital).real, axis=(1, 3), keepdims=True)
         by_raw = np.sqrt(self.scenario.max_power_w) / norm * (by_digital - raw * radial / norm**2)
         return value, np.concatenate(
             [by_analog.ravel(), by_raw.real.ravel(), by_raw.imag.ravel()])
-
-    def _codebook(self, variables: np.ndarray, *, relaxed: bool) -> Codebook:
-        analog, raw, norm = self._split(variables)
-        if not relaxed:
-            analog = on_levels(self.scenario, analog)
-        return Codebook(analog, raw * (np.sqrt(self.scenario.max_power_w) / norm))
 
     def _split(self, variables: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return configurations, unscaled combining vectors, and their norm in each frame."""

@@ -130,7 +130,7 @@ def add_legend(place: Any, panels: Sequence[Any], lines: Sequence[Axis],
 def shown(name: str, value: Any) -> str:
     """Return a value of a field as a short text for a legend or an axis."""
     if isinstance(value, GainPattern):
-        return value.name
+        return value.origin
     if name == 'center_frequencies_hz':
         return ', '.join(f'{entry / 1e9:.4g}' for entry in value) + ' GHz'
     if isinstance(value, float | int):

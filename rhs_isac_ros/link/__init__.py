@@ -6,7 +6,7 @@ from rhs_isac_ros.link.capacity import (
     actual_capacity,
     beam_pattern,
     capacity,
-    expected_capacity,
+    expected_capacities,
 )
 from rhs_isac_ros.link.steering import (
     CapacityReport,
@@ -20,5 +20,5 @@ from rhs_isac_ros.link.steering import (
 
 __all__ = [
     'Beam', 'BeamPattern', 'CapacityReport', 'Choice', 'actual_capacity', 'applied_beam',
-    'beam_pattern', 'capacity', 'capacity_report', 'choose_beam', 'expected_capacity',
+    'beam_pattern', 'capacity', 'capacity_report', 'choose_beam', 'expected_capacities',
     'prepare_steering', 'steer']

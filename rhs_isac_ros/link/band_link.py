@@ -9,7 +9,7 @@ import numpy as np
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.geometry import element_positions, feed_positions
-from rhs_isac_ros.model.los import los_gain_at
+from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import onboard_matrix
@@ -21,7 +21,7 @@ _MIN_GAIN = 1e-300
 def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
     """Divide power [W] among channels so that the sum of log(1 + gain * share) is highest.
 
-    The gains are relative to noise, float64 [..., N] [1/W]; each row is a problem of its own. The
+    The gains are relative to noise, float64 [..., N] [1/W]; each row is a separate problem. The
     shares, float64 [..., N] [W], are not negative, and those of a row have the sum `power_w`. If
     no gain of a row is positive, its shares are equal.
     """
@@ -89,7 +89,8 @@ class BandLink:
         Raise ValueError if the position is not a finite [3] array.
         """
         onboard, fixed = arrays(scenario, surface)
-        los = los_gain_at(scenario, position, [bands] if isinstance(bands, int) else bands)
+        listed, place = np.atleast_1d(bands).tolist(), np.asarray(position)[None]
+        los = np.concatenate([los_gain(scenario, place, band) for band in listed])
         if isinstance(bands, int):
             los = los[0]
         index = band_index(bands)

@@ -67,7 +67,7 @@ def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray)
 @one_blas_thread
 def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray,
                     blocked: np.ndarray | None = None) -> np.ndarray:
-    """Compute the capacity on the paths of a channel file; without one, that of `capacity`.
+    """Compute the capacity on the paths of a channel file, or `capacity` if there is no file.
 
     With a channel file, `blocked`, bool [N], marks the users without line of sight.
     """
@@ -79,25 +79,19 @@ def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray,
 
 
 @one_blas_thread
-def expected_capacity(
-        scenario: Scenario, beam: Beam, mean: np.ndarray, covariance: np.ndarray) -> float:
-    """Average Eq. (10) [bit/s] over a Gaussian posterior of the user's position.
+def expected_capacities(
+        scenario: Scenario, beams: Sequence[Beam], mean: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
+    """Average Eq. (10) of n beams over a Gaussian posterior of the position, float64 [n] [bit/s].
 
     The posterior has a mean, float64 [3] [m], and a covariance, float64 [3, 3] [m^2].
 
     Raises
     ------
     ValueError
-        If `mean` or `covariance` has a wrong shape or is not finite, or the beam does not fit the
+        If `mean` or `covariance` has a wrong shape or is not finite, or a beam does not fit the
         scenario.
     """
-    return float(expected_capacities(scenario, [beam], mean, covariance)[0])
-
-
-def expected_capacities(
-        scenario: Scenario, beams: Sequence[Beam], mean: np.ndarray, covariance: np.ndarray
-) -> np.ndarray:
-    """Compute `expected_capacity` for several beams, float64 [n] [bit/s]."""
     points, weights = posterior_points(scenario, mean, covariance)
     # One product for each beam, so that the others do not affect its rounding.
     return np.array([weights @ rates for rates in capacities(scenario, beams, points)])

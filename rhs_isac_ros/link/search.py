@@ -1,4 +1,4 @@
-"""Search for configurations from which to start an ascent, for all bands at a time."""
+"""Search for the configurations from which an ascent starts, in all bands at once."""
 
 import functools
 from typing import NamedTuple
@@ -229,7 +229,7 @@ class _Waves(NamedTuple):
     @classmethod
     def at(cls, paths: np.ndarray, analog: np.ndarray,
            on_board: np.ndarray | None = None) -> '_Waves':
-        """Improve waves on the board by a power step, or take those for the line of sight."""
+        """Improve waves on the board by a power step, or begin with those of the direct path."""
         n_bands, n_elements, *shape = paths.shape
         channels = (analog @ paths.reshape(n_bands, n_elements, -1).view(np.float32)).view(
             np.complex64).reshape(n_bands, -1, *shape)

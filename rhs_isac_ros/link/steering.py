@@ -182,7 +182,7 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
 def steer_bands(
         scenario: Scenario, position: np.ndarray, bands: Sequence[int],
         surface: SurfaceEstimate | None = None) -> list[Beam]:
-    """Find the beams of `steer` for several bands, which takes hardly longer than for one."""
+    """Find the beams of `steer` for several bands, which takes little longer than for one."""
     if not len(bands):
         raise ValueError('bands: none, expected at least one')
     for band in bands:

@@ -26,7 +26,7 @@ def blocks(n: int, size: int) -> list[slice]:
 
 @functools.cache
 def gauss_legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights of a quadrature from -1 to 1; their computation takes long."""
+    """Return nodes and weights of a quadrature from -1 to 1, which are slow to compute."""
     nodes, weights = np.polynomial.legendre.leggauss(n)
     return read_only(nodes), read_only(weights)
 

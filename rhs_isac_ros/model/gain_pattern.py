@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rhs_isac_ros.model.arrays import digest
+from rhs_isac_ros.model.external import External
 from rhs_isac_ros.support import plugins
 
 # Callable that takes angles [rad], float64 of any shape, and returns float64 of that shape.
@@ -26,11 +27,10 @@ class PatternError(ValueError):
     """A gain pattern has a wrong shape or digest, or values that are negative or not finite."""
 
 
-class GainPattern:
+class GainPattern(External):
     """Amplitude gain that depends only on the angle from the boresight.
 
-    Patterns whose gains agree to seven digits are equal, even if they use different functions;
-    `digest`, 16 hexadecimal digits, identifies them in all processes.
+    Patterns whose gains agree to seven digits are equal, even if they use different functions.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class GainPattern:
         Derivative of `amplitude` [1/rad], a callable of the same form. The default, fourth-order
         finite differences, is accurate to ten digits where the pattern is smooth over a few
         degrees.
-    name
+    origin
         Name of the plug-in; empty for other functions.
 
     Raises
@@ -50,9 +50,11 @@ class GainPattern:
         If a function fails, or returns another shape or values that are not real or out of range.
     """
 
+    WORDS = 'a function', f'a number or the name of a plug-in of {plugins.GAIN_PATTERNS}'
+
     def __init__(self, amplitude: AngleFunction, slope: AngleFunction | None = None,
-                 name: str = '') -> None:
-        self._amplitude, self._slope, self.name = amplitude, slope, name
+                 origin: str = '') -> None:
+        self._amplitude, self._slope, self.origin = amplitude, slope, origin
         gains = self.amplitude(_ANGLES)
         valid = (gains >= 0) & (gains <= _MAX_GAIN)
         if not valid.all():
@@ -81,45 +83,19 @@ class GainPattern:
         return (8 * (gain(1) - gain(-1)) - (gain(2) - gain(-2))) / (12 * _STEP_RAD)
 
     @classmethod
-    def named(cls, text: str) -> 'GainPattern':
-        """Load the pattern of a plug-in.
+    def load(cls, origin: str) -> 'GainPattern':
+        """Load the pattern of a plug-in, an entry point of `plugins.GAIN_PATTERNS`.
 
-        Takes the name of an entry point of `plugins.GAIN_PATTERNS`, optionally with ``@`` and the
-        digest that the pattern must have. Raises PatternError or PluginError if there is no such
-        pattern.
+        Raises PatternError or PluginError if there is no valid pattern of this name.
         """
-        name, _, expected = text.partition('@')
-        if not name:
-            raise PatternError(
-                f'{text!r}: a function that is not a plug-in, expected a number or the name of a '
-                f'plug-in of {plugins.GAIN_PATTERNS}')
-        source = plugins.load(plugins.GAIN_PATTERNS, name)
-        origin = plugins.describe(plugins.GAIN_PATTERNS, name)
+        source = plugins.load(plugins.GAIN_PATTERNS, origin)
         try:
-            pattern = (cls(source._amplitude, source._slope, name)
-                       if isinstance(source, GainPattern) else cls(source, name=name))
+            if isinstance(source, GainPattern):
+                return cls(source._amplitude, source._slope, origin)
+            return cls(source, origin=origin)
         except PatternError as error:
-            raise PatternError(f'{origin}: {error}') from None
-        if expected and pattern.digest != expected:
-            raise PatternError(f'{origin}: digest {pattern.digest}, expected {expected}: the '
-                               'pattern has changed')
-        return pattern
-
-    def __str__(self) -> str:
-        """Return name and digest in the form that `named` reads."""
-        return f'{self.name}@{self.digest}'
-
-    def __repr__(self) -> str:
-        """Return a description that is the same in all processes."""
-        return f'GainPattern({str(self)!r})'
-
-    def __eq__(self, other: object) -> bool:
-        """Return whether the gains are the same."""
-        return isinstance(other, GainPattern) and self.digest == other.digest
-
-    def __hash__(self) -> int:
-        """Hash the gains."""
-        return hash(self.digest)
+            raise PatternError(
+                f'{plugins.describe(plugins.GAIN_PATTERNS, origin)}: {error}') from None
 
 
 def _evaluate(function: AngleFunction, angles: np.ndarray) -> np.ndarray:

@@ -1,4 +1,8 @@
-"""Positions of the elements and feeds, and centre frequencies of the sub-bands."""
+"""Positions of the elements and feeds, frequencies of the sub-bands, and polar coordinates.
+
+The polar coordinates q = (r, u, v) of a position are its range and two direction cosines: it lies
+at r (w, u, v) with w = sqrt(1 - u^2 - v^2), in front of the surface.
+"""
 
 import functools
 
@@ -6,6 +10,9 @@ import numpy as np
 
 from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
+
+# A region thinner than this, in wavelengths, determines the coordinate.
+_NO_EXTENT = 1e-5
 
 
 def mean_wavelength_m(scenario: Scenario) -> float:
@@ -52,3 +59,61 @@ def subband_frequencies_hz(scenario: Scenario) -> np.ndarray:
     centers = np.array(scenario.center_frequencies_hz)[:, None]
     offsets = np.arange(scenario.n_subbands) - (scenario.n_subbands - 1) / 2
     return read_only(centers + offsets * scenario.subband_width_hz)
+
+
+def to_positions(points: np.ndarray) -> np.ndarray:
+    """Convert points (r [m], u, v), float64 [..., 3], to positions, float64 [..., 3] [m].
+
+    Directions outside the unit circle have x = 0.
+    """
+    distance, u, v = points[..., 0], points[..., 1], points[..., 2]
+    positions = np.empty_like(points, dtype=float)
+    positions[..., 0] = np.sqrt(np.maximum(1 - u**2 - v**2, 0.0))
+    positions[..., 1:] = points[..., 1:]
+    positions *= distance[..., None]
+    return positions
+
+
+def to_polar(positions: np.ndarray) -> np.ndarray:
+    """Convert positions with x > 0, float64 [..., 3] [m], to (r [m], u, v), float64 [..., 3]."""
+    points = np.empty(positions.shape)
+    points[..., 0] = np.sqrt(np.sum(positions**2, axis=-1))
+    points[..., 1:] = positions[..., 1:] / points[..., :1]
+    return points
+
+
+def jacobian(points: np.ndarray) -> np.ndarray:
+    """Compute dp/dq at points (r [m], u, v), float64 [N, 3].
+
+    The result is float64 [N, 3, 3], with the coordinates of the position in rows.
+    """
+    distance, u, v = points.T
+    w = np.sqrt(np.maximum(1 - u**2 - v**2, 1e-9))
+    matrix = np.zeros((len(points), 3, 3))
+    matrix[:, 0, 0], matrix[:, 1, 0], matrix[:, 2, 0] = w, u, v
+    matrix[:, 0, 1], matrix[:, 0, 2] = -distance * u / w, -distance * v / w
+    matrix[:, 1, 1] = matrix[:, 2, 2] = distance
+    return matrix
+
+
+def polar_bounds(bounds: np.ndarray) -> np.ndarray:
+    """Compute lower and upper limits of (r [m], u, v) between bounds of positions, [2, 3]."""
+    nearest, farthest = np.clip(0.0, *bounds), np.abs(bounds).max(axis=0)
+    limits = np.empty((2, 3))
+    limits[:, 0] = np.linalg.norm(nearest), np.linalg.norm(farthest)
+    for axis in (1, 2):
+        # A cosine is the largest where the other coordinates are the smallest, if it is positive.
+        for side, bound in enumerate(bounds[:, axis]):
+            outward = bound > 0 if side else bound < 0
+            others = np.delete(nearest if outward else farthest, axis)
+            limits[side, axis] = bound / np.hypot(bound, np.linalg.norm(others))
+    return limits
+
+
+def region_information(scenario: Scenario) -> np.ndarray:
+    """Return the information of a Gaussian as wide as the region, float64 [3, 3] [1/m^2].
+
+    Its covariance is that of the uniform distribution, size^2 / 12.
+    """
+    shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
+    return np.diag(12 / np.maximum(scenario.roi_size_m, _NO_EXTENT * shortest)**2)

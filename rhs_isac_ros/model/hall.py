@@ -2,10 +2,10 @@
 
 A survey measures the covariance. Gains g of the elements in all measurements of a band are
 Gaussian with the covariance C_0 that three fields of the scenario declare. A survey with the
-radiation matrix T replaces the covariance L_0 of its signals T g + noise by a measured one, L, and
-leaves the distribution of g given these signals as it is. Of all covariances whose signals have
-the covariance L, the following one of g is then the closest to C_0 in the sense of Kullback and
-Leibler, apart from the noise:
+radiation matrix T replaces the covariance L_0 of its signals T g + noise with a measured one, L,
+and keeps the distribution of g given these signals. Among all covariances of g for which the
+signals have the covariance L, the result has the smallest Kullback-Leibler divergence from C_0,
+apart from the noise:
 
     C = C_0 + C_0 T^H M T C_0    with    M = L_0^-1 (L - L_0) L_0^-1.
 
@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.model.arrays import check_arrays, read_only
+from rhs_isac_ros.model.external import ArrayFile
 from rhs_isac_ros.support.files import (
     ArchiveError,
-    ArrayFile,
     read_archive,
     read_arrays,
     write_archive,
@@ -69,14 +69,12 @@ class MultipathEstimate(ArrayFile):
     excess
         M_i, complex128 [N_B, N_SB F, N_SB F] [1/W].
     conditions
-        Fields of the scenario of the survey on which it depends.
+        Fields of the survey's scenario on which the covariance depends.
     about
         How it was made: ``positions``, their number; ``prior_weight`` nu, ``inflation`` t and
         ``level_std_db``, the standard deviation of the power among users [dB];
         ``coverage``, the expected share of positions in the 95 % region, with its interval;
         ``warnings``; ``codebook``, its id; ``version``.
-    path
-        File from which it was read.
 
     Raises
     ------
@@ -91,7 +89,7 @@ class MultipathEstimate(ArrayFile):
     excess: np.ndarray
     conditions: dict[str, Any]
     about: dict[str, Any] = dataclasses.field(default_factory=dict)
-    path: str = ''
+    origin: str = ''
 
     def __post_init__(self) -> None:
         """Check sizes and numbers, and make the arrays read-only."""
@@ -142,7 +140,7 @@ class MultipathEstimate(ArrayFile):
             content: dict[str, Any] = {name: float(about[name]) for name in FIELDS}
             content |= {name: array.astype(complex) for name, array in arrays.items()}
             content |= {name: dict(about[name]) for name in ('conditions', 'about')}
-            return cls(**content, path=str(path))
+            return cls(**content, origin=str(path))
         except (KeyError, TypeError, ValueError) as error:
             raise ArchiveError(f'{path}: {error}') from None
 
@@ -169,8 +167,6 @@ class PathChannel(ArrayFile):
     gains
         Factors of the paths at each element, complex128 [N, P, N_E], for objects that only a part
         of the surface sees; None if all are 1.
-    path
-        File from which the paths were read.
 
     Raises
     ------
@@ -184,7 +180,7 @@ class PathChannel(ArrayFile):
     n: np.ndarray
     f0: float
     gains: np.ndarray | None = None
-    path: str = ''
+    origin: str = ''
 
     def __post_init__(self) -> None:
         """Check sizes and numbers, and make the arrays read-only."""
@@ -314,6 +310,6 @@ class PathChannel(ArrayFile):
                     raise ArchiveError(f'{name}: missing, expected an array of this name')
             content: dict[str, Any] = {
                 name: arrays[name].astype(kind) for name, kind in _TYPES.items() if name in arrays}
-            return cls(**content | {'f0': float(arrays['f0'])}, path=str(path))
+            return cls(**content | {'f0': float(arrays['f0'])}, origin=str(path))
         except (TypeError, ValueError) as error:
             raise ArchiveError(f'{path}: {error}') from None

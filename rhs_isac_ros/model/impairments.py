@@ -33,7 +33,7 @@ _NEPERS_PER_DB = np.log(10) / 20
 
 
 class Scope(enum.Enum):
-    """How long the value of an impairment lasts."""
+    """How often the value of an impairment is drawn anew."""
 
     USER = 'user'
     CYCLE = 'cycle'

@@ -56,13 +56,6 @@ def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
     return total
 
 
-def los_gain_at(scenario: Scenario, position: np.ndarray, bands: Sequence[int]) -> np.ndarray:
-    """Compute `los_gain` at one position [3] [m] in n bands, complex128 [n, N_SB, N_E]."""
-    offsets, distances = _separation(scenario, np.asarray(position)[None])
-    amplitude = _amplitude(scenario, offsets)
-    return np.concatenate([_gain(scenario, distances, band, amplitude) for band in bands])
-
-
 def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
              weights: np.ndarray) -> np.ndarray:
     """Sum the gains of `los_gain` over the elements in n bands, complex128 [n, N, N_SB].
@@ -87,18 +80,13 @@ def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
     return sums
 
 
-def los_derivative(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
-    """Compute the derivative of the line-of-sight gains, complex128 [N, 3, N_SB, N_E] [1/m].
-
-    This is the H-dot of Eq. (13): dh/dp_u = h (-i 2 pi f / v_0 - 1 / d) (p - p_m)_u / d. A gain
-    pattern adds a term for the change of the gain with the angle from the boresight.
-    """
-    return los_and_derivative(scenario, positions, band)[1]
-
-
 def los_and_derivative(
         scenario: Scenario, positions: np.ndarray, band: int) -> tuple[np.ndarray, np.ndarray]:
-    """Compute `los_gain` and `los_derivative` together, as fast as the derivative alone."""
+    """Compute `los_gain` and its derivative, complex128 [N, 3, N_SB, N_E] [1/m].
+
+    The derivative is the H-dot of Eq. (13): dh/dp_u = h (-i 2 pi f / v_0 - 1 / d) (p - p_m)_u / d.
+    A gain pattern adds a term for the change of the gain with the angle from the boresight.
+    """
     gain, radial, boresight_term = los_derivative_terms(scenario, positions, band)
     offsets = np.moveaxis(_separation(scenario, positions)[0], 2, 1)
     derivative = radial[:, None] * offsets[:, :, None, :]

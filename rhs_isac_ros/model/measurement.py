@@ -25,7 +25,6 @@ from rhs_isac_ros.model.los import (
     constant_gain,
     direct_gain,
     draw_blocked,
-    los_derivative,
     los_derivative_terms,
     los_gain,
 )
@@ -144,20 +143,6 @@ def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
     return scattered_covariance(scenario, radiation) + noise
 
 
-def mean_derivative(slopes: np.ndarray, radiation: np.ndarray) -> np.ndarray:
-    """Implements Eq. (13). Derivative of one band's mean signal with respect to the position.
-
-    Takes the derivative of the line-of-sight gains, complex128 [N, 3, N_SB, N_E] [1/m], and T_i of
-    the band, complex128 [N_SB F, N_E]. Returns complex128 [N, 3, N_SB F] [1/m], sub-band-major.
-    """
-    n, n_rows, n_subbands, n_elements = slopes.shape
-    frames = radiation.reshape(n_subbands, -1, n_elements)
-    # One matrix product per sub-band: [G N, N_E] with [N_E, F].
-    stacked = np.moveaxis(slopes, 2, 0).reshape(n_subbands, n_rows * n, n_elements)
-    products = np.matmul(stacked, np.swapaxes(frames, 1, 2))
-    return np.moveaxis(products, 0, 1).reshape(n, n_rows, -1)
-
-
 def position_blocks(scenario: Scenario, n: int) -> list[slice]:
     """Split n positions into blocks whose line-of-sight gains need little memory."""
     return blocks(
@@ -263,30 +248,17 @@ class MeasurementModel:
             los = los_gain(self.scenario, positions, band)
             return received_signal(los, 0.0, self.radiation[band], 0.0)
 
-        return self._of_bands(positions, (), of_band)
+        return self._of_bands(positions, of_band)
 
-    def band_jacobian(self, positions: np.ndarray, band: int) -> np.ndarray:
-        """Compute the derivative of one band's mean signals, complex128 [N, 3, N_SB F] [1/m].
-
-        All positions are evaluated at once, with memory for [N, 3, N_SB, N_E] numbers.
-        """
-        slopes = los_derivative(self.scenario, positions, band)
-        return mean_derivative(slopes, self.radiation[band])
-
-    def jacobian(self, positions: np.ndarray) -> np.ndarray:
-        """Compute the derivative of the mean signals, complex128 [N, 3, N_B, N_SB F] [1/m]."""
-        return self._of_bands(
-            positions, (3,), lambda positions, _, band: self.band_jacobian(positions, band))
-
-    def _of_bands(self, positions: np.ndarray, rows: tuple[int, ...],
+    def _of_bands(self, positions: np.ndarray,
                   of_band: Callable[[np.ndarray, slice, int], np.ndarray]) -> np.ndarray:
-        """Evaluate a function of positions, block and band, [N, *rows, N_B, N_SB F]."""
+        """Evaluate a function of positions, block and band, complex128 [N, N_B, N_SB F]."""
         positions = checked_positions(positions)
-        result = np.empty((len(positions), *rows, *self.shape), complex)
+        result = np.empty((len(positions), *self.shape), complex)
 
         def fill(block: slice) -> None:
             for band in range(len(self.radiation)):
-                result[block, ..., band, :] = of_band(positions[block], block, band)
+                result[block, band] = of_band(positions[block], block, band)
 
         map_blocks(fill, position_blocks(self.scenario, len(positions)))
         return result
@@ -294,10 +266,11 @@ class MeasurementModel:
     def mean_and_jacobian(
             self, positions: np.ndarray, by_coordinate: np.ndarray | None = None, *,
             whitened: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Compute `mean` and `jacobian` together, much faster, but with different rounding.
+        """Compute the mean and its derivative, complex128 [N, 3, N_B, N_SB F] [1/m]: Eq. (13).
 
-        Both may be `whitened`. With derivatives of the positions with respect to Q other
-        coordinates, float64 [N, 3, Q], the derivatives of the mean are with respect to these.
+        The mean is that of `mean`, computed faster and with different rounding. Both results may
+        be `whitened`. With derivatives of the positions with respect to Q other coordinates,
+        float64 [N, 3, Q], the derivatives of the mean are with respect to these.
         """
         positions, weights = checked_positions(positions), self._weights
         n, (n_bands, n_rows) = len(positions), self.shape
@@ -334,8 +307,8 @@ class MeasurementModel:
 
         Multipath and noise are drawn together, with the covariance Lambda_i. `simulate_received`
         draws the gain of every element instead; the distribution is the same, but the call takes
-        a hundred times as long. Impairments that the scenario declares are drawn as described
-        there, and so are the signals of a channel file.
+        a hundred times as long. As there, impairments that the scenario declares are drawn too,
+        and the paths of a channel file replace direct path and random multipath.
         """
         scenario = self.scenario
         surface, factors = draw_impairments(scenario, len(positions), rng)
@@ -348,7 +321,7 @@ class MeasurementModel:
             los = direct_gain(scenario, positions, band, blocked[block])
             return received_signal(los, 0.0, model.radiation[band], 0.0)
 
-        signals = model._of_bands(positions, (), of_band)
+        signals = model._of_bands(positions, of_band)
         if not scenario.channel:
             white = complex_normal(signals.shape, rng)
             # Factors act on the multipath, but not on the noise.
@@ -367,7 +340,7 @@ class MeasurementModel:
 
 
 class ElementSums:
-    """Weights of the elements for the mean signals and their derivative.
+    """Implements Eq. (13). Sums over the elements for the mean signals and their derivative.
 
     Each sum over elements of a T_i (p - p_m) is p times the sum of a T_i, minus the sum of
     a T_i p_m: sums of N_E terms that need no array of N_E by 3. `block` is the number of positions

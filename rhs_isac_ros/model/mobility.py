@@ -156,9 +156,9 @@ class RandomWalk(StraightMobility):
 
 
 class Traced:
-    """User of a channel file who is nearest to the position of another mobility.
+    """The user of a channel file who is nearest to the position of another mobility.
 
-    The velocity is the one of the other mobility.
+    The velocity is that of the other mobility.
     """
 
     def __init__(self, mobility: Mobility, channel: PathChannel) -> None:

@@ -1,8 +1,7 @@
 """Multipath: spatial covariance, correlation over sub-bands and frames, random gains.
 
 Indices of bands, sub-bands and frames start at 0. Bands are independent. Fields of a scenario
-declare the covariance of the gains; a measured one adds a term of the rank of its measurements to
-it, see `hall`.
+declare the covariance of the gains; a measured covariance adds a term of low rank, see `hall`.
 """
 
 import dataclasses
@@ -32,7 +31,7 @@ _ROI_NODES = 24
 
 
 def multipath_covariance(scenario: Scenario) -> np.ndarray:
-    """Implements Eq. (2). Covariance of the multipath gains of the elements that fields declare.
+    """Implements Eq. (2). Covariance of the multipath gains, as the fields declare it.
 
     The power-angle profile is a product of two Laplacians of `angular_spread_deg` about
     `multipath_direction_deg`, normalised over the half space in front of the surface, weighted by
@@ -140,7 +139,7 @@ def spatial_covariance(scenario: Scenario) -> SpatialCovariance:
 
 @functools.lru_cache(maxsize=16)
 def declared_covariance(scenario: Scenario) -> SpatialCovariance:
-    """Return V_i of all bands as fields declare it, the same in all measurements."""
+    """Return V_i of all bands as the fields declare it; it is the same in all measurements."""
     lattice, shape = _lattice(scenario), (scenario.n_rows, scenario.n_columns)
     is_real = not lattice.imag.any()
     power = np.repeat(lattice[:, shape[0] - 1, shape[1] - 1, None].real, scenario.n_elements, 1)
@@ -207,8 +206,8 @@ def _plane_waves(
 ) -> Iterator[_PlaneWaves]:
     """Yield the waves of a quadrature over the profile, some elevations at a time.
 
-    Of an even profile in azimuth or elevation, only the positive angles are needed. The number of
-    elevations leaves memory for `n_draws` amplitudes of each wave.
+    If the profile is even in azimuth or elevation, only its positive angles are needed. The number
+    of elevations leaves memory for `n_draws` amplitudes of each wave.
     """
     wavenumber = 2 * np.pi * scenario.center_frequencies_hz[band] / SPEED_OF_LIGHT_MPS
     columns, rows = (np.arange(n) * element_interval_m(scenario)
@@ -316,7 +315,7 @@ def coupling(scenario: Scenario, radiation: np.ndarray, other: np.ndarray) -> np
 
 
 def scattered_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
-    """Compute the covariance of the multipath in the received signals, as `signal_covariance`."""
+    """Compute the multipath part of `signal_covariance`."""
     covariance = coupling(scenario, radiation, radiation)
     if measured := scenario.multipath:
         to_survey = coupling(scenario, radiation, measured.radiation)
@@ -407,8 +406,8 @@ def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase
                         ) -> tuple[np.ndarray, np.ndarray]:
     """Angles [n] and weights [n] of the Laplacian profile, normalised to a sum of one.
 
-    The phase [rad] over the elements determines the number. Of an even profile, only the positive
-    angles are included.
+    The number of angles depends on the phase [rad] over the elements. If the profile is even, only
+    its positive angles are included.
     """
     nodes, weights = gauss_legendre(_ANGLE_NODES)
     mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)

@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.model.arrays import read_only
-from rhs_isac_ros.model.gain_pattern import GainPattern, PatternError
+from rhs_isac_ros.model.external import ArrayFile, External
+from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.hall import SPEED_OF_LIGHT_MPS as SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.hall import MultipathEstimate, PathChannel
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.fields import Field
-from rhs_isac_ros.support.files import ArchiveError, ArrayFile, read_yaml
+from rhs_isac_ros.support.files import read_yaml
 from rhs_isac_ros.support.plugins import PluginError
 
 # Relative rounding of differences between frequencies.
@@ -196,8 +197,11 @@ class Extensions:
         '', label='channel')
 
 
-# Fields whose values are files of arrays.
-_FILES: dict[str, type[ArrayFile]] = {'multipath': MultipathEstimate, 'channel': PathChannel}
+# Fields whose values come from outside, and those among them that are files.
+_EXTERNAL: dict[str, type[External]] = {
+    'element_gain': GainPattern, 'user_gain': GainPattern, 'multipath': MultipathEstimate,
+    'channel': PathChannel}
+_FILES = [name for name, kind in _EXTERNAL.items() if issubclass(kind, ArrayFile)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -366,7 +370,7 @@ def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) 
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, GainPattern | ArrayFile | str):
+    if isinstance(value, External | str):
         return str(value)
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
 
@@ -377,12 +381,10 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
     if name == 'feed_positions_m':
         return None if value is None else tuple(
             _numbers(field, row, 3) for row in _entries(field, value, '[x, y, z]'))
-    if name in ('element_gain', 'user_gain'):
-        return _gain(field, value)
     if name == 'impairments':
         return _strengths(field, value)
-    if name in _FILES:
-        return _arrays(field, value)
+    if name in _FILES or name in _EXTERNAL and not _is_number(value):
+        return _external(field, value, _EXTERNAL[name])
     if name == 'elements_per_side' and isinstance(value, list | tuple | np.ndarray):
         if len(value) != 2:
             raise ScenarioError(f'{name}: {value!r}, expected an integer or two')
@@ -407,27 +409,17 @@ def _number(field: dataclasses.Field[Any], value: Any) -> Any:
     return value
 
 
-def _gain(field: dataclasses.Field[Any], value: Any) -> float | GainPattern:
-    try:
-        if isinstance(value, GainPattern) or callable(value):
-            return value if isinstance(value, GainPattern) else GainPattern(value)
-        if isinstance(value, str) and not _is_number(value):
-            return GainPattern.named(value)
-    except (PatternError, PluginError) as error:
-        raise ScenarioError(f'{field.name}: {error}') from None
-    return _number(field, value)
-
-
-def _arrays(field: dataclasses.Field[Any], value: Any) -> ArrayFile | None:
-    kind = _FILES[field.name]
-    if value is None or isinstance(value, kind):
+def _external(field: dataclasses.Field[Any], value: Any, kind: type[External]) -> Any:
+    if isinstance(value, kind) or value is None and field.default is None:
         return value
-    if not isinstance(value, str | Path):
-        raise ScenarioError(f'{field.name}: {value!r}, expected the path of a file, or null')
     try:
-        return kind.named(str(value))
-    except ArchiveError as error:
+        if isinstance(value, str | Path):
+            return kind.named(str(value))
+        if kind is GainPattern and callable(value):
+            return GainPattern(value)
+    except ValueError as error:
         raise ScenarioError(f'{field.name}: {error}') from None
+    raise ScenarioError(f'{field.name}: {value!r}, expected {kind.WORDS[1]}')
 
 
 def _strengths(field: dataclasses.Field[Any], value: Any) -> tuple[tuple[str, float], ...]:
@@ -446,10 +438,10 @@ def _strengths(field: dataclasses.Field[Any], value: Any) -> tuple[tuple[str, fl
     return tuple(pair for pair in checked_pairs if pair[1])
 
 
-def _is_number(text: str) -> bool:
+def _is_number(value: Any) -> bool:
     try:
-        float(text)
-    except ValueError:
+        float(value)
+    except (TypeError, ValueError):
         return False
     return True
 

@@ -10,46 +10,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
+from rhs_isac_ros.model.geometry import jacobian as jacobian
+from rhs_isac_ros.model.geometry import to_polar as to_polar
+from rhs_isac_ros.model.geometry import to_positions as to_positions
 
 # Alternating projections onto the region and onto a sphere.
 _N_PROJECTIONS = 4
 # A named tuple of arrays with equal first dimensions.
 _Rows = TypeVar('_Rows', bound=tuple[np.ndarray, ...])
-
-
-def to_positions(points: np.ndarray) -> np.ndarray:
-    """Convert points (r [m], u, v), float64 [..., 3], to positions, float64 [..., 3] [m].
-
-    Directions outside the unit circle have x = 0.
-    """
-    distance, u, v = points[..., 0], points[..., 1], points[..., 2]
-    positions = np.empty_like(points, dtype=float)
-    positions[..., 0] = np.sqrt(np.maximum(1 - u**2 - v**2, 0.0))
-    positions[..., 1:] = points[..., 1:]
-    positions *= distance[..., None]
-    return positions
-
-
-def to_polar(positions: np.ndarray) -> np.ndarray:
-    """Convert positions with x > 0, float64 [..., 3] [m], to (r [m], u, v), float64 [..., 3]."""
-    points = np.empty(positions.shape)
-    points[..., 0] = np.sqrt(np.sum(positions**2, axis=-1))
-    points[..., 1:] = positions[..., 1:] / points[..., :1]
-    return points
-
-
-def jacobian(points: np.ndarray) -> np.ndarray:
-    """Compute dp/dq at points (r [m], u, v), float64 [N, 3].
-
-    The result is float64 [N, 3, 3], with the coordinates of the position in rows.
-    """
-    distance, u, v = points.T
-    w = np.sqrt(np.maximum(1 - u**2 - v**2, 1e-9))
-    matrix = np.zeros((len(points), 3, 3))
-    matrix[:, 0, 0], matrix[:, 1, 0], matrix[:, 2, 0] = w, u, v
-    matrix[:, 0, 1], matrix[:, 0, 2] = -distance * u / w, -distance * v / w
-    matrix[:, 1, 1] = matrix[:, 2, 2] = distance
-    return matrix
 
 
 def carrier_wavenumbers(scenario: Scenario) -> np.ndarray:

@@ -203,7 +203,8 @@ class SearchEstimator(abc.ABC):
     def _fit(self, modes: Modes, signals: Signals, rows: list[int]) -> Iterator[_Fit]:
         """Yield the posterior of each phase in `rows`, ascending, from its modes."""
         likelihood = self._likelihood
-        conditionals: dict[int, Sequence[Conditional]] = dict.fromkeys(rows, [likelihood])
+        conditionals: dict[int, Sequence[Conditional]] = dict.fromkeys(
+            rows, [self._dispersed or likelihood])
         if self._dispersed:
             modes = ascend(self._dispersed, likelihood, modes.starts(), signals, 1, np.inf)
         if self._failures:

@@ -8,12 +8,13 @@ probable sets, one at a time.
 A failed element is stuck at an amplitude that is uniform in [0, 1]. With its amplitude treated as
 Gaussian, of mean 1/2 and variance 1/12, the signals are Gaussian. The amplitude is one more
 unknown of the direct path, in which the mean is linear; its variance adds to the covariance of the
-multipath.
+multipath. Errors of the elements have their average covariance in the search for sets, and the
+covariance at each point in the likelihood of a set.
 """
 
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -37,6 +38,7 @@ from rhs_isac_ros.positioning.likelihood import (
     Signals,
     assemble,
     log_determinant,
+    whiten_each,
 )
 from rhs_isac_ros.positioning.search import Modes, ascend, predict
 
@@ -215,16 +217,19 @@ class FailedSet:
     Its value includes the prior of the set, and is relative to the value of `Likelihood`.
     """
 
-    def __init__(self, likelihood: Likelihood, failed: Failed, whitening: Whitening,
-                 amplitudes: np.ndarray, log_prior: float) -> None:
+    def __init__(self, likelihood: Likelihood, failed: Failed, surface: Surface,
+                 whitening: Whitening, amplitudes: np.ndarray, log_prior: float,
+                 excess_at: Callable[[np.ndarray], np.ndarray] | None) -> None:
         self._likelihood, scenario = likelihood, likelihood.scenario
+        self._covariance, self._excess_at = surface.covariance, excess_at
         self._failed = list(failed)
         stuck = np.full(scenario.n_elements, np.nan)
         stuck[self._failed] = 0.5
         self._means = Means(MeasurementModel(
             scenario, likelihood.codebook, ElementErrors(np.ones(len(stuck)), stuck)))
         self._whitener, self._information = whitening.whitener[:, 0], whitening.information
-        self._offset = log_prior + likelihood.log_volume - whitening.log_volume[0]
+        self._log_volume = whitening.log_volume
+        self._offset = log_prior + likelihood.log_volume
         self._amplitudes = amplitudes[self._failed]
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
@@ -237,11 +242,15 @@ class FailedSet:
             for band in range(mean.shape[1])])
         amplitudes = np.moveaxis(gains, (0, 1, 2, 3), (2, 0, 3, 1)) * self._amplitudes
         columns = prior.columns(values, signals.received, mean, slopes, amplitudes)
-        white = np.einsum('irs,mcis->mcir', self._whitener, columns, optimize=True)
-        local = assemble(prior, values, white.reshape(*columns.shape[:2], -1),
-                         information_of_covariance=self._information,
+        if self._excess_at is None:
+            white = np.einsum('irs,mcis->mcir', self._whitener, columns, optimize=True)
+            white, log_volume = white.reshape(*columns.shape[:2], -1), self._log_volume
+        else:
+            roots = np.linalg.cholesky(self._covariance + self._excess_at(positions))
+            white, log_volume = whiten_each(roots, columns), log_determinant(roots).sum(axis=1)
+        local = assemble(prior, values, white, information_of_covariance=self._information,
                          n_linear=len(self._failed))
-        return local._replace(value=local.value + self._offset)
+        return local._replace(value=local.value + self._offset - log_volume)
 
 
 class FailureModel:
@@ -272,9 +281,14 @@ class FailureModel:
         cache = functools.lru_cache(maxsize=_MAX_SURFACES)
         self.surface = cache(self._surface)
         self._whitening = cache(lambda failed: self.surface(failed).whitening(likelihood.nuisance))
+        excess_at = None if self._model.elements.is_exact else self._excess_at
         self.failed_set = cache(lambda failed: FailedSet(
-            likelihood, failed, self._whitening(failed), self._amplitudes,
-            len(failed) * self._log_odds + self._log_intact))
+            likelihood, failed, self.surface(failed), self._whitening(failed), self._amplitudes,
+            len(failed) * self._log_odds + self._log_intact, excess_at))
+
+    def _excess_at(self, positions: np.ndarray) -> np.ndarray:
+        """Covariance of element errors at positions, less its average, [M, N_B, S, S]."""
+        return self._model.covariance_at(positions) - self._intact.covariance
 
     def _surface(self, failed: Failed) -> Surface:
         if not failed:

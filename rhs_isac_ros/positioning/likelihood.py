@@ -330,6 +330,15 @@ def log_determinant(roots: np.ndarray) -> np.ndarray:
     return 2 * np.log(np.diagonal(roots, axis1=-2, axis2=-1).real).sum(axis=-1)
 
 
+def whiten_each(roots: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Whiten the columns of M points, complex128 [M, C, N_B, N_SB F], with roots at each point.
+
+    Takes Cholesky factors, complex128 [M, N_B, N_SB F, N_SB F]; returns [M, C, N_B N_SB F].
+    """
+    white = np.linalg.solve(roots, np.moveaxis(columns, 1, 3))
+    return np.moveaxis(white, 3, 1).reshape(*columns.shape[:2], -1)
+
+
 class DispersedLikelihood:
     """The likelihood with the covariance of element errors at each position.
 
@@ -376,9 +385,8 @@ class DispersedLikelihood:
         columns = prior.columns(values, signals.received, *self._means(points))
         for roots, offset, information in zip(
                 self._roots_at(points), self._offsets, self._information, strict=True):
-            white = np.linalg.solve(roots, np.moveaxis(columns, 1, 3))
-            white = np.moveaxis(white, 3, 1).reshape(*columns.shape[:2], -1)
-            local = assemble(prior, values, white, information_of_covariance=information)
+            local = assemble(prior, values, whiten_each(roots, columns),
+                             information_of_covariance=information)
             volume = log_determinant(roots).sum(axis=1)
             states.append(local._replace(value=local.value + offset - volume))
         return _average_of(states)

@@ -1,12 +1,8 @@
 """Atomic writing of files, and files of arrays with a description."""
 
-import abc
 import contextlib
-import functools
-import hashlib
 import json
 import os
-import re
 import secrets
 import tempfile
 import zipfile
@@ -143,70 +139,3 @@ def read_archive(path: str | Path, kind: str, version: int, names: set[str]
         raise ArchiveError(
             f'{path}: not a {kind}, expected a {kind} file of format {version}')
     return arrays, about
-
-
-class ArrayFile(abc.ABC):
-    """Arrays of a file that take the place of a scenario field; equal if their contents are.
-
-    Attributes
-    ----------
-    path
-        File from which they were read; empty for others.
-    """
-
-    path: str
-
-    @abc.abstractmethod
-    def content(self) -> tuple[np.ndarray, ...]:
-        """Return the arrays that the digest covers."""
-
-    @abc.abstractmethod
-    def misfit(self, scenario: Any) -> str:
-        """Return why the arrays do not fit a scenario, from the field on; empty if they do."""
-
-    @classmethod
-    @abc.abstractmethod
-    def load(cls, path: str | Path) -> 'ArrayFile':
-        """Read the arrays; raise ArchiveError if the file is invalid."""
-
-    @classmethod
-    def named(cls, text: str) -> 'ArrayFile':
-        """Read a file by its path, optionally with ``@`` and the digest that it must have.
-
-        Raise ArchiveError if the file is invalid or the digest differs.
-        """
-        path, digest = re.fullmatch(  # type: ignore[union-attr]
-            r'(.*?)(?:@([0-9a-f]{16}))?', text, re.DOTALL).groups()
-        if not path:
-            raise ArchiveError(f'{text!r}: arrays without a file, expected the path of a file')
-        result = cls.load(path)
-        if digest and result.digest != digest:
-            raise ArchiveError(f'{path}: digest {result.digest}, expected {digest}: the file has '
-                               'changed')
-        return result
-
-    @functools.cached_property
-    def digest(self) -> str:
-        """16 hexadecimal digits that identify the content."""
-        digest = hashlib.sha256()
-        for array in self.content():
-            little = np.ascontiguousarray(array, array.dtype.newbyteorder('<'))
-            digest.update(f'{array.dtype.kind}{array.shape}'.encode())
-            digest.update(little.tobytes())
-        return digest.hexdigest()[:16]
-
-    def __str__(self) -> str:
-        """Return path and digest in the form that `named` reads."""
-        return f'{self.path}@{self.digest}'
-
-    def __repr__(self) -> str:
-        """Return a description that is the same in all processes."""
-        return f'{type(self).__name__}({self.digest!r})'
-
-    def __eq__(self, other: object) -> bool:
-        """Return whether the contents are the same."""
-        return isinstance(other, type(self)) and self.digest == other.digest
-
-    def __hash__(self) -> int:
-        """Hash the content."""
-        return hash(self.digest)

@@ -64,7 +64,8 @@ def evaluate(assumed: Scenario, name: str, change: dict[str, float], codebook: C
     rng = np.random.default_rng(options.seed)
     positions = assumed.sample_positions(options.positions, rng)
     true = dataclasses.replace(assumed, **change)
-    result = misspecified(assumed, true, codebook, positions)
+    result = misspecified(
+        MeasurementModel(assumed, codebook), MeasurementModel(true, codebook), positions)
     row = {'level_db': assumed.multipath_to_los_db, 'field': name, 'change': change,
            'valid': float(result.valid.mean())}
     text = '- | - | -'

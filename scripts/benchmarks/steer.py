@@ -24,7 +24,7 @@ from parts.sequential_steering import steer_sequentially
 from scipy.optimize import minimize
 
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, steer
+from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacities, steer
 from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.link.steering import steer_bands
 from rhs_isac_ros.model import Scenario, ScenarioError
@@ -83,8 +83,9 @@ def compare_times(scenario: Scenario, bands: Sequence[int], positions: np.ndarra
     """
     def plain(position: np.ndarray) -> None:
         for band in bands:
-            expected_capacity(
-                scenario, steer_sequentially(scenario, position, band), position, COVARIANCE_M2)
+            expected_capacities(
+                scenario, [steer_sequentially(scenario, position, band)], position,
+                COVARIANCE_M2)[0]
 
     calls = {
         'choice of the band': lambda position: choose_beam(

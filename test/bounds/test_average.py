@@ -130,16 +130,6 @@ def test_evaluations_do_not_affect_each_other(faded, items, loss, random_beams):
     assert_is(average(codebook), expected, 1e-14)
 
 
-def test_a_constant_loss_has_its_value_and_no_gradient(faded, items):
-    scenario, codebook = faded
-    value, by_analog, by_digital = make(
-        scenario, items, lambda block, forms: (np.full(len(forms), 2.5), np.zeros_like(forms))
-    )(codebook)
-    assert value == 2.5
-    np.testing.assert_array_equal(by_analog, 0)
-    np.testing.assert_array_equal(by_digital, 0)
-
-
 def test_the_loss_receives_every_item_once_and_in_order(faded, items, plain, monkeypatch):
     scenario, codebook = faded
     monkeypatch.setattr(rows, '_BLOCK', 3)
@@ -157,18 +147,6 @@ def test_the_loss_receives_every_item_once_and_in_order(faded, items, plain, mon
         evaluate(codebook)
         assert [n for numbers, _ in seen for n in numbers] == list(range(N_ITEMS))
         assert_is([np.concatenate([forms for _, forms in seen])], [expected], 1e-9)
-
-
-def test_rows_are_exact_unless_there_is_a_tolerance(faded, items, loss):
-    scenario, _ = faded
-    assert isinstance(make(scenario, items, loss).rows, rows.ExactRows)
-    assert isinstance(make(scenario, items, loss, 1e-3).rows, rows.CompressedRows)
-
-
-@pytest.mark.parametrize('tolerance', [rows.MIN_TOLERANCE / 2, -1.0, -0.1, np.nan])
-def test_an_average_with_a_tolerance_out_of_range_is_an_error(faded, items, loss, tolerance):
-    with pytest.raises(ValueError, match='^tolerance: .*, expected 1e-07 to 1, or 0 '):
-        make(faded[0], items, loss, tolerance)
 
 
 def assert_matches_vectors(outcome, vectors, tolerance=1e-8, value_tolerance=1e-8):
@@ -190,18 +168,6 @@ def test_bound_and_gradients_match_the_vectors(case):
     value = AverageCrlb(case.scenario, case.vectors['positions']).value(case.codebook)
     assert type(value) is float
     assert value == pytest.approx(float(case.vectors['average_crlb']), rel=1e-8)
-
-
-def test_evaluations_of_the_bound_are_repeatable(case):
-    average = AverageCrlb(case.scenario, case.vectors['positions'])
-    for _ in range(2):
-        assert_matches_vectors(average(case.codebook), case.vectors)
-
-
-def test_the_bound_does_not_depend_on_the_blocks(case, monkeypatch):
-    monkeypatch.setattr(rows, '_BLOCK', 4)
-    assert_matches_vectors(
-        average_crlb(case.scenario, case.codebook, case.vectors['positions']), case.vectors)
 
 
 @pytest.mark.parametrize('tolerance', [1e-7, 1e-6, 1e-5, 1e-4])
@@ -236,14 +202,6 @@ def test_gradients_are_the_limit_of_differences_of_plain_bounds(
     assert value == pytest.approx(bound(codebook.analog, codebook.digital), rel=1e-7)
     # The weights of a single feed have little effect compared with rounding in the bound.
     assert_gradients(gradients, bound, codebook, rng, slack=1e-6 * value)
-
-
-def test_the_bound_is_the_mean_over_the_positions(small):
-    """The vectors contain the bound of every position."""
-    average = AverageCrlb(small.scenario, small.vectors['positions'][[4, 1, 1]])
-    expected = small.vectors['crlb'][[4, 1, 1]].mean()
-    assert average(small.codebook).value == pytest.approx(expected, rel=1e-8)
-    assert average.value(small.codebook) == pytest.approx(expected, rel=1e-8)
 
 
 def test_the_bound_is_the_mean_of_the_bounds_of_many_positions(small):
@@ -283,12 +241,6 @@ def test_malformed_positions_are_errors(small, positions):
         average_crlb(small.scenario, small.codebook, np.array(positions))
     with pytest.raises(ValueError, match='^positions: .*, expected '):
         AverageCrlb(small.scenario, np.array(positions), 1e-3)
-
-
-@pytest.mark.parametrize('tolerance', [1e-8, -1e-3, np.nan])
-def test_a_bound_with_a_tolerance_out_of_range_is_an_error(small, tolerance):
-    with pytest.raises(ValueError, match='^tolerance: .*, expected 1e-07 to 1'):
-        AverageCrlb(small.scenario, small.vectors['positions'], tolerance)
 
 
 FACTORS = tuple(one.field for one in BUILT_IN)

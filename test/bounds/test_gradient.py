@@ -6,15 +6,10 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import AverageCrlb, crlb
-from rhs_isac_ros.bounds.average import gradient_analog, gradient_digital
 from rhs_isac_ros.model import MeasurementModel, MultipathEstimate, Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.hall import CONDITIONS, FIELDS
 from rhs_isac_ros.model.surface import AppliedBeams
-
-
-def complex_array(rng, *shape):
-    return rng.normal(size=(*shape, 2)) @ [1, 1j]
 
 
 @pytest.fixture(scope='module')
@@ -23,52 +18,6 @@ def odd(random_beams):
         center_frequencies_hz=(1.9e9, 3.3e9), n_subbands=3, n_frames=2, n_feeds=4,
         elements_per_side=3, subband_width_hz=2e7)
     return scenario, random_beams(scenario, np.random.default_rng(0))
-
-
-@pytest.fixture(scope='module')
-def distance(odd, plain):
-    """Callable that returns the sum of |T - A|^2 for random A, and its derivative by T.
-
-    It is quadratic in the analog and in the digital variables, so that central differences are
-    exact.
-    """
-    scenario, _ = odd
-    targets = 0.05 * complex_array(np.random.default_rng(1), 2, 6, 9)
-
-    def of(analog, digital):
-        p = plain(scenario, analog, digital)
-        offsets = np.stack([p.pattern(i) for i in range(2)]) - targets
-        return np.sum(np.abs(offsets)**2), 2 * offsets
-    return of
-
-
-def test_gradient_by_the_configurations_is_the_difference_quotient(odd, distance):
-    scenario, codebook = odd
-    analog, digital = codebook.analog, codebook.digital
-    gradient = gradient_analog(scenario, codebook, distance(analog, digital)[1])
-    assert (gradient.shape, gradient.dtype) == (analog.shape, float)
-    for index in ((0, 0, 0), (0, 1, 5), (1, 0, 3), (1, 1, 8)):
-        step = np.zeros_like(analog)
-        step[index] = 1.0
-        difference = distance(analog + step, digital)[0] - distance(analog - step, digital)[0]
-        assert gradient[index] == pytest.approx(
-            difference / 2, rel=1e-9, abs=1e-9 * np.abs(gradient).max())
-
-
-def test_gradient_by_the_digital_weights_is_the_difference_quotient(odd, distance):
-    scenario, codebook = odd
-    analog, digital = codebook.analog, codebook.digital
-    gradient = gradient_digital(scenario, codebook, distance(analog, digital)[1])
-    assert (gradient.shape, gradient.dtype) == (digital.shape, complex)
-    size = np.abs(digital).max()
-    for index in ((0, 0, 0, 0), (0, 2, 1, 3), (1, 1, 0, 2), (1, 2, 1, 1)):
-        for direction in (1, 1j):
-            step = np.zeros_like(digital)
-            step[index] = direction * size
-            difference = (distance(analog, digital + step)[0]
-                          - distance(analog, digital - step)[0])
-            assert (gradient[index].conj() * direction).real == pytest.approx(
-                difference / (2 * size), rel=1e-9, abs=1e-9 * np.abs(gradient).max())
 
 
 SCENARIO = Scenario(elements_per_side=4, n_feeds=2, element_error_rms=0.1)

@@ -126,6 +126,15 @@ def test_impairments_are_estimated_with_the_multipath(beams):
     assert errors[0] < 1.1 * errors[1]
 
 
+def test_users_with_a_random_phase_at_one_height(beams):
+    """The region has no extent along z, and the phase of a user is a nuisance parameter."""
+    declared, hall = (dataclasses.replace(
+        one, phase_std_rad=1.0, roi_size_m=(10.0, 10.0, 0.0)) for one in (DECLARED, HALL))
+    estimate = survey(declared, beams, *send(hall, beams, 40))
+    assert estimate.multipath_to_los_db == pytest.approx(-5, abs=2)
+    assert estimate.about['coverage'][0] > 0.9
+
+
 @pytest.mark.slow
 def test_a_calibrated_surface_takes_part(beams):
     """A gain of a band is not multipath if the surface explains it."""

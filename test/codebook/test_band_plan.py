@@ -12,7 +12,6 @@ from rhs_isac_ros.codebook.band_plan import (
     best_of,
     choose_bands,
     expected_error,
-    optimize_band_plan,
     raster,
     screen,
     with_bands,
@@ -90,10 +89,11 @@ def test_the_number_of_pilots_stays_the_same(small):
         four, center_frequencies_hz=small.center_frequencies_hz, n_frames=4) == small
 
 
-def test_the_candidates_are_sorted_and_reported(small, short):
+def test_the_candidates_are_sorted_and_reported(small, short, monkeypatch):
+    monkeypatch.setattr(band_plan, '_CANDIDATES', 3)
     reported = []
     candidates = choose_bands(
-        small, SPECTRUM, 4, raster_hz=10e6, seed=1, n_candidates=3, report=reported.append)
+        small, SPECTRUM, 4, raster_hz=10e6, seed=1, report=reported.append)
     assert sorted(reported, key=lambda candidate: candidate.error_m2) == list(candidates)
     assert len({candidate.frequencies_hz for candidate in candidates}) == 3
     for one, other in itertools.combinations(candidates, 2):
@@ -111,13 +111,16 @@ def test_a_raster_with_few_plans_has_few_candidates(small, short):
 
 @pytest.mark.slow
 def test_the_result_has_the_lowest_expected_error_up_to_chance(small, short):
-    plan = optimize_band_plan(small, SPECTRUM, 2, raster_hz=25e6, seed=1, max_steps=2)
+    def search(world):
+        return optimize(world, objective='error', seed=1, max_steps=2)
+
+    candidates = choose_bands(small, SPECTRUM, 2, raster_hz=25e6, seed=1)
+    plan = best_of(small, candidates, search, 1)
     plan.result.codebook.check(plan.scenario)
     assert 'objective=error' in plan.result.codebook.provenance
     assert plan.error_m2 == expected_error(plan.scenario, plan.result.codebook, 1, 8)
     tried = []
-    again = best_of(small, plan.candidates, lambda world: optimize(
-        world, objective='error', seed=1, max_steps=2), 1, tried.append)
+    again = best_of(small, plan.candidates, search, 1, tried.append)
     least = plan.candidates[0].error_m2
     assert [candidate.frequencies_hz for candidate in tried] == [
         candidate.frequencies_hz for candidate in plan.candidates[:3]
@@ -129,8 +132,9 @@ def test_the_result_has_the_lowest_expected_error_up_to_chance(small, short):
     assert again.result.codebook.id == plan.result.codebook.id
 
 
-def test_an_interrupted_search_ends_with_the_best_plan_so_far(small, short):
-    candidates = choose_bands(small, SPECTRUM, 2, raster_hz=25e6, n_candidates=2)
+def test_an_interrupted_search_ends_with_the_best_plan_so_far(small, short, monkeypatch):
+    monkeypatch.setattr(band_plan, '_CANDIDATES', 2)
+    candidates = choose_bands(small, SPECTRUM, 2, raster_hz=25e6)
     results = [optimize(with_bands(small, candidate.frequencies_hz), max_steps=1)
                for candidate in candidates]
     interrupted = [dataclasses.replace(result, reason='interrupted') for result in results]
@@ -172,8 +176,7 @@ def test_unequal_spacing_pays_only_if_phases_are_known(
     (3, {}, '^bands: 3, expected a divisor of 8, '),
     (0, {}, '^bands: 0, '),
     (8, {'raster_hz': 100e6}, '^bands: 8 with gaps of 250000 Hz, .* 3 frequencies'),
-    (4, {'min_gap_hz': 80e6}, '^bands: 4 with gaps of 8e.07 Hz'),
-    (2, {'n_candidates': 0}, '^n_candidates: 0, ')])
+    (4, {'min_gap_hz': 80e6}, '^bands: 4 with gaps of 8e.07 Hz')])
 def test_what_does_not_fit_is_an_error(small, n_bands, options, message):
     with pytest.raises(ValueError, match=message):
         choose_bands(small, SPECTRUM, n_bands, **options)

@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-import yaml
 
 import rhs_isac_ros
 from rhs_isac_ros.codebook import Codebook, Progress, Provenance
@@ -26,12 +25,6 @@ def test_the_text_is_one_line_with_all_fields():
         'method=lbfgs, objective=crlb, seed=3, sampling=sobol, positions=64, '
         f'scenario={{"n_feeds":2}}, version="{rhs_isac_ros.__version__}", steps=5, '
         'evaluations=9, value_m2=0.30000000000000004, reason=done')
-
-
-def test_the_yaml_of_earlier_versions_can_be_parsed():
-    fields = dataclasses.asdict(dataclasses.replace(PLAIN, steps=5, reason='a: {b}, c'))
-    parsed = Provenance.parse(yaml.safe_dump(fields, default_flow_style=True, width=10**9))
-    assert dataclasses.replace(parsed, value_m2=0) == Provenance(**(fields | {'value_m2': 0}))
 
 
 SCENARIOS = [
@@ -67,11 +60,6 @@ def test_any_value_is_preserved_as_a_float(value):
     assert read == value
 
 
-def test_nan_is_preserved():
-    text = text_of(end=dataclasses.replace(END, value_m2=np.nan))
-    assert np.isnan(Provenance.parse(text).value_m2)
-
-
 def test_a_codebook_file_preserves_it(small, tmp_path):
     text = text_of(scenario=small.scenario.changes(), reason='a: "b"')
     dataclasses.replace(small.codebook, provenance=text).save(tmp_path / 'codebook.yaml')
@@ -94,13 +82,6 @@ def test_parsing_any_other_text_returns_none(text):
                          ids=['date', 'number', 'deep'])
 def test_parsing_text_that_breaks_the_yaml_parser_returns_none(text):
     assert Provenance.parse(text) is None
-
-
-@pytest.mark.parametrize('text', ['', 'random', '{method: lbfgs}'])
-def test_only_a_result_of_an_optimisation_can_be_resumed(small, text):
-    codebook = dataclasses.replace(small.codebook, provenance=text)
-    with pytest.raises(ValueError, match='^resume: provenance .*, expected that of an optim'):
-        PLAIN.resumed(codebook.provenance)
 
 
 def test_resuming_returns_the_earlier_progress(small):

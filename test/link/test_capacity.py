@@ -11,7 +11,7 @@ from rhs_isac_ros.link import (
     actual_capacity,
     capacity,
     capacity_report,
-    expected_capacity,
+    expected_capacities,
     steer,
 )
 from rhs_isac_ros.link.capacity import posterior_points
@@ -157,7 +157,7 @@ def test_expected_capacity_matches_random_draws(table1, covariance, band):
     beam = steer(scenario, POSITION, band)
     draws = np.random.default_rng(1).multivariate_normal(POSITION, covariance, 4000)
     rates = capacity(scenario, beam, draws)
-    expected = expected_capacity(scenario, beam, POSITION, covariance)
+    (expected,) = expected_capacities(scenario, [beam], POSITION, covariance)
     assert expected == pytest.approx(rates.mean(), abs=4 * rates.std() / np.sqrt(len(rates)))
     assert expected < capacity(scenario, beam, POSITION[None])[0]
 
@@ -165,8 +165,8 @@ def test_expected_capacity_matches_random_draws(table1, covariance, band):
 def test_expected_capacity_without_variance_is_the_capacity_at_the_mean(table1):
     scenario = table1.scenario
     beam = steer(scenario, POSITION)
-    assert expected_capacity(scenario, beam, POSITION, np.zeros((3, 3))) == capacity(
-        scenario, beam, POSITION[None])[0]
+    assert expected_capacities(scenario, [beam], POSITION, np.zeros((3, 3))) == capacity(
+        scenario, beam, POSITION[None])
 
 
 @pytest.mark.parametrize('covariance', [LONG, rotated(LONG), rotated(np.diag([1.0, 0.3, 0.0]))])
@@ -217,7 +217,7 @@ def test_points_are_deterministic(table1):
 def test_an_invalid_covariance_still_gives_a_finite_capacity(table1, covariance):
     scenario = table1.scenario
     beam = steer(scenario, POSITION)
-    expected = expected_capacity(scenario, beam, POSITION, covariance)
+    (expected,) = expected_capacities(scenario, [beam], POSITION, covariance)
     assert 0 < expected <= capacity(scenario, beam, POSITION[None])[0] * 1.1
 
 

@@ -18,13 +18,12 @@ from rhs_isac_ros.model import (
     MeasurementModel,
     Scenario,
     ScenarioError,
-    simulate_received,
 )
 from rhs_isac_ros.model.gain_pattern import PatternError
 from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import mean_los_power, multipath_covariance
-from rhs_isac_ros.positioning import make_estimator, store
+from rhs_isac_ros.positioning import store
 from rhs_isac_ros.support import plugins
 
 
@@ -165,24 +164,6 @@ def test_mean_power_is_weighted_by_the_users_pattern(scenario):
     assert mean_los_power(scenario, 0) == pytest.approx(expected, rel=3e-3)
 
 
-def test_bounds_match_differences_of_the_mean(scenario, codebook):
-    """Eq. (11) from the mean signals alone."""
-    positions = scenario.sample_positions(5, np.random.default_rng(2))
-    model = MeasurementModel(scenario, codebook)
-    step = 1e-5
-    slopes = []
-    for u in range(3):
-        shift = step * np.eye(3)[u]
-        difference = (model.mean(positions + shift) - model.mean(positions - shift)) / (2 * step)
-        slopes.append(model.whiten(difference).reshape(5, -1))
-    slopes = np.stack(slopes, axis=1)
-    information = 2 * np.einsum('nur,nvr->nuv', slopes.conj(), slopes).real
-    expected = np.trace(np.linalg.inv(information), axis1=1, axis2=2)
-    np.testing.assert_allclose(crlb(scenario, codebook, positions), expected, rtol=1e-5)
-    isotropic = dataclasses.replace(scenario, element_gain=1.0, user_gain=1.0)
-    assert not np.allclose(crlb(isotropic, codebook, positions), expected, rtol=0.1)
-
-
 def test_whitened_jacobian_is_the_limit_of_differences(scenario, codebook):
     model = MeasurementModel(scenario, codebook)
     positions = scenario.sample_positions(6, np.random.default_rng(6))
@@ -195,20 +176,6 @@ def test_whitened_jacobian_is_the_limit_of_differences(scenario, codebook):
             model.mean(positions + shift) - model.mean(positions - shift)) / (2 * step)
         np.testing.assert_allclose(
             slopes[:, u], difference, rtol=0, atol=1e-7 * np.abs(slopes).max())
-
-
-def test_estimators_need_the_pattern(scenario, codebook):
-    rng = np.random.default_rng(7)
-    positions = scenario.sample_positions(40, rng)
-    received = simulate_received(scenario, codebook, positions, rng)
-    isotropic = dataclasses.replace(scenario, element_gain=1.0, user_gain=1.0)
-    errors = []
-    for assumed in (scenario, isotropic):
-        estimate = make_estimator('bayes', assumed, codebook).estimate(received)
-        squares = np.sum((estimate.mean - positions)**2, axis=1)
-        errors.append(np.where(estimate.fix, squares, np.inf))
-    assert np.isfinite(errors[0]).all()
-    assert np.median(errors[0]) < np.median(errors[1]) / 2
 
 
 def test_beams_are_steered_with_the_pattern(scenario):
@@ -271,7 +238,7 @@ class TestIdentity:
         assert first != second
         assert yaml.safe_load(yaml.safe_dump(first)) == first
         with pytest.raises(
-                ScenarioError, match='element_gain: .* not a plug-in, expected a number'):
+                ScenarioError, match='element_gain: .* without an origin, expected a number'):
             Scenario(**first)
 
     def test_a_pattern_with_a_function_of_a_module_can_be_pickled(self):
@@ -325,9 +292,9 @@ def broken(angles):
 
     def test_a_pattern_with_another_digest_is_an_error(self):
         with pytest.raises(ScenarioError, match=(
-                r'element_gain: .*antennas:patch of antennas: digest \w+, expected 0123: the '
-                'pattern has changed')):
-            Scenario(element_gain='panel@0123')
+                r'element_gain: panel: digest \w+, expected 0123456789abcdef: the content has '
+                'changed')):
+            Scenario(element_gain='panel@0123456789abcdef')
 
     @pytest.mark.parametrize(('name', 'words'), [
         ('absent', r"'absent', expected a plug-in of .*; installed: broken, complex_, minus"),

@@ -7,6 +7,7 @@ import pytest
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model import geometry as g
+from rhs_isac_ros.model.geometry import jacobian, polar_bounds, to_polar, to_positions
 
 
 def test_positions_and_frequencies_match_the_vectors(case):
@@ -47,3 +48,43 @@ def test_given_feed_positions_are_used():
     positions = ((0.0, -0.1, 0.2), (0.01, 0.1, 0.0), (0.0, 0.0, 0.3))
     scenario = dataclasses.replace(Scenario(), feed_positions_m=positions)
     np.testing.assert_array_equal(g.feed_positions(scenario), positions)
+
+
+def positions_in_front(n, seed):
+    return np.random.default_rng(seed).uniform([0.5, -6, -6], [12, 6, 6], (n, 3))
+
+
+def test_points_are_range_and_direction_cosines():
+    for x, y, z in positions_in_front(5, 0):
+        distance = (x * x + y * y + z * z)**0.5
+        point = to_polar(np.array([x, y, z]))
+        np.testing.assert_allclose(point, [distance, y / distance, z / distance], rtol=1e-14)
+
+
+def test_the_conversions_are_inverse_to_each_other():
+    positions = positions_in_front(60, 1).reshape(5, 4, 3, 3)
+    np.testing.assert_allclose(to_positions(to_polar(positions)), positions, rtol=1e-10)
+
+
+def test_directions_outside_the_unit_circle_have_x_0():
+    positions = to_positions(np.array([[2.0, 0.9, 0.9], [2.0, 1.0, 0.0]]))
+    np.testing.assert_allclose(positions, [[0, 1.8, 1.8], [0, 2, 0]], atol=1e-14)
+
+
+def test_jacobian_matches_finite_differences():
+    points, step = to_polar(positions_in_front(20, 2)), 1e-6
+    matrices = jacobian(points)
+    assert matrices.shape == (20, 3, 3)
+    for a in range(3):
+        shift = step * np.eye(3)[a]
+        difference = (to_positions(points + shift) - to_positions(points - shift)) / (2 * step)
+        np.testing.assert_allclose(matrices[:, :, a], difference, rtol=1e-6, atol=1e-6)
+
+
+def test_polar_bounds_are_the_extrema_inside():
+    bounds = np.array([[6.0, -4.0, 0.5], [14.0, 4.0, 1.0]])
+    axes = np.linspace(*bounds, 41).T
+    points = to_polar(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3))
+    low, high = polar_bounds(bounds)
+    np.testing.assert_allclose(low, points.min(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(high, points.max(axis=0), rtol=1e-12)

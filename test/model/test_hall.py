@@ -149,11 +149,15 @@ def test_invalid_files_are_refused_by_the_array(mirror, tmp_path, name, change, 
         Scenario(channel=str(tmp_path / 'bad.npz'))
 
 
-def test_users_in_another_frame_are_refused(mirror):
-    moved = dataclasses.replace(mirror, users=mirror.users + [40, 0, 0],
-                                src=mirror.src + [40, 0, 0], a=0.1 * mirror.a)
-    with pytest.raises(ScenarioError, match=re.escape('channel: users: 0 % in the region')):
-        Scenario(channel=moved)
+def test_half_of_the_users_must_be_in_the_region(mirror):
+    def moved(n):
+        offset = np.where(np.arange(20)[:, None] < n, [40, 0, 0], 0)
+        return dataclasses.replace(mirror, users=mirror.users + offset,
+                                   src=mirror.src + offset[:, None], a=0.1 * mirror.a)
+
+    Scenario(channel=moved(10))
+    with pytest.raises(ScenarioError, match=re.escape('channel: users: 45 % in the region')):
+        Scenario(channel=moved(11))
 
 
 @pytest.fixture(scope='module')
@@ -366,6 +370,13 @@ def test_an_estimate_of_another_scenario_is_refused(measured):
 def test_numbers_that_are_not_finite_are_refused(estimate, name):
     with pytest.raises(ArchiveError, match=f'^{name}: not finite'):
         dataclasses.replace(estimate, **{name: np.nan * getattr(estimate, name)})
+
+
+def test_arrays_are_read_only(mirror, estimate):
+    for array in (mirror.users, mirror.a, mirror.src, mirror.n, estimate.radiation,
+                  estimate.excess):
+        with pytest.raises(ValueError, match='read-only'):
+            array[0] = 1
 
 
 def test_sizes_that_disagree_are_refused(estimate):

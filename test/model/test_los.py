@@ -4,13 +4,10 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.los import (
     checked_positions,
     los_and_derivative,
-    los_derivative,
     los_gain,
-    los_gain_at,
     los_sums,
 )
 
@@ -35,8 +32,8 @@ def test_gains_and_derivatives_match_the_definition(wide, plain):
     positions = wide.sample_positions(3, np.random.default_rng(0))
     p = plain(wide)
     for band in range(wide.n_bands):
-        gains = los_gain(wide, positions, band)
-        slopes = los_derivative(wide, positions, band)
+        gains, slopes = los_and_derivative(wide, positions, band)
+        np.testing.assert_array_equal(gains, los_gain(wide, positions, band))
         assert gains.shape == (3, 5, 9)
         assert slopes.shape == (3, 3, 5, 9)
         for n, position in enumerate(positions):
@@ -53,7 +50,7 @@ def test_derivative_is_the_limit_of_differences_of_the_gains(wide, plain):
     positions = wide.sample_positions(4, np.random.default_rng(1))
     p = plain(wide)
     for band in range(wide.n_bands):
-        slopes = los_derivative(wide, positions, band)
+        slopes = los_and_derivative(wide, positions, band)[1]
         for u in range(3):
             shift = step * np.eye(3)[u]
             for j in range(5):
@@ -65,14 +62,6 @@ def test_derivative_is_the_limit_of_differences_of_the_gains(wide, plain):
                         slopes[:, u, j, m], difference, rtol=0, atol=1e-7 * scale)
 
 
-def test_gain_and_derivative_together_equal_each_alone(case):
-    positions = case.vectors['positions']
-    for band in range(case.scenario.n_bands):
-        gains, slopes = los_and_derivative(case.scenario, positions, band)
-        np.testing.assert_array_equal(gains, los_gain(case.scenario, positions, band))
-        np.testing.assert_array_equal(slopes, los_derivative(case.scenario, positions, band))
-
-
 def test_one_subband_works(plain):
     scenario = Scenario(n_subbands=1, elements_per_side=2)
     position = np.array([[7.0, -1.0, 0.5]])
@@ -80,7 +69,7 @@ def test_one_subband_works(plain):
     np.testing.assert_allclose(los_gain(scenario, position, 1), expected, rtol=1e-11)
 
 
-@pytest.mark.parametrize('function', [los_gain, los_derivative, los_and_derivative])
+@pytest.mark.parametrize('function', [los_gain, los_and_derivative])
 @pytest.mark.parametrize(('positions', 'words'), [
     ([1.0, 2.0, 3.0], r'positions: shape \(3,\), expected \[N, 3\]'),
     ([[1.0, 2.0]], r'positions: shape \(1, 2\), expected \[N, 3\]'),
@@ -95,15 +84,6 @@ def test_checked_positions_accepts_lists():
     positions = checked_positions([[1, 2, 3]])
     assert positions.dtype == float
     assert positions.tolist() == [[1.0, 2.0, 3.0]]
-
-
-@pytest.mark.parametrize('gain', [1.0, GainPattern(lambda angles: np.cos(angles / 2))])
-def test_gains_at_one_position_are_those_of_each_band(gain):
-    scenario, position = Scenario(element_gain=gain), np.array([8.0, -2.0, 0.5])
-    found = los_gain_at(scenario, position, [1, 0])
-    for by_band, band in zip(found, [1, 0], strict=True):
-        expected = los_gain(scenario, position[None], band)[0]
-        np.testing.assert_allclose(by_band, expected, rtol=1e-9)
 
 
 def test_sums_over_the_elements_are_those_of_the_gains(table1):

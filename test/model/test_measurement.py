@@ -12,12 +12,11 @@ from rhs_isac_ros.model import (
     measurement,
     simulate_received,
 )
-from rhs_isac_ros.model.los import los_derivative
+from rhs_isac_ros.model.los import los_and_derivative
 from rhs_isac_ros.model.measurement import receive_feeds, received_signal
 from rhs_isac_ros.model.multipath import multipath_covariance
-from rhs_isac_ros.model.surface import radiation_matrix
 
-POSITION_METHODS = ('mean', 'fast_mean', 'jacobian', 'mean_and_jacobian')
+POSITION_METHODS = ('mean', 'fast_mean', 'mean_and_jacobian')
 N_PHASES = 20_000
 
 
@@ -99,15 +98,16 @@ def test_result_does_not_depend_on_the_blocks(case, model, monkeypatch, method):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12 * np.abs(other).max())
 
 
-def test_jacobian_is_the_limit_of_differences_of_the_mean(faded, plain):
+def test_mean_and_jacobian_match_the_mean_and_its_differences(faded, plain):
     scenario, codebook = faded
     p = plain(scenario, codebook.analog, codebook.digital)
     model, step = MeasurementModel(scenario, codebook), 1e-5
     positions = scenario.sample_positions(2, np.random.default_rng(2))
-    jacobian = model.jacobian(positions)
+    mean, jacobian = model.mean_and_jacobian(positions)
+    np.testing.assert_allclose(
+        mean, model.mean(positions), rtol=0, atol=1e-9 * np.abs(mean).max())
     assert jacobian.shape == (2, 3, 3, 6)
     for band in range(3):
-        np.testing.assert_array_equal(jacobian[:, :, band], model.band_jacobian(positions, band))
         for u in range(3):
             shift = step * np.eye(3)[u]
             difference = (p.mean(positions + shift, band)
@@ -125,45 +125,26 @@ PATTERNS = {
                       'user_gain': GainPattern(lambda angles: 1 + np.cos(angles))}}
 
 
+def by_elements(model, positions):
+    """Mean and derivative as sums over the gains of all elements."""
+    shape = model.scenario.n_subbands, model.scenario.n_frames, -1
+    sums = [[np.einsum('...jm,jqm->...jq', gains, radiation.reshape(shape)).reshape(
+        *gains.shape[:-2], -1) for gains in los_and_derivative(model.scenario, positions, band)]
+        for band, radiation in enumerate(model.radiation)]
+    return [np.stack(parts, axis=-2) for parts in zip(*sums, strict=True)]
+
+
 @pytest.mark.parametrize('gains', PATTERNS.values(), ids=PATTERNS.keys())
-@pytest.mark.parametrize('n', [1, 300])
-def test_fast_mean_and_jacobian_equal_the_exact_ones(faded, gains, n):
-    scenario = dataclasses.replace(faded[0], **gains)
-    model = MeasurementModel(scenario, faded[1])
-    positions = scenario.sample_positions(n, np.random.default_rng(3))
-    mean, jacobian = model.mean_and_jacobian(positions)
-    np.testing.assert_array_equal(model.fast_mean(positions), mean)
-    for actual, expected in ((mean, model.mean(positions)), (jacobian, model.jacobian(positions))):
-        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
-
-
-def test_fast_mean_and_jacobian_of_a_single_frame(random_beams):
-    scenario = Scenario(n_frames=1)
+@pytest.mark.parametrize(('n', 'n_frames'), [(1, 3), (300, 3), (2, 1)])
+def test_mean_and_jacobian_are_sums_over_the_elements(faded, random_beams, gains, n, n_frames):
+    scenario = dataclasses.replace(faded[0], n_frames=n_frames, **gains)
     model = MeasurementModel(scenario, random_beams(scenario, np.random.default_rng(0)))
-    positions = scenario.sample_positions(2, np.random.default_rng(1))
-    mean, jacobian = model.mean_and_jacobian(positions)
-    for actual, expected in ((mean, model.mean(positions)), (jacobian, model.jacobian(positions))):
+    positions = scenario.sample_positions(n, np.random.default_rng(3))
+    np.testing.assert_array_equal(
+        model.fast_mean(positions), model.mean_and_jacobian(positions)[0])
+    for actual, expected in zip(model.mean_and_jacobian(positions),
+                                by_elements(model, positions), strict=True):
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
-
-
-@pytest.mark.parametrize('n_rows', [1, 2, 3])
-def test_mean_derivative_accepts_any_number_of_rows(faded, n_rows):
-    scenario, codebook = faded
-    rng, radiation = np.random.default_rng(7), radiation_matrix(scenario, codebook)[1]
-    rows = rng.normal(size=(4, n_rows, 2, 9, 2)) @ [1, 1j]
-    means = measurement.mean_derivative(rows, radiation)
-    assert means.shape == (4, n_rows, 6)
-    expected = np.einsum('jqm,ngjm->ngjq', radiation.reshape(2, 3, 9), rows)
-    np.testing.assert_allclose(means, expected.reshape(4, n_rows, 6), rtol=1e-10)
-
-
-def test_band_jacobian_is_the_derivative_of_the_gains_times_the_radiation(case, model):
-    positions = case.vectors['positions']
-    for band in range(len(model.radiation)):
-        slopes = los_derivative(case.scenario, positions, band)
-        np.testing.assert_array_equal(
-            model.band_jacobian(positions, band),
-            measurement.mean_derivative(slopes, model.radiation[band]))
 
 
 def assert_distributed_as_vectors(signals, case):
@@ -217,7 +198,6 @@ def factorizations(monkeypatch):
 def test_construction_computes_only_the_radiation(case, factorizations):
     model = MeasurementModel(case.scenario, case.codebook)
     model.mean(case.vectors['positions'])
-    model.jacobian(case.vectors['positions'])
     assert factorizations == []
     assert not {'root', 'whitener', '_weights'} & set(vars(model))
     model.mean_and_jacobian(case.vectors['positions'])
@@ -251,7 +231,6 @@ def test_arrays_are_read_only(model, name):
 def test_no_positions_have_no_signals(model):
     empty = np.zeros((0, 3))
     assert model.mean(empty).shape == (0, *model.shape)
-    assert model.jacobian(empty).shape == (0, 3, *model.shape)
     assert [part.shape for part in model.mean_and_jacobian(empty)] == [
         (0, *model.shape), (0, 3, *model.shape)]
 
@@ -269,6 +248,8 @@ def test_beamforming_of_another_size_is_an_error(small):
     scenario = dataclasses.replace(small.scenario, elements_per_side=3)
     with pytest.raises(ValueError, match='^analog: shape '):
         MeasurementModel(scenario, small.codebook)
+    with pytest.raises(ValueError, match='^digital: shape '):
+        MeasurementModel(dataclasses.replace(small.scenario, n_feeds=1), small.codebook)
 
 
 N_PHASES = 1500

@@ -129,6 +129,7 @@ BAD = [
     ('elements_per_side', [4, 129], '129', 'expected 1 to 128'),
     ('roi_size_m', [1, -1, 1], '-1.0', 'expected 0 to 1e+06 m'),
     ('roi_size_m', [0, 0, 0], '(0.0, 0.0, 0.0)', 'expected at least one length above 0'),
+    ('angular_spread_deg', 0.005, '0.005', 'expected 0.01 to 1000 deg'),
     ('multipath_direction_deg', [91, 0], '91.0', 'expected -90 to 90 deg'),
     ('multipath_direction_deg', [0, 0, 0], '3 values', 'expected a list of 2 numbers'),
     ('center_frequencies_hz', [3e9, 2e9, 2.0005e9], '2e+09 and 2.0005e+09 Hz',

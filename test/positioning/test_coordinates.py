@@ -4,7 +4,6 @@ import numpy as np
 
 from rhs_isac_ros.positioning.coordinates import (
     is_inside,
-    jacobian,
     likelihood_loss,
     offset_to_roi,
     to_polar,
@@ -15,37 +14,6 @@ BOUNDS = np.array([[6.0, -4.0, -1.0], [14.0, 4.0, 1.0]])
 # Range and direction are independent here.
 UNCOUPLED = np.diag([1e6, 1e3, 1e3])
 COUPLED = np.array([[1e6, 2e3, -1e3], [2e3, 1e3, 0.0], [-1e3, 0.0, 1e3]])
-
-
-def positions_in_front(n, seed):
-    return np.random.default_rng(seed).uniform([0.5, -6, -6], [12, 6, 6], (n, 3))
-
-
-def test_points_are_range_and_direction_cosines():
-    for x, y, z in positions_in_front(5, 0):
-        distance = (x * x + y * y + z * z)**0.5
-        point = to_polar(np.array([x, y, z]))
-        np.testing.assert_allclose(point, [distance, y / distance, z / distance], rtol=1e-14)
-
-
-def test_the_conversions_are_inverse_to_each_other():
-    positions = positions_in_front(60, 1).reshape(5, 4, 3, 3)
-    np.testing.assert_allclose(to_positions(to_polar(positions)), positions, rtol=1e-10)
-
-
-def test_directions_outside_the_unit_circle_have_x_0():
-    positions = to_positions(np.array([[2.0, 0.9, 0.9], [2.0, 1.0, 0.0]]))
-    np.testing.assert_allclose(positions, [[0, 1.8, 1.8], [0, 2, 0]], atol=1e-14)
-
-
-def test_jacobian_matches_finite_differences():
-    points, step = to_polar(positions_in_front(20, 2)), 1e-6
-    matrices = jacobian(points)
-    assert matrices.shape == (20, 3, 3)
-    for a in range(3):
-        shift = step * np.eye(3)[a]
-        difference = (to_positions(points + shift) - to_positions(points - shift)) / (2 * step)
-        np.testing.assert_allclose(matrices[:, :, a], difference, rtol=1e-6, atol=1e-6)
 
 
 def curvatures(matrix, n):

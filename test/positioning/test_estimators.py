@@ -260,7 +260,8 @@ def test_no_position_nearby_is_more_likely(strong, plain):
 def test_the_covariance_is_the_inverse_information_at_the_estimate(strong):
     scenario, codebook, _, received = strong
     estimate = make_estimator('ml', scenario, codebook).estimate(received)
-    expected = np.linalg.inv(fisher_information(scenario, codebook, estimate.mean))
+    model = MeasurementModel(scenario, codebook)
+    expected = np.linalg.inv(fisher_information(model, estimate.mean))
     for found, bound in zip(estimate.covariance, expected, strict=True):
         np.testing.assert_allclose(found, bound, atol=0.15 * np.trace(bound))
 

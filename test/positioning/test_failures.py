@@ -9,10 +9,10 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.positioning import make_estimator
-from rhs_isac_ros.positioning.coordinates import jacobian, to_polar
+from rhs_isac_ros.positioning.coordinates import jacobian, to_polar, to_positions
 from rhs_isac_ros.positioning.failures import FailureModel, FailureSearch, can_enumerate
 from rhs_isac_ros.positioning.grid import TemplateTable, tabulate
-from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
 
 SCENARIO = Scenario(
     center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
@@ -79,7 +79,7 @@ def test_the_likelihood_has_the_moments_of_surfaces_with_a_given_set(codebook, m
             shares.append(share)
             mean = mean + share * means[-1]
             scattered = scattered + share * surface.covariance()
-            slopes = slopes + share * surface.jacobian(POSITION[None])[0]
+            slopes = slopes + share * surface.mean_and_jacobian(POSITION[None])[1][0]
     covariance = real_covariance(scattered)
     for share, one in zip(shares, means, strict=True):
         deviation = real(one - mean)
@@ -111,6 +111,23 @@ def test_the_likelihood_has_the_moments_of_surfaces_with_a_given_set(codebook, m
     assert value == pytest.approx(prior - energy - volume + gain, rel=1e-3)
     spread = volume - np.linalg.slogdet(scattered)[1].sum()
     assert deviance == pytest.approx(energy - gain + spread, rel=1e-3)
+
+
+def test_element_errors_have_their_covariance_at_the_position(codebook):
+    """With no failure, the likelihood is that of element errors alone."""
+    declared = dataclasses.replace(SCENARIO, element_error_rms=0.1)
+    alone = Likelihood(dataclasses.replace(declared, failed_element_share=0.0), codebook)
+    both = Likelihood(declared, codebook)
+    points = to_polar(np.array([[3.1, 0.0, 0.2], POSITION, [4.9, -0.8, 0.4]]))
+    received = MeasurementModel(declared, codebook).sample(
+        to_positions(points), np.random.default_rng(3))
+    values = np.zeros((3, 0))
+    found = FailureModel(both).failed_set(()).local(points, values, both.signals(received))
+    expected = DispersedLikelihood(alone).local(points, values, alone.signals(received))
+    for name in ('gradient', 'information', 'residual'):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6)
+    shift = both.log_volume - alone.log_volume + 36 * np.log(0.98)
+    np.testing.assert_allclose(found.value, expected.value + shift, rtol=1e-6)
 
 
 def test_a_set_is_weighed_with_nuisance_parameters_as_the_signals_without_them(codebook, model):

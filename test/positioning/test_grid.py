@@ -46,7 +46,8 @@ def test_arrays_of_the_table_match_their_definitions(random_beams):
     spread = np.einsum('cir,cis->irs', means, means.conj()) / len(means)
     np.testing.assert_allclose(table['spread'], spread, atol=2e-3 * np.abs(spread).max())
     by_point = jacobian(grid.points)
-    information = fisher_information(scenario, codebook, to_positions(grid.points))
+    model = MeasurementModel(scenario, codebook)
+    information = fisher_information(model, to_positions(grid.points))
     expected = np.swapaxes(by_point, 1, 2) @ information @ by_point
     scale = np.sqrt(np.einsum('caa->ca', expected))
     scale = scale[:, :, None] * scale[:, None]

@@ -8,8 +8,8 @@ from scipy.special import i0e, ive
 from scipy.stats import qmc
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.positioning import make_estimator
-from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.positioning import estimators, make_estimator
+from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
 from rhs_isac_ros.positioning.posterior import BandPhases
 
 SCENARIO = Scenario(
@@ -109,3 +109,20 @@ def test_random_phases_of_the_bands_leave_the_moments_of_the_posterior(random_be
     assert np.mean(difference) < 0.04 * np.mean(variance)
     predicted = np.trace(estimate.covariance, axis1=1, axis2=2)
     assert np.mean(predicted) == pytest.approx(np.mean(variance), rel=0.15)
+
+
+def test_samples_have_the_element_errors_at_their_positions(codebook, monkeypatch):
+    """Their weights come from the likelihood that has refined the modes."""
+    scenario, draw, used = dataclasses.replace(
+        SCENARIO, band_phase_std_rad=UNIFORM_RAD, element_error_rms=0.05
+    ), estimators.draw_broad_samples, []
+
+    def record(likelihood, conditionals, *arguments):
+        used.extend(conditionals)
+        return draw(likelihood, conditionals, *arguments)
+
+    monkeypatch.setattr(estimators, 'draw_broad_samples', record)
+    rng = np.random.default_rng(4)
+    received = MeasurementModel(scenario, codebook).sample(scenario.sample_positions(1, rng), rng)
+    make_estimator('bayes', scenario, codebook).estimate(received)
+    assert [type(one) for one in used] == [DispersedLikelihood]

@@ -111,8 +111,7 @@ def test_the_curvature_is_the_information_in_polar_coordinates(setting):
     likelihood, grid, signals, _, _ = setting
     modes = find_modes(likelihood, grid, signals.take([0]), np.zeros((1, 0)))
     by_point = jacobian(modes.points)
-    information = fisher_information(
-        likelihood.scenario, likelihood.codebook, to_positions(modes.points))
+    information = fisher_information(likelihood.model, to_positions(modes.points))
     expected = np.swapaxes(by_point, 1, 2) @ information @ by_point
     expected += np.diag(likelihood.nuisance.floor)
     inside = (np.abs(modes.roi_offset) < 1e-9).all(axis=1)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rhs_isac_ros
-from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, steer
+from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacities, steer
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
@@ -106,7 +106,8 @@ def test_the_capacities_are_those_of_the_beam(network, scenario, places):
     beam = Beam(sent.analog, sent.digital, sent.band)
     assert report.band == sent.band
     assert report.expected_bps == sent.expected_bps == pytest.approx(
-        expected_capacity(scenario, beam, estimate.position, estimate.covariance_m2))
+        expected_capacities(
+            scenario, [beam], estimate.position, estimate.covariance_m2)[0])
     assert report.at_estimate_bps == pytest.approx(
         capacity(scenario, beam, estimate.position[None])[0])
     assert report.actual_bps == pytest.approx(capacity(scenario, beam, places[:1])[0])

@@ -11,7 +11,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds.fisher import inverse_information, quadratic_form
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.los import los_derivative, los_gain
+from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import (
     complex_normal,
     measurement_correlation,
@@ -28,6 +28,10 @@ from rhs_isac_ros.positioning.search import find_modes
 # largest whitened amplitude outside of it.
 _N_SUBSPACE, _TOLERANCE = 2000, 1e-3
 _BLOCK = 128
+
+
+def _slopes(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
+    return los_and_derivative(scenario, positions, band)[1]
 
 
 class ArrayReceiver:
@@ -102,7 +106,7 @@ class ArrayReceiver:
         The signals are white in any case; `by_coordinate` is as in `MeasurementModel`.
         """
         jacobian = np.stack(
-            [self._gains(los_derivative, positions, band) @ response
+            [self._gains(_slopes, positions, band) @ response
              for band, response in enumerate(self._responses)], axis=2)
         if by_coordinate is not None:
             jacobian = np.einsum('nxq,nx...->nq...', by_coordinate, jacobian)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.los import los_derivative
+from rhs_isac_ros.model.los import los_and_derivative
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import onboard_matrix
 
@@ -29,7 +29,7 @@ class JaxAverageCrlb:
         n_rows = n_subbands * scenario.n_frames
         # With the sub-bands first, the products read contiguous memory.
         derivatives = np.stack([
-            np.moveaxis(los_derivative(scenario, positions, band), 2, 0).reshape(
+            np.moveaxis(los_and_derivative(scenario, positions, band)[1], 2, 0).reshape(
                 n_subbands, 3 * n, scenario.n_elements) for band in range(n_bands)])
         self._constants = [jnp.asarray(array) for array in (
             derivatives, onboard_matrix(scenario), multipath_covariance(scenario),

@@ -1,0 +1,90 @@
+"""Values of a scenario that come from outside of it: arrays of a file, or a plug-in."""
+
+import abc
+import functools
+import hashlib
+import re
+from typing import Any, ClassVar
+
+import numpy as np
+
+
+class External(abc.ABC):
+    """A value that a scenario writes as its origin and a digest; equal if the digests are.
+
+    Attributes
+    ----------
+    origin
+        Path of the file, or name of the plug-in; empty for other values.
+    """
+
+    origin: str
+    # The kind of value, and what a scenario expects, for errors.
+    WORDS: ClassVar[tuple[str, str]]
+
+    @classmethod
+    @abc.abstractmethod
+    def load(cls, origin: Any) -> 'External':
+        """Load the value; raise ValueError if there is no valid one."""
+
+    @classmethod
+    def named(cls, text: str) -> 'External':
+        """Load a value by its origin, optionally with ``@`` and the digest that it must have.
+
+        Raise ValueError if there is no valid value or the digest differs.
+        """
+        origin, expected = re.fullmatch(  # type: ignore[union-attr]
+            r'(.*?)(?:@([0-9a-f]{16}))?', text, re.DOTALL).groups()
+        if not origin:
+            raise ValueError(f'{text!r}: {cls.WORDS[0]} without an origin, expected '
+                             f'{cls.WORDS[1]}')
+        value = cls.load(origin)
+        if expected and value.digest != expected:
+            raise ValueError(f'{origin}: digest {value.digest}, expected {expected}: the content '
+                             'has changed')
+        return value
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """16 hexadecimal digits that identify the content in all processes."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        """Return origin and digest in the form that `named` reads."""
+        return f'{self.origin}@{self.digest}'
+
+    def __repr__(self) -> str:
+        """Return a description that is the same in all processes."""
+        return f'{type(self).__name__}({self.digest!r})'
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether the contents are the same."""
+        return isinstance(other, type(self)) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        """Hash the content."""
+        return hash(self.digest)
+
+
+class ArrayFile(External):
+    """Arrays of a file."""
+
+    WORDS = 'arrays', 'the path of a file, or null'
+
+    @abc.abstractmethod
+    def content(self) -> tuple[np.ndarray, ...]:
+        """Return the arrays that the digest covers."""
+
+    @abc.abstractmethod
+    def misfit(self, scenario: Any) -> str:
+        """Return why the arrays do not fit a scenario, from the field on; empty if they do."""
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """16 hexadecimal digits that identify the content."""
+        digest = hashlib.sha256()
+        for array in self.content():
+            little = np.ascontiguousarray(array, array.dtype.newbyteorder('<'))
+            digest.update(f'{array.dtype.kind}{array.shape}'.encode())
+            digest.update(little.tobytes())
+        return digest.hexdigest()[:16]
