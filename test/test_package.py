@@ -34,7 +34,7 @@ PIP_ONLY = {
 # Modules of the repository.
 OWN = {
     'rhs_isac_ros', 'parts', 'peers', 'diagram', 'sequence', 'run_notebook', 'pictures',
-    'conftest',
+    'conftest', 'forked',
     'headless_browser', 'impairment_checks', 'in_memory_network', 'node_processes', 'system',
     'test_installation'}
 

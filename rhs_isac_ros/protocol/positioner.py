@@ -137,9 +137,9 @@ class ResidualWatch:
     def status(self) -> dict[str, str]:
         """Return the values for the diagnostics, those of `Diagnosis.status` among them.
 
-        After the first residual, these include ``residual.ratio`` and ``residual.spread``, the mean
+        After the first residual, they include ``residual.ratio`` and ``residual.spread``, the mean
         and the variance of the energy relative to the expectation, and ``residual.fixes``, the
-        number of fixes in the mean; during a warning, they also include ``warning.residual``.
+        number of fixes in the mean; during a warning, ``warning.residual`` as well.
         """
         values = self._diagnosis.status(bool(self._warning))
         if self._all.n_fixes:
