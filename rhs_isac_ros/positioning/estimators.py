@@ -319,8 +319,8 @@ def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> Weighted
     """Compute the modes for the signals of one phase, complex128 [N_B, N_SB F] or [N_B, N_SB, F].
 
     Mean and covariance of the mixture are those of the estimate of `BayesEstimator`, up to the
-    uncertainty of the mean of its samples. The result is None if there is no position. Raises
-    `SignalError` if the signals cannot be used.
+    uncertainty of the mean of its samples, unless that estimate is an average over draws. The
+    result is None if there is no position. Raises `SignalError` if the signals cannot be used.
     """
     modes = estimator.posterior(received.reshape(len(received), -1)).modes
     if modes is None:
