@@ -148,10 +148,9 @@ class PositionerNode(RoleNode[Positioner]):
         """Publish a message, and poses for an estimate; return False if it is invalid."""
         is_published = super().publish(message)
         if is_published and isinstance(message, m.PositionEstimate):
+            pose = convert.pose(message, convert.stamp_of(message, self), self._frame)
             for publisher in (self._pose, *self._user_poses.publishers(message.user)):
-                if publisher.get_subscription_count():
-                    publisher.publish(convert.pose(
-                        message, convert.stamp_of(message, self), self._frame))
+                publisher.publish(pose)
         return is_published
 
     def destroy_node(self) -> None:
