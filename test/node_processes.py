@@ -18,7 +18,7 @@ from ament_index_python.packages import get_package_prefix
 from forked import Forked
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.signals import SignalHandlerOptions
@@ -136,7 +136,7 @@ class Watch:
         self._context = Context()
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self.node = Node('watch', namespace=namespace, context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self.node)
         self.received = {kind: [] for kind in topics.NAMES}
         self._of_cycle = collections.defaultdict(list)
