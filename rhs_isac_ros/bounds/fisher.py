@@ -50,7 +50,7 @@ def crlb_of(model: MeasurementModel, positions: np.ndarray, *,
 
 
 def without_nuisance(joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the information about the position that remains with unknown nuisance parameters.
+    """Compute the information about the position if the nuisance parameters are unknown.
 
     Takes the result of `joint_information_of`, float64 [N, 3 + Q, 3 + Q]. Returns float64
     [N, 3, 3] [1/m^2], and how the parameters change with the position, [N, Q, 3].

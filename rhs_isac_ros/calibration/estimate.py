@@ -126,7 +126,7 @@ class Alignment:
         return self.patterns * np.where(self._moves_multipath, aligned[:, None], mean[:, None])
 
     def start(self, white: np.ndarray, white_mean: np.ndarray, values: np.ndarray) -> None:
-        """Set each value that only turns whole bands to its most likely one, in order."""
+        """Set the values that only rotate whole bands to their most likely ones, one by one."""
         outputs = np.sum(np.conj(white_mean) * white, axis=2)
         for q in np.flatnonzero(self._phases.any(axis=0)):
             turns = self._phases[:, q]

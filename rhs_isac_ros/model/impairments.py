@@ -7,9 +7,9 @@ nepers, an imaginary one a phase. The factor applies to the direct path and to t
 not to the thermal noise. The exponential wraps phases, so that a phase whose standard deviation is
 a turn is uniform.
 
-Simulation, estimators, bounds and calibration use the results of an `Impairment` only, so that
-another one requires no change elsewhere: a `Factor` in `BUILT_IN`, or a plug-in of the group
-``rhs_isac_ros.impairments``.
+Simulation, estimators, bounds and calibration use the results of an `Impairment` only. Another
+one is a plug-in of the group ``rhs_isac_ros.impairments``, or a `Factor` in `BUILT_IN` and the
+field of the scenario that declares it.
 """
 
 import dataclasses

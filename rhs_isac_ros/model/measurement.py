@@ -294,7 +294,7 @@ class MeasurementModel:
         return mean, jacobian
 
     def fast_mean(self, positions: np.ndarray) -> np.ndarray:
-        """Compute `mean` with the rounding of `mean_and_jacobian`, in a third of the time."""
+        """Compute the mean that `mean_and_jacobian` returns, in a third of its time."""
         positions, weights = checked_positions(positions), self._weights
         mean = np.empty((len(positions), *self.shape), complex)
         for block in blocks(len(positions), weights.block):

@@ -87,7 +87,7 @@ def marker(
 
 
 def deletion(namespace: str, number: int, stamp: Time) -> Marker:
-    """Return a marker that deletes the marker with a namespace and an id."""
+    """Return a marker that deletes the marker with the given namespace and id."""
     marker = _marker(namespace, number, Marker.SPHERE, stamp)
     marker.action = Marker.DELETE
     return marker

@@ -100,7 +100,7 @@ class Blocked:
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
                         prior: NuisancePrior) -> float:
-        """Compute the evidence, as `Alternative` describes; phases have no effect."""
+        """Compute the evidence, as `Alternative` describes, from the energies of the signals."""
         energy = np.array([residual, np.sum(np.abs(whitened)**2)])
         # The gain of the user is a part of the level.
         std_db = math.hypot(BLOCKED_STD_DB, self._std_db, _DB_PER_NEPER * prior.gain_std)
@@ -110,7 +110,7 @@ class Blocked:
         return blocked - (in_sight + residual) + prior.log_evidence_of_aligned(aligned)
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
-        """Return whether some level explains the signals, as `Alternative` describes."""
+        """Return whether a plausible level explains the signals, as `Alternative` describes."""
         energy = float(np.sum(np.abs(whitened)**2))
         return energy <= max_residual * 10**(_LEVEL_REACH * BLOCKED_STD_DB / 10)
 

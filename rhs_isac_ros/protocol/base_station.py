@@ -538,7 +538,7 @@ class BaseStation(StateMachine):
                 outcome=Outcome.RETRY_DATA, restart_timeout=True),
             Row((State.TRANSMITTING,), (_abandon,), State.RESTING, outcome=Outcome.DATA_LOST)),
         *on(m.Ack, 'ack', {_not_allowed: Outcome.NOT_ALLOWED, _too_often: Outcome.TOO_OFTEN})(
-            # All that are not dropped count towards the rate of their user.
+            # All acks that pass these two checks count towards the rate of their user.
             Row(ANY, (_count_ack,), guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE),
             # Of several nodes with the same number, the first is served.
             Row(ANY, (_count_ack, _reject_number), guard=_number_taken,

@@ -71,7 +71,7 @@ class LocateRequested:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EstimatorBuilt:
-    """The estimator of `BuildEstimator`, built in `elapsed_s`; None after a `failure`."""
+    """The result of `BuildEstimator` after `elapsed_s`: an estimator, or a `failure`."""
 
     codebook: Codebook
     estimator: Estimator | None

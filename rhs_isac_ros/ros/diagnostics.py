@@ -38,7 +38,7 @@ def from_ros(message: DiagnosticArray, namespace: str) -> Iterator[tuple[str, Re
 
 
 def subscribe_reports(node: Node, on_report: Callable[[str, Report], None]) -> None:
-    """Subscribe to the reports of the nodes in the namespace of a node; the topic is common."""
+    """Call a function for each report of a node in the namespace of `node`."""
     namespace = node.get_namespace()
 
     def receive(message: DiagnosticArray) -> None:

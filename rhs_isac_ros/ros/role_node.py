@@ -167,7 +167,7 @@ class Clocks:
         return self._world_s
 
     def role_s(self, in_world: bool) -> float:
-        """Return the time of the roles [s]; `in_world` if they waited for the world until now."""
+        """Return the time of the roles [s]; `in_world` if they have waited for the world."""
         self._advance(in_world)
         return self._role_s
 

@@ -1,6 +1,6 @@
 """The roles of a network, each declared once.
 
-Executables, parameters, launch files, permissions, readiness, the fault trials and the topics in
+Parameters, launch files, permissions, readiness, the fault trials and the topics in
 the documentation derive from `ROSTER`.
 """
 

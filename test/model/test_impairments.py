@@ -142,7 +142,7 @@ def test_gain_acts_on_the_multipath_but_not_on_the_noise(small, draw):
     assert np.abs(found - expected).max() < 0.25 * np.abs(expected).max()
 
 
-# A new impairment needs a strength here, and no other test.
+# A new impairment needs a strength here, but no test of its own.
 BUILT_IN_STRENGTHS = {
     'user_gain_std_db': 2.0, 'carrier_offset_std_hz': 700.0, 'phase_std_rad': 0.4,
     'timing_std_s': 30e-9, 'band_phase_std_rad': 0.4}
