@@ -6,6 +6,7 @@ import math
 import os
 import signal
 import subprocess
+import sys
 import time
 import warnings
 from pathlib import Path
@@ -136,7 +137,9 @@ class Watch:
         self._context = Context()
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self.node = Node('watch', namespace=namespace, context=self._context)
-        self._executor = EventsExecutor(context=self._context)
+        # It requires a standard error with a file descriptor, which pytest may have replaced.
+        with contextlib.redirect_stderr(sys.__stderr__):
+            self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self.node)
         self.received = {kind: [] for kind in topics.NAMES}
         self._of_cycle = collections.defaultdict(list)

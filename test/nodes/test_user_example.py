@@ -17,7 +17,9 @@ TOPICS = sorted({topic for member in ROSTER.values() for topic in member.receive
 
 def test_the_example_is_served_without_repetitions(processes, make_watch):
     space, watch = '/example', make_watch('/example')
-    running = [processes.start(role, namespace=space) for role in ROSTER if role != 'user']
+    # Programs start as slowly as the example, so that it discovers all of them before its cycle.
+    running = [processes.start(role, namespace=space, as_program=True)
+               for role in ROSTER if role != 'user']
     with subprocess.Popen(
             [sys.executable, str(EXAMPLE), '--ros-args', '-r', f'__ns:={space}']) as user:
         try:

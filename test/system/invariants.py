@@ -228,9 +228,10 @@ class InvariantChecker:
         """Compare the received signals with their distribution at the true position."""
         received = cycle.signals[0]
         position = cycle.truths.get((received.user, received.user_instance))
-        if position is None:
+        model = self._models.get(received.codebook_id)
+        # Signals of an unknown codebook are a fault of their own.
+        if position is None or model is None:
             return
-        model = self._models[received.codebook_id]
         signals = received.signals.reshape(model.shape)
         residual = model.whiten(signals - model.mean(position[None])[0])
         n, t = residual.size, _RESIDUAL_EXPONENT
