@@ -20,7 +20,7 @@ from rhs_isac_ros.support import plugins
 # Fixtures that several folders share. Those of processes need ROS, which the pure layers do not.
 pytest_plugins = ['in_memory_network']
 if importlib.util.find_spec('rclpy'):
-    pytest_plugins.append('node_processes')
+    pytest_plugins += ['node_processes', 'node_bench']
 HERE = Path(__file__).resolve().parent
 LIBRARIES = ('numpy', 'scipy', 'scikit-learn', 'matplotlib', 'pyyaml', 'joblib', 'dask', 'rich')
 

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')
 
 PLACE = np.array([10.0, 0.5, 0.2])
 HUGE = (1e100, 1e200, 1e308)
-# Of the scenario of `small_files`.
+# Of the scenario of `bench_files`.
 N_FRAMES = 2
 
 
@@ -89,28 +89,28 @@ class NodeUnderTest:
 
 
 @pytest.fixture(scope='module')
-def channel(module_bench, small_files):
+def channel(module_bench, bench_files):
     return NodeUnderTest(
-        module_bench, small_files, ChannelNode,
+        module_bench, bench_files, ChannelNode,
         (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data), m.FeedSignals)
 
 
 @pytest.fixture(scope='module')
-def optimizer(module_bench, small_files):
-    return add(module_bench, small_files, OptimizerNode, codebook_file=small_files / 'first.yaml')
+def optimizer(module_bench, bench_files):
+    return add(module_bench, bench_files, OptimizerNode, codebook_file=bench_files / 'first.yaml')
 
 
 @pytest.fixture(scope='module')
-def transmission(module_bench, optimizer, small_files):
+def transmission(module_bench, optimizer, bench_files):
     return NodeUnderTest(
-        module_bench, small_files, TransmissionNode,
+        module_bench, bench_files, TransmissionNode,
         (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth), m.Beam)
 
 
 @pytest.fixture(scope='module')
-def positioner(module_bench, optimizer, small_files):
+def positioner(module_bench, optimizer, bench_files):
     return NodeUnderTest(
-        module_bench, small_files, PositionerNode, (m.ReceivedSignals,), m.PositionEstimate)
+        module_bench, bench_files, PositionerNode, (m.ReceivedSignals,), m.PositionEstimate)
 
 
 def truth(cycle_id, place=PLACE):

@@ -20,10 +20,10 @@ DYNAMIC = [(executable, p) for executable, group in NODES.items() for p in group
 
 
 @pytest.fixture
-def make(bench, small_files, tmp_path, monkeypatch):
+def make(bench, bench_files, tmp_path, monkeypatch):
     """Return a function that creates a node which only records new settings, in `offered`."""
     def make(executable):
-        values = {'scenario_file': str(small_files / 'scenario.yaml')}
+        values = {'scenario_file': str(bench_files / 'scenario.yaml')}
         if executable == 'positioner':
             values['table_folder'] = str(tmp_path)
         node = bench.add(KINDS[executable], parameter_overrides=[

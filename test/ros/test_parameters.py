@@ -274,8 +274,8 @@ def test_a_band_beyond_those_of_the_scenario_is_rejected(bench):
         bench.add(TransmissionNode, parameter_overrides=[Parameter('band', value=2)])
 
 
-def test_a_node_reads_the_scenario_of_its_file(bench, small, small_files):
-    overrides = [Parameter('scenario_file', value=str(small_files / 'scenario.yaml'))]
+def test_a_node_reads_the_scenario_of_its_file(bench, small, bench_files):
+    overrides = [Parameter('scenario_file', value=str(bench_files / 'scenario.yaml'))]
     assert bench.add(BsNode, parameter_overrides=overrides).scenario == small.scenario
 
 

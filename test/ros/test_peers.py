@@ -344,12 +344,12 @@ def test_invalid_announcements_are_ignored(bench, probe, add_channel, scenario):
     assert not node.report().values['conflict.role'].startswith('stands by')
 
 
-def test_the_newer_of_two_optimizers_is_followed_until_it_has_gone(bench, small_files, small):
+def test_the_newer_of_two_optimizers_is_followed_until_it_has_gone(bench, bench_files, small):
     def add(name):
         return bench.add(OptimizerNode, parameter_overrides=[
-            Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
-            Parameter('codebook_file', value=str(small_files / f'{name}.yaml'))])
-    first, second = (Codebook.load(small_files / f'{name}.yaml').id
+            Parameter('scenario_file', value=str(bench_files / 'scenario.yaml')),
+            Parameter('codebook_file', value=str(bench_files / f'{name}.yaml'))])
+    first, second = (Codebook.load(bench_files / f'{name}.yaml').id
                      for name in ('first', 'second'))
     got, late = [], []
     older = add('first')
@@ -368,12 +368,12 @@ def test_the_newer_of_two_optimizers_is_followed_until_it_has_gone(bench, small_
 
 
 def test_the_serving_optimizer_announces_again_after_an_older_one_has_returned(
-        bench, probe, small_files, small):
+        bench, probe, bench_files, small):
     """A process that was suspended serves for a moment, because it misses the newer one."""
-    first, second = (Codebook.load(small_files / f'{name}.yaml') for name in ('first', 'second'))
+    first, second = (Codebook.load(bench_files / f'{name}.yaml') for name in ('first', 'second'))
     newer = bench.add(OptimizerNode, parameter_overrides=[
-        Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
-        Parameter('codebook_file', value=str(small_files / 'first.yaml'))])
+        Parameter('scenario_file', value=str(bench_files / 'scenario.yaml')),
+        Parameter('codebook_file', value=str(bench_files / 'first.yaml'))])
     got = []
     CodebookClient(bench.add(Node, 'client'), small.scenario,
                    lambda codebook: got.append(codebook.id))

@@ -57,16 +57,16 @@ class Hardware:
         return data.bits // 2
 
 
-def test_a_network_with_the_radio_serves_a_user(bench, example, small_files):
-    file = small_files / 'scenario.yaml'
-    scenario, codebook = Scenario.from_yaml(file), Codebook.load(small_files / 'first.yaml')
+def test_a_network_with_the_radio_serves_a_user(bench, example, bench_files):
+    file = bench_files / 'scenario.yaml'
+    scenario, codebook = Scenario.from_yaml(file), Codebook.load(bench_files / 'first.yaml')
     hardware = Hardware(scenario)
 
     def add(kind, *arguments, **values):
         values = {'scenario_file': str(file), **values}
         return bench.add(kind, *arguments, parameter_overrides=[
             Parameter(name, value=value) for name, value in values.items()])
-    add(OptimizerNode, codebook_file=str(small_files / 'first.yaml'))
+    add(OptimizerNode, codebook_file=str(bench_files / 'first.yaml'))
     add(RhsControllerNode)
     add(PositionerNode, table_folder='')
     add(TransmissionNode)

@@ -26,8 +26,8 @@ PLACE = np.array([10.0, 0.5, 0.2])
 
 
 @pytest.fixture
-def codebooks(small_files):
-    return [Codebook.load(small_files / f'{name}.yaml') for name in ('first', 'second')]
+def codebooks(bench_files):
+    return [Codebook.load(bench_files / f'{name}.yaml') for name in ('first', 'second')]
 
 
 @pytest.fixture
@@ -37,8 +37,8 @@ def values():
 
 
 @pytest.fixture
-def node(bench, small_files, tmp_path, values):
-    values = {'scenario_file': str(small_files / 'scenario.yaml'),
+def node(bench, bench_files, tmp_path, values):
+    values = {'scenario_file': str(bench_files / 'scenario.yaml'),
               'table_folder': str(tmp_path / 'tables'), **values}
     return bench.add(PositionerNode, parameter_overrides=[
         Parameter(name, value=value) for name, value in values.items()])
@@ -281,10 +281,10 @@ def test_a_missing_plug_in_is_rejected_at_the_start(bench, install, name, words)
 
 
 def test_the_log_names_a_plug_in_that_fails(
-        bench, install, codebooks, small_files, monkeypatch):
+        bench, install, codebooks, bench_files, monkeypatch):
     install('guesses', TestPlugin.CODE, {plugins.ESTIMATORS: {'fails': 'fails'}})
     node = bench.add(PositionerNode, parameter_overrides=[
-        Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
+        Parameter('scenario_file', value=str(bench_files / 'scenario.yaml')),
         Parameter('estimator', value='fails')])
     logged = []
     monkeypatch.setattr(node, 'get_logger', lambda: types.SimpleNamespace(

@@ -25,12 +25,12 @@ def follow(bench):
 
 
 @pytest.fixture
-def optimizer_of(bench, small_files):
+def optimizer_of(bench, bench_files):
     """Return a function that creates an optimizer with a codebook of the small scenario."""
     def optimizer_of(name, **options):
         files = {'scenario_file': 'scenario', 'codebook_file': name}
         return bench.add(OptimizerNode, parameter_overrides=[
-            Parameter(key, value=str(small_files / f'{file}.yaml'))
+            Parameter(key, value=str(bench_files / f'{file}.yaml'))
             for key, file in files.items()], **options)
     return optimizer_of
 
@@ -40,8 +40,8 @@ def ids(codebooks):
 
 
 @pytest.fixture(scope='session')
-def stored(small_files):
-    return {name: Codebook.load(small_files / f'{name}.yaml') for name in ('first', 'second')}
+def stored(bench_files):
+    return {name: Codebook.load(bench_files / f'{name}.yaml') for name in ('first', 'second')}
 
 
 def change(optimizer, codebook):

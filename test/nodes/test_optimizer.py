@@ -273,11 +273,11 @@ def test_a_file_of_an_earlier_version_is_converted_at_the_start(bench, other, tm
     assert node.get_parameter('codebook.id').value == other.id
 
 
-def test_scenario_and_codebook_come_from_the_given_files(bench, small, small_files):
+def test_scenario_and_codebook_come_from_the_given_files(bench, small, bench_files):
     node = bench.add(OptimizerNode, parameter_overrides=[
-        Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
-        Parameter('codebook_file', value=str(small_files / 'first.yaml'))])
-    assert held(node).id == Codebook.load(small_files / 'first.yaml').id
+        Parameter('scenario_file', value=str(bench_files / 'scenario.yaml')),
+        Parameter('codebook_file', value=str(bench_files / 'first.yaml'))])
+    assert held(node).id == Codebook.load(bench_files / 'first.yaml').id
     held(node).check(small.scenario)
 
 

@@ -120,7 +120,7 @@ def probe(bench):
 
 
 @pytest.fixture(scope='session')
-def small_files(small, random_beams, tmp_path_factory):
+def bench_files(small, random_beams, tmp_path_factory):
     """Folder with the files of a small scenario and of two codebooks for it."""
     folder = tmp_path_factory.mktemp('small')
     fields = {key: list(value) if isinstance(value, tuple) else value

@@ -20,10 +20,10 @@ ROOT = FilePath(__file__).parents[2]
 
 
 @pytest.fixture
-def shown(bench, probe, small_files, request):
+def shown(bench, probe, bench_files, request):
     """Dictionary of the latest markers of the node, by namespace and id."""
     bench.add(VisualizerNode, parameter_overrides=[
-        Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
+        Parameter('scenario_file', value=str(bench_files / 'scenario.yaml')),
         Parameter('period_s', value=0.02),
         Parameter('forget_s', value=getattr(request, 'param', 60.0))])
     latest = {}
