@@ -1,7 +1,4 @@
-"""Permissions of the nodes for topics and services, as a policy for SROS2.
-
-``python3 -m rhs_isac_ros.tools.permissions`` prints the policy.
-"""
+"""Prints the permissions of the nodes for topics and services, as a policy for SROS2."""
 
 import argparse
 import sys
@@ -12,7 +9,6 @@ from typing import NamedTuple
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.validate_namespace import validate_namespace
 
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.parameters import TF
@@ -187,7 +183,7 @@ def policy(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the policy, and return the exit code 0."""
     parser = ArgumentParser(
-        prog='python3 -m rhs_isac_ros.tools.permissions',
+        prog='policy.py',
         description='Print the SROS2 policy of a network.',
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--namespace', type=_namespace, default='/',
@@ -220,4 +216,4 @@ def _namespace(text: str) -> str:
 
 
 if __name__ == '__main__':
-    sys.exit(exit_code_of(main))
+    sys.exit(main())
