@@ -66,7 +66,8 @@ class GroupParameterService(ParameterService):
             return SetParametersResult(successful=False, reason=str(error))
 
 
-def _ros_parameters(values: Mapping[str, Any]) -> list[Parameter]:
+def ros_parameters(values: Mapping[str, Any]) -> list[Parameter]:
+    """Return parameters with values by name."""
     return [Parameter(name, value=value) for name, value in values.items()]
 
 
@@ -85,7 +86,7 @@ def push(node: Node, codebook: Codebook, timeout_s: float = 10.0) -> None:
     end_s, future = time.monotonic() + timeout_s, None
     if client.wait_for_services(timeout_s):
         future = client.set_parameters_atomically(
-            _ros_parameters(codebook.to_parameters()))
+            ros_parameters(codebook.to_parameters()))
         executor = SingleThreadedExecutor(context=node.context)
         rclpy.spin_until_future_complete(
             node, future, executor, max(end_s - time.monotonic(), 0.0))
@@ -119,7 +120,7 @@ class OptimizerNode(ParameterizedNode):
         self._codebook_id, self._refused = '', 0
         # A file of an earlier version contains another provenance, and may lack the id.
         self.set_parameters_atomically(
-            _ros_parameters(self._first_codebook(file).to_parameters()))
+            ros_parameters(self._first_codebook(file).to_parameters()))
         self._announce(False)
         self._peers = Peers(
             self, topics.OPTIMIZER_NODE, self._instance, self._scenario, lambda missing: None,
@@ -243,7 +244,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return _push(codebook, args)
     if reason == INTERRUPTED:
         return 0
-    overrides = _ros_parameters({'codebook_file': str(options.output),
+    overrides = ros_parameters({'codebook_file': str(options.output),
                                  'scenario_file': str(options.scenario or '')})
     return run(lambda: [OptimizerNode(parameter_overrides=overrides)], args)
 

@@ -148,7 +148,7 @@ class Peers:
             return ''
         # Observers have single endpoints, so that only a node with all of them is present. Names
         # of nodes may arrive after their endpoints.
-        nodes = [{_full_name(info) for info in (
+        nodes = [{full_name(info) for info in (
             node.get_publishers_info_by_topic(topic) if kind == 'publisher'
             else node.get_subscriptions_info_by_topic(topic)) if info.node_name != _UNNAMED}
             for kind, topic in endpoints]
@@ -185,7 +185,7 @@ class Peers:
         publishers = self._node.get_publishers_info_by_topic(topic)
         subscriptions = self._node.get_subscriptions_info_by_topic(topic)
         for publisher, subscription in itertools.product(publishers, subscriptions):
-            names = {_full_name(publisher), _full_name(subscription)}
+            names = {full_name(publisher), full_name(subscription)}
             if _UNNAMED in (publisher.node_name, subscription.node_name):
                 # The name may arrive after the endpoint; the next poll examines it again.
                 self._counts = []
@@ -217,7 +217,7 @@ class Peers:
         """Forget nodes in conflict that are absent in two polls in a row."""
         infos = self._node.get_publishers_info_by_topic(self._publisher.topic_name)
         present = collections.Counter(
-            '' if info.node_name == _UNNAMED else _full_name(info) for info in infos)
+            '' if info.node_name == _UNNAMED else full_name(info) for info in infos)
         was_short, self._is_short = self._is_short, bool(self._presences.gone(present))
         if was_short and self._is_short:
             self._apply(lambda presences: presences.keep(present))
@@ -238,6 +238,6 @@ class Peers:
             self._on_rival(presences.stands_by)
 
 
-def _full_name(info: Any) -> str:
+def full_name(info: Any) -> str:
     """Return the fully qualified name of the node of an endpoint."""
     return f'{info.node_namespace.rstrip("/")}/{info.node_name}'

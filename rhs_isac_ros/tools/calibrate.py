@@ -6,7 +6,6 @@ publish their true positions, or arrays in a file.
 
 import argparse
 import dataclasses
-import sys
 import time
 import warnings
 from collections.abc import Sequence
@@ -28,7 +27,6 @@ from rhs_isac_ros.calibration import (
     survey_report,
 )
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.positioning import make_estimator
@@ -119,13 +117,6 @@ class CalibratorNode(Node):
         super().__init__('calibrator', **WITHOUT_SERVICES)
         subscribe_messages(self, RECEIVES, scenario.sizes, log.add, scenario_id=scenario.id)
         command.subscribe_codebooks(self, scenario, log.add)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Calibrate, print the result and write the file; 1 if there were too few pilots in time."""
-    return command.run_command(
-        _calibrate, _parser(), arguments, ['file', '--config', '--codebook', '--calibration'],
-        ['--output'])
 
 
 def _calibrate(options: argparse.Namespace, arguments: list[str]) -> int:
@@ -263,5 +254,5 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-if __name__ == '__main__':
-    sys.exit(exit_code_of(main))
+main = command.entry(
+    _calibrate, _parser, ['file', '--config', '--codebook', '--calibration'], ['--output'])

@@ -63,51 +63,49 @@ class ToolError(RuntimeError):
     """A command cannot be executed."""
 
 
-def run_command(
+def entry(
         work: Callable[[argparse.Namespace, list[str]], int],
-        parser: argparse.ArgumentParser, arguments: Sequence[str] | None,
+        make_parser: Callable[[], argparse.ArgumentParser],
         inputs: Sequence[str] = (), outputs: Sequence[str] = (),
-        conflict: Callable[[argparse.Namespace], str] = lambda options: '') -> int:
-    """Run a command whose command line may contain ROS arguments.
+        conflict: Callable[[argparse.Namespace], str] = lambda options: ''
+) -> Callable[..., int]:
+    """Return the main function of a command whose command line may contain ROS arguments.
+
+    The function takes a command line, by default that of the process. It returns the exit code of
+    `work`, usually 0, including after a signal or when the reader closes the output; 1 after a
+    `ToolError`; 2 if an argument or a file is invalid.
 
     Parameters
     ----------
     work
         Takes the options, and the name of the program with its command line; returns an exit code.
-    arguments
-        Command line; by default that of the process.
     inputs, outputs
         Options with names of files; no output may be an input or another output.
     conflict
         Returns the error if options contradict each other, otherwise ''.
-
-    Returns
-    -------
-    int
-        Exit code: that of `work`, usually 0, including after a signal or when the reader closes
-        the output; 1 after a `ToolError`; 2 if an argument or a file is invalid.
     """
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    options = parse(parser, arguments)
-    if problem := conflict(options):
-        parser.error(problem)
-
-    def named(names: Sequence[str]) -> dict[str, Path | None]:
-        return {name: getattr(options, name.removeprefix('--')) for name in names}
-    check_distinct(parser, named(inputs), named(outputs))
-    try:
-        return work(options, [parser.prog, *arguments])
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
-    except BrokenPipeError:
-        discard_stdout()
-        return 0
-    except (ToolError, MissingLibraryError) as error:
-        print_error(error, parser.prog)
-        return 1
-    except INVALID as error:
-        print_error(error, parser.prog)
-        return 2
+    def main(arguments: Sequence[str] | None = None) -> int:
+        parser, arguments = make_parser(), sys.argv[1:] if arguments is None else list(arguments)
+        options = parse(parser, arguments)
+        if problem := conflict(options):
+            parser.error(problem)
+        given, written = ({name: getattr(options, name.removeprefix('--')) for name in names}
+                          for names in (inputs, outputs))
+        check_distinct(parser, given, written)
+        try:
+            return work(options, [parser.prog, *arguments])
+        except (KeyboardInterrupt, ExternalShutdownException):
+            return 0
+        except BrokenPipeError:
+            discard_stdout()
+            return 0
+        except (ToolError, MissingLibraryError) as error:
+            print_error(error, parser.prog)
+            return 1
+        except INVALID as error:
+            print_error(error, parser.prog)
+            return 2
+    return main
 
 
 def add_files(parser: argparse.ArgumentParser, *names: str) -> None:

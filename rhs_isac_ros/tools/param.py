@@ -1,11 +1,8 @@
-"""``scripts/param``: ``ros2 param``, which the wheels lack, with the same output.
-
-``python3 -m rhs_isac_ros.tools.param --help`` lists the commands.
-"""
+"""``scripts/param``: ``ros2 param``, which the wheels lack, with the same output."""
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import yaml
@@ -18,9 +15,8 @@ from rclpy.parameter import (
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
-from rhs_isac_ros.tools.command import Session, ToolError, print_now, run_command, run_verb
+from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run_verb
 
 # Maximum time to discover a node [s]. With DDS security, keys are exchanged first.
 _DISCOVERY_TIMEOUT_S = 10.0
@@ -37,11 +33,6 @@ _LABELS = {
     ParameterType.PARAMETER_DOUBLE_ARRAY: 'Double values are:',
     ParameterType.PARAMETER_STRING_ARRAY: 'String values are:',
 }
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command on parameters and return the exit code of `run_command`."""
-    return run_command(run_verb, _parser(), arguments)
 
 
 # Each of the following raises a ToolError if the node does not exist or does not respond.
@@ -181,5 +172,4 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-if __name__ == '__main__':
-    sys.exit(exit_code_of(main))
+main = entry(run_verb, _parser)

@@ -1,16 +1,13 @@
 """``scripts/record FILE``: records all topics of a network."""
 
 import argparse
-import sys
-from collections.abc import Sequence
 
 from rclpy.node import Node
 
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.ros.recording import Recorder
 from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, output_file
-from rhs_isac_ros.tools.command import ToolError, choose_scenario, observe, run_command
+from rhs_isac_ros.tools.command import ToolError, choose_scenario, entry, observe
 
 
 class RecorderNode(Node):
@@ -27,11 +24,6 @@ class RecorderNode(Node):
         if name not in self._topics:
             self._topics.add(name)
             self._log.info(f'first message of {name}')
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Record until a signal arrives; return the exit code of `run_command`."""
-    return run_command(_record, _parser(), arguments, ['--config'], ['file'])
 
 
 def _record(options: argparse.Namespace, arguments: list[str]) -> int:
@@ -59,5 +51,4 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-if __name__ == '__main__':
-    sys.exit(exit_code_of(main))
+main = entry(_record, _parser, ['--config'], ['file'])

@@ -17,15 +17,13 @@ import numpy as np
 import yaml
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog
-from rhs_isac_ros.nodes.optimizer import OptimizerNode
+from rhs_isac_ros.nodes.optimizer import OptimizerNode, ros_parameters
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
     BayesEstimator,
@@ -39,6 +37,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer
+from rhs_isac_ros.ros.peers import full_name
 from rhs_isac_ros.ros.recording import RecordingError, read, recorded_topics
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.ros.startup import WITHOUT_SERVICES, is_enabled
@@ -129,9 +128,10 @@ class RepublisherNode(Node):
         if name == _SIGNALS:
             # Observers may subscribe to the signals as well. Wait for the nodes that publish
             # estimates, which subscribe to the signals only once their tables are complete.
-            estimators = _nodes_of(self.get_publishers_info_by_topic(
-                self.resolve_topic_name(_ESTIMATES))) - {self.get_fully_qualified_name()}
-            subscribers = _nodes_of(self.get_subscriptions_info_by_topic(publisher.topic_name))
+            estimators = {*map(full_name, self.get_publishers_info_by_topic(
+                self.resolve_topic_name(_ESTIMATES)))} - {self.get_fully_qualified_name()}
+            subscribers = {*map(
+                full_name, self.get_subscriptions_info_by_topic(publisher.topic_name))}
             if not estimators or not estimators <= subscribers:
                 return False
             n_expected = len(subscribers)
@@ -164,7 +164,8 @@ class RepublisherNode(Node):
                 self.count += 1
             elif self.optimizer:
                 self.optimizer.set_parameters_atomically(
-                    _parameters(convert.codebook_from_ros(message)))
+                    ros_parameters(
+                    convert.codebook_from_ros(message).to_parameters()))
 
     def check(self, end_s: float, timeout_s: float) -> None:
         """Raise a ToolError if the messages cannot be published, or not until `end_s` [s]."""
@@ -244,22 +245,13 @@ def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
         file = Path(folder) / 'scenario.yaml'
         file.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
-        return OptimizerNode(parameter_overrides=[
-            Parameter('scenario_file', value=str(file)), *_parameters(codebook)])
+        return OptimizerNode(parameter_overrides=ros_parameters(
+            {'scenario_file': str(file), **codebook.to_parameters()}))
 
 
 def _optimizer_present(node: Node) -> bool:
     return AsyncParameterClient(node, topics.OPTIMIZER_NODE).wait_for_services(
         _SECURE_DISCOVERY_TIMEOUT_S if is_enabled() else _DISCOVERY_TIMEOUT_S)
-
-
-def _parameters(codebook: Codebook) -> list[Parameter]:
-    return [Parameter(name, value=value) for name, value in codebook.to_parameters().items()]
-
-
-def _nodes_of(endpoints: Iterable[Any]) -> set[str]:
-    return {f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
-            for endpoint in endpoints}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -328,11 +320,6 @@ def errors_m(
         errors.append(np.linalg.norm(estimate.mean - cycle.truth.position)
                       if estimate.fix else np.nan)
     return np.array(errors)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the recorded position errors and those of estimators applied to the same signals."""
-    return command.run_command(_replay, _parser(), arguments, conflict=_conflict)
 
 
 def _conflict(options: argparse.Namespace) -> str:
@@ -434,5 +421,4 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-if __name__ == '__main__':
-    sys.exit(exit_code_of(main))
+main = command.entry(_replay, _parser, conflict=_conflict)

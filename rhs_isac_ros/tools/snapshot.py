@@ -4,12 +4,10 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 from rclpy.node import Node
 
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
@@ -73,11 +71,6 @@ class SnapshotNode(Node):
                     and time.monotonic() > self._began_s + 2 * _REPORT_PERIOD_S)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw the scene when it is complete, or after some time as far as it is known."""
-    return command.run_command(_snapshot, _parser(), arguments, ['--config'], ['--output'])
-
-
 def _snapshot(options: argparse.Namespace, arguments: list[str]) -> int:
     scenario = command.choose_scenario(options.config)
     end_s = time.monotonic() + options.timeout
@@ -137,5 +130,4 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-if __name__ == '__main__':
-    sys.exit(exit_code_of(main))
+main = command.entry(_snapshot, _parser, ['--config'], ['--output'])

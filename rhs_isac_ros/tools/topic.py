@@ -1,7 +1,4 @@
-"""``scripts/topic``: ``ros2 topic``, which the wheels lack, with the same output.
-
-``python3 -m rhs_isac_ros.tools.topic --help`` lists the commands.
-"""
+"""``scripts/topic``: ``ros2 topic``, which the wheels lack, with the same output."""
 
 import argparse
 import array
@@ -18,21 +15,15 @@ import yaml
 from rclpy.qos import QoSPresetProfiles, qos_profile_sensor_data
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.ros.endpoints import steady_timer
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
-from rhs_isac_ros.tools.command import Session, ToolError, print_now, run_command, run_verb
+from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run_verb
 
 _MAX_LENGTH = 128
 # Number of messages whose rate is measured.
 _MAX_TIMES = 10001
 # Time for the discovery of other nodes [s]: unlike ``ros2``, there is no daemon with their names.
 _DISCOVERY_TIMEOUT_S = 3.0
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command on topics and return the exit code of `run_command`."""
-    return run_command(run_verb, _parser(), arguments)
 
 
 def as_yaml(message: Any, max_length: int | None = None) -> str:
@@ -205,5 +196,4 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-if __name__ == '__main__':
-    sys.exit(exit_code_of(main))
+main = entry(run_verb, _parser)

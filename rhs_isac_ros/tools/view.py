@@ -18,7 +18,6 @@ from rclpy.node import Node
 from rhs_isac_ros.bounds import global_bound
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView, TrackPoint
@@ -44,6 +43,7 @@ from rhs_isac_ros.ros.endpoints import (
     subscribe,
     subscribe_messages,
 )
+from rhs_isac_ros.ros.frames import vector
 from rhs_isac_ros.ros.recording import RecordingError
 from rhs_isac_ros.ros.run import collect_signals
 from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
@@ -241,11 +241,10 @@ class ViewNode(Node):
                   functools.partial(self._on_track, user), endpoints.EXCHANGE)
 
     def _on_track(self, user: int, message: Odometry) -> None:
-        position, velocity = message.pose.pose.position, message.twist.twist.linear
         point = TrackPoint(
-            user, np.array([position.x, position.y, position.z]),
+            user, vector(message.pose.pose.position),
             np.reshape(message.pose.covariance, (6, 6))[:3, :3],
-            np.array([velocity.x, velocity.y, velocity.z]))
+            vector(message.twist.twist.linear))
         if all(np.isfinite(field).all() for field in (
                 point.position, point.covariance_m2, point.velocity)):
             self._write(self.view.add_track(0, point))
@@ -299,13 +298,6 @@ def entries(
             break
     if not view.n_cycles:
         raise RecordingError(f'{path}: no cycle in the namespace {namespace}')
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Show a network or a recording until a signal arrives, or write a file."""
-    return command.run_command(
-        _view, _parser(), arguments, ['file', '--config', '--calibration'], ['--save'],
-        _conflict)
 
 
 def _conflict(options: argparse.Namespace) -> str:
@@ -411,5 +403,5 @@ def _recording_file(text: str) -> Path:
     return path
 
 
-if __name__ == '__main__':
-    sys.exit(exit_code_of(main))
+main = command.entry(
+    _view, _parser, ['file', '--config', '--calibration'], ['--save'], _conflict)

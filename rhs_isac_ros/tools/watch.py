@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import sys
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
@@ -10,7 +9,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from rclpy.node import Node
 
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle
 from rhs_isac_ros.monitoring.network_state import Overview
 from rhs_isac_ros.protocol.base_station import State
@@ -19,7 +17,7 @@ from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.support.optional import optional_import
-from rhs_isac_ros.tools.command import none_within, observe, print_now, run_command
+from rhs_isac_ros.tools.command import entry, none_within, observe, print_now
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -141,11 +139,6 @@ class WatchNode(Node):
             name, report, time.monotonic()))
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Show a network until a signal arrives, or once; see `run_command`."""
-    return run_command(_watch, _parser(), arguments)
-
-
 def _watch(options: argparse.Namespace, arguments: list[str]) -> int:
     with optional_import('watch', extra=_PROGRAM):
         import rich  # noqa: F401
@@ -209,5 +202,4 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-if __name__ == '__main__':
-    sys.exit(exit_code_of(main))
+main = entry(_watch, _parser)

@@ -312,7 +312,7 @@ def test_a_full_disk_ends_the_recording_with_one_error(bench, probe, tmp_path):
 def test_the_tool_ends_with_one_line_if_the_disk_is_full(bench, probe, tmp_path):
     (tmp_path / 'run.mcap.part').symlink_to('/dev/full')
     process = subprocess.Popen(
-        [sys.executable, '-m', 'rhs_isac_ros.tools.record', str(tmp_path / 'run.mcap')],
+        [sys.executable, '-m', 'rhs_isac_ros.tools', 'record', str(tmp_path / 'run.mcap')],
         stderr=subprocess.PIPE, text=True)
     publisher = probe.create_publisher(ros.Ack, 'ack', ACKS)
     bench.until(publisher.get_subscription_count, 'the recorder')

@@ -1,0 +1,9 @@
+"""Runs a command, as the scripts do: ``python3 -m rhs_isac_ros.tools COMMAND [ARGUMENT ...]``."""
+
+import importlib
+import sys
+
+from rhs_isac_ros.executables import exit_code_of
+
+name = sys.argv.pop(1)
+sys.exit(exit_code_of(importlib.import_module(f'rhs_isac_ros.tools.{name}').main, program=name))
