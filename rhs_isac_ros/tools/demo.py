@@ -2,13 +2,12 @@
 
 import argparse
 import contextlib
-import dataclasses
 import math
 import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +17,11 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.utilities import try_shutdown
 
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
-from rhs_isac_ros.executables import STARTED_S, exit_code_of, print_error
+from rhs_isac_ros.executables import STARTED_S, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog, CycleRecord
 from rhs_isac_ros.protocol.messages import Phase
-from rhs_isac_ros.protocol.settings import PRIORS, REGION, Impairments
+from rhs_isac_ros.protocol.settings import PRIORS, REGION
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import parameters
 from rhs_isac_ros.ros.processes import MAX_USER_NODES, Processes, max_processes, private_domain
@@ -100,41 +99,27 @@ def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Pa
 
 
 def start_network(
-        processes: Processes, users: int, seed: int, scenario_file: Path | None,
-        codebook_file: Path, scenario: Scenario, rest_s: float = 0.1, first_cycle: int = 1,
-        impairments: Impairments | None = None, together: bool = False,
-        positioner: Mapping[str, Any] | None = None) -> None:
+        processes: Processes, users: int, scenario: Scenario, *, together: bool = False,
+        **given: Any) -> None:
     """Start each node of a network in a process of its own.
 
     Parameters
     ----------
     users
         Number of users; they walk at random at the scenario's maximum speed.
-    scenario_file
-        File of ``scenario``; None for the paper's Table I.
-    rest_s
-        Pause between cycles [s].
-    first_cycle
-        Number of the first cycle. With 1, cycles are reproducible for a seed; with 0, cycle
-        numbers are derived from the clock, so that the base station can be restarted.
-    impairments
-        Impairments of signals and packets; by default none.
+    scenario
+        Scenario of the parameter ``scenario_file``.
     together
         Whether the users share one node, named ``users``, instead of a node for each.
-    positioner
-        Further parameters of the positioner.
+    given
+        Parameters, for each node that has them; None stands for the default. With
+        ``first_cycle=1``, cycles are reproducible for a seed.
     """
-    given: dict[str, Any] = {
-        'seed': seed, 'codebook_file': codebook_file, 'rest_s': rest_s,
-        'first_cycle': first_cycle, **dataclasses.asdict(impairments or Impairments())}
-    if scenario_file:
-        given['scenario_file'] = Path(scenario_file).resolve()
-    for role in ROSTER:
+    for role, member in ROSTER.items():
         known = {parameter.name for parameter in parameters.NODES[role]}
-        values = {name: value for name, value in given.items() if name in known}
-        if role == 'positioner':
-            values |= positioner or {}
-        if ROSTER[role].is_unique:
+        values = {name: value for name, value in given.items()
+                  if name in known and value is not None}
+        if member.is_unique:
             processes.start(role, **values)
             continue
         for name, first, count in [('users', 1, users)] if together else [
@@ -286,9 +271,6 @@ def _run(
     together = options.users > min(MAX_USER_NODES, max_user_processes())
     if together:
         print(f'the {options.users} users share one process', file=sys.stderr)
-    # The parameter does not admit 0.
-    positioner = {} if options.prior == REGION else {
-        'prior': options.prior, 'track_speed_mps': max(scenario.max_user_speed_mps, 0.01)}
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         # The log of the cycles is complete when the processes are about to end.
         with Processes(Path(logs), {'ROS_LOG_DIR': logs}, fork=True) as processes:
@@ -296,8 +278,12 @@ def _run(
             try:
                 with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
                     start_network(
-                        processes, options.users, options.seed, options.config, codebook_file,
-                        scenario, together=together, positioner=positioner)
+                        processes, options.users, scenario, together=together, first_cycle=1,
+                        seed=options.seed, scenario_file=options.config,
+                        codebook_file=codebook_file, prior=options.prior,
+                        # The parameter does not admit 0.
+                        track_speed_mps=None if options.prior == REGION else max(
+                            scenario.max_user_speed_mps, 0.01))
                     problem = _observe(log, processes, recorder, options.cycles, parts)
             finally:
                 # Also if a signal arrives before the observer exists.
@@ -376,7 +362,3 @@ def _parser() -> argparse.ArgumentParser:
     add('--picture', type=picture_file, default='demo.png', metavar='FILE',
         help='file to draw: PNG, PDF or SVG')
     return parser
-
-
-if __name__ == '__main__':
-    sys.exit(exit_code_of(main))

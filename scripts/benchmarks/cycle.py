@@ -27,7 +27,6 @@ from parts.hops import CHAIN, ping_pong
 from rclpy.experimental import EventsExecutor
 from system.trial_processes import TrialProcesses
 
-from rhs_isac_ros.codebook import default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
@@ -121,8 +120,7 @@ def run_cycles(
                 processes.start('network', users=users, rest_s=REST_S, mobility='random_walk',
                                 speed_mps=scenario.max_user_speed_mps)
             else:
-                start_network(
-                    processes, users, 0, None, default_codebook_file(), scenario, REST_S)
+                start_network(processes, users, scenario, first_cycle=1, rest_s=REST_S)
             served, end_s, before_s = 0, time.monotonic() + TIMEOUT_S, 0.0
             while observer.served < WARM_UP + cycles:
                 executor.spin_once(timeout_sec=0.5)

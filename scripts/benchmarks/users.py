@@ -18,7 +18,6 @@ from parts.hops import CHAIN, ping_pong
 from system.observer import NetworkObserver
 from system.trial_processes import TrialProcesses
 
-from rhs_isac_ros.codebook import default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros.processes import private_domain
@@ -84,8 +83,8 @@ def run_network(scenario: Scenario, users: int, rounds: int, together: bool) -> 
     observer = NetworkObserver(scenario)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         with TrialProcesses(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
-            start_network(processes, users, 0, None, default_codebook_file(), scenario,
-                          rest_s=0.0, together=together)
+            start_network(
+                processes, users, scenario, together=together, first_cycle=1, rest_s=0.0)
             ended = observer.log.ended
             wait_until(
                 observer, lambda: {cycle.user for cycle in ended} == {*range(1, users + 1)},

@@ -1,6 +1,7 @@
 """The command line of ``scripts/chaos``."""
 
 import argparse
+import dataclasses
 import json
 import os
 import sys
@@ -73,9 +74,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             with processes:
                 start_network(
-                    processes, 2, options.seed, options.config, codebook_file, scenario,
-                    rest_s=_FUZZING_REST_S if options.fuzz else _REST_S, first_cycle=0,
-                    impairments=soaking.IMPAIRMENTS if options.soak else None)
+                    processes, 2, scenario, seed=options.seed, scenario_file=options.config,
+                    codebook_file=codebook_file,
+                    rest_s=_FUZZING_REST_S if options.fuzz else _REST_S,
+                    **(dataclasses.asdict(soaking.IMPAIRMENTS) if options.soak else {}))
                 figures = _run(observer, processes, scenario, options, Path(logs), codebook_file)
         except ChaosError as error:
             print_error(error, parser.prog)

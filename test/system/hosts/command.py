@@ -84,8 +84,8 @@ def _run(
     _set_environment(profile, options.static_peers)
     with Hosts() as hosts, tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs, \
             TrialProcesses(Path(logs), {'ROS_LOG_DIR': logs}, hosts.command_prefix) as processes:
-        start_network(processes, options.users, options.seed, options.config, codebook_file,
-                      scenario)
+        start_network(processes, options.users, scenario, first_cycle=1, seed=options.seed,
+                      scenario_file=options.config, codebook_file=codebook_file)
         hosts.enter(plan.OBSERVER)
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         observer = NetworkObserver(scenario)
