@@ -11,14 +11,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from rhs_isac_ros.protocol.role import (
-    ANY,
-    SAME,
-    StateMachine,
-    Transition,
-    always,
-    rows_for,
-)
+from rhs_isac_ros.protocol.role import ANY, SAME, Row, StateMachine, always, rows_for
 from rhs_isac_ros.ros.roster import ROSTER
 
 # Sizes of the picture [px].
@@ -174,7 +167,7 @@ def rows(role: str) -> list[tuple[str, ...]]:
             for row in ROLES[role].TABLE]
 
 
-def _source(row: Transition[Any, Any], states: type[enum.Enum]) -> str:
+def _source(row: Row[Any, Any], states: type[enum.Enum]) -> str:
     if row.source is ANY:
         return 'any'
     others = [state for state in states if state not in row.source]
@@ -183,11 +176,11 @@ def _source(row: Transition[Any, Any], states: type[enum.Enum]) -> str:
     return ', '.join(state.value for state in row.source)
 
 
-def _guard(row: Transition[Any, Any]) -> str:
+def _guard(row: Row[Any, Any]) -> str:
     return '' if row.guard is always else row.guard.__name__.lstrip('_')
 
 
-def _label(row: Transition[Any, Any]) -> str:
+def _label(row: Row[Any, Any]) -> str:
     guard = _guard(row)
     return f'{row.event.__name__} [{guard}]' if guard else row.event.__name__
 

@@ -14,15 +14,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Event, Outcome, Timeout
-from rhs_isac_ros.protocol.role import (
-    ANY,
-    Drops,
-    EventT,
-    NewestDict,
-    StateMachine,
-    Transition,
-    on,
-)
+from rhs_isac_ros.protocol.role import ANY, Drops, NewestDict, Row, StateMachine, on
 from rhs_isac_ros.protocol.settings import BaseStationSettings, PendingSettings
 from rhs_isac_ros.protocol.user_registry import (
     LAST_NUMBER,
@@ -83,10 +75,6 @@ class Cycle:
     def codebook_id(self) -> str:
         """Id of the codebook; empty if there is none."""
         return self.codebook.id if self.codebook else ''
-
-
-class Row(Transition['BaseStation', EventT]):
-    """A row of the table."""
 
 
 def reply(success: bool, text: str) -> Callable[['BaseStation', Event], None]:
@@ -261,8 +249,8 @@ class BaseStation(StateMachine):
         self._settings.latest = event.settings
 
     def _apply_settings(self, event: Event) -> None:
-        for message in self._settings.apply():
-            self.act(message)
+        if changes := self._settings.apply():
+            self.log(changes)
             settings = self._settings.in_use
             self._use(settings)
             for user in self._users.remove_all_except(self._allows):

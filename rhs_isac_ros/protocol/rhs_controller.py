@@ -10,10 +10,9 @@ from rhs_isac_ros.protocol.role import (
     ANY,
     REMEMBERED_CYCLES,
     CodebookCache,
-    EventT,
     NewestDict,
+    Row,
     StateMachine,
-    Transition,
     on,
 )
 
@@ -24,10 +23,6 @@ class State(enum.Enum):
     IDLE = 'idle'                  # applies no configuration
     POSITIONING = 'positioning'    # applies the bands' configurations, one for each frame
     TRANSMITTING = 'transmitting'  # applies the configuration of a beam
-
-
-class Row(Transition['RhsController', EventT]):
-    """A row of the table."""
 
 
 class RhsController(StateMachine):

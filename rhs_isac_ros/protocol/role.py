@@ -138,7 +138,7 @@ def always(role: object, event: object) -> bool:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Transition(Generic[RoleT, EventT]):
+class Row(Generic[RoleT, EventT]):
     """One row of a table."""
 
     source: tuple[enum.Enum, ...] | None  # states in which it applies, or ANY
@@ -153,7 +153,7 @@ class Transition(Generic[RoleT, EventT]):
     event_name: str = ''
 
 
-AnyRow = Transition[Any, Any]
+AnyRow = Row[Any, Any]
 # Conditions on which a message is dropped in every state, each with the outcome to count, or None.
 Drops = dict[Callable[..., bool], Outcome | None]
 
@@ -164,9 +164,9 @@ class on(Generic[EventT]):
     def __init__(self, event: type[EventT], name: str, drops: Drops | None = None) -> None:
         self._event, self._name, self._drops = event, name, drops or {}
 
-    def __call__(self, *rows: Transition[Any, EventT]) -> tuple[AnyRow, ...]:
+    def __call__(self, *rows: Row[Any, EventT]) -> tuple[AnyRow, ...]:
         """Return the rows that drop messages, followed by others."""
-        drops = [Transition[Any, EventT](ANY, guard=wrong, outcome=outcome)
+        drops = [Row[Any, EventT](ANY, guard=wrong, outcome=outcome)
                  for wrong, outcome in self._drops.items()]
         return tuple(dataclasses.replace(row, event=self._event, event_name=self._name)
                      for row in (*drops, *rows))

@@ -9,15 +9,7 @@ import numpy as np
 from rhs_isac_ros.model.mobility import Crowd, Mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome, PeersChanged, Timeout
-from rhs_isac_ros.protocol.role import (
-    ANY,
-    REMEMBERED_CYCLES,
-    EventT,
-    NewestDict,
-    StateMachine,
-    Transition,
-    on,
-)
+from rhs_isac_ros.protocol.role import ANY, REMEMBERED_CYCLES, NewestDict, Row, StateMachine, on
 
 # Steps of a cycle during which the user may receive nothing: the signals of the last band, the
 # position, the beam and the data.
@@ -32,10 +24,6 @@ class State(enum.Enum):
     NO_BEACON = 'no_beacon'        # waits for a beacon for longer than the timeout
     ACKNOWLEDGED = 'acknowledged'  # waits for the grant
     GRANTED = 'granted'            # a user is being positioned and served
-
-
-class Row(Transition['User', EventT]):
-    """A row of the table."""
 
 
 class User(StateMachine):

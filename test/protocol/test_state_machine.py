@@ -6,7 +6,7 @@ import enum
 import pytest
 
 from rhs_isac_ros.protocol.events import LogMessage, Outcome
-from rhs_isac_ros.protocol.role import ANY, StateMachine, Transition, on, rows_for
+from rhs_isac_ros.protocol.role import ANY, Row, StateMachine, on, rows_for
 
 
 class State(enum.Enum):
@@ -72,20 +72,20 @@ class Light(LightSteps):
     STATES = State
     TABLE = (
         *on(Go, 'go', {LightSteps.past: Outcome.STALE})(
-            Transition((State.RED,), target=State.GREEN, guard=LightSteps.fast,
+            Row((State.RED,), target=State.GREEN, guard=LightSteps.fast,
                        outcome=Outcome.OVERFLOW),
-            Transition((State.RED,), (LightSteps.note, LightSteps.record, LightSteps.note),
+            Row((State.RED,), (LightSteps.note, LightSteps.record, LightSteps.note),
                        State.GREEN),
-            Transition((State.GREEN,))),
-        *on(Stop, 'stop')(Transition((State.GREEN,), target=State.RED)),
+            Row((State.GREEN,))),
+        *on(Stop, 'stop')(Row((State.GREEN,), target=State.RED)),
         *on(Fail, 'fail')(
-            Transition((State.GREEN,), (LightSteps.shorten,), State.RED),
-            Transition(ANY, (LightSteps.note,), State.DARK, outcome=Outcome.OVERFLOW)),
-        *on(Wait, 'wait')(Transition((State.RED,))),
+            Row((State.GREEN,), (LightSteps.shorten,), State.RED),
+            Row(ANY, (LightSteps.note,), State.DARK, outcome=Outcome.OVERFLOW)),
+        *on(Wait, 'wait')(Row((State.RED,))),
         *on(Blink, 'blink')(
-            Transition((State.RED, State.GREEN), restart_timeout=True),
-            Transition(ANY, (LightSteps.note,), outcome=Outcome.DUPLICATE)),
-        *on(Renew, 'renew')(Transition((State.RED,), target=State.RED)),
+            Row((State.RED, State.GREEN), restart_timeout=True),
+            Row(ANY, (LightSteps.note,), outcome=Outcome.DUPLICATE)),
+        *on(Renew, 'renew')(Row((State.RED,), target=State.RED)),
     )
 
 
