@@ -134,23 +134,10 @@ def _colour(values: Iterable[float], opacity: float) -> ColorRGBA:
 _NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 
 
-def surface_transform(frame: Frame, stamp: Time) -> TransformStamped:
-    """Return the transform of the surface."""
-    return _transform(frame, frame.surface, frame.origin, frame.orientation, stamp)
-
-
-def user_transform(
-        frame: Frame, number: int, position: np.ndarray, stamp: Time) -> TransformStamped:
-    """Return the transform of a user at a position, float64 [3] [m], of unknown orientation.
-
-    The position is in the frame of the surface.
-    """
-    return _transform(frame, frame.user(number), frame.from_surface(position), _NO_TURN, stamp)
-
-
-def _transform(
-        frame: Frame, child: str, position: np.ndarray, orientation: np.ndarray, stamp: Time
-) -> TransformStamped:
+def transform(
+        frame: Frame, child: str, position: np.ndarray, stamp: Time,
+        orientation: np.ndarray = _NO_TURN) -> TransformStamped:
+    """Return the transform of a child of a frame, by default of unknown orientation."""
     return TransformStamped(
         header=Header(stamp=stamp, frame_id=frame.name), child_frame_id=child,
         transform=Transform(translation=to_ros(Vector3, position),
@@ -174,7 +161,8 @@ class TransformPublisher:
         self._dynamic = create_publisher(node, TFMessage, TF, EXCHANGE)
         self._static = create_publisher(node, TFMessage, TF_STATIC, LATCHED)
         self._static.publish(TFMessage(transforms=[
-            surface_transform(frame, node.get_clock().now().to_msg())]))
+            transform(frame, frame.surface, frame.origin, node.get_clock().now().to_msg(),
+                      frame.orientation)]))
 
     def publish(self, transform: TransformStamped) -> None:
         """Publish a transform that changes."""
@@ -212,8 +200,9 @@ class VisualizerNode(Node):
         self._scene.add(message, time.monotonic())
         # As for the topics, the number of frames is bounded: tf2 keeps every frame.
         if isinstance(message, m.PositionEstimate) and self._paths.publishers(message.user):
-            self._transforms.publish(user_transform(
-                self._frame, message.user, message.position, convert.stamp_of(message, self)))
+            self._transforms.publish(transform(
+                self._frame, self._frame.user(message.user),
+                self._frame.from_surface(message.position), convert.stamp_of(message, self)))
 
     def _show(self) -> None:
         """Publish the whole scene, so that late joiners receive it."""

@@ -210,8 +210,8 @@ class Channel(Role):
             self.count(Outcome.DUPLICATE)
             return
         self._begun.put(key, None)
-        for change in self._settings.apply():
-            self.act(change)
+        if changes := self._settings.apply():
+            self.log(changes)
             self._use(self._settings.in_use)
         multipath = self._fading.gains(
             truth.user, truth.cycle_id, truth.time_s(self.now_s),

@@ -252,8 +252,7 @@ class Positioner(Role):
                 if self._codebook:
                     self._request(_Job(self._codebook, settings))
                 else:
-                    for change in self._settings.apply():
-                        self.act(change)
+                    self.log(self._settings.apply())
             case EstimatorBuilt(codebook, estimator, elapsed_s, failure):
                 job = self._building or _Job(codebook, self._settings.latest)
                 if estimator is None:

@@ -9,7 +9,6 @@ from typing import Any, Generic, TypeVar
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import ESTIMATORS, BayesEstimator
-from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.user_registry import MAX_USERS, POLICIES, parse_users
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.fields import Field
@@ -164,11 +163,11 @@ class PendingSettings(Generic[SettingsT]):
         self.in_use = settings
         self.latest = settings
 
-    def apply(self) -> list[LogMessage]:
-        """Put the latest settings into use; return a message that lists the changes, if any."""
+    def apply(self) -> str:
+        """Put the latest settings into use; return a text that lists the changes, if any."""
         described = ', '.join(f'{name} {text!r}' for name, text in self._pending().items())
         self.in_use = self.latest
-        return [LogMessage(f'settings applied: {described}')] if described else []
+        return f'settings applied: {described}' if described else ''
 
     def describe(self) -> dict[str, str]:
         """Return ``parameter.<name>`` for each value in use, ``pending.<name>`` for newer ones."""

@@ -102,8 +102,7 @@ class Transmission(Role):
             case events.SettingsOffered(settings):
                 # A cycle that has a beam keeps its bands.
                 self._settings.latest = settings
-                for change in self._settings.apply():
-                    self.act(change)
+                self.log(self._settings.apply())
             case m.GroundTruth() if event.cycle_id:
                 self._truths.put((event.cycle_id, event.user, event.sender), event)
             case m.PositionEstimate() if event.codebook_id not in self._codebooks:

@@ -132,7 +132,9 @@ HAS_TF2 = importlib.util.find_spec('tf2_msgs') is not None
 
 
 def test_the_surface_is_at_the_origin_of_the_map():
-    transform = scene.surface_transform(Frame(), Time(sec=3))
+    frame = Frame()
+    transform = scene.transform(
+        frame, frame.surface, frame.origin, Time(sec=3), frame.orientation)
     assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'rhs_link')
     assert transform.header.stamp.sec == 3
     assert [getattr(transform.transform.translation, axis) for axis in 'xyz'] == [0.0] * 3
@@ -140,7 +142,9 @@ def test_the_surface_is_at_the_origin_of_the_map():
 
 
 def test_a_user_is_at_its_estimate():
-    transform = scene.user_transform(Frame(), 7, np.array([9.0, -1.5, 0.25]), Time(sec=4))
+    frame = Frame()
+    transform = scene.transform(
+        frame, frame.user(7), np.array([9.0, -1.5, 0.25]), Time(sec=4))
     assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'user_7')
     assert [getattr(transform.transform.translation, axis) for axis in 'xyz'] == [9.0, -1.5, 0.25]
     assert [getattr(transform.transform.rotation, axis) for axis in 'xyzw'] == [0.0, 0.0, 0.0, 1.0]
@@ -148,9 +152,7 @@ def test_a_user_is_at_its_estimate():
 
 def test_two_networks_have_frames_of_their_own():
     frames = [Frame('odom', prefix=f'{space}/') for space in ('left', 'right')]
-    children = [transform.child_frame_id for frame in frames for transform in (
-        scene.surface_transform(frame, Time()),
-        scene.user_transform(frame, 1, np.zeros(3), Time()))]
+    children = [child for frame in frames for child in (frame.surface, frame.user(1))]
     assert children == ['left/rhs_link', 'left/user_1', 'right/rhs_link', 'right/user_1']
 
 

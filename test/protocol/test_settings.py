@@ -2,7 +2,6 @@
 
 import pytest
 
-from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
     PendingSettings,
@@ -43,12 +42,12 @@ def test_tracks_need_the_estimator_bayes(estimator):
 def test_the_latest_settings_are_pending_until_they_are_applied():
     old, new = PositionerSettings(), PositionerSettings('ml')
     pending = PendingSettings(old)
-    assert pending.apply() == []
+    assert pending.apply() == ''
     pending.latest = PositionerSettings('neural')
     pending.latest = new
     assert pending.in_use == old
     assert pending.describe()['pending.estimator'] == 'ml'
-    assert pending.apply() == [LogMessage("settings applied: estimator 'ml'")]
+    assert pending.apply() == "settings applied: estimator 'ml'"
     assert pending.in_use == new
     assert 'pending.estimator' not in pending.describe()
-    assert pending.apply() == []
+    assert pending.apply() == ''
