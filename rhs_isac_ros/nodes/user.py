@@ -12,15 +12,7 @@ from rclpy.time import Time
 
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol.user import User
-from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import (
-    SENSOR,
-    UserTopics,
-    create_or_refuse,
-    create_timer,
-    steady_timer,
-    subscribe,
-)
+from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.ros.frames import Frame, rotation_matrix, vector
 from rhs_isac_ros.ros.parameters import ODOMETRY, ROBOTS
 from rhs_isac_ros.ros.role_node import RoleNode
@@ -102,7 +94,7 @@ def follow_odometry(node: Node, frame: Frame, topic: str, timeout_s: float) -> R
                      vector(message.pose.pose.position),
                      rotation_matrix(orientation) @ vector(message.twist.twist.linear))
     # Drivers and simulators often publish best effort.
-    subscribe(node, Odometry, topic, receive, SENSOR, overridable=True)
+    endpoints.subscribe(node, Odometry, topic, receive, endpoints.SENSOR, overridable=True)
     return mobility
 
 
@@ -119,9 +111,9 @@ def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> Robo
             'installed; it comes with a ROS 2 installation, but not as a wheel') from None
     mobility = RobotMobility(node, frame, f'transform from {frame.name} to {child}', timeout_s)
     buffer = tf2_ros.Buffer(node=node)
-    listener = create_or_refuse(
+    listener = endpoints.create_or_refuse(
         node, f'subscription to {topics.TF}', lambda: tf2_ros.TransformListener(buffer, node))
-    steady_timer(node, _LOOKUP_S, _lookup(mobility, buffer, listener, frame.name, child))
+    endpoints.steady_timer(node, _LOOKUP_S, _lookup(mobility, buffer, listener, frame.name, child))
     return mobility
 
 
@@ -165,13 +157,13 @@ class UserNode(RoleNode[User]):
         self.start(User(
             mobilities, values.step_timeout_s, values.beacon_timeout_s, self.instance,
             self.clocks.world_s))
-        self._true_odometry = UserTopics(
+        self._true_odometry = endpoints.UserTopics(
             self, {topics.TRUE_ODOMETRY: Odometry}, values.user_topics)
         # On the clock of ROS, as the mobilities.
-        create_timer(self, values.ground_truth_period_s, self._publish_ground_truth)
+        endpoints.create_timer(self, values.ground_truth_period_s, self._publish_ground_truth)
         if robot := self._robot:
             self._watch_robot(robot)
-            steady_timer(self, _WATCH_S, functools.partial(self._watch_robot, robot))
+            endpoints.steady_timer(self, _WATCH_S, functools.partial(self._watch_robot, robot))
 
     def _mobilities(self) -> dict[int, mobility.Mobility]:
         """Return the mobility of each user by id."""

@@ -25,15 +25,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState, UserState
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, parameters, topics
-from rhs_isac_ros.ros.endpoints import (
-    EXCHANGE,
-    LATCHED,
-    UserTopics,
-    create_publisher,
-    steady_timer,
-    subscribe_messages,
-)
+from rhs_isac_ros.ros import convert, endpoints, parameters, topics
 from rhs_isac_ros.ros.frames import Frame, to_ros
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.ros.topics import RHS_FRAME, TF, TF_STATIC
@@ -158,8 +150,8 @@ class TransformPublisher:
             return
         self.available = True
         self._message = TFMessage
-        self._dynamic = create_publisher(node, TFMessage, TF, EXCHANGE)
-        self._static = create_publisher(node, TFMessage, TF_STATIC, LATCHED)
+        self._dynamic = endpoints.create_publisher(node, TFMessage, TF, endpoints.EXCHANGE)
+        self._static = endpoints.create_publisher(node, TFMessage, TF_STATIC, endpoints.LATCHED)
         self._static.publish(TFMessage(transforms=[
             transform(frame, frame.surface, frame.origin, node.get_clock().now().to_msg(),
                       frame.orientation)]))
@@ -183,14 +175,14 @@ class VisualizerNode(Node):
         # The latest beam and its marker, cached because a beam pattern is slow to compute.
         self._drawn: tuple[m.Beam, Marker] | None = None
         self._shown: set[tuple[str, int]] = set()
-        self._publisher = create_publisher(self, MarkerArray, topics.MARKERS, EXCHANGE,
-                                           overridable=True)
-        self._paths = UserTopics(self, {topics.PATH: Path, topics.TRUE_PATH: Path},
-                                 values.user_topics)
+        self._publisher = endpoints.create_publisher(
+            self, MarkerArray, topics.MARKERS, endpoints.EXCHANGE, overridable=True)
+        self._paths = endpoints.UserTopics(
+            self, {topics.PATH: Path, topics.TRUE_PATH: Path}, values.user_topics)
         self._transforms = TransformPublisher(self, self._frame)
-        subscribe_messages(self, SCENE_RECEIVES, self._scenario.sizes, self._on_message,
-                           scenario_id=self._scenario.id)
-        steady_timer(self, values.period_s, self._show)
+        endpoints.subscribe_messages(self, SCENE_RECEIVES, self._scenario.sizes, self._on_message,
+                                     scenario_id=self._scenario.id)
+        endpoints.steady_timer(self, values.period_s, self._show)
         self.get_logger().info(  # type: ignore[no-untyped-call]
             'serving: markers, paths' + (
                 ' and transforms' if self._transforms.available

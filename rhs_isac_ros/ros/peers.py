@@ -14,15 +14,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.messages import MessageError
 from rhs_isac_ros.protocol.presences import Presence, Presences
-from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import (
-    LATCHED,
-    PRESENCES,
-    create_publisher,
-    refusals,
-    steady_timer,
-    subscribe,
-)
+from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.ros.roster import ROSTER, identifying_endpoints
 
 # Poll period while a role is missing or nodes are in conflict, and otherwise. A poll takes half a
@@ -88,10 +80,12 @@ class Peers:
         # Whether the last poll found that a node in conflict has gone.
         self._is_short = False
         if self._is_announced:
-            self._publisher = create_publisher(node, ros.Presence, topics.PRESENCE, LATCHED)
-            subscribe(node, ros.Presence, topics.PRESENCE, self._receive, PRESENCES, raw=True)
+            self._publisher = endpoints.create_publisher(
+                node, ros.Presence, topics.PRESENCE, endpoints.LATCHED)
+            endpoints.subscribe(node, ros.Presence, topics.PRESENCE, self._receive,
+                                endpoints.PRESENCES, raw=True)
             self._announce()
-        self._timer = steady_timer(node, _POLL_S, self._poll)
+        self._timer = endpoints.steady_timer(node, _POLL_S, self._poll)
         self.restart()
 
     def restart(self) -> None:
@@ -107,7 +101,7 @@ class Peers:
             f'conflict.qos.{topic.lstrip("/")}.{name.lstrip("/")}': text
             for (topic, name), text in self._incompatible.items()} | {
             f'conflict.{what.replace(" ", "_")}': text
-            for what, text in refusals(self._node).items()}
+            for what, text in endpoints.refusals(self._node).items()}
 
     def _poll(self) -> None:
         self._polls += 1
@@ -140,10 +134,10 @@ class Peers:
         """Return a missing role with the endpoints that it lacks; empty if it lacks none."""
         node, (publishers, subscriptions) = self._node, self._required[name]
         # The counts do not apply remapping rules.
-        endpoints = [*(('publisher', node.resolve_topic_name(topic)) for topic in publishers),
-                     *(('subscriber', node.resolve_topic_name(topic)) for topic in subscriptions)]
+        wanted = [*(('publisher', node.resolve_topic_name(topic)) for topic in publishers),
+                  *(('subscriber', node.resolve_topic_name(topic)) for topic in subscriptions)]
         counts = tuple(node.count_publishers(topic) if kind == 'publisher'
-                       else node.count_subscribers(topic) for kind, topic in endpoints)
+                       else node.count_subscribers(topic) for kind, topic in wanted)
         if counts == self._present.get(name):
             return ''
         # Observers have single endpoints, so that only a node with all of them is present. Names
@@ -151,11 +145,11 @@ class Peers:
         nodes = [{full_name(info) for info in (
             node.get_publishers_info_by_topic(topic) if kind == 'publisher'
             else node.get_subscriptions_info_by_topic(topic)) if info.node_name != _UNNAMED}
-            for kind, topic in endpoints]
+            for kind, topic in wanted]
         absent = [f'no {kind} of {topic}' for (kind, topic), names in zip(
-            endpoints, nodes, strict=True) if not names & nodes[0]]
+            wanted, nodes, strict=True) if not names & nodes[0]]
         if absent:
-            is_gone = len(absent) == len(endpoints)
+            is_gone = len(absent) == len(wanted)
             return name if is_gone else f'{name} ({", ".join(absent)})'
         self._present[name] = counts
         return ''

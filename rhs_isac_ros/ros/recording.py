@@ -23,16 +23,7 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import (
-    EXCHANGE,
-    LATCHED,
-    OBSERVATION,
-    PRESENCES,
-    profile_for,
-    subscribe,
-    subscribe_messages,
-)
+from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 # Separator between the message definitions of a schema, as in ROS 1 and 2.
@@ -47,12 +38,12 @@ class RecordingError(Exception):
 
 def recorded_topics() -> dict[str, tuple[type, QoSProfile]]:
     """Return the type and the quality of service of each recorded topic, by relative name."""
-    found = {name: (convert.ros_type(kind), profile_for(kind))
+    found = {name: (convert.ros_type(kind), endpoints.profile_for(kind))
              for kind, name in topics.NAMES.items()}
-    found[topics.POSITION] = PoseWithCovarianceStamped, EXCHANGE
-    found[topics.CODEBOOK] = ros.Codebook, LATCHED
-    found[topics.PRESENCE] = ros.Presence, PRESENCES
-    found[topics.DIAGNOSTICS] = DiagnosticArray, EXCHANGE
+    found[topics.POSITION] = PoseWithCovarianceStamped, endpoints.EXCHANGE
+    found[topics.CODEBOOK] = ros.Codebook, endpoints.LATCHED
+    found[topics.PRESENCE] = ros.Presence, endpoints.PRESENCES
+    found[topics.DIAGNOSTICS] = DiagnosticArray, endpoints.EXCHANGE
     return found
 
 
@@ -135,7 +126,7 @@ class Recorder:
                 schema_id=self._writer.register_schema(
                     type_name(kind), 'ros2msg', schema(kind).encode()),
                 metadata={'offered_qos_profiles': _offered_qos(profile)})
-            subscribe(
+            endpoints.subscribe(
                 node, kind, name, self._writer_of(channel, name, on_message), profile, raw=True)
 
     def _writer_of(
@@ -273,8 +264,8 @@ class CycleObserver(Node):
             recorder.record_topics(self, lambda name, message: self._on_recorded(
                 kinds.get(name), message))
             return
-        subscribe_messages(self, receives, sizes, self._on_message, on_malformed,
-                           exchange=OBSERVATION)
+        endpoints.subscribe_messages(self, receives, sizes, self._on_message, on_malformed,
+                                     exchange=endpoints.OBSERVATION)
 
     def observe(self, message: m.Message, now_s: float) -> None:
         """Process a message that arrived at `now_s` [s]; subclasses may extend this."""

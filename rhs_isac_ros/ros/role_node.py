@@ -21,17 +21,8 @@ from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.role import Role
-from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.ros.diagnostics import Diagnostics
-from rhs_isac_ros.ros.endpoints import (
-    LATCHED,
-    create_or_refuse,
-    create_publisher,
-    profile_for,
-    steady_timer,
-    subscribe,
-    subscribe_messages,
-)
 from rhs_isac_ros.ros.frames import surface_frame
 from rhs_isac_ros.ros.parameters import CODEBOOK, ParameterizedNode, scenario_of
 from rhs_isac_ros.ros.peers import Peers, new_instance
@@ -58,7 +49,7 @@ class CodebookClient:
         self._node, self._scenario, self._on_codebook = node, scenario, on_codebook
         # Only one of the parameter services, so that a security policy need not allow the others.
         name = f'{topics.OPTIMIZER_NODE}/get_parameters'
-        self._client = create_or_refuse(
+        self._client = endpoints.create_or_refuse(
             node, f'client of {name}', lambda: node.create_client(GetParameters, name))
         # Serial numbers of announcements. A response is stale if its request was sent before the
         # latest announcement.
@@ -68,9 +59,9 @@ class CodebookClient:
         # Why the latest codebook was rejected.
         self._problem = ''
         self.codebook_id = ''
-        subscribe(
-            node, ros.Codebook, topics.CODEBOOK, self._on_announcement, LATCHED, raw=True)
-        self._timer = steady_timer(node, _RETRY_S, self._request)
+        endpoints.subscribe(node, ros.Codebook, topics.CODEBOOK, self._on_announcement,
+                            endpoints.LATCHED, raw=True)
+        self._timer = endpoints.steady_timer(node, _RETRY_S, self._request)
 
     def _on_announcement(self, content: bytes) -> None:
         try:
@@ -220,7 +211,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._statistics = RoleStatistics()
         # One timer serves all deadlines. It is set again only if it would expire too late, or
         # when it has expired too early.
-        self._timer = steady_timer(self, 3600.0, self._on_timer)
+        self._timer = endpoints.steady_timer(self, 3600.0, self._on_timer)
         self._timer.cancel()
         self._timer_due_s: float | None = None
 
@@ -251,14 +242,14 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._is_advertised = True
         for kind in () if self.stands_by else self.role.SENDS:
             if kind not in self._sending:
-                self._sending[kind] = create_publisher(
-                    self, convert.ros_type(kind), topics.NAMES[kind], profile_for(kind))
+                self._sending[kind] = endpoints.create_publisher(
+                    self, convert.ros_type(kind), topics.NAMES[kind], endpoints.profile_for(kind))
 
     def subscribe(self) -> None:
         """Create the subscriptions of the role; the graph then shows that the role is ready."""
         kinds = [kind for kind in self.role.RECEIVES if kind not in self._receiving]
         self._receiving.update(kinds)
-        subscribe_messages(
+        endpoints.subscribe_messages(
             self, kinds, self._sizes, self._on_message, self._on_malformed, self.scenario.id,
             on_foreign=self._on_foreign, on_arrival=self._statistics.count_received)
 

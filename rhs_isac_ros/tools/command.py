@@ -26,18 +26,10 @@ from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning import ModelError
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, diagnostics, endpoints, topics
+from rhs_isac_ros.ros import convert, diagnostics, endpoints, startup, topics
 from rhs_isac_ros.ros.endpoints import subscribe
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
 from rhs_isac_ros.ros.run import parse, run
-from rhs_isac_ros.ros.startup import (
-    WITHOUT_SERVICES,
-    SecurityError,
-    is_enabled,
-    one_line,
-    prepare,
-    use_discovery_profile,
-)
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import check_distinct, input_file
 from rhs_isac_ros.support.optional import MissingLibraryError
@@ -46,7 +38,7 @@ from rhs_isac_ros.support.optional import MissingLibraryError
 _POLL_PERIOD_S = 0.02
 # Discovery is complete when the graph has not changed for this time [s]. It pauses while DDS
 # security exchanges keys.
-_SETTLE_S = 1.0 if is_enabled() else 0.4
+_SETTLE_S = 1.0 if startup.is_enabled() else 0.4
 # Errors of arguments and files.
 INVALID = (RecordingError, ScenarioError, CodebookError, CalibrationError, ModelError,
            plugins.PluginError, OSError)
@@ -220,10 +212,10 @@ class Session(contextlib.AbstractContextManager['Session']):
     """A context manager with one node, which the command itself spins."""
 
     def __init__(self, arguments: Sequence[str] = ('',)) -> None:
-        use_discovery_profile()
-        rclpy.init(args=prepare(arguments))
-        with one_line():
-            self.node = Node(f'_rhs_isac_cli_{os.getpid()}', **WITHOUT_SERVICES)
+        startup.use_discovery_profile()
+        rclpy.init(args=startup.prepare(arguments))
+        with startup.one_line():
+            self.node = Node(f'_rhs_isac_cli_{os.getpid()}', **startup.WITHOUT_SERVICES)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
 
@@ -276,9 +268,9 @@ def run_verb(options: argparse.Namespace, arguments: list[str]) -> int:
     Errors have no name of a program in front, as those of ``ros2``.
     """
     try:
-        with Session(arguments) as session, one_line():
+        with Session(arguments) as session, startup.one_line():
             options.verb(session, options)
-    except (ToolError, SecurityError) as error:
+    except (ToolError, startup.SecurityError) as error:
         print(error, file=sys.stderr)
         return 1
     return 0

@@ -23,18 +23,11 @@ from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog, CycleReco
 from rhs_isac_ros.protocol.messages import Phase
 from rhs_isac_ros.protocol.settings import PRIORS, REGION
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
-from rhs_isac_ros.ros import parameters
+from rhs_isac_ros.ros import parameters, startup
 from rhs_isac_ros.ros.processes import MAX_USER_NODES, Processes, max_processes, private_domain
 from rhs_isac_ros.ros.recording import CycleObserver, Recorder, RecordingError
 from rhs_isac_ros.ros.roster import ROSTER, UNIQUE
 from rhs_isac_ros.ros.run import check_domain
-from rhs_isac_ros.ros.startup import (
-    WITHOUT_SERVICES,
-    SecurityError,
-    one_line,
-    prepare,
-    use_discovery_profile,
-)
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
@@ -249,12 +242,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scenario, codebook_file = load_files(options.config, options.codebook)
         recorder = Recorder(options.record, scenario) if options.record else None
         os.environ.update(private_domain())
-        use_discovery_profile()
+        startup.use_discovery_profile()
         return _run(scenario, codebook_file, recorder, options)
     except CodebookError as error:
         print_error(f'{error}; to create a codebook for a scenario: python3 -m '
                     'rhs_isac_ros.codebook --scenario FILE --output FILE', parser.prog)
-    except (ScenarioError, RecordingError, SecurityError) as error:
+    except (ScenarioError, RecordingError, startup.SecurityError) as error:
         print_error(error, parser.prog)
     return 2
 
@@ -302,9 +295,9 @@ def _observe(
         log: CycleLog, processes: Processes, recorder: Recorder | None, cycles: int,
         parts: list[tuple[str, float]]) -> str:
     """Observe a number of cycles, and return the error that ended them; empty if none did."""
-    rclpy.init(args=prepare(['demo']))
-    with one_line():
-        observer = CycleObserver(recorder, log=log, **WITHOUT_SERVICES)
+    rclpy.init(args=startup.prepare(['demo']))
+    with startup.one_line():
+        observer = CycleObserver(recorder, log=log, **startup.WITHOUT_SERVICES)
     # The network needs a moment to start.
     prepare_drawing()
     discovered_s: list[float] = []

@@ -37,12 +37,6 @@ from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.protocol.role import NewestDict
 from rhs_isac_ros.ros import endpoints, topics
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
-from rhs_isac_ros.ros.endpoints import (
-    BackgroundWorker,
-    steady_timer,
-    subscribe,
-    subscribe_messages,
-)
 from rhs_isac_ros.ros.frames import vector
 from rhs_isac_ros.ros.recording import RecordingError
 from rhs_isac_ros.ros.run import collect_signals
@@ -152,7 +146,7 @@ class ViewNode(Node):
         # Names of a destroyed node are not available.
         self._namespace = self.get_namespace()
         self._posteriors, self._write = posteriors, write
-        self._worker, self._bounds = BackgroundWorker(self), BackgroundWorker(self)
+        self._worker, self._bounds = (endpoints.BackgroundWorker(self) for _ in range(2))
         self._requested: set[str] = set()  # ids of codebooks that are being prepared
         self._is_searching = False
         self._waiting: m.ReceivedSignals | None = None
@@ -162,9 +156,10 @@ class ViewNode(Node):
         command.subscribe_codebooks(self, scenario, self._on_codebook)
         subscribe_reports(self, lambda node, report: self._write(
             self.view.add_report(node, report)))
-        subscribe_messages(self, RECEIVES, scenario.sizes, self._on_message, self._on_mismatch,
-                           exchange=endpoints.OBSERVATION)
-        self._silence_timer = steady_timer(self, _SILENCE_S, self._log_silence)
+        endpoints.subscribe_messages(
+            self, RECEIVES, scenario.sizes, self._on_message, self._on_mismatch,
+            exchange=endpoints.OBSERVATION)
+        self._silence_timer = endpoints.steady_timer(self, _SILENCE_S, self._log_silence)
 
     @property
     def silence(self) -> str:
@@ -237,7 +232,7 @@ class ViewNode(Node):
         if user in self._users or len(self._users) >= _MAX_TRACKS:
             return
         self._users.add(user)
-        subscribe(self, Odometry, topics.ODOMETRY.format(user=user),
+        endpoints.subscribe(self, Odometry, topics.ODOMETRY.format(user=user),
                   functools.partial(self._on_track, user), endpoints.EXCHANGE)
 
     def _on_track(self, user: int, message: Odometry) -> None:

@@ -26,9 +26,10 @@ def test_a_signal_during_the_start_completes_the_recording(tmp_path, monkeypatch
     def interrupted(*_, **__):
         raise KeyboardInterrupt
     # The environment of this process remains as it is.
-    for name, replacement in (('start_network', interrupted), ('private_domain', dict),
-                              ('use_discovery_profile', lambda: None)):
-        monkeypatch.setattr(demo, name, replacement)
+    for module, name, replacement in (
+            (demo, 'start_network', interrupted), (demo, 'private_domain', dict),
+            (demo.startup, 'use_discovery_profile', lambda: None)):
+        monkeypatch.setattr(module, name, replacement)
     assert main(['--record', str(tmp_path / 'run.mcap'),
                  '--picture', str(tmp_path / 'demo.png')]) == 0
     assert [file.name for file in tmp_path.iterdir()] == ['run.mcap']
