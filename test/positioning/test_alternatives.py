@@ -57,7 +57,7 @@ def reference(setting):
     user = np.array([[7.0, 2.0, 1.0]])
     signals = model.whiten(model.sample(user, rng))[0]
     ranges = alternatives._ranges(scenario)[[0, -1]]
-    n = 200_000
+    n = 80_000
     direction = rng.normal(size=(n, 3))
     direction[:, 0] = np.abs(direction[:, 0])
     direction /= np.linalg.norm(direction, axis=1)[:, None]
