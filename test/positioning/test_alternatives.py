@@ -71,6 +71,7 @@ def reference(setting):
     return signals, positions, -np.sum(np.abs(signals - means)**2, axis=(1, 2))
 
 
+@pytest.mark.slow
 def test_evidence_is_the_average_likelihood(setting, reference):
     scenario, _, arrays = setting
     signals, _, exponent = reference

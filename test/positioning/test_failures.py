@@ -250,6 +250,7 @@ def search_at_the_truth(model, received):
     return search, search.add(POINT[None], NO_VALUES[None])
 
 
+@pytest.mark.slow
 def test_sets_grow_to_the_true_one_or_to_one_that_is_more_probable(ambiguous):
     rng = np.random.default_rng(6)
     for seed in range(12):
