@@ -48,7 +48,6 @@ def found_and_exact(scenario, codebook):
     return found, exact
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('changes', [{}, {'roi_size_m': (6, 6, 0)}])
 def test_draws_have_the_moments_of_the_posterior(changes, codebook):
     """The mean of 150 random draws would have an error of 0.08 standard deviations."""
