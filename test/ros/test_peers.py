@@ -219,6 +219,15 @@ def test_a_node_without_an_optimizer_reports_it(bench, kind, capfd):
     assert log.count('optimizer is present again') == 1
 
 
+def test_what_a_role_lacks_is_reported_with_the_missing_roles(bench):
+    node = bench.add(RhsControllerNode)
+    # What is missing is not known yet.
+    node.set_lacking('power')
+    bench.until(lambda: node._statistics.missing == ('optimizer', 'power'), 'the report')
+    node.set_lacking('')
+    assert node._statistics.missing == ('optimizer',)
+
+
 # Quality of service
 
 @pytest.mark.parametrize('publishes', [True, False])
