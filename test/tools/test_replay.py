@@ -217,6 +217,17 @@ def test_an_optimizer_is_awaited_as_long_as_discovery_takes(monkeypatch, enabled
     assert replay._optimizer_present(None)
 
 
+def test_endpoints_settle_some_time_after_the_last_change(monkeypatch):
+    node = types.SimpleNamespace(
+        _message_publishers=['received_signals'], _endpoints=None, _unchanged_since_s=0.0,
+        count_publishers=lambda name: count, count_subscribers=lambda name: 1)
+    for now_s, count, settled in ((9.0, 1, False), (9.9, 1, False), (10.1, 2, False),
+                                  (11.0, 2, False), (11.2, 2, True), (11.3, 1, False)):
+        clock = types.SimpleNamespace(monotonic=lambda now_s=now_s: now_s)
+        monkeypatch.setattr(replay, 'time', clock)
+        assert replay.RepublisherNode._endpoints_settled(node) == settled
+
+
 @pytest.mark.parametrize('arguments', [['--estimator', 'ml'], ['--rate', '0'],
                                        ['--topic', 'codebook']])
 def test_options_that_exclude_publishing_are_named(run, capsys, arguments):
