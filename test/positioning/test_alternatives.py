@@ -186,7 +186,7 @@ def test_users_around_the_region_get_no_fix_or_a_probability_outside(name, shipp
         found.outside_probability[found.fix] <= 0.05)
 
 
-N_USERS = 120
+N_USERS = 60
 DECLARED = dataclasses.replace(Scenario(), blocked_probability=0.3)
 
 
