@@ -41,11 +41,15 @@ def create_endpoints(node, endpoints):
         node.create_subscription(TYPES[name], name, lambda message: None, EXCHANGE)
 
 
-@pytest.fixture
-def monitor(bench, monkeypatch):
-    """Return a function that watches for the peers of a role and returns the reports."""
+@pytest.fixture(autouse=True)
+def frequent_polls(monkeypatch):
     monkeypatch.setattr(peers, '_POLL_S', 0.01)
+    monkeypatch.setattr(peers, '_IDLE_POLL_S', 0.1)
 
+
+@pytest.fixture
+def monitor(bench):
+    """Return a function that watches for the peers of a role and returns the reports."""
     def monitor(role, *cli_args):
         reports = []
         node = bench.add(Node, 'monitor', cli_args=['--ros-args', *cli_args])
@@ -220,6 +224,15 @@ def test_a_node_without_an_optimizer_reports_it(bench, kind, capfd):
     assert log.count('optimizer is present again') == 1
 
 
+def test_what_a_role_lacks_is_reported_with_the_missing_roles(bench):
+    node = bench.add(RhsControllerNode)
+    # What is missing is not known yet.
+    node.set_lacking('power')
+    bench.until(lambda: node._statistics.missing == ('optimizer', 'power'), 'the report')
+    node.set_lacking('')
+    assert node._statistics.missing == ('optimizer',)
+
+
 # Quality of service
 
 @pytest.mark.parametrize('publishes', [True, False])
@@ -239,7 +252,8 @@ def test_endpoints_with_incompatible_qos_are_named_once(bench, probe, publishes,
     assert text in node.report().summary
     log = capfd.readouterr().err
     assert log.count(text) == 1
-    assert ('durability' if publishes else 'reliab').lower() in log.lower()
+    assert ('Volatile publisher and transient local' if publishes else
+            'Best effort publisher and reliable') + ' subscription' in log
     bench.remove(observer)
     bench.until(lambda: key not in node.report().values, 'its end')
 
