@@ -224,7 +224,7 @@ class TemplateTable:
         signals = weighted.reshape(n, n_bands, -1, self._filters.shape[3]).astype(np.complex64)
         outputs = np.ascontiguousarray(np.moveaxis(np.matmul(
             self._filters, np.moveaxis(signals, 0, 3)), 3, 0))
-        query = Query(0, signals, outputs, energies, template_energy, np.empty(0), prior, margin)
+        query = Query(0, signals, outputs, energies, template_energy, np.empty(()), prior, margin)
         return query._replace(bound=self._bound(query))
 
     def _starts(self, query: 'Query', steps: bool = True,
