@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.gaussian import quadratic_form
 from rhs_isac_ros.positioning.coordinates import (
     carrier_wavenumbers,
     concatenate,
