@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.link import Beam, CapacityReport
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.measurement import receive_feeds, received_signal
@@ -19,6 +20,7 @@ from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
 from rhs_isac_ros.model.surface import radiation_matrix
 from rhs_isac_ros.positioning import Estimate, ModelError
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol import transmission
 from rhs_isac_ros.protocol import user as user_role
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.channel import Channel
@@ -431,6 +433,22 @@ class Network:
             if self._kind(name) in PEERS and self._reported.get(role) != missing:
                 self._reported[role] = missing
                 self.dispatch(name, PeersChanged(missing))
+
+
+@pytest.fixture(scope='module')
+def plain_beams():
+    """Replace the optimisation of beams, most of a cycle, by a function of the position."""
+    def choose(scenario, position, covariance_m2, bands, surface):
+        angles = np.arange(scenario.n_elements) * np.abs(position).sum()
+        digital = np.full((scenario.n_subbands, scenario.n_feeds), 0.1 + 0j)
+        return types.SimpleNamespace(
+            beam=Beam(0.5 + 0.5 * np.cos(angles), digital, bands[0]), expected_bps=1e6)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(transmission, 'choose_beam', choose)
+        patch.setattr(
+            transmission, 'capacity_report', lambda *_: CapacityReport(1e6, 1.1e6))
+        yield
 
 
 @pytest.fixture(scope='session')

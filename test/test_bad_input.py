@@ -105,6 +105,7 @@ CALLS = [
     ('nodes.network', ['--ros-args', '--params-file', 'garbage'], "'--params-file garbage'"),
     ('nodes.optimizer', ['--push', '--push-file', 'good.yaml'], 'not allowed with --push'),
     ('nodes.optimizer', ['--push-file', 'garbage'], 'garbage: cannot be read'),
+    ('nodes.optimizer', ['--push-file', 'none.yaml'], 'none.yaml'),
 ]
 # The scripts, as processes.
 PROCESSES = [

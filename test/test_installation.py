@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import venv
 from pathlib import Path
 
 import pytest
@@ -32,27 +33,32 @@ class Installation:
         self.folder = folder
         self.prefix = folder / 'venv'
 
+    def pip(self, *arguments):
+        """Run the pip of the tests, because one of its own takes as long as all libraries."""
+        return self._run(sys.executable, '-m', 'pip', '--python', self.prefix / 'bin' / 'python',
+                         '--quiet', '--disable-pip-version-check', *arguments)
+
     def run(self, program, *arguments):
+        return self._run(self.prefix / 'bin' / program, *arguments)
+
+    def _run(self, *command):
         # The caller's environment may name ROS and the clone itself.
         environment = {name: value for name, value in os.environ.items() if name not in (
             'PYTHONPATH', 'PYTHONHOME', 'LD_LIBRARY_PATH', 'VIRTUAL_ENV')}
         # Compiling all modules of SciPy takes longer than the rest of the installation.
         environment['PIP_NO_COMPILE'] = '1'
         return subprocess.run(
-            [self.prefix / 'bin' / program, *arguments], cwd=self.folder, env=environment,
-            capture_output=True, text=True, timeout=SECONDS, check=False)
+            command, cwd=self.folder, env=environment, capture_output=True, text=True,
+            timeout=SECONDS, check=False)
 
 
 @pytest.fixture(scope='module')
 def installation(tmp_path_factory):
     folder = tmp_path_factory.mktemp('installation')
-    made = subprocess.run([sys.executable, '-m', 'venv', folder / 'venv'], capture_output=True,
-                          text=True, timeout=SECONDS, check=False)
-    if made.returncode:
-        pytest.skip(f'python3 -m venv fails: {made.stdout.strip()[:200]}')
+    venv.create(folder / 'venv', symlinks=True)
     fresh = Installation(folder)
     # The build needs setuptools. Its download also shows whether there is an index.
-    probe = fresh.run('pip', 'download', '--quiet', '--no-deps', '--dest', 'index', 'setuptools')
+    probe = fresh.pip('download', '--no-deps', '--dest', 'index', 'setuptools')
     if probe.returncode:
         pytest.skip('pip cannot reach a package index')
     # A copy, since pip builds inside the source folder.
@@ -64,7 +70,7 @@ def installation(tmp_path_factory):
             shutil.copytree(path, source / name, ignore=shutil.ignore_patterns('__pycache__'))
         else:
             shutil.copy(path, source)
-    done = fresh.run('pip', 'install', '--quiet', './source')
+    done = fresh.pip('install', './source')
     assert done.returncode == 0, done.stderr
     return fresh
 

@@ -241,7 +241,7 @@ class Diagnosis:
             str(one.reason).partition(':')[0] for one in self._estimates if one.reason)
         if subjects:
             values['no_fix.share'] = f'{sum(subjects.values())} of {len(self._estimates)}'
-            values['no_fix.cause'] = self._cause(subjects.most_common(1)[0][0], deviates)
+            values['no_fix.cause'] = self._cause(subjects.most_common()[0][0], deviates)
         return values
 
     def _cause(self, subject: str, deviates: bool) -> str:

@@ -197,7 +197,7 @@ class TemplateTable:
         outputs = np.ascontiguousarray(np.moveaxis(np.matmul(
             self._filters, np.moveaxis(signals, 0, 3)), 3, 0))
         energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
-        query = Query(0, signals, outputs, energies, np.empty(0), prior, margin)
+        query = Query(0, signals, outputs, energies, np.empty(()), prior, margin)
         return query._replace(bound=self._bound(query))
 
     def _starts(self, query: 'Query', draw: Callable[['Query', int], bool] | None) -> 'Starts':

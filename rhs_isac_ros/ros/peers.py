@@ -34,8 +34,10 @@ _GRACE_POLLS = 10
 _MAX_LOGGED = 16
 # Topics of every node, which are not ours.
 _FOREIGN = ('/rosout', '/parameter_events')
-# Name of a node whose name has not arrived yet.
-_UNNAMED = '_NODE_NAME_UNKNOWN_'
+# What the middleware returns instead of the name of a node that is unknown.
+_UNNAMED = ('_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_')
+# Number of bytes of the identity of an endpoint that identify its participant.
+_PREFIX_LENGTH = 12
 
 _last_instance = 0
 
@@ -146,14 +148,12 @@ class Peers:
                        else node.count_subscribers(topic) for kind, topic in endpoints)
         if counts == self._present.get(name):
             return ''
-        # Observers have single endpoints, so that only a node with all of them is present. Names
-        # of nodes may arrive after their endpoints.
-        nodes = [{_full_name(info) for info in (
+        # Observers have single endpoints, so that only a node with all of them is present.
+        owners = [{_owner(info) for info in (
             node.get_publishers_info_by_topic(topic) if kind == 'publisher'
-            else node.get_subscriptions_info_by_topic(topic)) if info.node_name != _UNNAMED}
-            for kind, topic in endpoints]
-        absent = [f'no {kind} of {topic}' for (kind, topic), names in zip(
-            endpoints, nodes, strict=True) if not names & nodes[0]]
+            else node.get_subscriptions_info_by_topic(topic))} for kind, topic in endpoints]
+        absent = [f'no {kind} of {topic}' for (kind, topic), found in zip(
+            endpoints, owners, strict=True) if not found & owners[0]]
         if absent:
             is_gone = len(absent) == len(endpoints)
             return name if is_gone else f'{name} ({", ".join(absent)})'
@@ -186,7 +186,7 @@ class Peers:
         subscriptions = self._node.get_subscriptions_info_by_topic(topic)
         for publisher, subscription in itertools.product(publishers, subscriptions):
             names = {_full_name(publisher), _full_name(subscription)}
-            if _UNNAMED in (publisher.node_name, subscription.node_name):
+            if publisher.node_name in _UNNAMED or subscription.node_name in _UNNAMED:
                 # The name may arrive after the endpoint; the next poll examines it again.
                 self._counts = []
             elif own in names:
@@ -217,7 +217,7 @@ class Peers:
         """Forget nodes in conflict that are absent in two polls in a row."""
         infos = self._node.get_publishers_info_by_topic(self._publisher.topic_name)
         present = collections.Counter(
-            '' if info.node_name == _UNNAMED else _full_name(info) for info in infos)
+            '' if info.node_name in _UNNAMED else _full_name(info) for info in infos)
         was_short, self._is_short = self._is_short, bool(self._presences.gone(present))
         if was_short and self._is_short:
             self._apply(lambda presences: presences.keep(present))
@@ -236,6 +236,18 @@ class Peers:
             self._announce()
         if presences.rival != rival:
             self._on_rival(presences.stands_by)
+
+
+def _owner(info: Any) -> str | bytes:
+    """Return the node of an endpoint, or its participant while the node is unknown.
+
+    The name of a node may arrive after its endpoints. If the process stood still for longer than
+    the lease of discovery, its endpoints are discovered again, but Fast DDS does not deliver the
+    name again.
+    """
+    if info.node_name in _UNNAMED:
+        return bytes(info.endpoint_gid[:_PREFIX_LENGTH])
+    return _full_name(info)
 
 
 def _full_name(info: Any) -> str:

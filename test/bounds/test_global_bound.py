@@ -23,6 +23,7 @@ def test_without_signal_the_bound_is_the_variance_of_the_region():
         np.sum(np.square(scenario.roi_size_m)) / 12, rel=0.02)
 
 
+@pytest.mark.slow
 def test_with_strong_signals_the_bound_is_the_cramer_rao_bound():
     scenario, codebook, bound = bound_and_codebook(
         512, multipath_to_los_db=-33.0, roi_center_m=(5.0, 0.3, 0.2), roi_size_m=(0.1, 0.4, 0.4))

@@ -270,6 +270,7 @@ def test_exact_differences_are_not_sampled(scenario, codebook, pairs):
         PairwiseErrorCost(scenario, *pairs).sample(codebook, 2, np.random.default_rng(0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('phases', [
     {'phase_std_rad': 0.2}, {'phase_std_rad': 6.3}, {'band_phase_std_rad': 0.2},
     {'band_phase_std_rad': 6.3}, {'phase_std_rad': 0.5, 'band_phase_std_rad': 0.5}])

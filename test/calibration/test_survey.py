@@ -126,6 +126,7 @@ def test_impairments_are_estimated_with_the_multipath(beams):
     assert errors[0] < 1.1 * errors[1]
 
 
+@pytest.mark.slow
 def test_users_with_a_random_phase_at_one_height(beams):
     """The region has no extent along z, and the phase of a user is a nuisance parameter."""
     declared, hall = (dataclasses.replace(
@@ -156,6 +157,7 @@ def test_a_calibration_holds_in_every_hall(estimate, beams, tmp_path):
     assert make_estimator('bayes', measured, beams, surface=surface).surface is surface
 
 
+@pytest.mark.slow
 def test_one_position_yields_nearly_the_fields_and_a_warning(beams):
     with pytest.warns(SurveyWarning, match='expected at least 20'):
         estimate = survey(DECLARED, beams, *send(HALL, beams, 1))
@@ -164,6 +166,7 @@ def test_one_position_yields_nearly_the_fields_and_a_warning(beams):
     assert 1.2 < estimate.about['inflation'] < 2
 
 
+@pytest.mark.slow
 def test_a_survey_in_a_corner_causes_a_warning(beams):
     positions, received = send(HALL, beams, 120)
     corner = (positions[:, 1] < -2)

@@ -89,6 +89,7 @@ def test_the_number_of_pilots_stays_the_same(small):
         four, center_frequencies_hz=small.center_frequencies_hz, n_frames=4) == small
 
 
+@pytest.mark.slow
 def test_the_candidates_are_sorted_and_reported(small, short, monkeypatch):
     monkeypatch.setattr(band_plan, '_CANDIDATES', 3)
     reported = []

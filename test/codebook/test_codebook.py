@@ -292,6 +292,7 @@ def test_shipped_codebooks_are_feasible_and_match_their_metadata(name):
     assert Provenance.parse(codebook.provenance).objective == SHIPPED[name]
 
 
+@pytest.mark.slow
 def test_the_default_codebook_confuses_fewer_positions():
     """On held-out pairs."""
     scenario, rng = Scenario(), np.random.default_rng(77)

@@ -64,7 +64,8 @@ def test_ambiguity_is_the_pairwise_error_cost_of_the_plain_equations(
 PHASES = {'phase_std_rad': 0.4, 'band_phase_std_rad': 0.8}
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.slow
+@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize(('name', 'phases'), [
     *((name, {}) for name in OBJECTIVES), ('ambiguity', PHASES), ('error', PHASES)])
 def test_gradients_agree_with_finite_differences(name, phases, random_beams, seed):

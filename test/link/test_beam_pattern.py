@@ -43,6 +43,7 @@ def test_both_cuts_contain_the_strongest_direction(small):
     assert (elevation_cut == found.relative[:, column]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('azimuth_deg', [-30.0, 0.0, 25.0])
 def test_the_strongest_direction_is_the_direction_of_steering(azimuth_deg):
     scenario, azimuth = Scenario(), np.radians(azimuth_deg)

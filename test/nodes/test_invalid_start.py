@@ -56,10 +56,6 @@ CASES = {
 }
 
 
-# Cases that also run as processes, to check the exit code.
-PROCESSES = ('type', 'unknown key', 'position', 'codebook file')
-
-
 @pytest.fixture(scope='module')
 def files(shipped, tmp_path_factory):
     folder = tmp_path_factory.mktemp('files')
@@ -186,14 +182,8 @@ def test_a_foreign_entry_of_a_file_is_ignored_with_a_warning(files, never_spins,
     assert 'unknown parameters are ignored: polcy (the closest is policy)' in warning
 
 
-@pytest.fixture(scope='module')
-def started(module_processes, files):
-    """The processes of all cases, which run concurrently."""
-    return {name: module_processes.start(CASES[name][0], *arguments(name, files), as_program=True)
-            for name in PROCESSES}
-
-
-@pytest.mark.parametrize('name', PROCESSES)
-def test_a_process_has_the_same_exit_code_and_line(started, crashed, name):
-    code = started[name].wait()
-    assert_clear(code, started[name].log, name, crashed)
+@pytest.mark.parametrize('name', ['type', 'codebook file'])
+def test_a_process_has_the_same_exit_code_and_line(processes, files, crashed, name):
+    process = processes.start(CASES[name][0], *arguments(name, files), as_program=True)
+    code = process.wait()
+    assert_clear(code, process.log, name, crashed)

@@ -4,7 +4,6 @@ import signal
 
 import pytest
 import rclpy
-import yaml
 from rclpy.context import Context
 from rclpy.node import Node
 
@@ -65,20 +64,6 @@ def test_a_codebook_of_another_scenario_is_rejected(
     assert 'optimizer: error: /push/optimizer: codebook rejected: analog: shape' in log
     assert ids[-1] == before
     assert process.running
-
-
-@pytest.mark.parametrize('fault', ['nan', 'missing'])
-def test_an_invalid_file_is_not_sent(processes, network, small_files, tmp_path, fault, crashed):
-    before = list(network[2])
-    invalid = tmp_path / 'bad.yaml'
-    if fault == 'nan':
-        data = yaml.safe_load((small_files / 'first.yaml').read_text(encoding='utf-8'))
-        next(iter(data.values()))['ros__parameters']['codebook']['analog'][0] = float('nan')
-        invalid.write_text(yaml.safe_dump(data), encoding='utf-8')
-    code, log = call(processes, network, '--push-file', invalid)
-    assert code == 2, log
-    assert 'error: ' in log and not crashed(log), log
-    assert network[2] == before
 
 
 def test_the_error_names_a_missing_optimizer(small_files):

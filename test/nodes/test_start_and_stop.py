@@ -18,7 +18,10 @@ EXECUTABLES = tuple(ROSTER)
 @pytest.fixture(scope='module', params=[signal.SIGINT, signal.SIGTERM],
                 ids=lambda number: number.name)
 def ended_network(request, module_processes, make_watch, small_files):
-    """The observer of a network, and exit code and log of each process after a signal."""
+    """The observer of a network, and exit code and log of each process after a signal.
+
+    One of the networks consists of programs, the other of copies, which start sooner.
+    """
     number = request.param
     namespace = f'/{number.name.lower()}'
     watch = make_watch(namespace)
@@ -29,7 +32,7 @@ def ended_network(request, module_processes, make_watch, small_files):
     running = {}
     for name in order:
         running[name] = module_processes.start(
-            name, namespace=namespace, as_program=True,
+            name, namespace=namespace, as_program=number == signal.SIGINT,
             scenario_file=small_files / 'scenario.yaml', **parameters.get(name, {}))
         if len(running) == 2:
             # The first two are running before the others start.

@@ -57,7 +57,7 @@ def reference(setting):
     user = np.array([[7.0, 2.0, 1.0]])
     signals = model.whiten(model.sample(user, rng))[0]
     ranges = alternatives._ranges(scenario)[[0, -1]]
-    n = 200_000
+    n = 80_000
     direction = rng.normal(size=(n, 3))
     direction[:, 0] = np.abs(direction[:, 0])
     direction /= np.linalg.norm(direction, axis=1)[:, None]
@@ -71,6 +71,7 @@ def reference(setting):
     return signals, positions, -np.sum(np.abs(signals - means)**2, axis=(1, 2))
 
 
+@pytest.mark.slow
 def test_evidence_is_the_average_likelihood(setting, reference):
     scenario, _, arrays = setting
     signals, _, exponent = reference
@@ -185,7 +186,7 @@ def test_users_around_the_region_get_no_fix_or_a_probability_outside(name, shipp
         found.outside_probability[found.fix] <= 0.05)
 
 
-N_USERS = 120
+N_USERS = 60
 DECLARED = dataclasses.replace(Scenario(), blocked_probability=0.3)
 
 

@@ -95,6 +95,14 @@ def test_signals_weaker_than_noise_give_no_fix(setting, factor):
     assert_no_fix(estimator.estimate(received), 'energy')
 
 
+def test_a_user_with_a_low_gain_is_not_weaker_than_the_multipath(setting):
+    scenario, codebook, estimator = setting
+    declared = dataclasses.replace(scenario, user_gain_std_db=6.0)
+    received = simulate_pairs(scenario, codebook, 4, 0)[1] / 4
+    estimate = make_estimator(estimator.name, declared, codebook).estimate(received)
+    assert estimate.reason == ('',) * 4 and estimate.fix.all()
+
+
 @pytest.mark.parametrize('position', [(4.0, 0.0, 1.5), (4.0, -3.0, 0.0), (2.0, 0.0, 0.0)], ids=str)
 def test_a_user_far_outside_the_region_gives_no_fix(setting, position):
     scenario, codebook, estimator = setting

@@ -25,7 +25,7 @@ def codebook(random_beams):
 
 
 def found_and_exact(scenario, codebook):
-    """Draws for N phases, and mean, covariance and logarithm of the integral from 2^17 points."""
+    """Draws for N phases, and mean, covariance and logarithm of the integral from 2^15 points."""
     likelihood = Likelihood(scenario, codebook)
     table = TemplateTable(scenario, tabulate(likelihood.model))
     drawn, rng = DrawnPosterior(scenario, table), np.random.default_rng(1)
@@ -34,7 +34,7 @@ def found_and_exact(scenario, codebook):
     query = table.query(whitened, likelihood.nuisance, 8.0)
     found = [drawn.of(query, phase) for phase in range(N)]
     low, high = likelihood.resolution.bounds_m
-    positions = low + (high - low) * qmc.Sobol(3, seed=0).random(1 << 17)
+    positions = low + (high - low) * qmc.Sobol(3, seed=0).random(1 << 15)
     means = likelihood.model.whiten(likelihood.model.mean(positions)).reshape(len(positions), -1)
     values = (2 * (whitened.reshape(N, -1).conj() @ means.T).real
               - np.sum(np.abs(means)**2, axis=1))

@@ -180,6 +180,7 @@ def share_covered(estimate, positions) -> float:
     return np.sum(normalised <= 7.815) / len(positions)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('changes', [
     {'user_gain_std_db': 3.0}, {'carrier_offset_std_hz': 2e3}, {'timing_std_s': 5e-8},
     {'phase_std_rad': 7.0}, {'band_phase_std_rad': 0.2},
@@ -235,6 +236,7 @@ def strong(random_beams):
     return scenario, codebook, positions, received
 
 
+@pytest.mark.slow
 def test_no_position_nearby_is_more_likely(strong, plain):
     """A search with the plain likelihood, from the true position, ends at the estimate."""
     scenario, codebook, positions, received = strong

@@ -1,5 +1,6 @@
 """Modes of the posterior under sets of failed elements, and the growth of these sets."""
 
+import collections
 import dataclasses
 
 import numpy as np
@@ -233,6 +234,7 @@ def search_at_the_truth(model, received):
     return search, search.add(POINT[None], NO_VALUES[None])
 
 
+@pytest.mark.slow
 def test_sets_grow_to_the_true_one_or_to_one_that_is_more_probable(ambiguous):
     rng = np.random.default_rng(6)
     for seed in range(12):
@@ -264,6 +266,17 @@ def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):
     search, sites = search_at_the_truth(model, strong)
     search.grow(sites)
     assert max(len(failed) for failed, _ in search.values) == 4
+
+
+def test_few_hypotheses_of_each_set_and_of_each_site_are_extended(monkeypatch):
+    ranked = [((1,), site) for site in range(10)] + [((set_,), 0) for set_ in range(2, 20)]
+    monkeypatch.setattr(failures, '_N_EXTENDED', len(ranked))
+    chosen = failures._diverse(ranked)
+    sets, sites = (collections.Counter(one) for one in zip(*chosen, strict=True))
+    assert max(sets.values()) == failures._MAX_PER_SET
+    assert max(sites.values()) == failures._MAX_PER_SITE
+    monkeypatch.setattr(failures, '_N_EXTENDED', 2)
+    assert failures._diverse(ranked) == ranked[:2]
 
 
 def test_neighbours_differ_by_one_element(ambiguous):

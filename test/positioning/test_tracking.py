@@ -272,6 +272,7 @@ def test_errors_and_covariances_of_walks(table1_estimator, sample):
     assert 1 < np.median(normalised) < 5
 
 
+@pytest.mark.slow
 def test_turns_whose_steps_are_the_distance_of_modes():
     """Modes of the band plan are 0.12 m apart: a user that turns back may seem not to have."""
     config = Path(__file__).parents[2] / 'config'
@@ -379,6 +380,7 @@ def test_estimates_are_inside_the_region(tracker, sample):
         assert (estimate.mean <= high + 1e-9).all()
 
 
+@pytest.mark.slow
 def test_the_probability_of_a_user_outside_is_that_of_single_phases(random_beams):
     """Weak signals of a user inside may be those of one outside."""
     scenario = Scenario(n_subbands=2, n_frames=4, elements_per_side=5, roi_center_m=(3, 0, 0),

@@ -5,6 +5,8 @@ import pytest
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 
+pytestmark = pytest.mark.usefixtures('plain_beams')
+
 IN_A_CYCLE = [State.BEACONING, State.CONFIGURING, State.SOUNDING, State.ESTIMATING,
               State.STEERING, State.TRANSMITTING]
 WITH_ID = (m.RhsCommand, m.RhsConfiguration, m.ReceivedSignals, m.PositionEstimate, m.Beam,

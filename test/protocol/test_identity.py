@@ -10,7 +10,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.events import PauseRequested, PeersChanged, Resumed, StoodBy
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('plain_beams')]
 
 
 def violations(net):

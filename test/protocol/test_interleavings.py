@@ -1,7 +1,6 @@
 """The guarantees of the protocol hold under losses, duplicates, delays, crashes and restarts."""
 
 import itertools
-import types
 from typing import NamedTuple
 
 import numpy as np
@@ -10,13 +9,11 @@ from hypothesis import example as explicit
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rhs_isac_ros.link import Beam, CapacityReport
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol import transmission
 from rhs_isac_ros.protocol.base_station import State
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('plain_beams')]
 
 STEP_S, ACK_S, REST_S = 0.2, 0.05, 0.08
 # Duration of the faults, and the time within which every user must be served after it.
@@ -99,22 +96,6 @@ NOISE = st.fixed_dictionaries({
     'seed': st.integers(0, 2**32 - 1), 'loss': st.sampled_from([0.0, 0.02, 0.1]),
     'doubles': st.sampled_from([0.0, 0.1, 0.5]),
     'jitter_s': st.sampled_from([0.0, 0.01, 0.1, 0.5])})
-
-
-@pytest.fixture(scope='module', autouse=True)
-def plain_beams():
-    """Replace the optimization of beams by a simple function of the position."""
-    def choose(scenario, position, covariance_m2, bands, surface):
-        angles = np.arange(scenario.n_elements) * np.abs(position).sum()
-        digital = np.full((scenario.n_subbands, scenario.n_feeds), 0.1 + 0j)
-        return types.SimpleNamespace(
-            beam=Beam(0.5 + 0.5 * np.cos(angles), digital, bands[0]), expected_bps=1e6)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(transmission, 'choose_beam', choose)
-        patch.setattr(
-            transmission, 'capacity_report', lambda *_: CapacityReport(1e6, 1.1e6))
-        yield
 
 
 @pytest.fixture(scope='module')
@@ -200,7 +181,6 @@ def check_results(net):
             assert (report.band, report.expected_bps) == (beam.band, beam.expected_bps)
 
 
-@pytest.mark.slow
 @given(faults=FAULTS, crashes=CRASHES, offers=OFFERS, changes=CHANGES, ordered=st.booleans(),
        retries=RETRIES)
 @explicit(faults=[], crashes=[], offers=[], changes=[], ordered=True, retries=3)
@@ -212,7 +192,6 @@ def test_guarantees_hold_under_single_faults_and_crashes(
 @given(noise=NOISE, crashes=CRASHES, offers=OFFERS, changes=CHANGES, ordered=st.booleans(),
        retries=RETRIES)
 # A late beacon and a late grant of a finished cycle.
-@pytest.mark.slow
 @explicit(noise={'seed': 1038635, 'loss': 0.02, 'doubles': 0.5, 'jitter_s': 0.5},
           crashes=[Crash(0.0, 'rhs_controller', 0.0, False), Crash(0.0, 'channel', 0.0, False)],
           offers=[], changes=[], ordered=False, retries=0)

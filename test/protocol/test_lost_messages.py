@@ -11,7 +11,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user as user_role
 from rhs_isac_ros.protocol.base_station import State
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('plain_beams')]
 
 POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
 DOWN = {'direction': m.Direction.DOWNLINK}

@@ -6,6 +6,8 @@ import pytest
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user_registry import INVITED
 
+pytestmark = pytest.mark.usefixtures('plain_beams')
+
 N_USERS = 2 * INVITED
 
 

@@ -9,6 +9,8 @@ from rhs_isac_ros.protocol import user as user_role
 from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.events import PeersChanged
 
+pytestmark = pytest.mark.usefixtures('plain_beams')
+
 ROLE_FAULTS = [
     ('rhs_controller', State.CONFIGURING, 'rhs_silent'),
     ('rhs_controller', State.ESTIMATING, 'transmission_silent'),

@@ -5,7 +5,7 @@ import pytest
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('plain_beams')]
 
 
 def test_a_late_user_is_waited_for_in_the_next_cycle(network):

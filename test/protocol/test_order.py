@@ -5,6 +5,8 @@ import pytest
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user import State
 
+pytestmark = pytest.mark.usefixtures('plain_beams')
+
 
 class Delays:
     """Delays messages of a class to one recipient."""

@@ -10,6 +10,8 @@ from rhs_isac_ros.protocol.events import SettingsOffered
 from rhs_isac_ros.protocol.positioner import ResidualWatch
 from rhs_isac_ros.protocol.settings import PositionerSettings
 
+pytestmark = pytest.mark.usefixtures('plain_beams')
+
 EXPECTED = 62.5
 PLACE = np.array([10.0, 0.0, 0.0])
 

@@ -8,6 +8,8 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.settings import Impairments, PositionerSettings
 
+pytestmark = pytest.mark.usefixtures('plain_beams')
+
 IN_A_CYCLE = [State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
               State.TRANSMITTING]
 UNFIT = {'estimator': 'neural', 'model_file': 'unfit'}

@@ -13,6 +13,8 @@ from rhs_isac_ros.protocol.user_registry import (
     parse_users,
 )
 
+pytestmark = pytest.mark.usefixtures('plain_beams')
+
 
 @pytest.fixture
 def make():

@@ -8,6 +8,8 @@ import pytest
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
 
+pytestmark = pytest.mark.usefixtures('plain_beams')
+
 POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
 DOWN = {'direction': m.Direction.DOWNLINK}
 UP = {'direction': m.Direction.UPLINK}

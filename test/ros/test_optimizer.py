@@ -13,12 +13,11 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
 import rhs_isac_msgs.msg as ros
-from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
-from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.codebook import Codebook, default_codebook_file
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
 from rhs_isac_ros.ros import convert
 from rhs_isac_ros.ros.endpoints import LATCHED
-from rhs_isac_ros.support.fields import ParameterError
 
 TYPES = {
     'codebook.id': Parameter.Type.STRING,
@@ -279,30 +278,3 @@ def test_scenario_and_codebook_come_from_the_given_files(bench, small, small_fil
         Parameter('codebook_file', value=str(small_files / 'first.yaml'))])
     assert held(node).id == Codebook.load(small_files / 'first.yaml').id
     held(node).check(small.scenario)
-
-
-@pytest.mark.parametrize(('name', 'content', 'error', 'text'), [
-    ('codebook_file', None, CodebookError, 'cannot be read'),
-    ('codebook_file', '{', CodebookError, 'cannot be read'),
-    ('codebook_file', 'a: 1', CodebookError, 'expected ros__parameters'),
-    ('scenario_file', None, ScenarioError, 'cannot be read'),
-    ('scenario_file', 'n_feed: 3', ScenarioError, 'n_feed: unknown field'),
-    ('scenario_file', 'n_feeds: 2', CodebookError, r'digital: shape \(2, 8, 4, 3\), expected'),
-])
-def test_a_bad_file_is_rejected_at_the_start(bench, tmp_path, name, content, error, text):
-    path = tmp_path / 'bad.yaml'
-    if content is not None:
-        path.write_text(content, encoding='utf-8')
-    with pytest.raises(error, match=text):
-        bench.add(OptimizerNode, parameter_overrides=[Parameter(name, value=str(path))])
-
-
-def test_a_bad_codebook_is_rejected_at_the_start(bench):
-    with pytest.raises(CodebookError, match='codebook.id'):
-        bench.add(OptimizerNode, parameter_overrides=[
-            Parameter('codebook.id', value='deadbeefdeadbeef')])
-
-
-def test_a_parameter_of_the_wrong_type_is_rejected_at_the_start(bench):
-    with pytest.raises(ParameterError, match='codebook_file: .*expected a string'):
-        bench.add(OptimizerNode, parameter_overrides=[Parameter('codebook_file', value=1)])

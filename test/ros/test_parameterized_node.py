@@ -78,6 +78,7 @@ def test_an_invalid_value_is_rejected_with_a_reason(make, executable, parameter)
 @pytest.mark.parametrize(('executable', 'values', 'reason'), [
     ('bs', {'allowed_users': '3-1'}, "allowed_users: '3-1', expected numbers from 1 to"),
     ('transmission', {'band': 2}, 'band: 2, expected 0 to 0 of the scenario, or -1'),
+    ('positioner', {'estimator': 'ml', 'prior': 'track'}, "prior: 'track', expected 'region'"),
     ('positioner', {'estimator': 'neural'}, "model_file: '', expected a trained model"),
     ('positioner', {'estimator': 'neural', 'model_file': '/no/model.npz'},
      'model_file: /no/model.npz: '),

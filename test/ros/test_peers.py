@@ -41,11 +41,15 @@ def create_endpoints(node, endpoints):
         node.create_subscription(TYPES[name], name, lambda message: None, EXCHANGE)
 
 
-@pytest.fixture
-def monitor(bench, monkeypatch):
-    """Return a function that watches for the peers of a role and returns the reports."""
+@pytest.fixture(autouse=True)
+def frequent_polls(monkeypatch):
     monkeypatch.setattr(peers, '_POLL_S', 0.01)
+    monkeypatch.setattr(peers, '_IDLE_POLL_S', 0.1)
 
+
+@pytest.fixture
+def monitor(bench):
+    """Return a function that watches for the peers of a role and returns the reports."""
     def monitor(role, *cli_args):
         reports = []
         node = bench.add(Node, 'monitor', cli_args=['--ros-args', *cli_args])
@@ -139,23 +143,28 @@ def test_an_observer_does_not_stand_for_a_role(bench, monitor):
     bench.until(lambda: 'positioner' not in reports[-1], 'presence')
 
 
-def test_nodes_whose_names_arrive_late_are_found():
+@pytest.mark.parametrize('unknown', ['_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_'])
+def test_endpoints_without_the_name_of_their_node_belong_to_their_participant(unknown):
+    """Fast DDS does not deliver names again after a process has stood still."""
+    def endpoint(participant):
+        return mock.Mock(node_name=unknown, node_namespace='/', qos_profile=EXCHANGE,
+                         endpoint_gid=[*[participant] * 12, 0, 0, 0, 1])
     node, reports = mock.MagicMock(), []
     node.get_fully_qualified_name.return_value = '/user'
     node.resolve_topic_name.side_effect = '/{}'.format
     node.count_publishers.return_value = node.count_subscribers.return_value = 1
-    info = mock.Mock(node_name='_NODE_NAME_UNKNOWN_', node_namespace='/', qos_profile=EXCHANGE)
-    node.get_publishers_info_by_topic.return_value = (
-        node.get_subscriptions_info_by_topic.return_value) = [info]
+    node.get_publishers_info_by_topic.return_value = [endpoint(1)]
+    node.get_subscriptions_info_by_topic.return_value = [endpoint(2)]
     Peers(node, 'user', 1, Scenario(), reports.append, lambda stands_by: None)
     poll = node.create_timer.call_args.args[1]
     for _ in range(20):
         poll()
-    assert reports == [{'channel': 'channel', 'bs': 'bs'}]
-    info.node_name = 'other'
+    assert reports == [{'channel': 'channel (no subscriber of /pilot)',
+                        'bs': 'bs (no subscriber of /ack)'}]
+    node.get_subscriptions_info_by_topic.return_value = [endpoint(1)]
     for _ in range(2):
         poll()
-    assert reports[1:] == [{}]
+    assert reports[-1] == {}
 
 
 def test_only_the_own_namespace_counts(bench, monitor):
@@ -215,6 +224,15 @@ def test_a_node_without_an_optimizer_reports_it(bench, kind, capfd):
     assert log.count('optimizer is present again') == 1
 
 
+def test_what_a_role_lacks_is_reported_with_the_missing_roles(bench):
+    node = bench.add(RhsControllerNode)
+    # What is missing is not known yet.
+    node.set_lacking('power')
+    bench.until(lambda: node._statistics.missing == ('optimizer', 'power'), 'the report')
+    node.set_lacking('')
+    assert node._statistics.missing == ('optimizer',)
+
+
 # Quality of service
 
 @pytest.mark.parametrize('publishes', [True, False])
@@ -234,7 +252,8 @@ def test_endpoints_with_incompatible_qos_are_named_once(bench, probe, publishes,
     assert text in node.report().summary
     log = capfd.readouterr().err
     assert log.count(text) == 1
-    assert ('durability' if publishes else 'reliab').lower() in log.lower()
+    assert ('Volatile publisher and transient local' if publishes else
+            'Best effort publisher and reliable') + ' subscription' in log
     bench.remove(observer)
     bench.until(lambda: key not in node.report().values, 'its end')
 

@@ -1,10 +1,13 @@
 """Executables as child processes, and their end with their parent."""
 
+import gc
 import os
 import select
 import signal
 import subprocess
 import sys
+import warnings
+from multiprocessing.context import ForkProcess
 from pathlib import Path
 
 import pytest
@@ -90,6 +93,14 @@ def test_a_fork_is_a_process_with_its_own_name_session_log_and_exit_code(tmp_pat
         'visualizer True', "{'viewer': -9, 'bs': 2, 'user': 2}", '0'], done.stderr
     assert (tmp_path / 'bs.log').read_text().startswith('bs: error: rest_s: ')
     assert 'argument -p: unknown: unknown parameter' in (tmp_path / 'user.log').read_text()
+
+
+def test_a_fork_of_a_process_with_threads_causes_no_warning(tmp_path, monkeypatch):
+    """Python 3.12 and newer warn; here, a warning is an error."""
+    monkeypatch.setattr(ForkProcess, 'start', lambda self: warnings.warn(
+        'multi-threaded', DeprecationWarning, stacklevel=2))
+    processes._Fork(['bs'], tmp_path / 'bs.log', {})
+    gc.unfreeze()
 
 
 def test_a_child_whose_parent_has_already_died_ends_before_it_starts(tmp_path):

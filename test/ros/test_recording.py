@@ -10,6 +10,7 @@ import pytest
 import yaml
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.duration import Infinite
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
@@ -335,7 +336,8 @@ def test_nodes_receive_a_recording_that_is_played_with_its_recorded_qos(bench, t
         convert.CodebookMessage.of(codebook, 1, Scenario().id), Time())
     player = bench.add(Node, 'player')
     (recorded,) = yaml.safe_load(_offered_qos(recorded_topics()[topics.CODEBOOK][1]))
-    assert recorded['liveliness_lease_duration'] == recorded['deadline']
+    assert recorded['liveliness_lease_duration'] == recorded['deadline'] == dict(
+        zip(('sec', 'nsec'), divmod(Infinite.nanoseconds, 10**9), strict=True))
     publisher = player.create_publisher(ros.Codebook, topics.CODEBOOK, QoSProfile(
         history=HistoryPolicy.get_from_short_key(recorded['history']), depth=recorded['depth'],
         reliability=ReliabilityPolicy.get_from_short_key(recorded['reliability']),

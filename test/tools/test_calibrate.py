@@ -1,7 +1,9 @@
 """``scripts/calibrate`` on a recording of a network with a damaged surface, and what follows."""
 
+import contextlib
 import dataclasses
 import functools
+import io
 import re
 import subprocess
 import time
@@ -74,16 +76,24 @@ def surface():
                         streams.generator(ERRORS['seed'], streams.SURFACE))
 
 
-def call(capsys, *arguments):
-    code = main([*map(str, arguments)])
-    return types.SimpleNamespace(code=code, **capsys.readouterr()._asdict())
+def call(*arguments):
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main([*map(str, arguments)])
+    return types.SimpleNamespace(code=code, out=out.getvalue(), err=err.getvalue())
+
+
+@pytest.fixture(scope='module')
+def calibrated(recording):
+    """The file of the calibrated surface, and what the command printed."""
+    file = recording.with_name('surface.npz')
+    return file, call(recording, '--namespace', NAMESPACE, '--output', file)
 
 
 def test_a_calibration_restores_the_accuracy_of_a_running_network(
-        process, recording, surface, make_watch, tmp_path, capsys):
+        process, calibrated, surface, make_watch):
     """Errors come close to those of an estimator that knows the surface exactly."""
-    file = tmp_path / 'surface.npz'
-    done = call(capsys, recording, '--namespace', NAMESPACE, '--output', file)
+    file, done = calibrated
     assert (done.code, done.err) == (0, '')
     failed = np.nonzero(~np.isnan(surface.stuck))[0].tolist()
     assert [int(text) for text in re.findall(r'element (\d+) .*stuck at', done.out)] == failed
@@ -139,11 +149,10 @@ def test_the_pilots_may_come_from_the_running_network(built_scripts, process, re
     assert 5 <= Calibration.load(tmp_path / 'live.npz').about['pilots'] < 50
 
 
-def test_a_recording_is_a_survey_of_the_multipath(recording, tmp_path, capsys):
-    surface, hall = tmp_path / 'surface.npz', tmp_path / 'hall.npz'
-    common = recording, '--namespace', NAMESPACE, '--output'
-    assert call(capsys, *common, surface).code == 0
-    done = call(capsys, *common, hall, '--multipath', '--calibration', surface)
+def test_a_recording_is_a_survey_of_the_multipath(recording, calibrated, tmp_path):
+    hall = tmp_path / 'hall.npz'
+    done = call(recording, '--namespace', NAMESPACE, '--output', hall, '--multipath',
+                '--calibration', calibrated[0])
     assert (done.code, done.err) == (0, '')
     assert re.search(r'pilots after: [\d.]+ m rms, 0 of \d+ without a fix', done.out)
     estimate = dataclasses.replace(SCENARIO, multipath=hall).multipath
@@ -154,18 +163,18 @@ def test_a_recording_is_a_survey_of_the_multipath(recording, tmp_path, capsys):
     assert done.out.splitlines()[-1].startswith(f'{hall}: multipath {estimate.digest}; ')
 
 
-def test_arrays_are_a_survey_of_the_multipath(tmp_path, capsys):
+def test_arrays_are_a_survey_of_the_multipath(tmp_path):
     rng = np.random.default_rng(0)
     positions = SCENARIO.sample_positions(12, rng)
     received = simulate_received(SCENARIO, CODEBOOK, positions, rng)
     np.savez(tmp_path / 'arrays.npz', positions=positions, received=received)
     options = ('--multipath', '--config', CONFIG / 'quick.yaml', '--codebook',
                CONFIG / 'codebook_quick.yaml', '--output', tmp_path / 'hall.npz')
-    done = call(capsys, tmp_path / 'arrays.npz', *options)
+    done = call(tmp_path / 'arrays.npz', *options)
     assert (done.code, done.err) == (0, '')
     assert 'warning: positions: 12, expected at least 20' in done.out
     np.savez(tmp_path / 'arrays.npz', positions=positions)
-    done = call(capsys, tmp_path / 'arrays.npz', *options)
+    done = call(tmp_path / 'arrays.npz', *options)
     assert done.code == 2
     assert 'received: missing' in done.err
 
@@ -177,8 +186,8 @@ def test_arrays_are_a_survey_of_the_multipath(tmp_path, capsys):
     (['--namespace', NAMESPACE, '--failed-element-share', '0.7'],
      'failed_element_share: 0.7, expected 0 to 0.5'),
 ])
-def test_an_unusable_recording_or_prior_is_named(recording, capsys, tmp_path, arguments, error):
-    done = call(capsys, recording, '--output', tmp_path / 'x.npz', *arguments)
+def test_an_unusable_recording_or_prior_is_named(recording, tmp_path, arguments, error):
+    done = call(recording, '--output', tmp_path / 'x.npz', *arguments)
     assert done.code == 2
     assert done.err.startswith('calibrate: error: ')
     assert error in done.err

@@ -203,6 +203,7 @@ def test_topics_of_a_running_network_are_not_published(built_scripts, run, share
 @pytest.mark.parametrize('arguments, error', [
     (['--namespace', '/lab'], 'no received_signals in the namespace /lab'),
     (['--codebook', CONFIG / 'codebook.yaml'], 'running nodes would drop them'),
+    (['--config', CONFIG / 'table1.yaml'], 'replay: error: analog: shape (2, 3, 36), expected'),
 ])
 def test_unusable_recordings_are_named(run, capsys, arguments, error):
     assert main([str(run.path), '--publish', *map(str, arguments)]) == 2
@@ -215,6 +216,18 @@ def test_an_optimizer_is_awaited_as_long_as_discovery_takes(monkeypatch, enabled
     monkeypatch.setattr(replay, 'AsyncParameterClient', lambda *_: types.SimpleNamespace(
         wait_for_services=lambda timeout_s: timeout_s >= least_s))
     assert replay._optimizer_present(None)
+
+
+def test_endpoints_settle_some_time_after_the_last_change(monkeypatch):
+    node = types.SimpleNamespace(
+        _message_publishers=['received_signals'], _endpoints=None, _unchanged_since_s=0.0,
+        count_subscribers=lambda name: 1)
+    for now_s, count, settled in ((9.0, 1, False), (9.9, 1, False), (10.1, 2, False),
+                                  (11.0, 2, False), (11.2, 2, True), (11.3, 1, False)):
+        node.count_publishers = lambda name, count=count: count
+        clock = types.SimpleNamespace(monotonic=lambda now_s=now_s: now_s)
+        monkeypatch.setattr(replay, 'time', clock)
+        assert replay.RepublisherNode._endpoints_settled(node) == settled
 
 
 @pytest.mark.parametrize('arguments', [['--estimator', 'ml'], ['--rate', '0'],

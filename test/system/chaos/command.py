@@ -98,10 +98,11 @@ def _run(
     if options.fuzz:
         return _fuzz(observer, processes, scenario, options)
     trials: list[Trial] = []
-    if options.intruders is None:
+    crashes_chosen = options.nodes is not None or options.phases is not None
+    if crashes_chosen or options.intruders is None:
         trials += _crash(observer, processes, options)
         print(report.trial_summary('crashes', trials))
-    if options.nodes is None and options.phases is None:
+    if options.intruders is not None or not crashes_chosen:
         intrusions = _intrude(observer, processes, scenario, options, folder, codebook_file)
         print(report.trial_summary('second nodes', intrusions))
         trials += intrusions

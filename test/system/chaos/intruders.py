@@ -134,8 +134,7 @@ def _intrude(
     wait_for_service(observer)
     executable, node, parameters = command
     n_violations = len(observer.invariants.violations)
-    log_lengths = {name: len(processes.log(name)) for name in processes.names}
-    log_lengths[_PROCESS] = 0
+    log_lengths = {_PROCESS: 0, **{name: len(processes.log(name)) for name in processes.names}}
     observer.warnings.clear()
     observer.invariants.expect_rediscovery(
         PUBLISHES[node or executable], by_another=True)
