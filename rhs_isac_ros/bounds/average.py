@@ -11,7 +11,6 @@ import numpy as np
 
 from rhs_isac_ros.bounds.fisher import (
     inverse_information,
-    quadratic_form,
     without_nuisance,
 )
 from rhs_isac_ros.bounds.rows import (
@@ -32,6 +31,7 @@ from rhs_isac_ros.model.elements import (
     error_radiation,
     error_terms,
 )
+from rhs_isac_ros.model.gaussian import quadratic_form
 from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions, los_and_derivative

@@ -3,7 +3,7 @@
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.gaussian import marginalise
+from rhs_isac_ros.model.gaussian import marginalise, quadratic_form
 from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
@@ -120,18 +120,3 @@ def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.n
 
     map_blocks(fill, position_blocks(model.scenario, len(positions)))
     return information
-
-
-def quadratic_form(whitened: np.ndarray) -> np.ndarray:
-    """Compute 2 Re(D^H Lambda^-1 D) of one band, float64 [N, G, G], as in Eq. (12).
-
-    Takes the transpose of L^-1 D, complex128 [N, G, N_SB F], where L L^H = Lambda.
-    """
-    # Re(a^H b) is the inner product of real and imaginary parts.
-    parts = np.ascontiguousarray(whitened).view(whitened.real.dtype)
-    if parts.shape[1] == 1:
-        # Products of single rows take many times as long as one sum over arrays.
-        form = np.einsum('nar,nar->na', parts, parts)[..., None]
-    else:
-        form = np.matmul(parts, np.swapaxes(parts, 1, 2))
-    return 2 * form

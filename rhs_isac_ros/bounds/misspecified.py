@@ -17,6 +17,7 @@ import numpy as np
 from rhs_isac_ros.bounds.fisher import inverse_information
 from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.arrays import adjoint
+from rhs_isac_ros.model.gaussian import quadratic_form
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
@@ -86,8 +87,7 @@ def misspecified(
     white = np.matmul(assumed.whitener @ true.covariance(), adjoint(assumed.whitener))
     gradients = 2 * np.einsum('nair,irs,nbis->nab', slopes.conj(), white, slopes,
                               optimize=True).real
-    curvature = 2 * _products(slopes)
-    curvature -= _bending(assumed, places, residual)
+    curvature = _curvature(slopes) - _bending(assumed, places, residual)
     inverse = inverse_information(curvature)
     covariance = inverse @ gradients @ inverse
     bias = places - positions
@@ -98,9 +98,8 @@ def misspecified(
     return Misspecified(bias, covariance, valid)
 
 
-def _products(slopes: np.ndarray) -> np.ndarray:
-    """Real inner products of derivatives, float64 [N, 3, 3]."""
-    return np.einsum('nair,nbir->nab', slopes.conj(), slopes).real
+def _curvature(slopes: np.ndarray) -> np.ndarray:
+    return quadratic_form(slopes.reshape(len(slopes), 3, -1))
 
 
 def _projections(slopes: np.ndarray, signals: np.ndarray) -> np.ndarray:
@@ -118,7 +117,7 @@ def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndar
     costs = cost(positions)
     for _ in range(_MAX_STEPS):
         mean, slopes = model.mean_and_jacobian(places, whitened=True)
-        information, gradient = _products(slopes), _projections(slopes, target - mean)
+        information, gradient = _curvature(slopes), 2 * _projections(slopes, target - mean)
         ridge = 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         step = np.linalg.solve(information + ridge, gradient[..., None])[..., 0]
         for _ in range(_HALVINGS):
@@ -197,7 +196,7 @@ def _ambiguities(model: MeasurementModel, place: np.ndarray, mean: np.ndarray,
                      & (points[:, None] * direction <= high)).all(axis=1)]
     means, slopes = model.mean_and_jacobian(points[:, None] * direction, whitened=True)
     # The maximum of an ambiguity is beside the ray.
-    information = _products(slopes) + np.diag([_MAX_OFFSET_M**-2] * 3)
+    information = _curvature(slopes) / 2 + np.diag([_MAX_OFFSET_M**-2] * 3)
     gradient = _projections(slopes, mean + residual - means)
     offset = np.linalg.solve(information, gradient[..., None])[..., 0]
     difference = means + np.einsum('na,nair->nir', offset, slopes) - mean

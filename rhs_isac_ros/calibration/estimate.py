@@ -21,7 +21,7 @@ from rhs_isac_ros.calibration.mixture import (
 from rhs_isac_ros.model import Beamforming, Scenario, SurfaceEstimate
 from rhs_isac_ros.model.arrays import blocks, check_arrays
 from rhs_isac_ros.model.elements import direct_design, element_radiation, scattered_errors
-from rhs_isac_ros.model.gaussian import eliminate
+from rhs_isac_ros.model.gaussian import eliminate, quadratic_form
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.measurement import signal_covariance
@@ -148,8 +148,7 @@ class Alignment:
     def curvature(self, slopes: np.ndarray) -> np.ndarray:
         """Return the curvature [N, Q, Q] of whitened slopes and prior."""
         n, n_values = slopes.shape[:2]
-        flat = np.ascontiguousarray(slopes.reshape(n, n_values, -1)).view(float)
-        return 2 * np.matmul(flat, np.swapaxes(flat, 1, 2)) + np.eye(n_values)
+        return quadratic_form(slopes.reshape(n, n_values, -1)) + np.eye(n_values)
 
 
 def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:

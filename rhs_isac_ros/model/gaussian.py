@@ -1,4 +1,4 @@
-"""Elimination of nuisance parameters from a Gaussian approximation of a likelihood."""
+"""Information of Gaussian signals, and elimination of nuisance parameters from it."""
 
 from typing import NamedTuple
 
@@ -39,6 +39,21 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
     highest = exponents.max(axis=1)
     total = np.exp(exponents - highest[:, None]).sum(axis=1)
     return highest + np.log(total) - np.log(np.exp(prior).sum())
+
+
+def quadratic_form(whitened: np.ndarray) -> np.ndarray:
+    """Compute 2 Re(D^H Lambda^-1 D), float64 [N, G, G], as in Eq. (12).
+
+    Takes the transpose of L^-1 D, complex128 [N, G, R], where L L^H = Lambda.
+    """
+    # Re(a^H b) is the inner product of real and imaginary parts.
+    parts = np.ascontiguousarray(whitened).view(whitened.real.dtype)
+    if parts.shape[1] == 1:
+        # Products of single rows take many times as long as one sum over arrays.
+        form = np.einsum('nar,nar->na', parts, parts)[..., None]
+    else:
+        form = np.matmul(parts, np.swapaxes(parts, 1, 2))
+    return 2 * form
 
 
 def eliminate(

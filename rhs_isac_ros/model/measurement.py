@@ -6,8 +6,7 @@ scenario declares add to the covariance; `impairments` describes unknown gains a
 """
 
 import functools
-from collections.abc import Callable, Iterator
-from typing import TypeAlias
+from collections.abc import Callable
 
 import numpy as np
 
@@ -22,11 +21,11 @@ from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_h
 from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.model.los import (
     checked_positions,
-    constant_gain,
     direct_gain,
     draw_blocked,
-    los_derivative_terms,
+    has_pattern,
     los_gain,
+    los_waves,
 )
 from rhs_isac_ros.model.multipath import (
     complex_normal,
@@ -34,7 +33,7 @@ from rhs_isac_ros.model.multipath import (
     scattered_covariance,
     square_root,
 )
-from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
+from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming, combine, radiation_matrix
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
@@ -43,11 +42,6 @@ Surface = ElementErrors | SurfaceEstimate
 # Largest number of positions evaluated at a time, and of gains of all elements and sub-bands. The
 # random numbers of `simulate_received` depend on the former.
 _BLOCK, _MAX_GAINS = 256, 1 << 21
-# Gain, radial factor, and boresight term or None, complex128 [N_SB, N, N_E].
-_Terms: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | None]
-# Number of unit phasors in the table of `_phasors`.
-_N_PHASORS = 512
-_TABLE = np.exp(2j * np.pi * np.arange(_N_PHASORS) / _N_PHASORS)
 # Memory for an array of all elements and sub-bands. Larger arrays leave the cache, and each call
 # gets new pages for them from the system.
 _ARRAY_BYTES = 3 << 18
@@ -351,15 +345,11 @@ class ElementSums:
         self._scenario = scenario
         shape = scenario.n_bands, scenario.n_subbands, scenario.n_frames, scenario.n_elements
         self.block = max(_ARRAY_BYTES // (16 * shape[1] * shape[3]), _MIN_BLOCK)
-        self._wavenumbers = 2 * np.pi * subband_frequencies_hz(scenario) / SPEED_OF_LIGHT_MPS
-        gain = constant_gain(scenario)
-        self._has_pattern = gain is None
-        # T_i, complex128 [N_B, N_SB, N_E, F]; without a pattern, times the constant part of the
-        # gain.
-        self._frames = np.ascontiguousarray(np.swapaxes(radiation.reshape(shape), 2, 3))
-        if gain is not None:
-            # Not in place: with one frame, the array belongs to the caller.
-            self._frames = self._frames * (gain / 2 / self._wavenumbers)[..., None, None]
+        self._has_pattern = has_pattern(scenario)
+        # T_i over the frequency, complex128 [N_B, N_SB, N_E, F].
+        self._frames = np.ascontiguousarray(
+            np.swapaxes(radiation.reshape(shape), 2, 3)
+            / subband_frequencies_hz(scenario)[..., None, None])
         self._elements = element_positions(scenario)
         # Coordinates in which the elements differ from the origin; a plane has two.
         self._axes = np.flatnonzero(self._elements.any(axis=0))
@@ -376,18 +366,16 @@ class ElementSums:
         n, (n_bands, n_subbands, _, n_frames) = len(positions), self._frames.shape
         n_terms = 2 + len(self._axes) + self._has_pattern if slopes else 1
         terms = np.empty((n_bands, n, n_terms, n_subbands, n_frames), complex)
-        gains = (self._gains_with_pattern(positions) if self._has_pattern
-                 else self._gains(positions, slopes))
-        for band, (gain, radial, boresight_term) in enumerate(gains):
+        waves = los_waves(self._scenario, positions, range(n_bands), slopes=slopes)
+        for band, (gain, radial, boresight_term) in enumerate(waves):
             frames, rows = self._frames[band], np.moveaxis(terms[band], 2, 0)
             rows[:, :, 0] = np.matmul(gain, frames)
             if not slopes:
                 continue
             sums = np.matmul(radial, self._moments[band])
             rows[:, :, 1:2 + len(self._axes)] = sums.reshape(n_subbands, n, -1, n_frames)
-            if self._has_pattern:
-                rows[:, :, -1] = (
-                    0 if boresight_term is None else np.matmul(boresight_term, frames))
+            if boresight_term is not None:
+                rows[:, :, -1] = np.matmul(boresight_term, frames)
         return terms.reshape(n_bands, n, n_terms, -1)
 
     def weights(self, positions: np.ndarray) -> np.ndarray:
@@ -398,57 +386,3 @@ class ElementSums:
         if self._has_pattern:
             weights[:, 0, -1] = 1
         return weights
-
-    def _gains(self, positions: np.ndarray, slopes: bool) -> Iterator[_Terms]:
-        """Yield `los_derivative_terms` of each band over the constant part, sub-bands first.
-
-        Without slopes, the radial factor is the gain.
-        """
-        distances = np.sqrt(sum(
-            (positions[:, axis, None] - self._elements[:, axis])**2 for axis in range(3)))
-        inverse = 1 / distances
-        minus_square = -inverse**2
-        # Sub-bands are equally spaced: two phasors and a running product replace N_SB phasors.
-        spacing = 2 * np.pi * self._scenario.subband_width_hz / SPEED_OF_LIGHT_MPS
-        step = _phasors(-spacing * distances)
-        shape = len(self._wavenumbers[0]), *distances.shape
-        for wavenumbers in self._wavenumbers:
-            gain = np.empty(shape, complex)
-            gain[0] = _phasors(-wavenumbers[0] * distances)
-            gain[0] *= inverse
-            for subband in range(1, len(gain)):
-                np.multiply(gain[subband - 1], step, out=gain[subband])
-            if not slopes:
-                yield gain, gain, None
-                continue
-            radial = np.empty(shape, complex)
-            radial.real = minus_square
-            np.multiply(-wavenumbers[:, None, None], inverse, out=radial.imag)
-            radial *= gain
-            yield gain, radial, None
-
-    def _gains_with_pattern(self, positions: np.ndarray) -> Iterator[_Terms]:
-        """Yield `los_derivative_terms` of each band, sub-bands first."""
-        for band in range(self._scenario.n_bands):
-            gain, radial, boresight_term = los_derivative_terms(self._scenario, positions, band)
-            yield (gain.transpose(1, 0, 2), radial.transpose(1, 0, 2),
-                   None if boresight_term is None else boresight_term.transpose(1, 0, 2))
-
-
-def _phasors(phases: np.ndarray) -> np.ndarray:
-    """Compute exp(i phase), complex128, for phases [rad] of moderate size.
-
-    The nearest phasor of a table is rotated by the rest of the phase with the Taylor series, which
-    takes a third of the time of an exponential. The error is below 1e-15, or below the rounding
-    of a large phase.
-    """
-    turns = phases * (_N_PHASORS / (2 * np.pi))
-    nearest = np.rint(turns)
-    rest = (turns - nearest) * (2 * np.pi / _N_PHASORS)
-    square = rest * rest
-    phasors = _TABLE[nearest.astype(np.intp) & (_N_PHASORS - 1)]
-    rotation = np.empty(phases.shape, complex)
-    rotation.real = 1 - square * (0.5 - square * (1 / 24))
-    rotation.imag = rest * (1 - square * (1 / 6 - square * (1 / 120)))
-    phasors *= rotation
-    return phasors

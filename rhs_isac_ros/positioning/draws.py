@@ -117,7 +117,7 @@ class DrawnPosterior:
         """Share of each cell in the posterior if the bands had random phases, roughly, [C]."""
         # The average of exp(2 A cos(phase)) is nearly exp(2 A) / sqrt(1 + 4 pi A).
         n_bands, bound = len(self._wavenumbers), query.bound[phase]
-        amplitude = (bound + query.template_energy) / (2 * n_bands)
+        amplitude = (bound + self._table.energy) / (2 * n_bands)
         value = bound - n_bands / 2 * np.log1p(4 * np.pi * amplitude) + self._log_volume
         shares: np.ndarray = np.exp(value - value.max(), dtype=float)
         return shares / shares.sum()

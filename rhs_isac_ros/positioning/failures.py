@@ -20,11 +20,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.elements import (
-    DeclaredElements,
-    ElementErrors,
-    element_correlation,
-)
+from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import onboard_matrix
@@ -52,15 +48,9 @@ _N_USUAL = 2
 _MAX_POINTS = 64
 _POINT_MARGIN = 30.0
 _N_SITES = 64
-# Shares of further failures that order the sets, and numbers of sets of the same size to extend,
-# in a first search and in those that follow while the most probable set is large: almost all sets
-# that the first search finds instead of the true one are large.
-_SEARCHES = ((0.3, 8), (1.0, 16), (0.1, 16))
-_LARGE_SET = 3
-# Largest number of further searches, each under the most probable set, and their points.
-_MAX_SEARCHES = 2
-_N_PEAKS = 16
-_N_GROWN = 3
+# Share of further failures that orders the sets, and number of sets of the same size to extend.
+_REMAINDER = 0.3
+_N_EXTENDED = 16
 # Sets to try at all sites.
 _N_SETS = 4
 # Hypotheses whose log-probability is lower than the best by more than this are dropped, before
@@ -118,36 +108,16 @@ class FailedElements:
         if search.explains(keys):
             search.grow(keys[:_N_USUAL])
         else:
-            aligned = self._aligned(modes.values[order[0]])
-            keys = [((), index) for index in range(len(search.sites))]
+            # The parameters that a search on the grid must know.
+            aligned = modes.values[order[0]] * self._likelihood.nuisance.moves_multipath
             found = self._grid.starts(
                 self._likelihood.whitened(aligned, signals), self._likelihood.nuisance,
                 _POINT_MARGIN)
+            keys = [((), index) for index in range(len(search.sites))]
             keys += search.add(found.points[:_MAX_POINTS], found.values[:_MAX_POINTS] + aligned)
-            for remainder, n_extended in _SEARCHES:
-                search.grow(keys[:_N_SITES], remainder, n_extended)
-                self._search_again(search, signals)
-                if len(search.best[0]) < _LARGE_SET:
-                    break
+            search.grow(keys[:_N_SITES], _REMAINDER)
         search.try_neighbours(search.best)
         return search
-
-    def _search_again(self, search: 'FailureSearch', signals: Signals) -> None:
-        """Add sites that are probable under a set, which the average over sets may miss."""
-        for _ in range(_MAX_SEARCHES):
-            failed, index = search.best
-            aligned = self._aligned(search.sites[index].values)
-            found = self._grid.starts_under(
-                self._likelihood.whitened(aligned, signals)[0], self._likelihood.nuisance,
-                self._model.search_factor(failed), _POINT_MARGIN)
-            keys = search.add(found.points[:_N_PEAKS], found.values[:_N_PEAKS] + aligned, failed)
-            search.grow(keys[:_N_GROWN])
-            if search.best[0] == failed:
-                break
-
-    def _aligned(self, values: np.ndarray) -> np.ndarray:
-        """Return the parameters [Q] that a search on the grid must know, and 0 for the others."""
-        return values * self._likelihood.nuisance.moves_multipath
 
     def _converge(self, search: 'FailureSearch', signals: Signals
                   ) -> tuple[Modes, list['FailedSet']]:
@@ -352,18 +322,6 @@ class FailureModel:
                          information_of_covariance=whitening.information)
         return predict(local, self.likelihood)
 
-    def search_factor(self, failed: Failed) -> np.ndarray:
-        """Compute the factor of the average covariance of a set for `starts_under`."""
-        covariance = self._intact.covariance.copy()
-        for band, of_band in enumerate(covariance):
-            correlation = element_correlation(self.scenario, band)
-            for element in failed:
-                parts = np.stack(
-                    [self._shift[element, band], self._amplitudes[element, band]], axis=1)
-                of_band += (parts @ parts.conj().T) * correlation[..., element]
-        ratio = np.linalg.solve(np.linalg.cholesky(covariance), self.likelihood.model.root)
-        return np.conj(np.swapaxes(ratio, 1, 2))
-
     def _extensions_of(self, failed: Failed, remainder: float) -> Whitening:
         if (failed, remainder) not in self._extensions:
             surface = self.surface(failed)
@@ -424,11 +382,11 @@ class FailureSearch:
                        for point, own in zip(points, values, strict=True)]
         return self._weigh((failed, index) for index in range(first, len(self.sites)))
 
-    def grow(self, parents: list[Key], remainder: float = 0.0, n_extended: int = 8) -> None:
+    def grow(self, parents: list[Key], remainder: float = 0.0) -> None:
         """Add failures to hypotheses as long as the result is probable.
 
         Takes the share of further failures that orders the sets, as in
-        `FailureModel.weigh_extensions`, and the number of sets of the same size to extend.
+        `FailureModel.weigh_extensions`.
         """
         # Earlier growth does not count: it may have ended with a set that is less probable.
         found = self._weigh(parents)
@@ -442,7 +400,7 @@ class FailureSearch:
             if self.values[exact[0]] < limit and self.explains(found):
                 break
             found += exact
-            parents = _diverse(ranked, n_extended)
+            parents = _diverse(ranked)
 
     def try_neighbours(self, key: Key) -> None:
         """Weigh the sets with one element more, less, or exchanged."""
@@ -474,13 +432,13 @@ class FailureSearch:
         return sorted(children, key=lambda key: -children[key])
 
 
-def _diverse(ranked: list[Key], n_extended: int) -> list[Key]:
+def _diverse(ranked: list[Key]) -> list[Key]:
     """Choose the first hypotheses to extend, few of each set and of each site."""
     chosen: list[Key] = []
     for failed, index in ranked:
         if (sum(other == failed for other, _ in chosen) < _MAX_PER_SET
                 and sum(other == index for _, other in chosen) < _MAX_PER_SITE):
             chosen.append((failed, index))
-        if len(chosen) == n_extended:
+        if len(chosen) == _N_EXTENDED:
             break
     return chosen

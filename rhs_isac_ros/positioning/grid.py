@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.gaussian import quadratic_form
 from rhs_isac_ros.positioning.coordinates import (
     carrier_wavenumbers,
     concatenate,
@@ -128,7 +128,7 @@ def standard_normal(n: int) -> np.ndarray:
 class TemplateTable:
     """Fast evaluation of the log-likelihood over the whole region of interest.
 
-    Takes the arrays of `tabulate`, of which `normal` and `spread` are attributes.
+    Takes the arrays of `tabulate`, of which `normal`, `spread` and `energy` are attributes.
     """
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
@@ -137,13 +137,13 @@ class TemplateTable:
         self._resolution = Resolution.of(scenario)
         self._filters, self._slope_filters = arrays['filters'], arrays['slope_filters']
         self._whitener = arrays['whitener']
-        self._energy, self._energy_slope = arrays['energy'], arrays['energy_slope']
+        self.energy, self._energy_slope = arrays['energy'], arrays['energy_slope']
         self._curvature = arrays['curvature'] + np.diag(self._resolution.curvature_floor)
         self._inverse = np.linalg.inv(self._curvature).astype(np.float32)
         # Largest loss of log-likelihood between the directions of the grid.
         half = PHASE_ERROR * self._resolution.direction
         across = np.abs(arrays['curvature'][:, 1:, 1:])
-        self._loss = np.einsum('a,cab,b->c', half, across, half) / 2 + _TABLE_ERROR * self._energy
+        self._loss = np.einsum('a,cab,b->c', half, across, half) / 2 + _TABLE_ERROR * self.energy
         self._bounds = self._resolution.bounds_m
         self._wavenumbers = subband_wavenumbers(scenario)
         self._cell_turns = self._turns(grid.ranges_m).astype(np.complex64)
@@ -181,54 +181,26 @@ class TemplateTable:
         may leave out. The points of a phase do not depend on the other phases. A phase in which
         very many cells matter has none if `draw`, called with its row in a query, returns True.
         """
-        n = max(1, _N_OUTPUTS // (len(self._energy) * len(self._wavenumbers)))
+        n = max(1, _N_OUTPUTS // (len(self.energy) * len(self._wavenumbers)))
         parts = []
         for first in range(0, len(whitened), n):
             query = self.query(whitened[first:first + n], prior, margin)._replace(first=first)
-            part = self._starts(query, draw=draw)
+            part = self._starts(query, draw)
             parts.append(part._replace(phases=part.phases + first))
         return concatenate(*parts)
 
     def query(self, whitened: np.ndarray, prior: NuisancePrior, margin: float) -> 'Query':
         """Filter the whitened signals of a few phases, complex128 [N, N_B, N_SB F]."""
         weighted = np.swapaxes(np.matmul(np.swapaxes(whitened, 0, 1), self._whitener.conj()), 0, 1)
-        energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
-        return self._query(weighted, energies, prior, margin, self._energy)
-
-    def starts_under(self, whitened: np.ndarray, prior: NuisancePrior, factor: np.ndarray,
-                     margin: float) -> 'Starts':
-        """Find the most likely separate points for another covariance of the signals.
-
-        Takes the whitened signals of one phase, complex128 [N_B, N_SB F], and the factor F of the
-        inverse F F^H of the other covariance after this whitening, [N_B, N_SB F, N_SB F].
-        """
-        root = np.matmul(np.conj(np.swapaxes(self._whitener, 1, 2)), factor)
-        signals = np.einsum('isr,is->ir', factor.conj(), whitened)
-        weighted = np.einsum('isr,ir->is', root, signals)
-        grid = self.grid
-        turns = np.repeat(self._cell_turns, self._filters.shape[3], axis=1)
-        energy = np.zeros(len(grid.node), np.float32)
-        for band, filters in enumerate(self._filters):
-            templates = np.swapaxes(filters, 0, 1).reshape(len(grid.nodes), -1)
-            means = templates[grid.node] * turns[band].T[grid.cell]
-            turned = means @ root[band].astype(np.complex64)
-            energy += np.sum(turned.real**2 + turned.imag**2, axis=1)
-        energies = np.array([np.sum(np.abs(signals)**2)])
-        return self._starts(self._query(weighted[None], energies, prior, margin, energy),
-                            steps=False)
-
-    def _query(self, weighted: np.ndarray, energies: np.ndarray, prior: NuisancePrior,
-               margin: float, template_energy: np.ndarray) -> 'Query':
-        """Filter signals [N, N_B, N_SB F], weighted with the inverse covariance."""
         n, n_bands = weighted.shape[:2]
         signals = weighted.reshape(n, n_bands, -1, self._filters.shape[3]).astype(np.complex64)
         outputs = np.ascontiguousarray(np.moveaxis(np.matmul(
             self._filters, np.moveaxis(signals, 0, 3)), 3, 0))
-        query = Query(0, signals, outputs, energies, template_energy, np.empty(()), prior, margin)
+        energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
+        query = Query(0, signals, outputs, energies, np.empty(()), prior, margin)
         return query._replace(bound=self._bound(query))
 
-    def _starts(self, query: 'Query', steps: bool = True,
-                draw: Callable[['Query', int], bool] | None = None) -> 'Starts':
+    def _starts(self, query: 'Query', draw: Callable[['Query', int], bool] | None) -> 'Starts':
         """Find the starts of a query."""
         prior, margin = query.prior, query.margin
         peaks = self._peaks(query, draw)
@@ -237,7 +209,7 @@ class TemplateTable:
         if len(prior):
             values = prior.start(peaks.outputs.T, peaks.gain)
         value = peaks.value
-        if steps and not prior.is_coarse:
+        if not prior.is_coarse:
             step, value = self._step(query, peaks, points, values)
             points = points + step
         error = _STEP_ERROR * self._loss[peaks.cell]
@@ -299,11 +271,11 @@ class TemplateTable:
             amplitude[:, pairs] = by_range.reshape(len(outputs), -1)[:, dense]
         if not query.prior.gain_std:
             amplitude *= 2
-            amplitude -= query.template_energy
+            amplitude -= self.energy
             return amplitude
         bounds = [query.over_gain(one, energy)[0]
                   for one, energy in zip(amplitude, query.energies.tolist(), strict=True)]
-        return np.stack(bounds) - query.template_energy
+        return np.stack(bounds) - self.energy
 
     def _peaks_of(self, phases: np.ndarray, cells: np.ndarray, query: 'Query') -> '_Peaks':
         """Find all peaks along the range in pairs [K] of the grid, for a phase each, ascending."""
@@ -314,7 +286,7 @@ class TemplateTable:
         by_subband = outputs[phases, :, :, grid.node[cells]]
         of_band = np.einsum('wis,isw->iw', by_subband, self._window_turns[:, :, window])
         scale = self._cell_ranges(cells) / self._window_ranges_m[window]
-        energy = query.template_energy[cells] * (scale**2).astype(np.float32)
+        energy = self.energy[cells] * (scale**2).astype(np.float32)
         fine = np.ones_like(self._fine[:, :1]) if prior.is_coarse else self._fine
         if prior.phase_covariance.any():
             likelihood = 2 * prior.amplitude(fine[..., None] * of_band[:, None])
@@ -373,12 +345,12 @@ class TemplateTable:
         by_subband = np.moveaxis(query.outputs[phase][:, :, node], 2, 0) + np.einsum(
             'iskqf,isf,kq->kis', self._slope_filters[:, :, node], query.signals[phase], change,
             optimize=True)
-        energy = (self._energy[cells] + np.sum(slope[:, 1:] * offset, axis=1)
+        energy = (self.energy[cells] + np.sum(slope[:, 1:] * offset, axis=1)
                   + likelihood_loss(offset, curvature))
         pair, window = self._windows_of(cells)
         outputs = np.einsum('wis,isw->iw', by_subband[pair], self._window_turns[:, :, window])
         range_m = self._window_ranges_m[window]
-        along = (slope[:, 0] + 2 * self._energy[cells] / cell_m)[pair]
+        along = (slope[:, 0] + 2 * self.energy[cells] / cell_m)[pair]
         energy = (cell_m[pair] / range_m)**2 * (energy[pair] + along * (range_m - cell_m[pair]))
         return Windows(
             pair, range_m, self._window_widths_m[window], outputs, energy.astype(np.float32))
@@ -411,7 +383,7 @@ class TemplateTable:
         cell_m, slope = self._cell_ranges(peaks.cell), self._energy_slope[peaks.cell]
         scale = ((cell_m / points[:, 0])**2)[:, None]
         changes -= scale[:, 0] * (points[:, 0] - cell_m) * (
-            slope[:, 0] + 2 * self._energy[peaks.cell] / cell_m)
+            slope[:, 0] + 2 * self.energy[peaks.cell] / cell_m)
         gradient -= scale * slope
         step = np.einsum('pij,pj->pi', self._inverse[peaks.cell], gradient) / scale
         limits = self._resolution.step_limits(prior.is_coarse)
@@ -453,7 +425,6 @@ class Query(NamedTuple):
     signals: np.ndarray  # Weighted with the inverse covariance, complex64 [N, N_B, N_SB, F].
     outputs: np.ndarray  # Of the filters of all templates, complex64 [N, N_B, N_SB, G].
     energies: np.ndarray  # Of the whitened signals, float64 [N].
-    template_energy: np.ndarray  # Of the whitened means, float32 [C].
     bound: np.ndarray  # Of the log-likelihood in each cell, float32 [N, C].
     prior: NuisancePrior
     margin: float

@@ -12,7 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, MeasurementModel, Scenario
-from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
+from rhs_isac_ros.model.geometry import (
+    element_positions,
+    polar_bounds,
+    subband_frequencies_hz,
+)
 from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
 
 # Largest sine of the angle from boresight on the grid: directions have no derivative at the rim.
@@ -71,23 +75,16 @@ class Resolution(NamedTuple):
         wavelength_m = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
         thickness_m, center = _MIN_THICKNESS * wavelength_m, np.array(scenario.roi_center_m)
         thick = np.stack([center - thickness_m / 2, center + thickness_m / 2])
-        low, high = bounds = np.where(
+        bounds = np.where(
             np.array(scenario.roi_size_m) < thickness_m, thick, scenario.roi_bounds_m)
-        nearest, farthest = np.clip(0.0, low, high), np.maximum(np.abs(low), np.abs(high))
-        directions = np.empty((2, 2))
-        for axis, other in ((1, 2), (2, 1)):
-            near, far = (np.hypot(ends[0], ends[other]) for ends in (nearest, farthest))
-            directions[axis - 1] = [
-                low[axis] / np.hypot(low[axis], near if low[axis] < 0 else far),
-                high[axis] / np.hypot(high[axis], far if high[axis] < 0 else near)]
-        farthest_m = float(np.linalg.norm(farthest))
+        (nearest_m, *lowest), (farthest_m, *highest) = polar_bounds(bounds).tolist()
         return cls(
             wavelength_m,
             1 / np.maximum(wavenumber * np.abs(elements[:, 1:]).max(axis=0), 1 / _MAX_DIRECTION),
             max(wavenumber * np.sum(elements**2, axis=1).max() / 2, 1e-9),
             SPEED_OF_LIGHT_MPS / (np.pi * scenario.n_subbands * scenario.subband_width_hz),
-            max(float(np.linalg.norm(nearest)), _MIN_RANGE * farthest_m), farthest_m, directions,
-            bounds)
+            max(nearest_m, _MIN_RANGE * farthest_m), farthest_m,
+            np.stack([lowest, highest], axis=1), bounds)
 
     @property
     def volume_m3(self) -> float:

@@ -15,10 +15,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.gaussian import eliminate, marginalise
+from rhs_isac_ros.model.gaussian import eliminate, marginalise, quadratic_form
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, nuisance_of
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.coordinates import to_positions

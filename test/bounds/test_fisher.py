@@ -174,15 +174,6 @@ def test_bound_is_the_trace_of_the_inverse_information_at_any_distance(shipped, 
         rtol=1e-15 * np.linalg.cond(information).max())
 
 
-def test_quadratic_form_is_twice_the_real_part_of_the_products():
-    whitened = np.random.default_rng(8).normal(size=(4, 2, 5, 2)) @ [1, 1j]
-    expected = 2 * np.einsum('nga,nha->ngh', whitened.conj(), whitened).real
-    # The memory layout does not matter.
-    for layout in (whitened, np.asfortranarray(whitened)):
-        np.testing.assert_allclose(
-            fisher.quadratic_form(layout), expected, rtol=1e-12, atol=1e-12)
-
-
 def test_no_positions_give_no_bounds(small):
     assert crlb(small.scenario, small.codebook, np.zeros((0, 3))).shape == (0,)
 

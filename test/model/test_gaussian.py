@@ -1,11 +1,20 @@
-"""Elimination of nuisance parameters from quadratic log-likelihoods."""
+"""Information of Gaussian signals, and elimination of nuisance parameters from it."""
 
 import numpy as np
 import pytest
 
-from rhs_isac_ros.model.gaussian import eliminate, marginalise
+from rhs_isac_ros.model.gaussian import eliminate, marginalise, quadratic_form
 
 N = 6
+
+
+def test_quadratic_form_is_twice_the_real_part_of_the_products():
+    whitened = np.random.default_rng(8).normal(size=(4, 2, 5, 2)) @ [1, 1j]
+    expected = 2 * np.einsum('nga,nha->ngh', whitened.conj(), whitened).real
+    # The memory layout does not matter.
+    for layout in (whitened, np.asfortranarray(whitened)):
+        np.testing.assert_allclose(
+            quadratic_form(layout), expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.fixture(params=[1, 2, 5], ids='{} parameters'.format)

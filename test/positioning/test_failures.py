@@ -12,7 +12,6 @@ from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.positioning import failures, make_estimator
 from rhs_isac_ros.positioning.coordinates import jacobian, to_polar, to_positions
 from rhs_isac_ros.positioning.failures import FailureModel, FailureSearch, can_enumerate
-from rhs_isac_ros.positioning.grid import TemplateTable, tabulate
 from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
 
 SCENARIO = Scenario(
@@ -191,22 +190,6 @@ def test_the_remainder_adds_to_the_covariance(weighing, codebook, monkeypatch):
         assert values[element] == pytest.approx(model.weigh(failed, site)[0], **tolerance(model))
 
 
-def test_the_second_search_follows_the_covariance_of_a_set(codebook):
-    """With the covariance of the search itself, it finds the peaks of the grid."""
-    likelihood = Likelihood(SCENARIO, codebook)
-    table, (n_bands, n_rows) = (
-        TemplateTable(SCENARIO, tabulate(likelihood.model)), likelihood.model.shape)
-    received = MeasurementModel(SCENARIO, codebook).sample(
-        POSITION[None], np.random.default_rng(4))
-    (whitened,) = likelihood.signals(received).whitened
-    identity = np.broadcast_to(np.eye(n_rows), (n_bands, n_rows, n_rows))
-    points = table.starts_under(whitened, likelihood.nuisance, identity, 10.0).points
-    expected = table.starts(whitened[None], likelihood.nuisance, 2.0).points
-    radii = likelihood.resolution.separation(is_coarse=False)
-    for point in expected:
-        assert (np.linalg.norm((points - point) / radii, axis=1) < 1).any()
-
-
 @pytest.mark.slow
 def test_a_few_failures_cost_little_accuracy(codebook):
     """One Gaussian for all failures has several times the error."""
@@ -262,12 +245,13 @@ def test_sets_grow_to_the_true_one_or_to_one_that_is_more_probable(ambiguous):
         assert search.values[search.best] >= true - 1e-6
 
 
-def test_without_a_remainder_the_growth_often_ends_with_another_set(ambiguous):
+def test_without_a_remainder_the_growth_often_ends_with_another_set(ambiguous, monkeypatch):
+    monkeypatch.setattr(failures, '_N_EXTENDED', 1)
     rng, missed = np.random.default_rng(6), 0
     for seed in range(12):
         failed = tuple(sorted(rng.choice(36, 3, replace=False).tolist()))
         search, sites = search_at_the_truth(ambiguous, sample_with(ambiguous, failed, seed))
-        search.grow(sites, n_extended=1)
+        search.grow(sites)
         true, _ = ambiguous.weigh(failed, search.sites[0])
         missed += search.values[search.best] < true - 1.0
     assert missed > 0
@@ -284,13 +268,15 @@ def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):
     assert max(len(failed) for failed, _ in search.values) == 4
 
 
-def test_few_hypotheses_of_each_set_and_of_each_site_are_extended():
+def test_few_hypotheses_of_each_set_and_of_each_site_are_extended(monkeypatch):
     ranked = [((1,), site) for site in range(10)] + [((set_,), 0) for set_ in range(2, 20)]
-    chosen = failures._diverse(ranked, len(ranked))
+    monkeypatch.setattr(failures, '_N_EXTENDED', len(ranked))
+    chosen = failures._diverse(ranked)
     sets, sites = (collections.Counter(one) for one in zip(*chosen, strict=True))
     assert max(sets.values()) == failures._MAX_PER_SET
     assert max(sites.values()) == failures._MAX_PER_SITE
-    assert failures._diverse(ranked, 2) == ranked[:2]
+    monkeypatch.setattr(failures, '_N_EXTENDED', 2)
+    assert failures._diverse(ranked) == ranked[:2]
 
 
 def test_neighbours_differ_by_one_element(ambiguous):

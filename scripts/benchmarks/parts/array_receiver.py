@@ -9,8 +9,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import inverse_information, quadratic_form
+from rhs_isac_ros.bounds.fisher import inverse_information
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.gaussian import quadratic_form
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import (
     complex_normal,
