@@ -86,8 +86,11 @@ def run_executable(
         command: Sequence[str], log: Path, environment: Mapping[str, str]) -> None:
     """Run an executable in this process, a new copy of another one, as its command would.
 
-    Output is appended to `log`.
+    Output is appended to `log`. The process ends with the exit code 0 after SIGINT, also before the
+    executable handles it; the caller has blocked the signal.
     """
+    signal.signal(signal.SIGINT, lambda number, _: sys.exit(0))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
     os.setsid()
     os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666), 1)
     os.dup2(1, 2)
@@ -117,7 +120,11 @@ class _Fork(ForkProcess):
         with warnings.catch_warnings():
             # The tracing library of ROS has two threads, which wait and hold no lock.
             warnings.simplefilter('ignore', DeprecationWarning)
-            self.start()
+            signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+            try:
+                self.start()
+            finally:
+                signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
 
     def poll(self) -> int | None:
         """Return the exit code, the negative number of a signal, or None while running."""
