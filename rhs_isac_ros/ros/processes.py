@@ -86,8 +86,8 @@ def run_executable(
         command: Sequence[str], log: Path, environment: Mapping[str, str]) -> None:
     """Run an executable in this process, a new copy of another one, as its command would.
 
-    Output is appended to `log`. The process ends with the exit code 0 after SIGINT, also before the
-    executable handles it; the caller has blocked the signal.
+    Output is appended to `log`. After SIGINT, which the caller has blocked, the exit code is 0,
+    also before the executable handles the signal.
     """
     signal.signal(signal.SIGINT, lambda number, _: sys.exit(0))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
