@@ -110,7 +110,13 @@ class SearchEstimator(abc.ABC):
         if scenario.blocked_probability:
             self._alternatives.append(Blocked(scenario))
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
-        self._test = FitTest(n_measurements)
+        # Level of the multipath of users in sight: its median, and the share of the deviations of
+        # a residual that are deviations of the level.
+        median_db, std_db = scenario.multipath.level_db if scenario.multipath else (0.0, 0.0)
+        variance = (np.log(10) / 10 * std_db)**2
+        self._level, self._level_share = 10**(median_db / 10), variance / (
+            variance + 1 / n_measurements)
+        self._test = FitTest(n_measurements, self._level)
         self._bounds = likelihood.resolution.bounds_m
         self._alignment = Alignment(likelihood, self._grid.spread)
         self._phases = BandPhases(likelihood)
@@ -247,7 +253,7 @@ class SearchEstimator(abc.ABC):
             for one in self._alternatives)])
         probabilities = shares(log_weights[None])[0]
         reason = self._reason(whitened * np.exp(-fit.gain), fit.residual, log_weights)
-        moments = _no_fix() if reason else (fit.mean, fit.covariance)
+        moments = _no_fix() if reason else (fit.mean, self._covariance(fit))
         # Of signals without a fix, only a residual that nothing explains is evidence against
         # the scenario.
         counts = (reason == self._test.residual_test(fit.residual) if reason
@@ -257,6 +263,14 @@ class SearchEstimator(abc.ABC):
         outside, blocked = (by_name.get(kind.name, np.nan) for kind in ALTERNATIVES)
         return ((*moments, reason, fit.residual, fit.expected if counts else np.nan,
                  outside, blocked), None if reason else fit.modes)
+
+    def _covariance(self, fit: _Fit) -> np.ndarray:
+        """Return the covariance for the level of the multipath that the residual reveals."""
+        relative = max(fit.residual, 1e-9) / (self._level * max(fit.expected, 0.5))
+        # No position is less certain than anywhere in the region.
+        prior = float(np.sum((self._bounds[1] - self._bounds[0])**2)) / 12
+        largest = max(prior / float(np.trace(fit.covariance)), 1.0)
+        return min(relative**self._level_share, largest) * fit.covariance
 
     def _reason(self, whitened: np.ndarray, residual: float, log_weights: np.ndarray) -> str:
         """Return why there is no fix, empty if there is one."""
