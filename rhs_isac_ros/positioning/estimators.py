@@ -118,6 +118,7 @@ class SearchEstimator(abc.ABC):
             variance + 1 / n_measurements)
         self._test = FitTest(n_measurements, self._level)
         self._bounds = likelihood.resolution.bounds_m
+        self._prior_m2 = float(np.sum((self._bounds[1] - self._bounds[0])**2)) / 12
         self._alignment = Alignment(likelihood, self._grid.spread)
         self._phases = BandPhases(likelihood)
         self._failures = (FailedElements(likelihood, self._grid)
@@ -268,8 +269,7 @@ class SearchEstimator(abc.ABC):
         """Return the covariance for the level of the multipath that the residual reveals."""
         relative = max(fit.residual, 1e-9) / (self._level * max(fit.expected, 0.5))
         # No position is less certain than anywhere in the region.
-        prior = float(np.sum((self._bounds[1] - self._bounds[0])**2)) / 12
-        largest = max(prior / float(np.trace(fit.covariance)), 1.0)
+        largest = max(self._prior_m2 / float(fit.covariance.trace()), 1.0)
         return min(relative**self._level_share, largest) * fit.covariance
 
     def _reason(self, whitened: np.ndarray, residual: float, log_weights: np.ndarray) -> str:
