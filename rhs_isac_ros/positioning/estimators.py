@@ -10,6 +10,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.gaussian import share_of_level
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.alternatives import (
     ALTERNATIVES,
@@ -110,12 +111,10 @@ class SearchEstimator(abc.ABC):
         if scenario.blocked_probability:
             self._alternatives.append(Blocked(scenario))
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
-        # Level of the multipath of users in sight: its median, and the share of the deviations of
-        # a residual that are deviations of the level.
+        # Median level of the multipath of users in sight, and its share in that of a residual.
         median_db, std_db = scenario.multipath.level_db if scenario.multipath else (0.0, 0.0)
-        variance = (np.log(10) / 10 * std_db)**2
-        self._level, self._level_share = 10**(median_db / 10), variance / (
-            variance + 1 / n_measurements)
+        self._level = 10**(median_db / 10)
+        self._level_share = share_of_level(n_measurements, std_db)
         self._test = FitTest(n_measurements, self._level)
         self._bounds = likelihood.resolution.bounds_m
         self._prior_m2 = float(np.sum((self._bounds[1] - self._bounds[0])**2)) / 12
