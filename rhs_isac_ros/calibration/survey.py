@@ -26,7 +26,7 @@ from rhs_isac_ros import __version__
 from rhs_isac_ros.calibration.estimate import Alignment, Pilots
 from rhs_isac_ros.model import Beamforming, MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import adjoint
-from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
+from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level, share_of_level
 from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.hall import CONDITIONS, FIELDS, MultipathEstimate
 from rhs_isac_ros.model.impairments import nuisance_of
@@ -105,7 +105,13 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
     model, n_sight = MeasurementModel(fit.fields, codebook, surface), int(fit.in_sight.sum())
     left_out = _left_out(model, pilots.positions[fit.in_sight], fit.residuals[fit.in_sight],
                          fit.total, fit.weight + n_sight - 1)
-    inflation = _inflation(left_out, int(np.prod(model.shape)))
+    n_measurements = int(np.prod(model.shape))
+    level_std_db = _level_std_db(left_out, n_measurements)
+    # Estimators scale the covariance of a position by the level that the residual reveals.
+    relative = left_out.energies / n_measurements
+    left_out = left_out._replace(distances=left_out.distances / relative**share_of_level(
+        n_measurements, level_std_db))
+    inflation = _inflation(left_out, n_measurements)
     measured, declared = inflation * fit.total / (fit.weight + n_sight), model.covariance()
     inverse = np.linalg.inv(declared)
     excess = inverse @ (measured - declared) @ inverse
@@ -115,7 +121,7 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
     inside = int(np.sum(left_out.distances <= inflation * _radius()))
     about: dict[str, Any] = {
         'positions': n_sight, 'blocked': n - n_sight, 'prior_weight': fit.weight,
-        'inflation': inflation, 'level_std_db': _level_std_db(left_out, int(np.prod(model.shape))),
+        'inflation': inflation, 'level_std_db': level_std_db,
         'coverage': [inside / n_sight, *_interval(inside, n_sight)],
         'warnings': texts, 'codebook': str(getattr(codebook, 'id', '')), 'version': __version__}
     plain = scenario.fields()

@@ -56,6 +56,17 @@ def quadratic_form(whitened: np.ndarray) -> np.ndarray:
     return 2 * form
 
 
+def share_of_level(n: int, std_db: float) -> float:
+    """Return the share of the level in the variance of the logarithm of an energy, from 0 to 1.
+
+    The energy is that of n complex Gaussian numbers of unknown level, a log-normal power with the
+    given standard deviation. Of the deviation of an energy from its median, this share is expected
+    to be a deviation of the level.
+    """
+    variance = float(np.log(10) / 10 * std_db)**2
+    return variance / (variance + 1 / n)
+
+
 def eliminate(
         curvature: np.ndarray, coupling: np.ndarray, gradient: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -23,7 +23,8 @@ from rhs_isac_ros.support.threads import map_blocks
 
 # Probabilities of a user outside, and of a blocked one, above which there is no fix.
 OUTSIDE_LIMIT = 0.99
-BLOCKED_LIMIT = 0.5
+# A region of 95 % cannot contain the user with this probability if the user may be blocked.
+BLOCKED_LIMIT = 0.05
 # Largest level of multipath without a direct path that explains signals, in standard deviations.
 _LEVEL_REACH = 3.0
 _DB_PER_NEPER = 20 / math.log(10)

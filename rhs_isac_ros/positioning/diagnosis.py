@@ -59,13 +59,17 @@ _MAX_DISPERSION = 1.2
 
 
 class FitTest:
-    """Tests of the energy of N_B N_SB F whitened signals; each returns a reason, or ''."""
+    """Tests of the energy of N_B N_SB F whitened signals; each returns a reason, or ''.
 
-    def __init__(self, n_measurements: int) -> None:
+    The multipath of users in sight has a median level relative to the whitened noise.
+    """
+
+    def __init__(self, n_measurements: int, level: float = 1.0) -> None:
         # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
         from scipy.special import gammainccinv, gammaincinv
 
         self.min_energy = float(gammaincinv(n_measurements, FALSE_ALARM))
+        self._level = level
         # With an unknown level of the multipath, the ratio of the likelihoods with and without a
         # direct path is that of residual and energy to the power of n.
         self._weak_share = FALSE_ALARM**(1 / n_measurements)
@@ -88,7 +92,7 @@ class FitTest:
         # Multipath may be weaker than in the model. The direct path at the best position then
         # explains most of the energy.
         excess = _excess(_RESIDUAL, residual, self._weak_share * energy)
-        if energy >= self.min_energy or not excess:
+        if energy >= self._level * self.min_energy or not excess:
             return ''
         return f'{excess} of signals weaker than the multipath'
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.gaussian import share_of_level
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.alternatives import (
     ALTERNATIVES,
@@ -110,8 +111,13 @@ class SearchEstimator(abc.ABC):
         if scenario.blocked_probability:
             self._alternatives.append(Blocked(scenario))
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
-        self._test = FitTest(n_measurements)
+        # Median level of the multipath of users in sight, and its share in that of a residual.
+        median_db, std_db = scenario.multipath.level_db if scenario.multipath else (0.0, 0.0)
+        self._level = 10**(median_db / 10)
+        self._level_share = share_of_level(n_measurements, std_db)
+        self._test = FitTest(n_measurements, self._level)
         self._bounds = likelihood.resolution.bounds_m
+        self._prior_m2 = float(np.sum((self._bounds[1] - self._bounds[0])**2)) / 12
         self._alignment = Alignment(likelihood, self._grid.spread)
         self._phases = BandPhases(likelihood)
         self._failures = (FailedElements(likelihood, self._grid)
@@ -247,7 +253,7 @@ class SearchEstimator(abc.ABC):
             for one in self._alternatives)])
         probabilities = shares(log_weights[None])[0]
         reason = self._reason(whitened * np.exp(-fit.gain), fit.residual, log_weights)
-        moments = _no_fix() if reason else (fit.mean, fit.covariance)
+        moments = _no_fix() if reason else (fit.mean, self._covariance(fit))
         # Of signals without a fix, only a residual that nothing explains is evidence against
         # the scenario.
         counts = (reason == self._test.residual_test(fit.residual) if reason
@@ -257,6 +263,13 @@ class SearchEstimator(abc.ABC):
         outside, blocked = (by_name.get(kind.name, np.nan) for kind in ALTERNATIVES)
         return ((*moments, reason, fit.residual, fit.expected if counts else np.nan,
                  outside, blocked), None if reason else fit.modes)
+
+    def _covariance(self, fit: _Fit) -> np.ndarray:
+        """Return the covariance for the level of the multipath that the residual reveals."""
+        relative = max(fit.residual, 1e-9) / (self._level * max(fit.expected, 0.5))
+        # No position is less certain than anywhere in the region.
+        largest = max(self._prior_m2 / float(fit.covariance.trace()), 1.0)
+        return min(relative**self._level_share, largest) * fit.covariance
 
     def _reason(self, whitened: np.ndarray, residual: float, log_weights: np.ndarray) -> str:
         """Return why there is no fix, empty if there is one."""

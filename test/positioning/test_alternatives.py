@@ -260,14 +260,27 @@ def test_the_inflation_of_a_survey_makes_no_user_in_sight_blocked(shipped):
     model, inflation = MeasurementModel(scenario, shipped), 6.0
     n_bands, n_rows = model.shape
     fields = declared.fields()
-    assumed = dataclasses.replace(scenario, multipath=MultipathEstimate(
-        declared.multipath_to_los_db + 10 * np.log10(inflation), declared.delay_spread_s,
-        declared.angular_spread_deg, np.array(model.radiation),
-        np.zeros((n_bands, n_rows, n_rows), complex), {name: fields[name] for name in CONDITIONS},
-        {'inflation': inflation, 'level_std_db': 1.0}))
-    estimate = make_estimator('bayes', assumed, shipped).estimate(received)
+    found = {std_db: make_estimator('bayes', dataclasses.replace(
+        scenario, multipath=MultipathEstimate(
+            declared.multipath_to_los_db + 10 * np.log10(inflation), declared.delay_spread_s,
+            declared.angular_spread_deg, np.array(model.radiation),
+            np.zeros((n_bands, n_rows, n_rows), complex),
+            {name: fields[name] for name in CONDITIONS},
+            {'inflation': inflation, 'level_std_db': std_db})), shipped).estimate(received)
+        for std_db in (1.0, 0.0)}
+    estimate, fixed = found.values()
+    # Without the level, signals in sight would be weaker than the multipath.
     assert estimate.fix[~blocked].mean() > 0.95
     assert estimate.fix[blocked].mean() < 0.1
+    # The residual reveals the level, and with it the size of the region.
+    both = estimate.fix & fixed.fix
+    level = inflation * estimate.residual / estimate.expected_residual
+    n, variance = n_bands * n_rows, (np.log(10) / 10)**2
+    sizes = [np.trace(one.covariance[both], axis1=1, axis2=2) for one in (estimate, fixed)]
+    expected = sizes[1] * level[both]**(variance / (variance + 1 / n))
+    usual = np.isfinite(expected) & (expected < 10)
+    assert usual.mean() > 0.8
+    np.testing.assert_allclose(sizes[0][usual], expected[usual], rtol=1e-6)
 
 
 def test_without_the_field_users_are_in_sight(shipped, table1_estimator):
