@@ -26,8 +26,10 @@ _GRACE_POLLS = 10
 _MAX_LOGGED = 16
 # Topics of every node, which are not ours.
 _FOREIGN = ('/rosout', '/parameter_events')
-# What the middleware returns instead of the name of a node that is unknown.
-_UNNAMED = ('_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_')
+# What the middleware returns instead of the name of a node: it has not arrived yet, or the
+# participant is unknown, which also endpoints of processes that have ended may be for a time.
+_NOT_YET = '_NODE_NAME_UNKNOWN_'
+_UNNAMED = (_NOT_YET, '_CREATED_BY_BARE_DDS_APP_')
 # Number of bytes of the identity of an endpoint that identify its participant.
 _PREFIX_LENGTH = 12
 
