@@ -9,6 +9,7 @@ from typing import NamedTuple
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.validate_namespace import validate_namespace
 
+from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.parameters import TF
@@ -216,4 +217,4 @@ def _namespace(text: str) -> str:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

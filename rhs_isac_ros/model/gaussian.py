@@ -41,6 +41,17 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
     return highest + np.log(total) - np.log(np.exp(prior).sum())
 
 
+def share_of_level(n: int, std_db: float) -> float:
+    """Return the share of the level in the variance of the logarithm of an energy, from 0 to 1.
+
+    The energy is that of n complex Gaussian numbers of unknown level, a log-normal power with the
+    given standard deviation. Of the deviation of an energy from its median, this share is expected
+    to be a deviation of the level.
+    """
+    variance = float(np.log(10) / 10 * std_db)**2
+    return variance / (variance + 1 / n)
+
+
 def quadratic_form(whitened: np.ndarray) -> np.ndarray:
     """Compute 2 Re(D^H Lambda^-1 D), float64 [N, G, G], as in Eq. (12).
 
@@ -54,17 +65,6 @@ def quadratic_form(whitened: np.ndarray) -> np.ndarray:
     else:
         form = np.matmul(parts, np.swapaxes(parts, 1, 2))
     return 2 * form
-
-
-def share_of_level(n: int, std_db: float) -> float:
-    """Return the share of the level in the variance of the logarithm of an energy, from 0 to 1.
-
-    The energy is that of n complex Gaussian numbers of unknown level, a log-normal power with the
-    given standard deviation. Of the deviation of an energy from its median, this share is expected
-    to be a deviation of the level.
-    """
-    variance = float(np.log(10) / 10 * std_db)**2
-    return variance / (variance + 1 / n)
 
 
 def eliminate(

@@ -245,7 +245,7 @@ def main(args: Sequence[str] | None = None) -> int:
     if reason == INTERRUPTED:
         return 0
     overrides = ros_parameters({'codebook_file': str(options.output),
-                                 'scenario_file': str(options.scenario or '')})
+                                'scenario_file': str(options.scenario or '')})
     return run(lambda: [OptimizerNode(parameter_overrides=overrides)], args)
 
 

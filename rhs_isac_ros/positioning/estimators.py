@@ -111,7 +111,8 @@ class SearchEstimator(abc.ABC):
         if scenario.blocked_probability:
             self._alternatives.append(Blocked(scenario))
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
-        # Median level of the multipath of users in sight, and its share in that of a residual.
+        # Median level of the multipath of users in sight, and the share of a residual's deviation
+        # that is a deviation of the level.
         median_db, std_db = scenario.multipath.level_db if scenario.multipath else (0.0, 0.0)
         self._level = 10**(median_db / 10)
         self._level_share = share_of_level(n_measurements, std_db)

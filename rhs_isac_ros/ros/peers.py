@@ -213,7 +213,7 @@ class Peers:
         """Forget nodes in conflict that are absent in two polls in a row."""
         infos = self._node.get_publishers_info_by_topic(self._publisher.topic_name)
         present = collections.Counter(
-            '' if info.node_name in _UNNAMED else full_name(info) for info in infos)
+            '' if info.node_name == _NOT_YET else full_name(info) for info in infos)
         was_short, self._is_short = self._is_short, bool(self._presences.gone(present))
         if was_short and self._is_short:
             self._apply(lambda presences: presences.keep(present))

@@ -164,8 +164,7 @@ class RepublisherNode(Node):
                 self.count += 1
             elif self.optimizer:
                 self.optimizer.set_parameters_atomically(
-                    ros_parameters(
-                    convert.codebook_from_ros(message).to_parameters()))
+                    ros_parameters(convert.codebook_from_ros(message).to_parameters()))
 
     def check(self, end_s: float, timeout_s: float) -> None:
         """Raise a ToolError if the messages cannot be published, or not until `end_s` [s]."""

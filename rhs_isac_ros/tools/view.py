@@ -233,7 +233,7 @@ class ViewNode(Node):
             return
         self._users.add(user)
         endpoints.subscribe(self, Odometry, topics.ODOMETRY.format(user=user),
-                  functools.partial(self._on_track, user), endpoints.EXCHANGE)
+                            functools.partial(self._on_track, user), endpoints.EXCHANGE)
 
     def _on_track(self, user: int, message: Odometry) -> None:
         point = TrackPoint(

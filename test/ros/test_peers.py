@@ -19,6 +19,7 @@ from rhs_isac_ros.nodes.rhs_controller import RhsControllerNode
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.presences import Presence
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, peers, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES
@@ -141,6 +142,25 @@ def test_an_observer_does_not_stand_for_a_role(bench, monitor):
     bench.until(lambda: reports and reports[-1]['positioner'] == text, 'a report')
     create_endpoints(positioner, ((), subscriptions))
     bench.until(lambda: 'positioner' not in reports[-1], 'presence')
+
+
+@pytest.mark.parametrize(('name', 'expected'), [
+    ('_NODE_NAME_UNKNOWN_', [True]), ('_CREATED_BY_BARE_DDS_APP_', [True, False])])
+def test_an_endpoint_whose_participant_is_unknown_keeps_no_node_standing_by(name, expected):
+    """It may belong to the newer node as long as its name may arrive, but not otherwise."""
+    node, standing_by = mock.MagicMock(), []
+    node.get_fully_qualified_name.return_value = '/channel'
+    node.get_clock.return_value.now.return_value.nanoseconds = 0
+    node.get_publishers_info_by_topic.return_value = [
+        mock.Mock(node_name=one, node_namespace='/') for one in ('channel', name)]
+    Peers(node, 'channel', 1, Scenario(), lambda missing: None, standing_by.append)
+    poll, receive = (create.call_args.args[index] for create, index in (
+        (node.create_timer, 1), (node.create_subscription, 2)))
+    receive(convert.to_bytes(Presence(2, Scenario().id, 'channel', '/channel',
+                                      Scenario().fields()), 0, frame=''))
+    for _ in range(3):
+        poll()
+    assert standing_by == expected
 
 
 @pytest.mark.parametrize('unknown', ['_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_'])
