@@ -1,7 +1,7 @@
-"""The entry points of the executables, which handle signals before anything slow is imported.
+"""Entry points of the executables, which install signal handlers before any slow import.
 
-Importing ROS, NumPy and the nodes takes a moment. A signal during that time would cause a
-traceback; the handlers set here end the process with exit code 0 instead, as a later signal does.
+Importing ROS, NumPy and the nodes takes a moment, and a signal in that time would print a
+traceback. These handlers end the process with exit code 0 instead, as a later signal does.
 """
 
 import importlib
@@ -27,7 +27,7 @@ EXECUTABLES = {
 
 
 def __getattr__(name: str) -> Callable[[], int]:
-    """Return the main function of an executable, which imports its module and returns its code."""
+    """Return a main function that imports an executable, runs it and returns its exit code."""
     if name not in EXECUTABLES:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
@@ -51,7 +51,7 @@ def __getattr__(name: str) -> Callable[[], int]:
 
 
 def _what_provides(missing: str) -> str:
-    """Return what to install or build so that a missing top-level module is found."""
+    """Return what to install or build to provide a missing top-level module."""
     # pip also installs the executables on systems without ROS.
     if importlib.util.find_spec('rclpy') is None:
         return 'ROS 2 Jazzy, which is not sourced or not installed (no module rclpy)'
@@ -64,7 +64,7 @@ def _what_provides(missing: str) -> str:
 
 
 def _join_network(name: str) -> None:
-    """Have a node discover the other processes while its modules are imported."""
+    """Start discovery for a node, so that it runs while the modules of the node are imported."""
     arguments = sys.argv[1:]
     if EXECUTABLES[name] != 'nodes' or arguments[:1] not in ([], ['--ros-args']):
         return
@@ -78,9 +78,9 @@ def _join_network(name: str) -> None:
 
 
 def _end_with_parent() -> None:
-    """Have the kernel send SIGTERM to this process when the parent that asked for it dies.
+    """Make the kernel send SIGTERM to this process when the parent dies, if the parent wants it.
 
-    The parent cannot do so between fork and exec, because it may have several threads.
+    The parent may have several threads, so it cannot arrange this between fork and exec.
     """
     parent = os.environ.pop(PARENT_ID, '')
     if parent:
@@ -88,13 +88,13 @@ def _end_with_parent() -> None:
         import ctypes
 
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-        # The parent may have died before.
+        # The parent may have died before the call.
         if os.getppid() != int(parent):
             os._exit(0)
 
 
 def print_error(error: object, program: str = '') -> None:
-    """Print an error as argparse does, with the name of the program or that of the process."""
+    """Print an error as argparse does, after the name of the program (default: this process)."""
     if not program:
         spec = getattr(sys.modules['__main__'], '__spec__', None)
         program = (f'python3 -m {spec.name.removesuffix(".__main__")}' if spec
@@ -105,22 +105,13 @@ def print_error(error: object, program: str = '') -> None:
 def exit_code_of(
         main: Callable[[], int | None], errors: tuple[type[Exception], ...] = (),
         program: str = '') -> int:
-    """Run a main function, and handle the standard streams of the process.
+    """Run a main function, handle the standard streams, and return the exit code.
 
-    Parameters
-    ----------
-    main
-        Returns an exit code; None is 0.
-    errors
-        Exceptions whose messages are errors of the user.
-
-    Returns
-    -------
-    int
-        Exit code of `main`; 0 if the reader of the output closes it early, as ``head`` does; 1 if
-        the output cannot be written; 2 after one of the `errors`.
+    This is the exit code of `main`, where None means 0; 0 if the reader of the output closes it
+    early, as ``head`` does; 1 if the output cannot be written; 2 after one of the `errors`, whose
+    messages are for the user.
     """
-    # If a standard stream is closed, Python has none, and the next file would take its place.
+    # If a standard stream is closed, the next file that opens would take its descriptor.
     for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode, encoding='utf-8'))
@@ -136,7 +127,7 @@ def exit_code_of(
         print_error(error, program)
         return 2
     except OSError as error:
-        # The errors of files name one.
+        # An error of a file contains its name.
         if error.filename is not None:
             raise
         discard_stdout()
@@ -145,5 +136,5 @@ def exit_code_of(
 
 
 def discard_stdout() -> None:
-    """Redirect the standard output to `os.devnull`, so that Python can flush it at its exit."""
+    """Redirect the standard output to `os.devnull`, so that Python can flush it at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""The base station, which sends beacons, then selects, positions and serves a user per cycle."""
+"""The base station, which sends beacons and selects, locates and serves one user in each cycle."""
 
 import collections
 import dataclasses
@@ -39,10 +39,10 @@ class State(enum.Enum):
     TRANSMITTING = 'transmitting'  # waits for the uplink data
 
 
-# Steps of a granted cycle: each waits for a reply and may request it again.
+# Steps of a granted cycle. Each waits for a reply, and may repeat its request.
 STEPS = (State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING, State.TRANSMITTING)
 NOT_BEACONING = tuple(state for state in State if state is not State.BEACONING)
-# The reasons for a lost cycle that concern one user; all others concern the whole network.
+# Reasons for a lost cycle that concern one user. All others concern the whole network.
 _USER_REASONS = (Outcome.USER_GONE, Outcome.NO_FIX)
 
 
@@ -51,23 +51,23 @@ class Cycle:
     """The memory of one cycle."""
 
     cycle_id: int
-    codebook: Codebook | None = None  # the one offered last before the latest beacon
+    codebook: Codebook | None = None  # the latest one when the latest beacon was sent
     attempt: int = 0  # number of beacons sent before the current one
     user: int = 0     # user that was granted the cycle; 0 before the grant
-    # The granted instance of the user; if unknown, that of the first signals; otherwise 0.
+    # The granted instance of the user; if unknown, the one that the first signals contain, or 0.
     user_instance: int = 0
-    # Instance of the channel that sent the first signals; 0 before them or if unknown.
+    # Instance of the channel that sent the first signals; 0 if unknown.
     channel: int = 0
     # Bands whose configurations the RHS has reported.
     configured: set[int] = dataclasses.field(default_factory=set)
     # Feed signals by band, complex128 [F, N_SB, K].
     signals: dict[int, np.ndarray] = dataclasses.field(default_factory=dict)
-    stamp_ns: int = 0  # time of the first of them [ns]; 0 if unknown
-    # Signals that were sent to the positioner, once all bands are complete.
+    stamp_ns: int = 0  # time of the first feed signals [ns]; 0 if unknown
+    # Signals that were sent to the positioner once all bands were complete.
     received: m.ReceivedSignals | None = None
     beam: m.Beam | None = None
     beam_applied: bool = False  # whether the RHS has reported the configuration of the beam
-    # Time at which each phase began [s]; NaN before. The latest beacon begins the first.
+    # Start of each phase [s]; NaN if it has not begun. The latest beacon begins the first phase.
     began_s: np.ndarray = dataclasses.field(
         default_factory=lambda: np.full(len(m.Phase), math.nan))
 
@@ -78,7 +78,7 @@ class Cycle:
 
 
 def reply(success: bool, text: str) -> Callable[['BaseStation', Event], None]:
-    """Return a step that answers an operator; see `BaseStation.fill` for placeholders."""
+    """Return a step that answers an operator; `BaseStation.fill` lists the placeholders."""
     def reply(role: 'BaseStation', event: Event) -> None:
         role.act(events.Reply(success, role.fill(text)))
 
@@ -94,13 +94,13 @@ class BaseStation(StateMachine):
     Parameters
     ----------
     rng
-        Source of randomness for the policy ``random``.
+        For the policy ``random``.
     receiver
         Callable that takes (codebook, feeds [N_B, F, N_SB, K], user, cycle_id, whether to add
         noise) and returns the received signals, complex128 [N_B, N_SB, F].
     first_cycle_id
-        Id of the first cycle. After a restart, it must exceed all ids used before, so that
-        messages still in transit are recognised as stale.
+        Id of the first cycle. After a restart, it must exceed all earlier ids, so that messages
+        still in transit are recognised as stale.
     """
 
     SENDS = (m.Beacon, m.Grant, m.RhsCommand, m.PilotRequest, m.ReceivedSignals, m.Data,
@@ -119,7 +119,7 @@ class BaseStation(StateMachine):
         self._bands = frozenset(range(scenario.n_bands))
         self._users = UserRegistry(settings.policy, rng)
         self._settings = PendingSettings(settings)
-        # Acks by user in the current second; discarded every second, which bounds the memory.
+        # Number of acks by user in the current second. Clearing it each second bounds the memory.
         self._acks: collections.Counter[int] = collections.Counter()
         self._second = 0
         self._use(settings)
@@ -128,11 +128,11 @@ class BaseStation(StateMachine):
         # Roles that are missing; None before the first report.
         self._missing: tuple[str, ...] | None = None
         self._cycle = Cycle(first_cycle_id - 1)
-        # Outages that were logged and last, by reason and user; user 0 for the whole network.
+        # Outages that have been logged and have not ended, by reason and user; 0: all users.
         self._outages: NewestDict[tuple[str, int], None] = NewestDict(MAX_USERS)
-        # What the last warning listed as missing; empty once a cycle has begun.
+        # Missing roles and codebook as logged last; empty once a cycle has begun.
         self._logged_lacking: tuple[str, ...] = ()
-        # Whether a cycle was served since something was missing.
+        # Whether a cycle has been served since the last time that something was missing.
         self._serving = False
 
     def _use(self, settings: BaseStationSettings) -> None:
@@ -141,10 +141,7 @@ class BaseStation(StateMachine):
         self._acks.clear()
 
     def timeout_s(self, state: enum.Enum) -> float | None:
-        """Return the timeout of a state [s]; the attempts of a step share its timeout equally.
-
-        There is no rest before a pause.
-        """
+        """Return the timeout of a state [s]; the attempts of a step share its timeout equally."""
         settings = self._settings.in_use
         if state is State.BEACONING:
             return settings.ack_timeout_s
@@ -160,7 +157,7 @@ class BaseStation(StateMachine):
     # Guards
 
     def _not_ready(self, event: Event) -> bool:
-        """Whether a role or the codebook is missing, once the event is taken into account."""
+        """Return whether a role or the codebook is missing after an event."""
         missing = event.missing if isinstance(event, events.PeersChanged) else self._missing
         has_codebook = self._offered or isinstance(event, events.CodebookOffered)
         return missing != () or not has_codebook
@@ -238,7 +235,7 @@ class BaseStation(StateMachine):
         self._missing = event.missing
 
     def _forget_peers(self, event: events.StoodBy) -> None:
-        """Forget which roles are missing; no cycle begins until that is known again."""
+        """Forget which roles are missing, so that no cycle begins until this is known again."""
         self._missing = None
 
     def _skip_cycles(self, event: events.Resumed) -> None:
@@ -257,7 +254,7 @@ class BaseStation(StateMachine):
                 self.log(f'user {user} removed: not in allowed_users {settings.allowed_users!r}')
 
     def _log_not_ready(self, event: Event) -> None:
-        """Log what is missing, unless it was logged or the other roles are not known yet."""
+        """Log what is missing, unless this was logged or the other roles are not known yet."""
         lacking = self._lacking()
         if self._missing is not None:
             self._serving = False
@@ -266,7 +263,7 @@ class BaseStation(StateMachine):
                 self.log(f'waiting for {", ".join(lacking)}', warning=True)
 
     def fill(self, text: str) -> str:
-        """Insert the id of the cycle, and what the next cycle lacks, into a text."""
+        """Fill in ``{cycle}`` (its id), ``{lacking}`` (what the next one lacks), ``{waiting}``."""
         lacking = ', '.join(self._lacking())
         return text.format(cycle=self._cycle.cycle_id, lacking=lacking,
                            waiting=f'; waiting for {lacking}' if lacking else '')
@@ -297,21 +294,21 @@ class BaseStation(StateMachine):
         self._beacon()
 
     def _beacon_again(self, event: Timeout) -> None:
-        """Send another beacon of the cycle, which invites more users if not all were invited."""
-        # If all users were invited, they may be absent for as long as the base station is alone.
+        """Send another beacon of the cycle, which invites more users if there are more."""
+        # If nobody answers a beacon to all users, the network may be at fault: nobody is removed.
         if not self._users.all_invited:
             self._lose_absent()
         self._cycle.attempt += 1
         self._beacon()
 
     def _beacon(self) -> None:
-        self._cycle.codebook = self._offered  # nothing before the grant depends on the codebook
+        self._cycle.codebook = self._offered  # may change until the grant
         self._cycle.began_s[m.Phase.BEACONING] = self.now_s
         first, last = self._users.invite(self._cycle.attempt)
         self._send(m.Beacon, attempt=self._cycle.attempt, first_user=first, last_user=last)
 
     def _send(self, kind: type[m.Message], **fields: Any) -> None:
-        """Send a message of the cycle, which carries its user and its codebook."""
+        """Send a message with the user and the codebook of the cycle."""
         self.send(m.derive(kind, self._cycle, **fields))
 
     def _count_ack(self, event: m.Ack) -> None:
@@ -328,11 +325,11 @@ class BaseStation(StateMachine):
         self.log(self._users.add_answer(event.user, event.sender, self.now_s), warning=True)
 
     def _register_user(self, event: m.Ack) -> None:
-        """Register a user, so that the next cycle waits for it as well."""
+        """Register a user, so that the next cycle waits for this user, too."""
         self.log(self._users.register(event.user, event.sender, self.now_s), warning=True)
 
     def _grant(self, event: m.Ack | Timeout) -> None:
-        """Grant the cycle to one of the users that answered, and begin to position it."""
+        """Grant the cycle to one of the users that answered, and begin to locate this user."""
         self._lose_absent()
         self._cycle.user = self._users.select()
         self._cycle.user_instance = self._users.owner(self._cycle.user)
@@ -341,7 +338,7 @@ class BaseStation(StateMachine):
         self._announce(m.Phase.POSITIONING)
 
     def _lose_absent(self) -> None:
-        """Count the invited users that did not answer, and remove those that no longer do."""
+        """Count missed invitations, and remove the users that no longer answer."""
         lost = self._users.remove_absent()
         self.count(Outcome.USER_LOST, len(lost))
         if lost:
@@ -365,7 +362,7 @@ class BaseStation(StateMachine):
                    n_frames=self._scenario.n_frames)
 
     def _store_signals(self, event: m.FeedSignals) -> None:
-        """Store the feed signals of a band; those of all bands come from the same instances."""
+        """Store the signals of a band; the first ones fix the instances of user and channel."""
         cycle = self._cycle
         cycle.user_instance = cycle.user_instance or event.user_instance
         cycle.channel = cycle.channel or event.sender
@@ -399,18 +396,18 @@ class BaseStation(StateMachine):
         self._announce(m.Phase.TRANSMITTING)
 
     def _send_downlink(self, event: Event) -> None:
-        """Send as much data as the beam is expected to carry."""
+        """Offer as much data as the beam is expected to carry."""
         assert self._cycle.beam
         duration_s = self._settings.in_use.data_duration_s
         self._send(m.Data, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
                    duration_s=duration_s, bits=self._cycle.beam.expected_bps * duration_s // 1)
 
     def _remove_user(self, event: Timeout) -> None:
-        """Stop waiting for the user until it answers again."""
+        """Stop waiting for the user until the user answers again."""
         self._users.remove(self._cycle.user)
 
     def _abandon(self, event: Timeout | m.NoFix) -> None:
-        """End the cycle without service; log it unless the outage is known."""
+        """End the cycle without service; log this unless the outage is known."""
         assert self.outcome
         cycle, reason = self._cycle, self.outcome.value
         self._report(m.Phase.BEACONING, reason)
@@ -422,7 +419,7 @@ class BaseStation(StateMachine):
         self._apply_settings(event)
 
     def _finish(self, event: m.Data) -> None:
-        """End the cycle with service; log that service begins, or which outages have ended."""
+        """End the cycle with service; log the start of service, or the outages that ended."""
         cycle, n_users = self._cycle, len(self._users)
         self._report(m.Phase.BEACONING, 'served')
         if not self._serving:
@@ -447,13 +444,13 @@ class BaseStation(StateMachine):
         self._send(m.ProtocolState, phase=phase, outcome=outcome, began_s=began_s - beacon_s,
                    elapsed_s=float(self.now_s - beacon_s))
 
-    # What a message of a cycle must match.
+    # Conditions that drop a message of a cycle.
     _OF_CYCLE: Drops = {_wrong_cycle: Outcome.WRONG_CYCLE}
     _OF_USER: Drops = _OF_CYCLE | {_wrong_user: Outcome.WRONG_USER}
     _OF_CODEBOOK: Drops = {_wrong_codebook: Outcome.WRONG_CODEBOOK}
     _DELIVERED: Drops = {_not_delivered_uplink: None}
 
-    # Every event, in the order in which its rows are tried.
+    # For each event, the first matching row applies.
     TABLE = (
         *on(events.CodebookOffered, 'codebook')(
             # A new codebook takes effect with the next cycle, as do new settings.
@@ -469,13 +466,13 @@ class BaseStation(StateMachine):
             Row((State.RESTING,), (_store_settings, _apply_settings), restart_timeout=True),
             Row(ANY, (_store_settings,))),
         *on(events.StoodBy, 'stood_by')(
-            # A newer base station serves, or has gone. A pause outlasts both.
+            # A pause persists while another base station serves.
             Row(ANY, (_forget_peers,), State.PAUSED, guard=_pausing),
             Row(ANY, (_forget_peers,), State.WAITING)),
         *on(events.Resumed, 'resumed')(
             Row((State.WAITING, State.PAUSED), (_skip_cycles,))),
         *on(events.PauseRequested, 'pause')(
-            # A pause begins between two cycles; a step runs one cycle of it.
+            # A pause begins between two cycles; a step runs one cycle of a paused base station.
             Row((State.PAUSED,), (reply(True, 'already paused'),)),
             Row((State.WAITING, State.RESTING), (_pause, _log_paused, reply(True, 'paused')),
                 State.PAUSED),
@@ -516,7 +513,7 @@ class BaseStation(StateMachine):
                 outcome=Outcome.RETRY_POSITION, restart_timeout=True),
             Row((State.ESTIMATING,), (_abandon,), State.RESTING,
                 outcome=Outcome.POSITIONER_SILENT),
-            # Roles repeat their replies to a repeated message, so the signals repeat the beam.
+            # Roles repeat their replies to a repeated message: the signals lead to the beam again.
             Row((State.STEERING,), (_resend_signals,), guard=_may_retry,
                 outcome=Outcome.RETRY_BEAM, restart_timeout=True),
             Row((State.STEERING,), (_abandon,), State.RESTING,
@@ -526,9 +523,9 @@ class BaseStation(StateMachine):
                 outcome=Outcome.RETRY_DATA, restart_timeout=True),
             Row((State.TRANSMITTING,), (_abandon,), State.RESTING, outcome=Outcome.DATA_LOST)),
         *on(m.Ack, 'ack', {_not_allowed: Outcome.NOT_ALLOWED, _too_often: Outcome.TOO_OFTEN})(
-            # All acks that pass these two checks count towards the rate of their user.
+            # All acks that pass these two checks count towards the limit of the rate.
             Row(ANY, (_count_ack,), guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE),
-            # Of several nodes with the same number, the first is served.
+            # If several nodes have the same number, the first one is served.
             Row(ANY, (_count_ack, _reject_number), guard=_number_taken,
                 outcome=Outcome.NUMBER_TAKEN),
             Row(ANY, (_count_ack,), guard=_duplicate_ack, outcome=Outcome.DUPLICATE),

@@ -21,31 +21,30 @@ from rhs_isac_ros.protocol.role import REMEMBERED_CYCLES, NewestDict, Role
 from rhs_isac_ros.protocol.settings import Impairments, PendingSettings
 from rhs_isac_ros.support import streams
 
-# Number of users whose multipath is kept. With more, the time between two cycles of a user is far
-# longer than the coherence time.
+# Number of users whose multipath is kept. With more users, the time between two cycles of a user
+# far exceeds the coherence time.
 _MAX_USERS = 32
-# Maximum number of messages of each kind kept until related messages arrive. The cycle of an older
-# message can no longer be completed.
+# Maximum number of messages of each kind that wait for related messages. Older ones belong to
+# cycles that can no longer be completed.
 _MAX_PENDING = 256
 
 
 class Fading:
-    """Source of multipath gains that depend on the seed and on the times of a user's cycles.
+    """Draws multipath gains, which are correlated over the cycles of a user.
 
-    The gains of a cycle are rho h + sqrt(1 - rho^2) w, where h are the gains of the user's
-    previous cycle, rho is Eq. (4) for the time between them, and w is a new draw that depends on
-    the seed, the user, the cycle and the band alone. Every cycle has the distribution of Eq. (2)
-    to (4), and consecutive cycles have the correlation of Eq. (4); it is negative for some times.
-    Over several cycles the correlation is the product of these, not Eq. (4): the exact
-    conditional distribution would need all earlier cycles.
+    The gains of a cycle are rho h + sqrt(1 - rho^2) w: h are the gains of the user's previous
+    cycle, rho is Eq. (4) for the time between the two, and w is a new draw that depends only on
+    the seed, the user, the cycle and the band. Every cycle has the distribution of Eq. (2) to (4),
+    and consecutive cycles have the correlation of Eq. (4), which is negative for some times. Over
+    several cycles, the correlation is the product of these values and not Eq. (4), for which all
+    earlier cycles would be needed.
 
-    With a channel file there is no fading: the paths of a user move with it.
+    A channel file replaces the multipath, so the gains are then 0.
     """
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
         self._scenario, self._seed = scenario, seed
-        # The first draw factorises covariances. Draw once now, so that it does not delay the first
-        # cycle.
+        # The first draw factorises covariances, which would delay the first cycle.
         if not scenario.channel:
             draw_multipath(scenario, 0, 1, np.random.default_rng(0))
         # Time [s] and gains of the latest cycle of each user.
@@ -54,7 +53,7 @@ class Fading:
     def gains(self, user: int, cycle_id: int, now_s: float, *, memory: bool) -> list[np.ndarray]:
         """Return the gains of a cycle for each band, complex128 [N_SB, F, N_E].
 
-        Without memory, they are independent of the previous cycle.
+        Without `memory`, they are independent of the previous cycle.
         """
         scenario = self._scenario
         shape = scenario.n_subbands, scenario.n_frames, scenario.n_elements
@@ -82,9 +81,8 @@ class Air:
         self.in_flight: list[tuple[float, int, m.Message]] = []
 
     def send(self, message: m.Message, impairments: Impairments, now_s: float) -> str:
-        """Send a message at a time [s]; return the name of the counter if it is impaired."""
-        # The number of draws is fixed, so that the impairments of one message do not affect
-        # those of others.
+        """Send a message at a time [s]; return a counter if it is lost or doubled, or ''."""
+        # Each message takes the same number of draws, so that it does not affect other messages.
         loss, duplication, *delays = self._rng.random(4)
         if loss < impairments.loss_probability:
             return 'emulated_loss'
@@ -95,7 +93,7 @@ class Air:
         return 'emulated_double' if is_doubled else ''
 
     def arrived(self, now_s: float) -> list[m.Message]:
-        """Return the messages that arrive by a time [s]; each arrives once."""
+        """Remove and return the messages that have arrived by a time [s]."""
         messages = []
         while self.in_flight and self.in_flight[0][0] <= now_s:
             messages.append(heapq.heappop(self.in_flight)[2])
@@ -104,17 +102,17 @@ class Air:
 
 @dataclasses.dataclass
 class _Cycle:
-    """The true position of a cycle and the channel that results from it."""
+    """The true position of the user in a cycle, and the resulting channel."""
 
     truth: m.GroundTruth
     multipath: list[np.ndarray]  # of each band, complex128 [N_SB, F, N_E]
     # Whether the user has no direct path, bool [1].
     blocked: np.ndarray
-    # Gains of the other paths of each band, complex128 [N_SB, N_E]: direct, or of a channel file.
+    # Gains of the direct path, or of the paths in a channel file, by band: complex128 [N_SB, N_E].
     los: list[np.ndarray]
     # Factors of all signals, complex128 [N_B, N_SB, F]; None if all are 1.
     factors: np.ndarray | None
-    # Capacity of the applied beam [bit/s]; None as long as no beam is applied.
+    # Capacity of the applied beam [bit/s]; None until a beam is applied.
     rate_bps: float | None = None
 
 
@@ -123,15 +121,8 @@ class Channel(Role):
 
     It answers the pilots of a band or a data packet once it has received the true position of the
     user and the configuration of the surface, in any order. The position applies to the whole
-    cycle: messages take longer in the network than the signals that they emulate.
-
-    Parameters
-    ----------
-    seed
-        Seed of the multipath and of the impairments, see `Fading`.
-    impairments
-        Initial impairments; by default those of the scenario. Others take effect with the next
-        cycle after they are offered.
+    cycle, because messages take longer in the network than the signals that they emulate. Changed
+    impairments take effect with the next cycle.
     """
 
     SENDS = (m.FeedSignals, m.Data)
@@ -157,14 +148,14 @@ class Channel(Role):
         self._serial = itertools.count()
 
     def _use(self, impairments: Impairments) -> None:
-        """Draw the surface, which depends on the seed alone: a failed element remains failed."""
+        """Draw the surface from the seed alone, so that a failed element remains failed."""
         self._deviating = impairments.applied_to(self._scenario)
         self._surface = (
             None if DeclaredElements(self._deviating).is_exact
             else draw_surface(self._deviating, streams.generator(self._seed, streams.SURFACE)))
 
     def next_deadline(self) -> float | None:
-        """Return when the next message arrives [s], or None if no message is in flight."""
+        """Return the time at which the next message arrives [s], or None if none is in flight."""
         return self._air.in_flight[0][0] if self._air.in_flight else None
 
     def status(self) -> Mapping[str, str]:
@@ -172,7 +163,7 @@ class Channel(Role):
         return self._settings.describe()
 
     def react(self, event: Event) -> None:
-        """Process a message, then send the signals and data whose delay has passed."""
+        """Process an event, then send the signals and data whose delay has passed."""
         match event:
             case SettingsOffered(settings):
                 self._settings.latest = settings
@@ -226,10 +217,7 @@ class Channel(Role):
         self._cycle.rate_bps = self._rate_bps(self._cycle)
 
     def _draw(self, truth: m.GroundTruth, multipath: list[np.ndarray]) -> _Cycle:
-        """Draw what depends on the seed, the user and the cycle alone: a user keeps its gain.
-
-        This is done here rather than on the first pilot, while other roles prepare the cycle.
-        """
+        """Draw the channel of a cycle before the first pilot, while other roles prepare."""
         scenario, seed, user = self._scenario, self._seed, truth.user
         blocked = draw_blocked(
             self._deviating, 1, streams.generator(seed, streams.BLOCKAGE, user))
@@ -243,7 +231,7 @@ class Channel(Role):
         return _Cycle(truth, multipath, blocked, los, factors)
 
     def _answer_pending(self, cycle: _Cycle) -> None:
-        """Answer the messages of the cycle for which nothing is missing."""
+        """Answer the pending messages of the cycle that lack no related message."""
         for key, event in list(self._pending.items()):
             answer = None
             if event.cycle_id != cycle.truth.cycle_id:
@@ -266,7 +254,7 @@ class Channel(Role):
             return None if applied is None else self._propagate(event, cycle, applied)
         if cycle.rate_bps is None:
             return None
-        # What exceeds the capacity of the true channel is lost.
+        # Data in excess of the true capacity are lost.
         bits = min(event.bits, cycle.rate_bps * event.duration_s // 1)
         return dataclasses.replace(event, stage=m.Stage.DELIVERED, bits=bits)
 
@@ -278,7 +266,7 @@ class Channel(Role):
         return self._surface.applied(reported)
 
     def _propagate(self, pilot: m.Pilot, cycle: _Cycle, applied: np.ndarray) -> m.FeedSignals:
-        """Return the signals at the feeds for the configurations applied in each frame."""
+        """Return the signals at the feeds for the coefficients applied in each frame."""
         band = pilot.band
         elements = element_signals(
             cycle.los[band][:, None], cycle.multipath[band], pilot.symbols[:, None])
@@ -289,7 +277,7 @@ class Channel(Role):
                         signals=feeds)
 
     def _rate_bps(self, cycle: _Cycle) -> float | None:
-        """Return the capacity of the true channel, once the beam and its configuration arrived."""
+        """Return the true capacity [bit/s]; None until the beam and its configuration arrive."""
         beam = self._beams.get((cycle.truth.cycle_id, cycle.truth.user))
         if beam is None:
             return None
@@ -298,7 +286,7 @@ class Channel(Role):
             return None
         digital = beam.digital
         if cycle.factors is not None:
-            # Only the magnitude, the gain of the user, changes the capacity.
+            # Phases do not change the capacity.
             digital = digital * np.abs(cycle.factors[beam.band, 0, 0])
         return float(actual_capacity(
             self._scenario, Beam(applied[0], digital, beam.band), cycle.truth.position[None],
@@ -306,6 +294,6 @@ class Channel(Role):
 
 
 def _is_from_other_instance(event: m.Pilot | m.Data, truth: m.GroundTruth) -> bool:
-    """Return whether a node other than the one at the true position transmits."""
+    """Return whether a user's message comes from a node other than the sender of the position."""
     is_downlink = isinstance(event, m.Data) and event.direction is m.Direction.DOWNLINK
     return not is_downlink and not m.same_instance(event.sender, truth.sender)

@@ -1,4 +1,4 @@
-"""Events of the roles other than messages, their actions, and the outcomes that they count."""
+"""Events of the roles (except messages), their actions, and the outcomes that they count."""
 
 import dataclasses
 import enum
@@ -23,7 +23,7 @@ class CodebookOffered:
 
 @dataclasses.dataclass(frozen=True)
 class SettingsOffered:
-    """New settings, of the same class as those in use, are available to the role."""
+    """New settings, of the same class as the current ones, are available to the role."""
 
     settings: Any
 
@@ -42,19 +42,19 @@ class StoodBy:
 
 @dataclasses.dataclass(frozen=True)
 class Resumed:
-    """The node serves again; ids of cycles used meanwhile are below `first_cycle_id`."""
+    """The node serves again; the ids below `first_cycle_id` may have been used meanwhile."""
 
     first_cycle_id: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
 class PauseRequested:
-    """An operator requests that no cycle begins after the current one."""
+    """An operator requests a pause after the current cycle."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ResumeRequested:
-    """An operator requests that cycles follow each other again."""
+    """An operator requests the end of a pause."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +64,7 @@ class StepRequested:
 
 @dataclasses.dataclass(frozen=True)
 class LocateRequested:
-    """A client requests the position of a user, which is served before others once."""
+    """A client requests the position of a user, who is then served once before all others."""
 
     user: int
 
@@ -100,7 +100,7 @@ class LogMessage:
 
 @dataclasses.dataclass(frozen=True)
 class Reply:
-    """Answer the request of an operator."""
+    """Answer a request from an operator."""
 
     success: bool
     text: str
@@ -116,7 +116,7 @@ class BuildEstimator:
 
 @dataclasses.dataclass(frozen=True)
 class RevertSettings:
-    """Reset the parameters to these settings, because the settings offered last are unusable."""
+    """Reset the parameters to these settings, because the latest ones are unusable."""
 
     settings: Any
 
@@ -137,17 +137,17 @@ Action = Send | LogMessage | Reply | BuildEstimator | RevertSettings | PublishTr
 
 
 class Kind(enum.Enum):
-    """Kind of an outcome; the value is the name of its section in the diagnostics."""
+    """Kind of an outcome; the value is the prefix of its counters in the diagnostics."""
 
     DROPPED = 'dropped'    # a message was ignored
     REPEATED = 'retries'   # a step of a cycle was requested again
     LOST = 'cycles'        # a cycle ended without service
-    IDLE = 'beacons'       # a beacon without acks, a user without acks, or no beacon at all
+    IDLE = 'beacons'       # nobody answered a beacon, a user stopped answering, or beacons ceased
 
 
 @enum.unique
 class Outcome(enum.Enum):
-    """A countable outcome; the value is the name of its counter."""
+    """A counted outcome; the value is the name of its counter."""
 
     kind: Kind
 
@@ -201,6 +201,6 @@ class Outcome(enum.Enum):
 
 
 def kind_of(counter: str) -> Kind:
-    """Return the kind of a counter; counters without an `Outcome` count dropped messages."""
+    """Return the kind of a counter; one without an `Outcome` counts dropped messages."""
     kinds = {outcome.value: outcome.kind for outcome in Outcome}
     return kinds.get(counter, Kind.DROPPED)

@@ -20,18 +20,10 @@ class MessageError(ValueError):
 def array(
         dims: str, kind: type = float, low: float = -math.inf, high: float = math.inf,
         nan_allowed: bool = False) -> Any:
-    """Declare an array field.
+    """Declare an array field, with an inclusive range for the entries of a real array.
 
-    Parameters
-    ----------
-    dims
-        Dimensions as numbers, or as symbols of `Scenario.sizes` or of `Message.own_sizes`.
-    kind
-        ``float``, ``complex`` or ``int``.
-    low, high
-        Range of the entries of a real array, inclusive.
-    nan_allowed
-        Whether entries may be NaN, for unknown values.
+    `dims` contains numbers, or symbols of `Scenario.sizes` or `Message.own_sizes`. NaN stands for
+    an unknown value.
     """
     return dataclasses.field(
         metadata={'dims': tuple(dims.split()), 'declared': Field(kind, low=low, high=high),
@@ -39,7 +31,7 @@ def array(
 
 
 def index(symbol: str) -> Any:
-    """Declare an index that is less than the size `symbol` of `Scenario.sizes`."""
+    """Declare an index below the size `symbol` of `Scenario.sizes`."""
     return dataclasses.field(metadata={'index_of': symbol})
 
 
@@ -50,23 +42,20 @@ def number(low: float, high: float, default: Any = dataclasses.MISSING) -> Any:
 
 
 def size(symbol: str) -> Any:
-    """Declare a field that equals the size `symbol` of `Scenario.sizes`."""
+    """Declare a number that must equal the size `symbol` of `Scenario.sizes`."""
     return dataclasses.field(metadata={'equals': symbol})
 
 
 def optional_float() -> Any:
-    """Declare a number that may be NaN, for an unknown value."""
+    """Declare a number that is NaN if it is unknown."""
     return dataclasses.field(metadata={'nan_allowed': True})
 
 
 def check(message: 'Message', sizes: Mapping[str, int]) -> None:
-    """Check the arrays, indices and numbers of a message with the sizes of `Scenario.sizes`.
+    """Check the arrays, indices and numbers of a message against the sizes of `Scenario.sizes`.
 
-    Raises
-    ------
-    MessageError
-        If a shape differs, an index is too large, or a number is not finite or out of its range;
-        the text names the message, the field, its value and the expected value.
+    Raises MessageError if a shape differs, an index is too large, or a number is out of range or
+    not finite.
     """
     own = message.own_sizes(sizes)
     sizes = {**sizes, **own} if own else sizes
@@ -93,7 +82,7 @@ def check(message: 'Message', sizes: Mapping[str, int]) -> None:
 
 @functools.cache
 def _fields(kind: type) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-    """Return name and declaration of every field whose values are restricted."""
+    """Return the name and the declaration of each restricted field."""
     return tuple((field.name, field.metadata) for field in dataclasses.fields(kind)
                  if field.metadata or field.type is float)
 
@@ -134,7 +123,7 @@ class Direction(enum.IntEnum):
 
 
 class Stage(enum.IntEnum):
-    """Whether data enter or leave the channel."""
+    """Whether data enter the channel or leave it."""
 
     OFFERED = 0
     DELIVERED = 1
@@ -153,19 +142,19 @@ class Phase(enum.IntEnum):
 class Message:
     """Base of all messages.
 
-    The adapter to ROS sets `sender` and `scenario_id` of the messages that a role sends, and drops
+    The adapter to ROS sets `sender` and `scenario_id` when a role sends a message, and drops
     received messages of another scenario.
 
     Attributes
     ----------
     sender
-        Instance of the node that sent the message: its start in nanoseconds since 1970; 0 if
-        unknown, as in messages sent by hand.
+        Instance of the node that sent the message, given by its start in nanoseconds since 1970; 0
+        if unknown, as in messages sent by hand.
     scenario_id
         `Scenario.id` of that node; empty if unknown.
     stamp_ns
-        Time of the header, on the clock of the emulated world [ns]: that of the measurement for
-        signals and what follows from them. 0 if unknown; the adapter then sends the present time.
+        Stamp of the header on the clock of the emulated world [ns]. Signals, and messages derived
+        from them, carry the time of the measurement. 0: the adapter inserts the present time.
     """
 
     cycle_id: int
@@ -174,35 +163,35 @@ class Message:
     stamp_ns: int = 0
 
     def time_s(self, now_s: float) -> float:
-        """Return the time of the message [s], by default the time of its arrival."""
+        """Return the time of the message [s], or `now_s` if it is unknown."""
         return 1e-9 * self.stamp_ns if self.stamp_ns else now_s
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return sizes that depend on the content, by symbol as in `Scenario.sizes`."""
+        """Return the sizes that depend on the content, by symbol as in `Scenario.sizes`."""
         return {}
 
 
 def same_instance(one: int, other: int) -> bool:
-    """Return whether two instances of a node are equal, or one of them is 0, which is unknown."""
+    """Return whether two instances of a node are equal, or one of them is unknown (0)."""
     return one == other or not one or not other
 
 
 def same(one: Message, other: Message) -> bool:
-    """Return whether two messages have the same class and fields but for stamps; NaN != NaN."""
+    """Return whether two messages have the same class and the same fields, except for stamps."""
     return type(one) is type(other) and all(
         np.array_equal(getattr(one, field.name), getattr(other, field.name))
         for field in dataclasses.fields(one) if field.name != 'stamp_ns')
 
 
-# The fields that connect the messages of a cycle.
+# Fields that the messages of a cycle share.
 _SHARED = ('cycle_id', 'user', 'user_instance', 'band', 'codebook_id')
 MessageT = TypeVar('MessageT', bound=Message)
 
 
 def derive(kind: type[MessageT], source: object, **fields: Any) -> MessageT:
-    """Return a message with the fields given, and the cycle, user, band and codebook of a source.
+    """Return a message with given fields, and with the cycle, user, band and codebook of a source.
 
-    The source is a message, or another object with attributes of these names.
+    The source is a message, or an object with attributes of the same names.
     """
     shared = {name: getattr(source, name) for name in _SHARED
               if name in kind.__dataclass_fields__ and hasattr(source, name)}
@@ -220,7 +209,7 @@ class Beacon(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Ack(Message):
-    """Request of a user to be served."""
+    """Request from a user to be served."""
 
     user: int = number(1, _LAST_USER)
 
@@ -257,7 +246,7 @@ class RhsConfiguration(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class PilotRequest(Message):
-    """Request to a user to send the pilots of a range of bands, in order."""
+    """Request to a user for the pilots of a range of bands, in order."""
 
     user: int = number(1, _LAST_USER)
     user_instance: int = 0
@@ -268,7 +257,7 @@ class PilotRequest(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Pilot(Message):
-    """Pilots of a user for a band, a symbol of unit magnitude in each frame."""
+    """Pilots of a user in one band: a symbol of unit magnitude for each frame."""
 
     user: int = number(1, _LAST_USER)
     band: int = index('N_B')
@@ -277,7 +266,7 @@ class Pilot(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class FeedSignals(Message):
-    """Signals at the feeds for the pilots of a band."""
+    """Signals that arrive at the feeds from the pilots of a band."""
 
     user: int = number(1, _LAST_USER)
     user_instance: int = 0
@@ -313,7 +302,7 @@ class PositionEstimate(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class NoFix(Message):
-    """Report that no position can be estimated from the received signals."""
+    """Report that the received signals yield no position."""
 
     user: int = number(1, _LAST_USER)
     codebook_id: str
@@ -402,7 +391,7 @@ class GroundTruths(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class ProtocolState(Message):
-    """Change of phase of a cycle."""
+    """Report that a phase of a cycle has begun, or that the cycle has ended."""
 
     user: int = number(0, _LAST_USER)
     phase: Phase
@@ -412,12 +401,12 @@ class ProtocolState(Message):
 
 
 def started(instance: int) -> str:
-    """Return the start of an instance [ns since 1970] for a log message."""
+    """Describe the start of an instance for a log message."""
     time = datetime.datetime.fromtimestamp(instance // 10**9, datetime.timezone.utc)
     return f'started {time:%Y-%m-%d %H:%M:%S} UTC'
 
 
 def describe_conflict(user: int, instance: int) -> str:
-    """Return a log message about several nodes with one user number, of which one is served."""
+    """Return a log message for two nodes with one user number, of which `instance` is served."""
     return (f'user {user}: two nodes have this number; the first one, {started(instance)}, '
             'is served')

@@ -1,4 +1,4 @@
-"""What roles have in common: their interface, bounded memory, and state machines with tables."""
+"""The interface of the roles, their bounded memory, and state machines defined by tables."""
 
 import collections
 import dataclasses
@@ -12,21 +12,21 @@ from rhs_isac_ros.protocol.messages import Message
 
 
 class Role:
-    """A role of the protocol. It maps events to actions and does not read a clock.
+    """A role of the protocol, which maps events to actions and does not read a clock.
 
-    A subclass defines `react`, which appends actions with `send`, `log` and `act`.
+    A subclass defines `react`, which appends actions through `send`, `log` and `act`.
     """
 
     # Messages that the role sends, and those that it handles.
     SENDS: ClassVar[tuple[type[Message], ...]] = ()
     RECEIVES: ClassVar[tuple[type[Message], ...]] = ()
-    # States in which something that the role needs is missing.
+    # States in which the role lacks something that it needs.
     BLOCKED_STATES: ClassVar[frozenset[enum.Enum]] = frozenset()
-    # States whose timeouts are on the clock of the emulated world, and not of the protocol.
+    # States whose timeouts follow the clock of the emulated world instead of the protocol's clock.
     WORLD_STATES: ClassVar[frozenset[enum.Enum]] = frozenset()
 
     def __init__(self) -> None:
-        # Number of occurrences of each outcome and of each kind of unexpected event.
+        # Number of times that each outcome and each kind of unexpected event occurred.
         self.counters: collections.Counter[str] = collections.Counter()
         # Time of the latest event [s].
         self.now_s = 0.0
@@ -35,7 +35,7 @@ class Role:
         self._actions: list[Action] = []
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Process an event at a time [s] of a monotonic clock and return actions, in order."""
+        """Process an event at a time [s] of a monotonic clock, and return the actions in order."""
         self.now_s, self._actions = now_s, []
         self.react(event)
         return self._actions
@@ -63,7 +63,7 @@ class Role:
             self.counters[outcome.value] += n
 
     def next_deadline(self) -> float | None:
-        """Return when the role expects a `Timeout` [s], on the clock of `handle`, or None."""
+        """Return the time of the next `Timeout` on the clock of `handle` [s], or None."""
         return None
 
     def status(self) -> Mapping[str, str]:
@@ -71,7 +71,7 @@ class Role:
         return {}
 
 
-# Number of cycles whose messages roles remember; no message of an older cycle is in transit.
+# Number of cycles whose messages the roles remember; no older message is still in transit.
 REMEMBERED_CYCLES = 8
 
 Key = TypeVar('Key')
@@ -79,9 +79,9 @@ Value = TypeVar('Value')
 
 
 class NewestDict(dict[Key, Value]):
-    """A dictionary that keeps only its newest `max_size` entries; `put` adds them.
+    """A dictionary whose `put` discards all but the newest `max_size` entries.
 
-    The entry with the key `pinned`, if any, is neither discarded nor counted.
+    The limit does not apply to the entry with the key `pinned`, which is never discarded.
     """
 
     def __init__(self, max_size: int) -> None:
@@ -90,10 +90,10 @@ class NewestDict(dict[Key, Value]):
         self.pinned: Key | None = None
 
     def put(self, key: Key, value: Value) -> int:
-        """Store an entry as the newest; return how many beyond the limit were discarded."""
+        """Store an entry as the newest, and return the number of entries that were discarded."""
         self.pop(key, None)
         self[key] = value
-        # Stops at the last entry to discard, because most calls discard none.
+        # `islice` stops at the last entry to discard: most calls discard none.
         n_surplus = len(self) - (self.pinned in self) - self.max_size
         surplus = list(itertools.islice(
             (known for known in self if known != self.pinned), max(n_surplus, 0)))
@@ -102,23 +102,23 @@ class NewestDict(dict[Key, Value]):
         return len(surplus)
 
 
-# Maximum number of codebooks offered during a cycle before the oldest one is discarded.
+# Number of codebooks that are kept in addition to the one in use.
 _MAX_OFFERED = 3
 
 
 class CodebookCache(NewestDict[str, Value]):
-    """Items by codebook id; the item in use, which was taken last, is never discarded."""
+    """Items by codebook id. The item in use is the one taken last, and is never discarded."""
 
     def __init__(self) -> None:
         super().__init__(_MAX_OFFERED)
 
     @property
     def in_use(self) -> str:
-        """Id of the item that was taken last; empty at first."""
+        """Id of the codebook in use; empty at first."""
         return self.pinned or ''
 
     def take(self, codebook_id: str) -> Value:
-        """Return the item of a codebook, which must be known, and mark it as in use."""
+        """Return the item of a known codebook, and mark it as in use."""
         item = self[codebook_id]
         self.pinned = codebook_id
         return item
@@ -133,39 +133,39 @@ SAME = None
 
 
 def always(role: object, event: object) -> bool:
-    """Accept every event; this is the guard of a row without a condition."""
+    """Accept every event: the guard of a row without a condition."""
     return True
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Row(Generic[RoleT, EventT]):
-    """One row of a table."""
+    """One row of a table of transitions."""
 
-    source: tuple[enum.Enum, ...] | None  # states in which it applies, or ANY
+    source: tuple[enum.Enum, ...] | None  # states in which the row applies, or ANY
     actions: tuple[Callable[[RoleT, EventT], None], ...] = ()  # steps to carry out, in order
     target: enum.Enum | None = SAME  # state to enter, with a new timeout, or SAME
-    # Condition on role and event, without side effects.
+    # Condition on the role and the event, without side effects.
     guard: Callable[[RoleT, EventT], bool] = always
-    outcome: Outcome | None = None  # what to count, if anything
+    outcome: Outcome | None = None  # outcome to count, if any
     restart_timeout: bool = False  # whether to restart the timeout of the current state
-    # The class of its event, and the name of the event in the counters; set by `on`.
+    # Class of the event, and name of the event in the counters; `on` sets both.
     event: type = object
     event_name: str = ''
 
 
 AnyRow = Row[Any, Any]
-# Conditions on which a message is dropped in every state, each with the outcome to count, or None.
+# Conditions under which a message is dropped in every state; the outcome to count, or None.
 Drops = dict[Callable[..., bool], Outcome | None]
 
 
 class on(Generic[EventT]):
-    """Returns the rows of an event, in order: ``on(event, its name, drops)(*rows)``."""
+    """Returns the rows for an event, in order: ``on(event, name of the event, drops)(*rows)``."""
 
     def __init__(self, event: type[EventT], name: str, drops: Drops | None = None) -> None:
         self._event, self._name, self._drops = event, name, drops or {}
 
     def __call__(self, *rows: Row[Any, EventT]) -> tuple[AnyRow, ...]:
-        """Return the rows that drop messages, followed by others."""
+        """Return the rows that drop messages, followed by `rows`."""
         drops = [Row[Any, EventT](ANY, guard=wrong, outcome=outcome)
                  for wrong, outcome in self._drops.items()]
         return tuple(dataclasses.replace(row, event=self._event, event_name=self._name)
@@ -173,21 +173,21 @@ class on(Generic[EventT]):
 
 
 class StateMachine(Role):
-    """A role with states, which takes events and returns actions.
+    """A role whose reactions depend on its state and are defined by `TABLE`.
 
-    `handle` takes the first row of `TABLE` whose source, event class and guard match. An event
-    without a matching row changes nothing and counts as ``unexpected_<name>``.
+    `handle` applies the first row whose source, event class and guard match. An event without a
+    matching row changes nothing and is counted as ``unexpected_<name>``.
     """
 
     STATES: ClassVar[type[enum.Enum]]
     TABLE: ClassVar[tuple[AnyRow, ...]]
-    # All events, and their names in the counters of unexpected events; derived from the table.
+    # Names of all events in the counters of unexpected events; derived from the table.
     EVENT_NAMES: ClassVar[Mapping[type, str]]
 
     _rows: ClassVar[Mapping[tuple[enum.Enum | None, type], tuple[AnyRow, ...]]]
 
     def __init_subclass__(cls) -> None:
-        """Derive the events from a new table, and group its rows by state and event."""
+        """Derive the events of a subclass from its table; group the rows by state and event."""
         super().__init_subclass__()
         if 'TABLE' in vars(cls):
             cls.EVENT_NAMES = {row.event: row.event_name for row in cls.TABLE}
@@ -198,22 +198,22 @@ class StateMachine(Role):
     def __init__(self, initial: enum.Enum) -> None:
         super().__init__()
         self.state: enum.Enum = initial
-        # Number of times that the timeout was restarted since the state was entered.
+        # Number of times that the timeout has been restarted in the current state.
         self.repeats = 0
-        # Outcome of the row that was taken last.
+        # Outcome of the row that was applied last.
         self.outcome: Outcome | None = None
         self._deadline_s: float | None = None
 
     def timeout_s(self, state: enum.Enum) -> float | None:
-        """Return the time after which a state expects a `Timeout` [s]; None: it has no timeout."""
+        """Return the timeout of a state [s], or None if it has none."""
         return None
 
     def next_deadline(self) -> float | None:
-        """Return when the machine expects a `Timeout` [s], on the clock of `handle`, or None."""
+        """Return the time at which the timeout of the current state ends [s], or None."""
         return self._deadline_s
 
     def react(self, event: Event) -> None:
-        """Take the first matching row; raise TypeError for an event that the table lacks."""
+        """Apply the first matching row; raise TypeError for an event that the table lacks."""
         kind = type(event)
         try:
             rows = self._rows[self.state, kind]
@@ -235,12 +235,12 @@ class StateMachine(Role):
         if row.target or row.restart_timeout:
             self.repeats = 0 if row.target else self.repeats + 1
             self.state = state = row.target or self.state
-            # Read after the actions, which may have changed it.
+            # Read after the actions, which may have changed the settings.
             timeout_s = self.timeout_s(state)
             self._deadline_s = None if timeout_s is None else self.now_s + timeout_s
 
 
 def rows_for(table: Iterable[AnyRow], state: enum.Enum, event: type) -> list[AnyRow]:
-    """Return the rows for a state and a class of events, in the order in which they are tried."""
+    """Return the rows for a state and a class of events, in order."""
     return [row for row in table
             if row.event is event and (row.source is ANY or state in row.source)]

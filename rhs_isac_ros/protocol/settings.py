@@ -1,7 +1,7 @@
-"""Settings of the roles that may change while the network runs.
+"""Settings of the roles, most of which may change while the network runs.
 
-Each field is declared once, by `setting`: the ROS parameter of the same name takes its default,
-range and description from here.
+`setting` declares each field once: the ROS parameter of the same name takes its default, range and
+description from here.
 """
 
 import dataclasses
@@ -13,16 +13,16 @@ from rhs_isac_ros.protocol.user_registry import MAX_USERS, POLICIES, parse_users
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.fields import Field
 
-# Priors of the position.
+# Priors for the position.
 REGION, TRACK = PRIORS = ('region', 'track')
 
 
 def setting(
         default: bool | int | float | str, text: str, *, dynamic: bool = True, **declared: Any
 ) -> Any:
-    """Declare a setting and its parameter, with further attributes of `Field`.
+    """Declare a setting and its parameter; only a `dynamic` one may change while the node runs.
 
-    Only a `dynamic` parameter may change while the node runs.
+    The keywords `declared` are further attributes of `Field`.
     """
     return dataclasses.field(default=default, metadata={
         'declared': Field(type(default), text, **declared), 'dynamic': dynamic})
@@ -30,7 +30,7 @@ def setting(
 
 @dataclasses.dataclass(frozen=True)
 class BaseStationSettings:
-    """Settings of the base station; ValueError if `parse_users` rejects ``allowed_users``."""
+    """Settings of the base station; raises ValueError if ``allowed_users`` is invalid."""
 
     policy: str = setting(
         'round_robin', 'Policy that selects among the users that answer.', choices=POLICIES)
@@ -38,7 +38,7 @@ class BaseStationSettings:
         True, 'Whether to add thermal noise; false if the radio adds its own.')
     ack_timeout_s: float = setting(
         0.1, 'Time to wait for acks.', unit='s', low=0.001, high=60.0)
-    # Users apply the same timeout and are not notified of a change.
+    # Users have the same timeout and would not notice a change.
     step_timeout_s: float = setting(
         1.0, 'Time to wait for the next message of a cycle.', unit='s', low=0.01, high=60.0,
         dynamic=False)
@@ -57,7 +57,7 @@ class BaseStationSettings:
         200.0, 'Maximum rate of acks accepted from each user.', unit='Hz', low=1.0, high=1e6)
 
     def __post_init__(self) -> None:
-        """Check the constraints that types and ranges cannot express."""
+        """Check ``allowed_users``."""
         try:
             parse_users(self.allowed_users)
         except ValueError as error:
@@ -70,7 +70,7 @@ def _calibration_file() -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class PositionerSettings:
-    """Settings of the positioner; ValueError if the estimator cannot use the prior."""
+    """Settings of the positioner; raises ValueError if the estimator cannot use the prior."""
 
     estimator: str = setting(
         'bayes', 'Position estimator.', choices=tuple(ESTIMATORS), plugins=plugins.ESTIMATORS)
@@ -86,7 +86,7 @@ class PositionerSettings:
         1.0, 'Typical speed of the users, for the prior track.', unit='m/s', low=0.01, high=1e3)
 
     def __post_init__(self) -> None:
-        """Check the constraints that types and ranges cannot express."""
+        """Check that the estimator can use the prior."""
         if self.prior == TRACK and self.estimator != BayesEstimator.name:
             raise ValueError(
                 f"prior: '{TRACK}', expected '{REGION}' with the estimator {self.estimator}; "
@@ -119,9 +119,9 @@ def _of_scenario(name: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Impairments:
-    """Impairments of the air interface, and deviations from the model of the signals.
+    """Impairments of the air interface, and deviations of the signals from their model.
 
-    Deviations that replace those of the scenario are unknown to the other roles.
+    The other roles do not know the values that replace those of the scenario.
     """
 
     loss_probability: float = setting(
@@ -146,7 +146,7 @@ class Impairments:
     failed_element_share: float = _of_scenario('failed_element_share')
 
     def applied_to(self, scenario: Scenario) -> Scenario:
-        """Return the scenario with the deviations that are set."""
+        """Return the scenario with the values that are set."""
         known = {field.name for field in dataclasses.fields(Scenario)}
         values = dataclasses.asdict(self)
         return dataclasses.replace(scenario, **{
@@ -157,28 +157,25 @@ SettingsT = TypeVar('SettingsT', bound=Any)
 
 
 class PendingSettings(Generic[SettingsT]):
-    """Holds the `latest` settings back until the role may use them instead of those `in_use`."""
+    """Keeps the `latest` settings until the role may use them in place of those `in_use`."""
 
     def __init__(self, settings: SettingsT) -> None:
         self.in_use = settings
         self.latest = settings
 
     def apply(self) -> str:
-        """Put the latest settings into use; return a text that lists the changes, if any."""
+        """Put the latest settings into use, and return a description of the changes, if any."""
         described = ', '.join(f'{name} {text!r}' for name, text in self._pending().items())
         self.in_use = self.latest
         return f'settings applied: {described}' if described else ''
 
     def describe(self) -> dict[str, str]:
-        """Return ``parameter.<name>`` for each value in use, ``pending.<name>`` for newer ones."""
-        in_use = {f'parameter.{name}': shown(value)
-                  for name, value in dataclasses.asdict(self.in_use).items()}
+        """Return ``parameter.<name>`` for values in use and ``pending.<name>`` for newer ones."""
+        in_use = {f'parameter.{name}': shown(value) for name, value in vars(self.in_use).items()}
         return in_use | {f'pending.{name}': text for name, text in self._pending().items()}
 
     def _pending(self) -> dict[str, str]:
         """Return the values that are not in use yet, by name."""
-        if self.latest == self.in_use:
-            return {}
-        latest = dataclasses.asdict(self.latest)
-        return {name: shown(latest[name]) for name, value in dataclasses.asdict(
-            self.in_use).items() if latest[name] != value}
+        in_use = vars(self.in_use)
+        return {name: shown(value) for name, value in vars(self.latest).items()
+                if value != in_use[name]}
