@@ -1,4 +1,4 @@
-"""The positioner, which estimates positions from received signals, and the tracks of users."""
+"""The positioner, which estimates the positions and the tracks of users from received signals."""
 
 import dataclasses
 import enum
@@ -33,28 +33,28 @@ from rhs_isac_ros.protocol.user_registry import MAX_NAMED, MAX_USERS
 
 @dataclasses.dataclass
 class _Track:
-    """A track, and the latest signals that continued it with the time of their arrival [s]."""
+    """A track, and the latest signals that continued it, which were measured at `time_s` [s]."""
 
     tracker: Tracker
     latest: m.ReceivedSignals
     time_s: float
 
     def is_late(self, received: m.ReceivedSignals) -> bool:
-        """Return whether signals belong to an earlier cycle; base stations number their own."""
+        """Return whether signals belong to an earlier cycle of the same base station."""
         return received.sender == self.latest.sender and (
             received.cycle_id <= self.latest.cycle_id)
 
     def may_continue(self, received: m.ReceivedSignals, now_s: float) -> bool:
-        """Return whether signals come from the same instance of the user, and no clock reset."""
+        """Return whether signals come from the same user, on a clock that was not set back."""
         return now_s >= self.time_s - MAX_GAP_S and m.same_instance(
             received.user_instance, self.latest.user_instance)
 
 
 class Tracks:
-    """A track for each user, started and ended by the signals alone.
+    """One track for each user, derived from the signals alone.
 
-    A track ends with a gap, with another instance of the user, or if thousands of other users have
-    been located since. Signals of an earlier cycle are located without the track.
+    A track ends after a gap, when another instance of the user appears, or after thousands of
+    other users have been located. Signals from an earlier cycle do not use or change it.
     """
 
     def __init__(self) -> None:
@@ -69,8 +69,8 @@ class Tracks:
             now_s: float) -> Estimate:
         """Estimate the position of a user from signals that were measured at `now_s` [s].
 
-        The result is a `TrackEstimate` if they continue its track; a new track begins with the
-        typical speed [m/s]. Raises SignalError if the signals cannot be used.
+        The result is a `TrackEstimate` if the signals belong to a track, which assumes the typical
+        speed `speed_mps`. Raises SignalError if the signals cannot be used.
         """
         signals = _stacked(received)
         # The oldest track comes first.
@@ -90,19 +90,19 @@ class Tracks:
 
 
 def _stacked(received: m.ReceivedSignals) -> np.ndarray:
-    """Return the signals as estimators take them, complex128 [N_B, N_SB F]."""
+    """Return the signals in the shape for estimators, complex128 [N_B, N_SB F]."""
     return received.signals.reshape(len(received.signals), -1)
 
 
-# Number of residuals in the mean of a user, which bounds the memory.
+# Number of residuals that are kept for each user.
 _USER_WINDOW = 100
 
 
 class ResidualWatch:
-    """Compares residuals with the model, over all users and for each user.
+    """Compares residuals with the model, for all users together and for each user.
 
-    The signals of a single user with an unknown gain deviate with little effect on the mean over
-    many users.
+    If only one user deviates, for instance by an unknown gain, the mean over many users hardly
+    changes.
     """
 
     def __init__(self) -> None:
@@ -113,7 +113,7 @@ class ResidualWatch:
         self._diagnosis = Diagnosis()
 
     def add(self, user: int, codebook_id: str, estimate: Estimate) -> tuple[str, bool]:
-        """Add an estimate; return a text if a warning begins or ends, and whether it begins."""
+        """Add an estimate; return a text when a warning begins or ends, and whether it begins."""
         if codebook_id != self._codebook_id:
             self.clear()
             self._codebook_id = codebook_id
@@ -135,11 +135,11 @@ class ResidualWatch:
         self._warning = ''
 
     def status(self) -> dict[str, str]:
-        """Return the values for the diagnostics, those of `Diagnosis.status` among them.
+        """Return values for the diagnostics, including those of `Diagnosis.status`.
 
-        After the first residual, they include ``residual.ratio`` and ``residual.spread``, the mean
-        and the variance of the energy relative to the expectation, and ``residual.fixes``, the
-        number of fixes in the mean; during a warning, ``warning.residual`` as well.
+        ``residual.ratio`` and ``residual.spread`` are the mean and the variance of the energy of
+        the residuals relative to the expectation, ``residual.fixes`` is the number of fixes that
+        they cover, and ``warning.residual`` is the text of the present warning.
         """
         values = self._diagnosis.status(bool(self._warning))
         if self._all.n_fixes:
@@ -149,7 +149,7 @@ class ResidualWatch:
         return values | ({'warning.residual': self._warning} if self._warning else {})
 
     def _describe(self) -> str:
-        """Describe the deviation; empty if there is none."""
+        """Return a description of the deviation; empty if there is none."""
         users = sorted(user for user, monitor in self._users.items() if monitor.drifts)
         parts = [_deviation('', self._all)] if self._all.drifts else []
         parts += [_deviation(f'user {user}: ', self._users[user]) for user in users[:MAX_NAMED]]
@@ -164,7 +164,7 @@ def _deviation(prefix: str, monitor: InnovationTest) -> str:
 
 
 class _Loss(enum.Enum):
-    """Why the signals of a user yield no position, and the text for when they do again."""
+    """Why the signals of a user yield no position; the value is the text for the recovery."""
 
     NO_FIX = 'has a position again'
     BLOCKED = 'is in sight again'
@@ -193,20 +193,17 @@ class Positioner(Role):
     """The role of the positioner.
 
     The codebook id of the received signals selects the estimator. Estimators are built one at a
-    time in the background. Meanwhile, estimators for other codebooks remain in use, and the latest
-    signals of the codebook wait for its estimator. If there is an estimator for the same codebook
-    with other settings, it remains in use until the new one is ready, or permanently if the new
-    one cannot be built.
-
-    With the prior ``track``, the positioner keeps the tracks of the users; they do not survive a
-    restart.
+    time in the background. Meanwhile, existing estimators remain in use, and the latest signals
+    without an estimator wait for it. New settings replace an estimator once the new one is built;
+    if it cannot be built, the old one remains. Tracks of the users, which the prior ``track``
+    requires, do not survive a restart.
 
     Parameters
     ----------
     stopwatch
         Callable that returns a time [s], to measure the latency of the estimators.
     settings
-        Initial settings.
+        Initial settings; by default those of `PositionerSettings`.
     """
 
     SENDS = (m.PositionEstimate, m.NoFix)
@@ -218,18 +215,17 @@ class Positioner(Role):
         super().__init__()
         self._scenario, self._stopwatch = scenario, stopwatch
         self._settings = PendingSettings(settings or PositionerSettings())
-        # Reason why the last change of settings was reverted; empty if it was not reverted.
+        # Why the latest change of settings was reverted; empty if it was not.
         self._failure = ''
         self._estimators: CodebookCache[_Built] = CodebookCache()
         self._codebook: Codebook | None = None
-        # The estimator that is being built, and the latest one requested since.
+        # The estimator that is being built, and the one to build after it.
         self._building: _Job | None = None
         self._next: _Job | None = None
-        # Signals that wait for it, and the time of their arrival [s].
+        # Signals that wait for an estimator, and the time of their arrival [s].
         self._waiting: tuple[m.ReceivedSignals, float] | None = None
         self._tracks = Tracks()
-        # Users whose last signals yielded no position; only changes are logged. Bounded, because
-        # signals may name any user.
+        # Users whose latest signals yielded no position, so that only changes are logged.
         self._lost: NewestDict[int, _Loss] = NewestDict(MAX_USERS)
         self._residuals = ResidualWatch()
         # The last signals that were answered, and the answer.
@@ -264,7 +260,7 @@ class Positioner(Role):
                 self._receive(event, self.now_s)
 
     def _request(self, job: _Job) -> None:
-        """Request an estimator, now or after the one that is being built, unless there is one."""
+        """Request an estimator unless it exists, after the one that is being built."""
         built = self._estimators.get(job.codebook.id)
         if (built and job.equals(built.job)) or job.equals(self._building):
             self._next = None
@@ -275,7 +271,7 @@ class Positioner(Role):
             self.act(events.BuildEstimator(job.codebook, job.settings))
 
     def _keep(self, job: _Job, estimator: Estimator, elapsed_s: float) -> None:
-        """Store an estimator, unless other settings were offered meanwhile."""
+        """Store an estimator, unless newer settings replace it and an older one can serve."""
         codebook = job.codebook
         if job.settings != self._settings.latest and codebook.id in self._estimators:
             return
@@ -300,7 +296,7 @@ class Positioner(Role):
             self.act(events.RevertSettings(kept))
 
     def _continue(self) -> None:
-        """Request the next estimator and process the signals that waited for the last one."""
+        """Request the next estimator, and process the signals that waited for the last one."""
         waiting, job = self._waiting, self._next
         self._building = self._next = self._waiting = None
         if job:
@@ -350,7 +346,7 @@ class Positioner(Role):
         self.log(*self._residuals.add(received.user, received.codebook_id, estimate))
 
     def _publish_track(self, received: m.ReceivedSignals, estimate: Estimate) -> None:
-        """Publish the track if there is one; log whether it predicts the position."""
+        """Publish the track, if there is one; log if it replaces the signals of a blocked user."""
         user, loss = received.user, None
         if isinstance(estimate, TrackEstimate):
             self.act(events.PublishTrack(user, estimate, received.stamp_ns))
@@ -364,7 +360,7 @@ class Positioner(Role):
         self._log_change(received, _Loss.NO_FIX, f'no fix of user {received.user}: {reason}')
 
     def _log_change(self, received: m.ReceivedSignals, loss: _Loss | None, text: str) -> None:
-        """Log a change of whether the signals of a user yield a position."""
+        """Log when the signals of a user cease to yield a position, and when they do again."""
         before = self._lost.pop(received.user, None)
         if loss:
             self._lost.put(received.user, loss)
@@ -377,7 +373,7 @@ class Positioner(Role):
 def build_estimator(
         codebook: Codebook, make: Callable[[Codebook], Estimator],
         stopwatch: Callable[[], float]) -> EstimatorBuilt:
-    """Build the estimator that `BuildEstimator` requests; this may run in another thread."""
+    """Build the estimator that a `BuildEstimator` requests, in any thread."""
     begin = stopwatch()
     try:
         estimator = make(codebook)

@@ -1,4 +1,4 @@
-"""Which instance of a role serves, and which stand by."""
+"""Selection of the node that serves, if several nodes have the same role."""
 
 import collections
 import dataclasses
@@ -11,11 +11,11 @@ from rhs_isac_ros.protocol.role import NewestDict
 
 # Maximum number of nodes in conflict with this one, which bounds the memory.
 _MAX_OTHERS = 64
-# Maximum number of scenarios that are logged, which bounds the log.
+# Maximum number of other scenarios that are logged.
 _MAX_LOGGED = 16
-# Maximum length of the listed differences in the log.
+# Maximum length of the list of differences in the log.
 _MAX_LENGTH = 500
-# Maximum difference between the clocks of two hosts [ns]; instances with later starts are ignored.
+# Instances that start later than this after the present are ignored: their clock is wrong [ns].
 _MAX_AHEAD_NS = 3600 * 10**9
 
 
@@ -35,27 +35,27 @@ class Presence:
 
 
 class Presences:
-    """Decides from the announcements of other nodes whether a node serves or stands by.
+    """Decides from the announcements of other nodes whether this node serves or stands by.
 
-    Of the nodes with the same role and scenario, the one that started last serves, as with the
-    fencing tokens of leases: a restarted node serves at once, and the older node resumes when the
-    newer one has gone. Nodes of another scenario are reported and otherwise ignored.
+    Among the nodes with the same role and scenario, the one that started last serves, as with the
+    fencing tokens of leases: a restarted node serves at once, and an older node resumes when the
+    newer one has gone. Nodes with another scenario are reported and otherwise ignored.
     """
 
     def __init__(self, own: Presence) -> None:
         self.own = own
         # Nodes in conflict with this one, by instance.
         self._others: NewestDict[int, Presence] = NewestDict(_MAX_OTHERS)
-        # The newest other node of the role, and the older one that was logged last, which is not
-        # logged again if it returns after a suspension.
+        # The newest other node of the role, and the last older one that was logged: it is not
+        # logged again when it returns after a suspension.
         self._rival: Presence | None = None
         self._logged_older = 0
-        # By id: the differences of other scenarios.
+        # Description of the differences from each other scenario, by scenario id.
         self._scenarios: NewestDict[str, str] = NewestDict(_MAX_OTHERS)
         self._n_logged = 0
 
     def add(self, other: Presence, now_ns: int) -> list[LogMessage]:
-        """Process an announcement that arrives at a time since 1970 [ns]."""
+        """Process an announcement that arrives at `now_ns` [ns since 1970]."""
         own = self.own
         is_stranger = bool(other.scenario_id) and other.scenario_id != own.scenario_id
         if other.sender in (0, own.sender) or other.sender > now_ns + _MAX_AHEAD_NS or not (
@@ -70,9 +70,9 @@ class Presences:
     def gone(self, announcing: Mapping[str, int]) -> set[str]:
         """Return the names of nodes in conflict that have gone.
 
-        If several nodes share a name, it is unknown which of them has gone. The caller forgets all
-        of them; those that are still present announce themselves again. `announcing` counts the
-        nodes that announce themselves by fully qualified name, which is empty if it is unknown.
+        If one of several nodes with the same name has gone, it is unknown which one. The caller
+        forgets them all; those that remain announce themselves again. `announcing` counts the
+        nodes that announce themselves, by fully qualified name, or '' for an unknown name.
         """
         known = collections.Counter(other.node for other in self._others.values())
         return {name for name, count in known.items()
@@ -80,7 +80,7 @@ class Presences:
                 < count + (name == self.own.node)}
 
     def keep(self, announcing: Mapping[str, int]) -> list[LogMessage]:
-        """Forget the nodes that have gone, see `gone`, and choose the node that serves."""
+        """Forget the nodes that have `gone`, and choose the node that serves."""
         gone = self.gone(announcing)
         for sender in [sender for sender, other in self._others.items() if other.node in gone]:
             del self._others[sender]
@@ -107,7 +107,7 @@ class Presences:
         return self._rival.sender if self._rival else 0
 
     def conflicts(self) -> dict[str, str]:
-        """Return a description of each conflict, by key of the diagnostics."""
+        """Return a description of each conflict, by its key in the diagnostics."""
         found = {f'conflict.{scenario_id}': text
                  for scenario_id, text in self._scenarios.items()}
         return found | ({'conflict.role': self._describe()} if self._rival else {})
@@ -116,7 +116,7 @@ class Presences:
         return f'{"stands by for" if self.stands_by else "serves instead of"} {self._rival}'
 
     def _update(self) -> list[LogMessage]:
-        """Find the newest other node of the role, and log whether this one serves."""
+        """Find the newest other node of the role; log a change of the node that serves."""
         own, before = self.own, self._rival if self.stands_by else None
         rivals = [other for other in self._others.values()
                   if other.role == own.role and other.scenario_id in ('', own.scenario_id)]

@@ -21,14 +21,14 @@ class State(enum.Enum):
     """States of the RHS controller."""
 
     IDLE = 'idle'                  # applies no configuration
-    POSITIONING = 'positioning'    # applies the bands' configurations, one for each frame
+    POSITIONING = 'positioning'    # applies the configurations of the bands, frame by frame
     TRANSMITTING = 'transmitting'  # applies the configuration of a beam
 
 
 class RhsController(StateMachine):
     """The role of the RHS controller.
 
-    It holds the latest codebooks; the commands of the base station select the one to apply.
+    It holds the latest codebooks. The commands of the base station select the one to apply.
     """
 
     SENDS = (m.RhsConfiguration,)
@@ -39,13 +39,13 @@ class RhsController(StateMachine):
         super().__init__(State.IDLE)
         self._codebooks: CodebookCache[Codebook] = CodebookCache()
         self._cycle_id = 0
-        # Instance that sent the beam applied last.
+        # Sender of the beam that was applied last.
         self._beam_sender = 0
         # The user of each granted cycle.
         self._granted: NewestDict[int, int] = NewestDict(REMEMBERED_CYCLES)
-        # Band and codebook of the executed commands of each cycle.
+        # Bands and codebooks of the commands executed in each cycle.
         self._applied: NewestDict[int, set[tuple[int, str]]] = NewestDict(REMEMBERED_CYCLES)
-        # Reset by the next executed command, so that each outage is logged once.
+        # Whether an unknown codebook has been logged since the last executed command.
         self._unknown_logged = False
 
     def status(self) -> Mapping[str, str]:
@@ -55,11 +55,11 @@ class RhsController(StateMachine):
     # Guards
 
     def _unknown_codebook(self, event: m.RhsCommand) -> bool:
-        """Whether the codebook of a command was never offered, or was discarded."""
+        """Return whether the codebook of a command was never offered, or was discarded."""
         return event.codebook_id not in self._codebooks
 
     def _repeats_command(self, event: m.RhsCommand) -> bool:
-        """Whether a command of the current cycle was executed before."""
+        """Return whether a command repeats an executed one of the current cycle."""
         return (self.state is State.POSITIONING and event.cycle_id == self._cycle_id
                 and self._was_executed(event))
 
@@ -70,11 +70,11 @@ class RhsController(StateMachine):
         return event.cycle_id != self._cycle_id
 
     def _wrong_user(self, event: m.Beam) -> bool:
-        """Whether the cycle of a beam is known to be granted to another user."""
+        """Return whether the cycle of a beam is known to be granted to another user."""
         return self._granted.get(event.cycle_id, event.user) != event.user
 
     def _wrong_instance(self, event: m.Beam) -> bool:
-        """Whether the beam of another sender is applied in the cycle."""
+        """Return whether a beam from another sender is already applied in the cycle."""
         return (self.state is State.TRANSMITTING
                 and not m.same_instance(self._beam_sender, event.sender))
 
@@ -84,7 +84,6 @@ class RhsController(StateMachine):
     # Steps
 
     def _store_codebook(self, event: CodebookOffered) -> None:
-        """Store a codebook; commands can be executed with it."""
         self._codebooks.put(event.codebook.id, event.codebook)
         self.log(f'serving: codebook {event.codebook.id}')
 
@@ -92,7 +91,7 @@ class RhsController(StateMachine):
         self._granted.put(event.cycle_id, event.user)
 
     def _apply_band(self, event: m.RhsCommand) -> None:
-        """Report the codebook's configurations of a band."""
+        """Report the configurations of a band."""
         self._cycle_id, self._unknown_logged = event.cycle_id, False
         applied = self._applied.get(event.cycle_id, set())
         self._applied.put(event.cycle_id, applied | {(event.band, event.codebook_id)})
@@ -106,7 +105,7 @@ class RhsController(StateMachine):
             m.RhsConfiguration, event, mode=m.Mode.TRANSMISSION, analog=event.analog[None]))
 
     def _log_unknown_codebook(self, event: m.RhsCommand | m.Beam) -> None:
-        """Log the first message of an outage whose codebook cannot be applied."""
+        """Log the first message with a codebook that cannot be applied."""
         if not self._unknown_logged:
             self._unknown_logged = True
             self.log(f'codebook {event.codebook_id!r} rejected; in use: '
@@ -121,7 +120,7 @@ class RhsController(StateMachine):
         *on(m.RhsCommand, 'command')(
             Row(ANY, (_log_unknown_codebook,), guard=_unknown_codebook,
                 outcome=Outcome.WRONG_CODEBOOK),
-            # The base station repeats a command if it may have missed the report.
+            # The base station repeats a command whose report may be lost.
             Row(ANY, (_apply_band,), guard=_repeats_command, outcome=Outcome.DUPLICATE),
             Row(ANY, guard=_was_executed, outcome=Outcome.STALE_COMMAND),
             Row(ANY, (_apply_band,), State.POSITIONING)),

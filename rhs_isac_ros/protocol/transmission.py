@@ -23,21 +23,21 @@ from rhs_isac_ros.protocol.events import Event, Outcome
 from rhs_isac_ros.protocol.role import REMEMBERED_CYCLES, CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.settings import PendingSettings, TransmissionSettings
 
-# Fields of a report for which statistics are computed, named as in `CapacityStatistics`.
+# Fields of `Capacity` and of `CapacityStatistics` that have statistics.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
-# Reports over which statistics are computed: they follow a changing network in bounded memory.
+# Number of latest reports in the statistics, which therefore follow a changing network.
 _WINDOW = 1000
-# Time without messages of a cycle after which the role computes a report [s]. In a process with
-# other roles, the rest of the cycle then comes first.
+# A report is computed when no message of a cycle has arrived for this time [s], so that in a
+# process with other roles it does not delay a cycle.
 _IDLE_S = 5e-3
-# Longest time by which such messages, or a true position that has not arrived, postpone a report
-# [s], and number of postponed reports.
+# Messages, or a true position that has not arrived, postpone a report by this time at most [s];
+# maximum number of postponed reports.
 _MAX_DELAY_S = 0.25
 _MAX_WAITING = 8
 
 
 class _Steered(NamedTuple):
-    """The beam of a cycle, its estimate, and the bands and surface for which it was chosen."""
+    """The beam of a cycle, and the estimate, bands and surface for which it was chosen."""
 
     estimate: m.PositionEstimate
     beam: m.Beam
@@ -46,7 +46,7 @@ class _Steered(NamedTuple):
 
 
 class _Waiting(NamedTuple):
-    """A report to compute: the beam applied in a cycle, and the last time [s]."""
+    """A report to compute by `deadline_s` [s], about the beam applied in a cycle."""
 
     steered: _Steered
     applied: m.RhsConfiguration
@@ -57,14 +57,14 @@ class Transmission(Role):
     """The role that steers the beam.
 
     The true position affects only the reported capacities, never the beam. A report takes as
-    long as a beam, so the role computes it when no message of a cycle has arrived for a while.
+    long as a beam, so the role computes it between cycles.
 
     Parameters
     ----------
     settings
-        Initial settings; by default the best band of each cycle.
+        Initial settings; by default those of `TransmissionSettings`.
     surface_of
-        Callable that returns the surface of a calibration file, None for an empty name.
+        Callable that returns the surface in a calibration file; None for an empty name.
     """
 
     SENDS = (m.Beam, m.Capacity, m.CapacityStatistics)
@@ -77,7 +77,7 @@ class Transmission(Role):
         self._scenario, self._surface_of = scenario, surface_of
         self._settings = PendingSettings(settings or TransmissionSettings())
         self._codebooks: CodebookCache[None] = CodebookCache()
-        # By cycle. `_counted` holds the cycles that the statistics already include.
+        # By cycle; `_counted` contains the cycles in the statistics.
         self._steered: NewestDict[int, _Steered] = NewestDict(REMEMBERED_CYCLES)
         self._truths: NewestDict[tuple[int, int, int], m.GroundTruth] = NewestDict(
             REMEMBERED_CYCLES + _MAX_WAITING)
@@ -93,7 +93,7 @@ class Transmission(Role):
             self._active_s = self.now_s
         match event:
             case events.Timeout() if self._waiting:
-                # Messages that have arrived meanwhile precede the next report.
+                # Messages that arrived during the report are processed before the next one.
                 self._active_s = self.now_s
                 self._report_next()
             case events.CodebookOffered(codebook):
@@ -115,7 +115,7 @@ class Transmission(Role):
                     self._report_next()
 
     def next_deadline(self) -> float | None:
-        """Return when the next report is due [s], or None."""
+        """Return the time at which the next report is due [s], or None."""
         if not self._waiting:
             return None
         deadline_s = self._waiting[0].deadline_s
@@ -131,7 +131,7 @@ class Transmission(Role):
         known = self._steered.get(estimate.cycle_id)
         is_other = known and not m.same_instance(known.estimate.sender, estimate.sender)
         if known and (is_other or m.same(known.estimate, estimate)):
-            # The first estimate of a cycle stands. A repeated answer is due all the same.
+            # The first estimate of a cycle is final, but each copy is answered.
             self.count(Outcome.WRONG_INSTANCE if is_other else Outcome.DUPLICATE)
             self.send(known.beam)
             return
@@ -163,7 +163,7 @@ class Transmission(Role):
             self._waiting.append(_Waiting(steered, applied, self.now_s + _MAX_DELAY_S))
 
     def _report_next(self) -> None:
-        """Report on the first beam whose true position is known, or the first if none is."""
+        """Report on the first beam with a known true position, or else on the first beam."""
         waiting = next(filter(self._truth_of, self._waiting), self._waiting[0])
         self._waiting.remove(waiting)
         steered, applied, _ = waiting
@@ -183,7 +183,7 @@ class Transmission(Role):
         self._summarize(report)
 
     def _truth_of(self, waiting: _Waiting) -> m.GroundTruth | None:
-        """Return the true position of the node whose position was estimated, if known."""
+        """Return the true position of the user whose position was estimated, if known."""
         estimate = waiting.steered.estimate
         found = [truth for (cycle_id, user, instance), truth in self._truths.items()
                  if (cycle_id, user) == (estimate.cycle_id, estimate.user)

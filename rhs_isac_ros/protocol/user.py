@@ -11,38 +11,38 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome, PeersChanged, Timeout
 from rhs_isac_ros.protocol.role import ANY, REMEMBERED_CYCLES, NewestDict, Row, StateMachine, on
 
-# Steps of a cycle during which the user may receive nothing: the signals of the last band, the
+# Number of consecutive steps in which the user receives nothing: the signals of the last band, the
 # position, the beam and the data.
 _SILENT_STEPS = 4
 
 
 class State(enum.Enum):
-    """States of the users of a node, of which a cycle serves one at most."""
+    """States of the users of a node, at most one of which is served at a time."""
 
     DISCONNECTED = 'disconnected'  # waits for the base station and the channel
     LISTENING = 'listening'        # waits for a beacon that invites a user
-    NO_BEACON = 'no_beacon'        # waits for a beacon for longer than the timeout
+    NO_BEACON = 'no_beacon'        # has waited for a beacon for longer than the timeout
     ACKNOWLEDGED = 'acknowledged'  # waits for the grant
     GRANTED = 'granted'            # a user is being positioned and served
 
 
 class User(StateMachine):
-    """The role of the users of a node, usually of one.
+    """The role of all users of a node, usually one.
 
-    A cycle serves one user, so that one state is enough for all users of the node.
+    A cycle serves one user, so one state is enough for all of them.
 
     Parameters
     ----------
     mobilities
-        By id, from 1: the position of each user as a function of time.
+        Mobility of each user, by id from 1.
     step_s
         Time that the base station waits for each step [s].
     beacon_s
         Time without a beacon after which the user logs a warning [s].
     instance
-        Instance of the node; only the instance that a grant names answers it.
+        Instance of the node, which ignores grants to other instances.
     world_s
-        Returns the time of the mobilities [s]; by default it is that of `handle`.
+        Returns the time for the mobilities [s]; by default the time passed to `handle`.
     """
 
     SENDS = (m.Ack, m.GroundTruth, m.GroundTruths, m.Pilot, m.Data)
@@ -56,15 +56,15 @@ class User(StateMachine):
         super().__init__(State.DISCONNECTED)
         self._step_s, self._beacon_s = step_s, beacon_s
         self.users, self._instance = tuple(sorted(mobilities)), instance
-        # By user: describes the node with the same number that is served instead.
+        # Descriptions of nodes that are served instead because they have the same number, by user.
         self._conflicts: dict[int, str] = {}
         self._mobilities, self._world_s = mobilities, world_s
         self._crowd = Crowd([mobilities[user] for user in self.users])
         self._cycle_id = 0
         # Cycle and bands of the last pilot request answered.
         self._sounded = (0, 0, 0)
-        # By cycle: the highest attempt received. By cycle and user: the position, fixed for the
-        # whole cycle.
+        # The highest attempt received, by cycle, and the position during a cycle, by cycle and
+        # user.
         self._attempts: NewestDict[int, int] = NewestDict(REMEMBERED_CYCLES)
         self._truths: NewestDict[tuple[int, int], m.GroundTruth] = NewestDict(REMEMBERED_CYCLES)
 
@@ -78,7 +78,7 @@ class User(StateMachine):
         return self._world_s() if self._world_s else now_s
 
     def timeout_s(self, state: enum.Enum) -> float | None:
-        """Return the timeout of a state [s], or None."""
+        """Return the timeout of a state [s], or None if it has none."""
         timeouts: dict[enum.Enum, float] = {
             State.LISTENING: self._beacon_s, State.ACKNOWLEDGED: self._step_s,
             State.GRANTED: _SILENT_STEPS * self._step_s}
@@ -94,7 +94,7 @@ class User(StateMachine):
         return bool(event.missing)
 
     def _stale_beacon(self, event: m.Beacon) -> bool:
-        """Whether a beacon is late or a duplicate."""
+        """Return whether a beacon is late or a duplicate."""
         granted = self.state is State.GRANTED and event.cycle_id == self._cycle_id
         return granted or event.attempt <= self._attempts.get(event.cycle_id, -1)
 
@@ -109,36 +109,36 @@ class User(StateMachine):
         return event.user not in self._mobilities
 
     def _other_user_granted(self, event: m.Grant) -> bool:
-        """Whether the acknowledged cycle is granted to a user of another node."""
+        """Return whether the acknowledged cycle is granted to a user of another node."""
         return self._other_user(event) and event.cycle_id == self._cycle_id
 
     def _other_instance_granted(self, event: m.Grant) -> bool:
-        """Whether the acknowledged cycle is granted to another node with the same number."""
+        """Return whether the acknowledged cycle is granted to another node of the same number."""
         return self._other_instance(event) and event.cycle_id == self._cycle_id
 
     def _other_instance(self, event: m.Grant | m.PilotRequest) -> bool:
         return not m.same_instance(event.user_instance, self._instance)
 
     def _other_granted(self, event: m.PilotRequest) -> bool:
-        """Whether the cycle is granted to another user of this node."""
+        """Return whether the cycle is granted to another user of this node."""
         return self.state is State.GRANTED and (event.cycle_id, event.user) not in self._truths
 
     def _not_granted(self, event: m.Data) -> bool:
-        """Whether the cycle was not granted to the user."""
+        """Return whether the cycle was not granted to the user."""
         return (event.cycle_id, event.user) not in self._truths
 
     def _wrong_cycle(self, event: m.Grant | m.PilotRequest | m.Data) -> bool:
         return event.cycle_id != self._cycle_id
 
     def _late_grant(self, event: m.Grant) -> bool:
-        """Whether the cycle was granted before and has ended."""
+        """Return whether the cycle was granted before and has ended."""
         return (event.cycle_id, event.user) in self._truths and self.state is not State.GRANTED
 
     def _new_request(self, event: m.PilotRequest) -> bool:
         return self._sounded != (event.cycle_id, event.band, event.last_band)
 
     def _not_delivered_downlink(self, event: m.Data) -> bool:
-        """Whether data are anything other than downlink data delivered by the channel."""
+        """Return whether data are anything other than downlink data delivered by the channel."""
         return event.stage is m.Stage.OFFERED or event.direction is m.Direction.UPLINK
 
     # Steps
@@ -206,7 +206,7 @@ class User(StateMachine):
         *on(m.Beacon, 'beacon')(
             Row(ANY, guard=_stale_beacon, outcome=Outcome.STALE_BEACON),
             Row((State.DISCONNECTED,)),
-            # A beacon to others shows that the base station is active, and ends the cycle before.
+            # A beacon to other users shows that the base station is active and the cycle is over.
             Row((State.LISTENING,), (_note_beacon,), guard=_invites_others, restart_timeout=True),
             Row((State.NO_BEACON,), (_log_resumed, _note_beacon), State.LISTENING,
                 guard=_invites_others),
@@ -225,7 +225,7 @@ class User(StateMachine):
             Row(ANY, (_log_other_instance,), guard=_other_instance, outcome=Outcome.NUMBER_TAKEN),
             Row(ANY, guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE),
             Row(ANY, guard=_late_grant, outcome=Outcome.LATE_GRANT),
-            # The base station may wait for longer than the user did.
+            # The base station may wait longer than the user does.
             Row((State.LISTENING, State.ACKNOWLEDGED), (_publish_position,), State.GRANTED),
             Row((State.NO_BEACON,), (_log_resumed, _publish_position), State.GRANTED),
             Row((State.GRANTED,))),
@@ -233,7 +233,7 @@ class User(StateMachine):
                              _other_instance: None,
                              _wrong_cycle: Outcome.WRONG_CYCLE,
                              _other_granted: Outcome.WRONG_USER})(
-            # A request that overtakes the grant implies it.
+            # A request that overtakes the grant replaces it.
             Row((State.ACKNOWLEDGED,), (_publish_position, _send_pilots), State.GRANTED,
                 guard=_new_request),
             Row((State.GRANTED,), (_send_pilots,), guard=_new_request, restart_timeout=True),

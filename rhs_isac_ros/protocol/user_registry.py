@@ -1,4 +1,4 @@
-"""The users that a base station knows: their turns, and the nodes that own their numbers."""
+"""The users known to a base station, their turns, and the nodes that own their numbers."""
 
 import bisect
 import dataclasses
@@ -11,17 +11,16 @@ import numpy as np
 from rhs_isac_ros.protocol import messages as m
 
 POLICIES = ('round_robin', 'first', 'random')
-# Highest number of a user, which bounds the memory whatever numbers the acks contain.
+# Highest number of a user, which bounds the memory for any content of the acks.
 MAX_USERS = 4096
 LAST_NUMBER = 2**32 - 1
-# Number of registered users that the first beacon of a cycle invites, and the factor by which
-# each further beacon of the cycle extends it. All acks of a cycle take time, but one user is
-# served.
+# Number of registered users that the first beacon of a cycle invites, and the factor by which each
+# further beacon increases it. A cycle serves one user, but each ack takes time.
 INVITED, _EXTENSION = 8, 8
 # Number of consecutive beacons without an answer after which a user is removed.
 _MAX_MISSED = 3
-# The node that owns a number is silent when it has not answered for this time [s], while others
-# with its number have answered as many beacons: a beacon invites all of them or none.
+# The owner of a number is silent if it has not answered for this time [s], in which other nodes
+# with the number have answered _MAX_MISSED beacons. A beacon invites all of them or none.
 SILENT_S = 1.0
 # Time without a rejected ack after which a conflict has ended [s].
 _CONFLICT_S = 5.0
@@ -29,39 +28,40 @@ _CONFLICT_S = 5.0
 
 @dataclasses.dataclass
 class _User:
-    """A registered user, and the node that owns its number: the first that answered."""
+    """A registered user, and the node that owns the number, which is the first that answered."""
 
-    # (turn, 1, number) if it was served in that turn, (turn, 0, number) if it was registered after
-    # it and not served yet.
+    # (turn, 1, number) if the user was served in the turn; (turn, 0, number) if the user was
+    # registered after it and has not been served yet.
     turn: tuple[int, int, int]
     missed: int = 0  # consecutive beacons without an answer
-    instance: int = 0  # of the owner; 0 if unknown
-    answered_s: float = 0.0  # time of its last ack [s]
-    rejected: int = 0  # acks of other instances since then
+    instance: int = 0  # instance of the owner; 0 if unknown
+    answered_s: float = 0.0  # time of the owner's last ack [s]
+    rejected: int = 0  # number of acks of other instances since then
 
 
 class UserRegistry:
-    """Registers the users that answer beacons and selects the next one to serve.
+    """Registers the users that answer beacons, and selects the next one to serve.
 
-    Each number belongs to one node: the first to answer, until it is silent. The policy selects
-    the user served longest ago (``round_robin``), the ``first`` to answer, or one at ``random``.
+    A number belongs to the first node that answers with it, until this node is silent. The policy
+    selects the user served longest ago (``round_robin``), the ``first`` to answer, or one at
+    ``random``.
     """
 
     def __init__(self, policy: str, rng: np.random.Generator) -> None:
         self.policy, self._rng = policy, rng
         self._users: dict[int, _User] = {}
-        # By number: when an owner last answered after another instance [s], and a description.
+        # Time at which a conflict was last observed [s] and its description, by number.
         self._conflicts: dict[int, tuple[float, str]] = {}
         # The registered users in ascending order.
         self._numbers: list[int] = []
         # The registered users that were invited and have not answered yet.
         self._awaited: set[int] = set()
-        # Users that are served before others once, in the order of the requests.
+        # Users to serve once before all others, in the order of the requests.
         self._requested: dict[int, None] = {}
         self._turn = 0
         # Whether the latest beacon invited all users.
         self.all_invited = True
-        # Users that answered in this cycle, in order; the values have no meaning.
+        # Users that answered in this cycle, in order; a dictionary serves as an ordered set.
         self.answered: dict[int, None] = {}
 
     def __len__(self) -> int:
@@ -69,11 +69,11 @@ class UserRegistry:
         return len(self._users)
 
     def invite(self, attempt: int) -> tuple[int, int]:
-        """Choose the users to wait for, and return their first and last number.
+        """Choose the users to wait for, and return the first and the last number to invite.
 
-        The range contains the user whose turn it is. The ranges of all turns cover every number,
-        so that new users are invited within a round. `attempt` is the number of beacons of the
-        cycle that nobody answered; each extends the range.
+        This range contains the user whose turn it is. The ranges of a round cover all numbers, so
+        that new users are invited, too. `attempt` is the number of beacons in this cycle that
+        nobody answered; the range grows with it.
         """
         self.answered = {}
         numbers, size = self._numbers, INVITED * _EXTENSION**min(attempt, 8)
@@ -88,7 +88,7 @@ class UserRegistry:
                 invited[-1] if begin + size < len(numbers) else LAST_NUMBER)
 
     def request(self, user: int) -> None:
-        """Serve a user before others once, as soon as it answers."""
+        """Serve a user once before all others, as soon as the user answers."""
         self._requested[user] = None
 
     def _next(self) -> int:
@@ -113,16 +113,15 @@ class UserRegistry:
         self._users[number].rejected += 1
 
     def register(self, number: int, instance: int = 0, now_s: float = 0.0) -> str:
-        """Wait for a user, without counting it among those that answered.
+        """Register a user that may have answered too late for this cycle.
 
-        A user that was invited to this cycle and has not answered in time loses its turn.
-        Otherwise, the range of a user that is always late would be invited in every cycle, and
-        other ranges would never be. Returns a warning at the first ack of the owner after the
-        rejection of another instance; otherwise an empty text.
+        An invited user that answers too late loses its turn. Otherwise, a user that is always late
+        would have its range invited in every cycle, and no other range. Returns a warning at the
+        first ack of the owner after another instance was rejected, otherwise ''.
         """
         user = self._users.get(number)
-        # A new user comes after all that wait and before the one served last, so that users that
-        # leave and return do not gain turns.
+        # A new user takes its turn after all waiting users and before the one served last, so that
+        # leaving and returning does not gain a turn.
         if user is None:
             user = self._users[number] = _User((self._turn, 0, number), instance=instance)
             bisect.insort(self._numbers, number)
@@ -137,24 +136,24 @@ class UserRegistry:
         return warning
 
     def add_answer(self, number: int, instance: int = 0, now_s: float = 0.0) -> str:
-        """Register a user as answering in this cycle; return a warning as `register` does."""
+        """Register a user that answered in time; return a warning as `register` does."""
         self._awaited.discard(number)
         self.answered[number] = None
         return self.register(number, instance, now_s)
 
     def remove(self, number: int) -> None:
-        """Stop waiting for a user until it answers again, and release its number."""
+        """Remove a user until the user answers again, and release the number."""
         if self._users.pop(number, None) is not None:
             del self._numbers[bisect.bisect_left(self._numbers, number)]
             self._awaited.discard(number)
 
     def owner(self, number: int) -> int:
-        """Return the instance that owns a number; 0 if none does or if it is unknown."""
+        """Return the instance that owns a number; 0 if there is none or it is unknown."""
         user = self._users.get(number)
         return user.instance if user else 0
 
     def conflicts(self, now_s: float) -> dict[str, str]:
-        """Return a description of each conflict, by key of the diagnostics."""
+        """Return a description of each conflict, by its key in the diagnostics."""
         return {f'conflict.user_{number}': text
                 for number, (latest_s, text) in self._conflicts.items()
                 if now_s < latest_s + _CONFLICT_S}
@@ -167,7 +166,7 @@ class UserRegistry:
         return removed
 
     def is_complete_with(self, user: int) -> bool:
-        """Return whether no further answers are needed once `user` has answered."""
+        """Return whether the answer of `user` is the last that the cycle needs."""
         if user in self._requested:
             return True
         if self.policy == 'first' and not self._awaited & self._requested.keys():
@@ -175,10 +174,7 @@ class UserRegistry:
         return self._awaited <= {user}
 
     def remove_absent(self) -> list[int]:
-        """Count missed beacons; remove and return the users that missed too many in a row.
-
-        Beacons that do not invite a user do not count.
-        """
+        """Count missed invitations; remove and return the users that missed too many in a row."""
         lost = []
         for number in sorted(self._awaited):
             self._users[number].missed += 1
@@ -188,7 +184,7 @@ class UserRegistry:
         return lost
 
     def select(self) -> int:
-        """Return the user to serve, one of those that answered."""
+        """Return the user to serve, who is one of those that answered."""
         if requested := [user for user in self._requested if user in self.answered]:
             chosen = requested[0]
             del self._requested[chosen]
@@ -207,9 +203,9 @@ _RANGE = re.compile(r'\s*(\d+)\s*(?:-\s*(\d+)\s*)?')
 
 
 def parse_users(text: str) -> tuple[range, ...]:
-    """Parse a list of user numbers from 1 and ranges, such as ``1, 4, 10-20``; may be empty.
+    """Parse a possibly empty list of user numbers and ranges, such as ``1, 4, 10-20``.
 
-    Raises ValueError if a part is neither a number nor an ascending range.
+    Raises ValueError if a part is neither a positive number nor an ascending range.
     """
     return tuple(_parse_range(part) for part in text.split(',')) if text.strip() else ()
 
@@ -223,12 +219,12 @@ def _parse_range(part: str) -> range:
     return range(first, last + 1)
 
 
-# Maximum number of users that one text names.
+# Maximum number of users that a message lists.
 MAX_NAMED = 8
 
 
 def join_users(users: Iterable[int]) -> str:
-    """Return the numbers of users as a list, which ends with a count of those beyond `MAX_NAMED`.
+    """Return the numbers of users as a text, with a count in place of those beyond `MAX_NAMED`.
 
     Examples
     --------
