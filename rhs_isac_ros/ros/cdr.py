@@ -1,8 +1,8 @@
-"""The encoding of the messages of the protocol on the wire, without ROS messages in between.
+"""Encoding of the messages of the protocol as bytes, without intermediate ROS messages.
 
-The conversion of a ROS message calls a Python function for each of its fields and nested messages,
-which takes longer than the transport. Publishers and raw subscriptions of rclpy exchange encoded
-messages instead: common data representation (CDR), version 1, little endian.
+Converting a ROS message calls a Python function for each field and nested message, which takes
+longer than the transport. Publishers and raw subscriptions of rclpy therefore exchange bytes:
+common data representation (CDR), version 1, little endian.
 """
 
 import dataclasses
@@ -19,9 +19,10 @@ from rhs_isac_ros.protocol.messages import MessageError
 
 
 class Type(NamedTuple):
-    """The encoding of a ROS type as a series of items.
+    """The encoding of a ROS type as a series of items, given by `wire`.
 
-    An item has a type code of `struct`, or is a string, ``s``, or a sequence, ``*I`` or ``*d``.
+    Each item is a number (a type code of `struct`), a string (``s``) or a sequence (``*I``,
+    ``*d``).
     """
 
     wire: tuple[str, ...]
@@ -37,7 +38,7 @@ def _encode_complex(values: np.ndarray) -> tuple[np.ndarray, ...]:
 
 def _decode_real(items: Sequence[np.ndarray]) -> np.ndarray:
     shape, values = items
-    # The numbers are not aligned in memory, so that computations with them would be slow.
+    # A copy, because the received numbers are not aligned in memory, which slows computations.
     return values.astype(float).reshape(_shape(values, shape))
 
 
@@ -63,7 +64,7 @@ def _numbers(n: int) -> Type:
 
 
 def _decode_mapping(items: Sequence[str]) -> dict[str, Any]:
-    # JSON is YAML without the references that let a short text describe an enormous value.
+    # Unlike YAML, JSON has no references, with which a short text can describe an enormous value.
     try:
         mapping = json.loads(items[0])
     except RecursionError as error:
@@ -73,7 +74,7 @@ def _decode_mapping(items: Sequence[str]) -> dict[str, Any]:
     return mapping
 
 
-# Types of one item on the wire.
+# Types that are one item on the wire.
 SCALARS = {'uint8': 'B', 'uint32': 'I', 'uint64': 'Q', 'double': 'd', 'string': 's'}
 # The other types.
 TYPES = {
@@ -88,7 +89,7 @@ TYPES = {
         ('*I', '*d'), lambda values: (
             np.array(values.shape, '<u4'), np.asarray(values, '<f8').ravel()), _decode_real),
     'rhs_isac_msgs/ComplexArray': Type(('*I', '*d', '*d'), _encode_complex, _decode_complex),
-    # A string, in which the class of the messages has a mapping.
+    # A string field in ROS, but a mapping in the dataclass.
     'mapping': Type(('s',), lambda mapping: (json.dumps(dict(mapping)),), _decode_mapping),
 }
 
@@ -101,10 +102,10 @@ _SIZES = {'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
 
 
 class _Run(NamedTuple):
-    """Numbers of fixed size, and the string or sequence that follows them, if any.
+    """Numbers of fixed size, and the type of the string or sequence after them, `tail`.
 
-    The layout depends on the position in the message modulo 8. `tail` is the wire type of what
-    follows; empty for the last run.
+    The layout of the numbers depends on their position in the message modulo 8. The `tail` of the
+    last run is empty.
     """
 
     layouts: tuple[struct.Struct, ...]
@@ -115,7 +116,7 @@ class _Run(NamedTuple):
 class _Field(NamedTuple):
     """A field of a message, and the range of its items on the wire.
 
-    A single item has no `encode`; then `decode` converts an enumeration, if given.
+    A field of one item has no `encode`; its `decode`, if any, converts an enumeration.
     """
 
     name: str
@@ -128,18 +129,9 @@ class _Field(NamedTuple):
 class Codec:
     """Encodes and decodes one class of messages.
 
-    Parameters
-    ----------
-    kind
-        Class of the messages: a dataclass with the fields of the ROS type, and ``stamp_ns`` if it
-        keeps the stamp of the header.
-    types
-        Types by field, as in ``get_fields_and_field_types`` of the ROS type.
-
-    Raises
-    ------
-    TypeError
-        If the type of a field is not supported.
+    `kind` is a dataclass with the fields of the ROS type, and with ``stamp_ns`` if it keeps the
+    stamp of the header; `types` is the result of ``get_fields_and_field_types`` of the ROS type.
+    Raises TypeError if the type of a field is not supported.
     """
 
     def __init__(self, kind: type[Any], types: dict[str, str]) -> None:
@@ -171,7 +163,7 @@ class Codec:
 
     def encode(
             self, message: Any, frame: str, stamp_ns: int, sender: int, scenario_id: str) -> bytes:
-        """Return the bytes of a message; the arguments replace its own values.
+        """Return the bytes of a message, whose own values the other arguments replace.
 
         Raises MessageError if a string has no UTF-8 encoding.
         """
@@ -217,13 +209,10 @@ class Codec:
                                f'{error.reason}') from None
 
     def decode(self, data: bytes) -> Any:
-        """Return the message of bytes that begin with `HEADER`; arrays do not share their memory.
+        """Decode bytes that begin with `HEADER`; the arrays do not share memory with them.
 
-        Raises
-        ------
-        MessageError
-            If the bytes end too early, an array does not fill its shape, or an enumeration field
-            is not one of its constants.
+        Raises MessageError if the bytes end too early, an array does not fill its shape, or the
+        value of an enumeration is undefined.
         """
         try:
             items = self._items(data)
@@ -277,7 +266,7 @@ def _runs(wire: Sequence[str]) -> list[_Run]:
         if one in _SIZES:
             numbers += one
             continue
-        # A string or a sequence begins with its size.
+        # A string or a sequence starts with its size.
         written = numbers + 'I' if one else numbers
         runs.append(_Run(tuple(_layout(written, start) for start in range(8)), len(numbers), one))
         numbers = ''
@@ -295,5 +284,5 @@ def _layout(numbers: str, start: int) -> struct.Struct:
 
 
 def _padding(position: int) -> int:
-    """Return the number of bytes before a number of eight bytes."""
+    """Return the number of padding bytes before a number of eight bytes."""
     return (len(HEADER) - position) % 8

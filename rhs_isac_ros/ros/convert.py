@@ -1,4 +1,4 @@
-"""Conversions between the plain messages of the protocol and ROS messages."""
+"""Conversions between the dataclasses of the protocol and ROS messages."""
 
 import dataclasses
 import math
@@ -27,7 +27,7 @@ _UNKNOWN_ROTATION_VARIANCE = 1e6
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class CodebookMessage:
-    """A codebook as it is announced; `sender` and `scenario_id` are as in `Message`."""
+    """The announcement of a codebook; `sender` and `scenario_id` are as in `Message`."""
 
     sender: int = 0
     scenario_id: str = ''
@@ -58,7 +58,7 @@ _MessageT = TypeVar('_MessageT', bound=Message | CodebookMessage | Presence)
 
 
 def ros_type(kind: type[_MessageT]) -> Any:
-    """Return the class of `rhs_isac_msgs.msg` of a message class."""
+    """Return the class in `rhs_isac_msgs.msg` for a dataclass."""
     return _ROS_TYPES[kind]
 
 
@@ -72,28 +72,19 @@ def to_ros(
 def to_bytes(
         message: _MessageT, stamp_ns: int, identity: tuple[int, str] | None = None,
         frame: str = RHS_FRAME) -> bytes:
-    """Serialize a message (CDR), as a publisher of `ros_type` accepts it.
+    """Serialize a message (CDR) for a publisher of `ros_type`.
 
-    Parameters
-    ----------
-    identity
-        Sender and id of the scenario; by default those of the message.
-    frame
-        Frame of the header.
-
-    Raises
-    ------
-    MessageError
-        If a string has no UTF-8 encoding.
+    The `identity` consists of the sender and the id of the scenario, by default those of the
+    message. Raises MessageError if a string has no UTF-8 encoding.
     """
     sender, scenario_id = identity or (message.sender, message.scenario_id)
     return _CODECS[type(message)].encode(message, frame, stamp_ns, sender, scenario_id)
 
 
 def from_ros(kind: type[_MessageT], message: Any) -> _MessageT:
-    """Convert a message of `ros_type` from ROS, or raise MessageError, as `from_bytes` does."""
+    """Convert a message of `ros_type`, or raise MessageError as `from_bytes` does."""
     serialized = serialize_message(message)
-    # The options that follow the identifier do not change the encoding.
+    # The options after the identifier do not change the encoding.
     if serialized[:2] != cdr.HEADER[:2]:
         raise RuntimeError(f'{kind.__name__}: serialized by rclpy with the representation '
                            f'{serialized[:2].hex()}, expected {cdr.HEADER[:2].hex()}: '
@@ -102,19 +93,15 @@ def from_ros(kind: type[_MessageT], message: Any) -> _MessageT:
 
 
 def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
-    """Convert a serialized message (CDR), as a raw subscription receives it.
+    """Convert a serialized message (CDR) from a raw subscription.
 
-    Other subscriptions of rclpy silently drop what they cannot deserialize.
-
-    Raises
-    ------
-    MessageError
-        If the bytes are not a message of `ros_type`, an array does not fill its shape, or an
-        enumeration field is not one of its constants.
+    Raises MessageError if the bytes are not a message of `ros_type`, an array does not fill its
+    shape, or the value of an enumeration is undefined. Other subscriptions of rclpy silently drop
+    bytes that they cannot deserialize.
     """
     if serialized.startswith(cdr.HEADER):
         return _CODECS[kind].decode(serialized)
-    # Another machine may send another byte order.
+    # A machine with another byte order may have sent the message.
     try:
         message = deserialize_message(serialized, ros_type(kind))
     # rclpy raises a RuntimeError without a public class; a string may be invalid UTF-8.
@@ -131,7 +118,7 @@ def codebook_from_ros(message: ros.Codebook) -> Codebook:
 
 
 def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
-    """Return the stamp of a message; the present time of a node if it is unknown."""
+    """Return the stamp of a message, or the present time of a node if it is unknown."""
     if not message.stamp_ns:
         return node.get_clock().now().to_msg()
     return Time(sec=message.stamp_ns // 10**9, nanosec=message.stamp_ns % 10**9)
@@ -140,9 +127,9 @@ def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
 def pose(
         estimate: PositionEstimate, stamp: Time, frame: Frame | None = None
 ) -> PoseWithCovarianceStamped:
-    """Return a position estimate as a pose with unknown orientation in a frame.
+    """Return a position estimate in a frame, as a pose of unknown orientation.
 
-    Each rotation has the variance of an angle that is uniform from -pi to pi.
+    Each rotation has the variance of an angle that is uniform between -pi and pi.
     """
     frame = frame or Frame()
     result = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=frame.name))
@@ -154,9 +141,9 @@ def pose(
 
 def odometry(
         user: int, estimate: TrackEstimate, stamp: Time, frame: Frame | None = None) -> Odometry:
-    """Return position and velocity of a track; orientation and angular velocity are unknown.
+    """Return the position and velocity of a track; orientation and angular velocity are unknown.
 
-    The axes of the child frame, in which the velocity is given, are those of the frame.
+    The child frame, in which the velocity is given, has the axes of the frame.
     """
     frame = frame or Frame()
     result = true_odometry(user, estimate.mean, estimate.velocity, stamp, frame)
@@ -179,7 +166,7 @@ def true_odometry(
 
 
 def _with_rotation(covariance: np.ndarray, variance: float) -> np.ndarray:
-    """Return the 36 elements of a covariance with independent rotations of a variance."""
+    """Return the 36 entries of a covariance with independent rotations of equal variance."""
     both = variance * np.eye(6)
     both[:3, :3] = covariance
     return both.ravel()

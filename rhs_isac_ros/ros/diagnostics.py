@@ -16,10 +16,7 @@ _PERIOD_S = 1.0
 
 
 def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
-    """Convert the report of a node, by its fully qualified name, to one status, OK or WARN.
-
-    The hardware id consists of the name of this host and the name of the node.
-    """
+    """Convert the report of a node to one status, OK or WARN, for its fully qualified `name`."""
     level = DiagnosticStatus.WARN if report.fault else DiagnosticStatus.OK
     values = [KeyValue(key=key, value=value) for key, value in report.values.items()]
     status = DiagnosticStatus(
@@ -29,7 +26,7 @@ def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
 
 
 def from_ros(message: DiagnosticArray, namespace: str) -> Iterator[tuple[str, Report]]:
-    """Yield the name of each node of a namespace, without its first slash, and its report."""
+    """Yield the name without the first slash, and the report, of each node in a namespace."""
     for status in message.status:
         if status.name.rpartition('/')[0] == namespace.strip('/'):
             yield status.name, Report(

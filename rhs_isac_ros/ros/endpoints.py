@@ -1,11 +1,11 @@
-"""Timers, quality of service, publishers and subscriptions, and a thread for slow work.
+"""Quality of service, publishers, subscriptions, timers, and a thread for slow work.
 
-Publishers and subscriptions have no event handlers. Those of subscriptions slow down executors.
-Those of publishers end a node that destroys one while an observer with an incompatible quality of
-service is present (ros2/rclpy#1644).
+Publishers and subscriptions have no event handlers: on a subscription, they slow down executors;
+on a publisher, they crash a node that destroys it while an observer with an incompatible quality
+of service is present (ros2/rclpy#1644).
 
-The middleware may refuse to create an endpoint, as without a permission. The node then runs
-without it, logs the refusal, and reports it in its diagnostics.
+The middleware may refuse to create an endpoint, for instance because a permission is missing. The
+node then runs without it, logs the refusal, and reports it in its diagnostics.
 """
 
 import collections
@@ -37,17 +37,16 @@ def _profile(
                       durability=durability)
 
 
-# For handshakes and signals, which must all arrive and are useless to late joiners. The depth
-# holds the acks of the users of a beacon, and messages that arrive during a computation.
+# For handshakes and signals, which must all arrive and are useless to late joiners. The queue
+# holds the messages that arrive during a computation.
 EXCHANGE = _profile(128)
-# For acks: all users answer the beacon of a base station to which they are new.
+# For acks: all users answer the first beacon of a new base station.
 ACKS = _profile(MAX_USERS)
-# For the same messages, received by an observer of the whole network: its queue must hold those
-# of several seconds in which a busy machine does not run the observer.
+# For observers of all messages: a busy machine may not run an observer for several seconds.
 OBSERVATION = _profile(4096)
 # For a current value, which late joiners receive as well.
 LATCHED = _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
-# For `LATCHED` values of many publishers, of which a subscription keeps one each.
+# For the `LATCHED` values of many publishers.
 PRESENCES = _profile(128, DurabilityPolicy.TRANSIENT_LOCAL)
 # For the positions of robots, whose drivers and simulators often publish best effort.
 SENSOR = _profile(10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -55,13 +54,13 @@ _LATCHED_MESSAGES = {m.CapacityStatistics}
 
 
 def profile_for(kind: type[m.Message], exchange: QoSProfile = EXCHANGE) -> QoSProfile:
-    """Return `LATCHED` for messages of a current value, `exchange` for others, `ACKS` for acks."""
+    """Return the profile of a message: `LATCHED` for a current value, `ACKS`, or `exchange`."""
     if kind is m.Ack and exchange is EXCHANGE:
         return ACKS
     return LATCHED if kind in _LATCHED_MESSAGES else exchange
 
 _CreatedT = TypeVar('_CreatedT')
-# By node: descriptions of what was refused, by kind and name.
+# For each node: descriptions of refused endpoints, by kind and name.
 _refusals: weakref.WeakKeyDictionary[Node, dict[str, str]] = weakref.WeakKeyDictionary()
 
 
@@ -71,10 +70,10 @@ def refusals(node: Node) -> dict[str, str]:
 
 
 def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> _CreatedT | None:
-    """Return what `create` returns, or log its refusal by the middleware once and return None."""
+    """Return the result of `create`, or None after logging once that the middleware refused it."""
     try:
         return create()
-    # Of an action, rclpy raises a ValueError.
+    # For an action, rclpy raises a ValueError.
     except (rclpy_implementation.RCLError, ValueError) as error:
         # The end of the text is a position in the sources of ROS.
         text = f'{what} was refused: {str(error).partition(", at ")[0].splitlines()[0]}'
@@ -86,7 +85,7 @@ def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> 
 
 
 class _NoTimer(Timer):
-    """Takes the place of a timer that was refused, and never expires."""
+    """Replaces a timer that was refused, and never expires."""
 
     timer_period_ns = 0
 
@@ -103,19 +102,19 @@ class _NoTimer(Timer):
 def create_timer(
         node: Node, period_s: float, callback: Callable[[], None], clock: Clock | None = None
 ) -> Timer:
-    """Create a running timer, by default on the clock of ROS; if refused, it never expires."""
+    """Create a running timer, by default on the clock of ROS; a refused timer never expires."""
     timer = create_or_refuse(node, f'timer of {period_s:g} s', lambda: node.create_timer(
         period_s, callback, clock=clock))
     return timer or _NoTimer()
 
 
 def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:
-    """Create a running timer on the steady clock, which the deadlines of the roles refer to."""
+    """Create a running timer on the steady clock."""
     return create_timer(node, period_s, callback, Clock(clock_type=ClockType.STEADY_TIME))
 
 
 class _NoPublisher(Publisher):
-    """Takes the place of a publisher that was refused, and publishes nothing."""
+    """Replaces a publisher that was refused, and publishes nothing."""
 
     def __init__(self, topic_name: str) -> None:
         self._name = topic_name
@@ -138,9 +137,9 @@ def _overriding(overridable: bool) -> QoSOverridingOptions | None:
 def create_publisher(
         node: Node, kind: type, name: str, profile: QoSProfile, overridable: bool = False
 ) -> Publisher:
-    """Create a publisher of a ROS type on a topic; one that was refused publishes nothing.
+    """Create a publisher of a ROS type on a topic; a refused publisher publishes nothing.
 
-    Parameters ``qos_overrides.*`` change the quality of service if it is `overridable`.
+    Parameters ``qos_overrides.*`` change the quality of service of an `overridable` topic.
     """
     publisher = create_or_refuse(node, f'publisher of {name}', lambda: node.create_publisher(
         kind, name, profile, qos_overriding_options=_overriding(overridable),
@@ -151,9 +150,9 @@ def create_publisher(
 def subscribe(
         node: Node, kind: type, name: str, callback: Callable[[Any], None], profile: QoSProfile,
         raw: bool = False, overridable: bool = False) -> None:
-    """Subscribe to a topic of a ROS type; a `raw` callback takes serialized bytes (CDR).
+    """Subscribe to a topic of a ROS type; a `raw` callback receives serialized bytes (CDR).
 
-    Parameters ``qos_overrides.*`` change the quality of service if it is `overridable`.
+    Parameters ``qos_overrides.*`` change the quality of service of an `overridable` topic.
     """
     create_or_refuse(node, f'subscription to {name}', lambda: node.create_subscription(
         kind, name, callback, profile, raw=raw,
@@ -168,20 +167,20 @@ def subscribe_messages(
         on_foreign: Callable[[m.Message], None] = lambda message: None,
         on_arrival: Callable[[type[m.Message]], None] = lambda kind: None,
         exchange: QoSProfile = EXCHANGE) -> None:
-    """Subscribe to messages of the protocol; malformed ones are dropped.
+    """Subscribe to messages of the protocol; malformed messages are dropped.
 
     Parameters
     ----------
     sizes
-        Required array sizes by symbol, as in `Scenario.sizes`; None: any.
+        Sizes to `check`, as in `Scenario.sizes`; None: no check.
     on_error
         Called with the reason why a message was dropped; by default, the node logs it.
     scenario_id, on_foreign
-        If given, messages of other scenarios are passed to `on_foreign`.
+        If `scenario_id` is given, messages of other scenarios are passed to `on_foreign`.
     on_arrival
-        Called with the class of each message before it is read.
+        Called with the class of each message before decoding.
     exchange
-        Quality of service for messages that are not latched.
+        Quality of service of messages that are not latched.
     """
     def log(error: m.MessageError) -> None:
         node.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
@@ -205,10 +204,10 @@ def subscribe_messages(
 
 
 class UserTopics:
-    """Publishers for each user up to a highest number, created on first use.
+    """Publishers for each user, created on first use.
 
-    The names of the topics contain ``{user}``. The numbers are limited, because they come from
-    messages and every topic takes time in discovery.
+    `kinds` contains the types by name of the topic, with ``{user}`` for the number of the user.
+    The numbers are limited, because they come from messages and every topic slows down discovery.
     """
 
     def __init__(self, node: Node, kinds: Mapping[str, type], max_users: int) -> None:
@@ -240,9 +239,9 @@ _IMMEDIATE_S = 1e-6
 
 
 class BackgroundWorker:
-    """A thread that runs jobs one after the other.
+    """A thread that runs jobs one after the other, and delivers results like messages.
 
-    Results are delivered in the thread that spins the node, as messages are.
+    The thread that spins the node calls the functions that receive the results.
     """
 
     def __init__(self, node: Node) -> None:
@@ -255,7 +254,7 @@ class BackgroundWorker:
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=node.get_name())
 
     def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
-        """Queue a job; the thread that spins the node gets its result, or its exception."""
+        """Queue a job; its result, or its exception, reaches the thread that spins the node."""
         def hand_over(future: Future[_Result]) -> None:
             self._done.append((future, on_result))
             executor = self._node.executor
@@ -269,7 +268,7 @@ class BackgroundWorker:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _wake(self) -> None:
-        # The task only starts the timer: an exception in a task would stop the events executor,
+        # The task only starts the timer, because an exception in a task would stop the executor,
         # and a task may outlast the node.
         if self._is_open:
             self._timer.reset()

@@ -18,12 +18,12 @@ from rhs_isac_ros.support.fields import ParameterError
 
 
 def surface_frame(namespace: str) -> str:
-    """Return the frame of the surface of a namespace; each network has its own."""
+    """Return the name of the frame of the surface in a namespace."""
     return f'{namespace.strip("/")}/{RHS_FRAME}'.lstrip('/')
 
 
 def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Return the matrix [3, 3] of a quaternion x, y, z, w of any length but 0."""
+    """Return the matrix [3, 3] of a quaternion x, y, z, w, whose length may be any except 0."""
     x, y, z, w = quaternion / np.linalg.norm(quaternion)
     return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
                      [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
@@ -36,7 +36,7 @@ def vector(message: Any) -> np.ndarray:
 
 
 def to_ros(kind: Any, values: np.ndarray) -> Any:
-    """Return a point, vector or quaternion of ROS with the values x, y, z and, if any, w."""
+    """Return a point, vector or quaternion of ROS with the given x, y, z and (if any) w."""
     return kind(**dict(zip('xyzw', values.tolist(), strict=False)))
 
 
@@ -45,8 +45,7 @@ class Frame:
     """The frame of standard messages, and the pose of the surface in it."""
 
     name: str = MAP_FRAME
-    # Namespace of the network with a slash at its end, or empty; precedes the names of the frames
-    # of the surface and of the users.
+    # Prefix of the frames of the surface and the users: the namespace with a final slash, or ''.
     prefix: str = ''
     # Position, float64 [3] [m], and quaternion x, y, z, w.
     origin: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
@@ -54,7 +53,7 @@ class Frame:
 
     @classmethod
     def of(cls, node: Node, values: types.SimpleNamespace) -> 'Frame':
-        """Check the parameters ``frame_id`` and ``surface_pose``, and return their frame."""
+        """Return the frame of the parameters ``frame_id`` and ``surface_pose``; check them."""
         pose = values.surface_pose or [0.0] * 6
         if len(pose) != 6:
             raise ParameterError(f'surface_pose: {len(pose)} numbers, expected six, x, y, z [m], '
@@ -76,23 +75,23 @@ class Frame:
 
     @property
     def rotation(self) -> np.ndarray:
-        """Matrix [3, 3] that rotates vectors of the surface's frame into this one."""
+        """Matrix [3, 3] that rotates vectors from the frame of the surface into this frame."""
         return rotation_matrix(self.orientation)
 
     def from_surface(self, position: np.ndarray) -> np.ndarray:
-        """Return a position, float64 [3] [m], of the surface's frame in this one."""
+        """Convert a position, float64 [3] [m], from the frame of the surface to this frame."""
         return self.rotation @ position + self.origin
 
     def to_surface(self, position: np.ndarray) -> np.ndarray:
-        """Return a position, float64 [3] [m], of this frame in that of the surface."""
+        """Convert a position, float64 [3] [m], from this frame to the frame of the surface."""
         return self.rotation.T @ (position - self.origin)
 
     def covariance(self, covariance: np.ndarray) -> np.ndarray:
-        """Return a covariance [3, 3] of the surface's frame in this one."""
+        """Convert a covariance [3, 3] from the frame of the surface to this frame."""
         return self.rotation @ covariance @ self.rotation.T
 
     def pose(self, local: Pose) -> Pose:
-        """Return a pose of the surface's frame in this one."""
+        """Convert a pose from the frame of the surface to this frame."""
         second = local.orientation
         turn = _product(
             self.orientation, np.array([second.x, second.y, second.z, second.w]))
@@ -101,7 +100,7 @@ class Frame:
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """Return the quaternion of rotations about x, then y, then z of the fixed axes."""
+    """Return the quaternion of rotations about the fixed axes x, y and z, in this order."""
     about = (np.array([*(math.sin(angle / 2) * axis), math.cos(angle / 2)])
              for angle, axis in zip((yaw, pitch, roll), np.eye(3)[::-1], strict=True))
     first, second, third = about

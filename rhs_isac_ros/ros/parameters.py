@@ -1,7 +1,7 @@
-"""The declarations of all ROS parameters, and nodes whose parameters may change while they run.
+"""The declarations of all ROS parameters, and nodes with parameters that may change.
 
-Descriptors, checks and documentation derive from the declarations. Parameters that belong to the
-settings of a role are declared there.
+Descriptors, checks and documentation derive from the declarations. `protocol.settings` declares
+the parameters that are settings of a role.
 """
 
 import dataclasses
@@ -36,13 +36,13 @@ from rhs_isac_ros.support.fields import Field, ParameterError
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Parameter(Field):
-    """Declaration of a parameter; a dynamic one may change while the node runs."""
+    """Declaration of a parameter; a `dynamic` one may change while the node runs."""
 
     name: str
     default: bool | int | float | str | list[float]
     dynamic: bool = False
 
-    # ROS rejects 1 for 1.0.
+    # ROS does not accept 1 in place of 1.0.
     WORDS = {**Field.WORDS, float: 'a number with a decimal point',
              list: 'a list of numbers, each with a decimal point'}
 
@@ -61,10 +61,8 @@ class Parameter(Field):
         return text.lower() if self.kind is bool else text
 
     def check(self, value: Any) -> None:
-        """Raise ParameterError for an invalid value.
-
-        ROS checks neither lists nor the ends of a range exactly.
-        """
+        """Raise ParameterError for an invalid value."""
+        # ROS does not check lists, nor the ends of a range exactly.
         if problem := self.problem(value):
             raise ParameterError(f'{self.name}: {problem}')
 
@@ -76,7 +74,7 @@ def _parameter(
 
 
 def _declared_by(settings: type[Any] | None) -> dict[str, Parameter]:
-    """Return the parameters, by name, that the fields of a settings class declare."""
+    """Return the parameters that the fields of a settings class declare, by name."""
     return {} if settings is None else {
         field.name: Parameter(
             **vars(field.metadata['declared']), name=field.name,
@@ -91,7 +89,7 @@ _USER_TOPICS = _parameter(
     'user_topics', 64, 'Highest number of a user that has topics of its own.',
     low=0, high=MAX_USERS)
 
-# Mobilities of robots, beside those of the library.
+# Mobilities of robots, in addition to those of the library.
 ODOMETRY, TF = ROBOTS = ('odometry', 'tf')
 _FRAME = (
     _parameter(
@@ -169,7 +167,7 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
 }
 
 CODEBOOK_PREFIX = 'codebook.'
-# The parameters that hold the codebook, with their descriptions; only the optimizer has them.
+# The parameters of the optimizer that hold the codebook, with their descriptions.
 CODEBOOK: Mapping[str, str] = {
     'codebook.id': 'Hash of the content, which must match.',
     'codebook.shape': 'Sizes N_B, N_SB, F, K, N_E.',
@@ -184,19 +182,19 @@ CODEBOOK: Mapping[str, str] = {
 def declare(node: Node, executable: str) -> types.SimpleNamespace:
     """Declare the parameters of an executable, and return their values by name.
 
-    Raises ParameterError for a wrong type, or a value out of range or not among the choices.
+    Raises ParameterError for a wrong type, or a value that is out of range or not a choice.
     """
     return types.SimpleNamespace(
         **{parameter.name: _declare_one(node, parameter) for parameter in NODES[executable]})
 
 
 def check_overrides(node: Node) -> None:
-    """Warn once of values given to a node at its start that belong to no known parameter.
+    """Warn if a node was started with parameters that are unknown to all executables.
 
-    Robots share one parameter file among all their nodes.
+    A parameter file may contain the parameters of several nodes.
     """
     known = known_names()
-    # rclpy has no public access to all overrides. Publishers declare qos_overrides when created.
+    # rclpy has no public access to all overrides. Publishers declare qos_overrides themselves.
     foreign = [f'{name}{hint(name)}' for name in sorted(node._parameter_overrides)
                if not (name in known or node.has_parameter(name)
                        or name.startswith('qos_overrides.'))]
@@ -211,7 +209,7 @@ def known_names() -> set[str]:
 
 
 def hint(name: str) -> str:
-    """Return the known parameter closest to a name, as text; empty if none is close."""
+    """Return a hint at the known parameter closest to a name; empty if none is close."""
     close = difflib.get_close_matches(name, known_names(), 1)
     return f' (the closest is {close[0]})' if close else ''
 
@@ -242,7 +240,7 @@ def _declare_one(node: Node, parameter: Parameter) -> Any:
 
 
 def settings_of(kind: type[Any], values: types.SimpleNamespace) -> Any:
-    """Return the settings of a role, from the parameters named as the fields of its class."""
+    """Return the settings of a class, from the parameters with the names of its fields."""
     try:
         return kind(**{field.name: getattr(values, field.name)
                        for field in dataclasses.fields(kind)})
@@ -252,7 +250,7 @@ def settings_of(kind: type[Any], values: types.SimpleNamespace) -> Any:
 
 def calibrated_surface(
         values: types.SimpleNamespace, scenario: Scenario) -> SurfaceEstimate | None:
-    """Return the surface of the parameter ``calibration_file``; None if it is empty."""
+    """Return the surface in the file of the parameter ``calibration_file``; None if empty."""
     try:
         return load_surface(values.calibration_file, scenario)
     except CalibrationError as error:
@@ -260,7 +258,7 @@ def calibrated_surface(
 
 
 def scenario_of(values: types.SimpleNamespace) -> Scenario:
-    """Return the scenario of the parameter ``scenario_file``."""
+    """Return the scenario in the file of the parameter ``scenario_file``."""
     file = values.scenario_file
     return Scenario.from_yaml(file) if file else Scenario()
 
@@ -277,8 +275,8 @@ def same_value(one: RosParameter, other: RosParameter) -> bool:
 class ParameterizedNode(Node):
     """A node that checks each change of its parameters as a whole and converts it to settings.
 
-    The executable determines the parameters; its name is by default that of the node. The initial
-    `values` are by name. Raises ParameterError if one is invalid.
+    The node declares the parameters of the executable, whose name is the default name of the node.
+    `values` contains the initial values by name. Raises ParameterError if one is invalid.
     """
 
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
@@ -288,22 +286,22 @@ class ParameterizedNode(Node):
         self._dynamic = {parameter.name: parameter for parameter in NODES[executable]
                          if parameter.dynamic}
         self._current_values = self.values
-        # The settings made by the last check; the change that was checked may still be rejected.
+        # Settings from the last check. ROS may still reject the change that was checked.
         self._checked_settings: Any = None
         self._is_reverting = False
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._on_set)
 
     def make_settings(self, values: types.SimpleNamespace) -> Any:
-        """Return the settings of the role for parameter values, or raise ParameterError."""
+        """Return the settings of the role for these parameters, or raise ParameterError."""
         settings = ROSTER[self._executable].settings
         return settings and settings_of(settings, values)
 
     def on_settings_changed(self, settings: Any) -> None:
-        """Handle new settings, made from parameters that were just set."""
+        """Handle the settings that result from a change of parameters."""
 
     def revert_parameters(self, settings: Any) -> None:
-        """Set the parameters back to the settings in use, which are not checked again."""
+        """Reset the parameters to settings that were in use, without checking them again."""
         self._is_reverting = True
         try:
             self.set_parameters_atomically([
@@ -314,10 +312,10 @@ class ParameterizedNode(Node):
 
     def set_parameters_atomically(
             self, parameter_list: list[RosParameter]) -> SetParametersResult:
-        """Set parameters together, as the parameter services do.
+        """Set all parameters or none, as the parameter services do.
 
-        Unlike in rclpy, the reason for a rejection states the value and the valid range. Read-only
-        parameters may be given if they keep their values, as in a dump of the node.
+        Unlike in rclpy, the reason for a rejection contains the value and the valid range, and
+        read-only parameters are accepted if they keep their values, as in a dump of the node.
         """
         parameter_list = [p for p in parameter_list if not self._is_kept(p)]
         if not parameter_list:
@@ -326,7 +324,7 @@ class ParameterizedNode(Node):
             self._check_each(parameter_list)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        # With use_sim_time, rclpy subscribes to the time of the simulation.
+        # A change of use_sim_time makes rclpy subscribe to the simulated time.
         what = f'subscription to {topics.CLOCK}'
         result = create_or_refuse(self, what, functools.partial(
             super().set_parameters_atomically, parameter_list))

@@ -1,7 +1,7 @@
-"""Recordings of a network and observation of its cycles.
+"""Recordings of a network, and a node that observes cycles.
 
-Recordings are self-contained MCAP files in the format of ``ros2 bag``. Foxglove, ``ros2 bag info``
-and ``ros2 bag play`` read them. The library mcap is optional.
+Recordings are self-contained MCAP files, which Foxglove, ``ros2 bag info`` and ``ros2 bag play``
+can read. The library mcap is optional.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ class RecordingError(Exception):
 
 
 def recorded_topics() -> dict[str, tuple[type, QoSProfile]]:
-    """Return the type and the quality of service of each recorded topic, by relative name."""
+    """Return the type and quality of service of each recorded topic, by relative name."""
     found = {name: (convert.ros_type(kind), endpoints.profile_for(kind))
              for kind, name in topics.NAMES.items()}
     found[topics.POSITION] = PoseWithCovarianceStamped, endpoints.EXCHANGE
@@ -53,7 +53,7 @@ def type_name(kind: type) -> str:
 
 
 def schema(kind: type) -> str:
-    """Return the definition of a message class and its nested messages, encoded as ``ros2msg``."""
+    """Return the definition of a message class and its nested messages, as ``ros2msg``."""
     first = type_name(kind).replace('/msg/', '/')
     texts: dict[str, str] = {}
     wanted = [first]
@@ -70,7 +70,7 @@ def schema(kind: type) -> str:
 
 
 def _offered_qos(profile: QoSProfile) -> str:
-    """Return a quality of service as ``ros2 bag play`` reads it, so that it latches topics."""
+    """Return a quality of service for ``ros2 bag play``, which then publishes latched topics."""
     unlimited = {'sec': 9223372036, 'nsec': 854775807}
     return yaml.safe_dump([{
         'history': profile.history.short_key, 'depth': profile.depth,
@@ -89,10 +89,10 @@ def _parts(text: str, package: str) -> Iterator[str]:
 
 
 class Recorder:
-    """Writes the messages of a network, and its scenario, to a file.
+    """Writes the messages and the scenario of a network to a file.
 
-    The file is ``<name>.part`` until it is closed, so that an interrupted run does not lose its
-    messages. Raises RecordingError if mcap is not installed, or the file cannot be written.
+    Until it is complete, the file is called ``<name>.part``; it remains after an interruption.
+    Raises RecordingError if mcap is not installed or the file cannot be written.
     """
 
     def __init__(self, path: str | Path, scenario: Scenario) -> None:
@@ -110,15 +110,15 @@ class Recorder:
         self._writer = Writer(self._stream)
         self._writer.start(profile='ros2', library='rhs_isac_ros')
         self._writer.add_metadata(_SCENARIO, {'yaml': yaml.safe_dump(scenario.changes())})
-        # Number of messages written, and why the rest is not recorded, as when the disk is full.
+        # Number of messages written, and why writing failed, for instance on a full disk.
         self.count, self.failure = 0, ''
 
     def record_topics(
             self, node: Node, on_message: Callable[[str, bytes], None] | None = None) -> None:
         """Record all topics in the namespace of a node.
 
-        `on_message` is called with the relative name of the topic and the serialized message after
-        each was written.
+        `on_message` is called with the relative name of the topic and the serialized message, once
+        the message is written.
         """
         for name, (kind, profile) in recorded_topics().items():
             channel = self._writer.register_channel(
@@ -142,7 +142,7 @@ class Recorder:
         return write
 
     def _attempt(self, write: Callable[[], object]) -> bool:
-        """Write unless an earlier attempt has failed; return whether it succeeds."""
+        """Write unless an earlier attempt has failed; return whether all attempts succeeded."""
         try:
             if not self.failure:
                 write()
@@ -157,7 +157,7 @@ class Recorder:
             return
         if self._attempt(self._writer.finish) and self._attempt(self._stream.flush):
             self._partial.replace(self._path)
-        # The buffer may still hold what cannot be written.
+        # Closing writes the rest of the buffer, which may fail.
         with contextlib.suppress(OSError):
             self._stream.close()
 
@@ -165,10 +165,10 @@ class Recorder:
 def read(
         path: str | Path, names: Collection[str] | None = None
 ) -> Iterator[tuple[str, Any, float]]:
-    """Yield topic, ROS message and time [s] of what a recording contains, in the order of writing.
+    """Yield the topic, the ROS message and the time [s] of each message, as recorded.
 
     `names` selects topics by their full names; None selects all. Raises RecordingError if the file
-    cannot be read, or a message had other fields when it was recorded.
+    cannot be read, or a recorded message has other fields than the installed one.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
     checked: set[int] = set()
@@ -183,7 +183,7 @@ def read(
 
 
 def _check_schema(path: str | Path, found: Any, kind: type) -> None:
-    """Raise RecordingError if a recorded message has other fields than the installed one."""
+    """Raise RecordingError unless a recorded message has the fields of the installed one."""
     if found.encoding == 'ros2msg' and _fields(found.data.decode(errors='replace')) != _fields(
             schema(kind)):
         raise RecordingError(
@@ -198,7 +198,7 @@ def _fields(text: str) -> list[str]:
 
 
 def read_scenario(path: str | Path) -> Scenario | None:
-    """Return the scenario of a recording; None if there is none, as when ``ros2 bag`` made it.
+    """Return the scenario of a recording, or None, as in a recording made with ``ros2 bag``.
 
     Raises RecordingError if the file cannot be read, ScenarioError if the scenario is invalid.
     """
@@ -207,7 +207,7 @@ def read_scenario(path: str | Path) -> Scenario | None:
             if metadata.name == _SCENARIO:
                 try:
                     text = metadata.metadata['yaml']
-                    # With references, a short text may describe an enormous value.
+                    # With references, a short text can describe an enormous value.
                     if '&' in text:
                         raise TypeError('it contains references')
                     return Scenario(**yaml.safe_load(text))
@@ -219,7 +219,7 @@ def read_scenario(path: str | Path) -> Scenario | None:
 
 @contextlib.contextmanager
 def _opened(path: str | Path) -> Iterator[Any]:
-    """Yield a reader and convert its exceptions to `RecordingError`."""
+    """Yield a reader, and convert exceptions to RecordingError."""
     try:
         with optional_import('reading a recording', extra='recording'):
             from mcap.exceptions import McapError
@@ -236,14 +236,13 @@ def _opened(path: str | Path) -> Iterator[Any]:
 
 
 class CycleObserver(Node):
-    """Collects the cycles of the network in its namespace.
+    """Collects the cycles of the network in the namespace of this node.
 
     Parameters
     ----------
     recorder
-        Records all topics of the namespace; the caller closes it. If given, the observer
-        receives exactly the recorded messages of the types `cycle_log.RECEIVES`, and ignores
-        the following parameters.
+        Records all topics of the namespace; the caller closes it. The observer then receives the
+        recorded messages of the types `cycle_log.RECEIVES`, and ignores the next three parameters.
     receives, sizes, on_malformed
         As in `subscribe_messages`.
     log
@@ -259,7 +258,8 @@ class CycleObserver(Node):
         super().__init__('cycle_observer', **node_options)
         self.log = log or cycle_log.CycleLog()
         if recorder is not None:
-            # One subscription for both, so that a replay yields the same cycles in the same order.
+            # The log and the recording share a subscription, so that a replay yields the same
+            # cycles in the same order.
             kinds = {topics.NAMES[kind]: kind for kind in cycle_log.RECEIVES}
             recorder.record_topics(self, lambda name, message: self._on_recorded(
                 kinds.get(name), message))
@@ -268,7 +268,7 @@ class CycleObserver(Node):
                                      exchange=endpoints.OBSERVATION)
 
     def observe(self, message: m.Message, now_s: float) -> None:
-        """Process a message that arrived at `now_s` [s]; subclasses may extend this."""
+        """Process a message that arrived at `now_s` [s]; subclasses may extend this method."""
         if isinstance(message, cycle_log.RECEIVES):
             self.log.add(message, now_s)
 

@@ -37,22 +37,21 @@ class CodebookClient:
     """Fetches the codebook from the parameters of the optimizer whenever it changes.
 
     A message on the latched topic announces the codebook and triggers a request to the parameter
-    service. Two optimizers have the same services, and either may answer. The announced codebook,
-    whose id proves its content, therefore replaces a response with another codebook or a missing
-    response. The optimizers agree on which of them announces; see `Presences`. The `codebook_id`
-    is that of the latest codebook, and empty before the first.
+    service. If there are two optimizers, either may answer. The announced codebook, whose id
+    proves its content, therefore replaces a missing response or another codebook. `Presences`
+    selects the optimizer that announces. `codebook_id` is the id of the latest codebook, or ''.
     """
 
     def __init__(
             self, node: Node, scenario: Scenario, on_codebook: Callable[[Codebook], None]
     ) -> None:
         self._node, self._scenario, self._on_codebook = node, scenario, on_codebook
-        # Only one of the parameter services, so that a security policy need not allow the others.
+        # This is the only parameter service that a security policy has to allow.
         name = f'{topics.OPTIMIZER_NODE}/get_parameters'
         self._client = endpoints.create_or_refuse(
             node, f'client of {name}', lambda: node.create_client(GetParameters, name))
-        # Serial numbers of announcements. A response is stale if its request was sent before the
-        # latest announcement.
+        # Serial numbers of the latest announcement, and of the announcements at the latest request
+        # and response: a response to a request before the latest announcement is stale.
         self._announced, self._requested, self._fetched = 0, 0, 0
         self._announced_s = math.inf
         self._announcement: Codebook | None = None
@@ -72,8 +71,7 @@ class CodebookClient:
             return
         if message.codebook_id != codebook.id or not self._fits(message, codebook):
             return
-        # Send the request even if the id is unchanged, because a response with a withdrawn
-        # codebook may be in transit.
+        # Even if the id is unchanged, a response with a withdrawn codebook may be in transit.
         self._announcement = codebook
         self._announced += 1
         self._announced_s = time.monotonic()
@@ -81,7 +79,7 @@ class CodebookClient:
         self._request()
 
     def _fits(self, message: convert.CodebookMessage, codebook: Codebook) -> bool:
-        """Return whether a codebook fits the scenario, or log once that it does not."""
+        """Return whether a codebook fits the scenario; log once if it does not."""
         before, self._problem = self._problem, ''
         try:
             codebook.check(self._scenario)
@@ -112,7 +110,7 @@ class CodebookClient:
             self._use(values)
 
     def _use(self, values: Sequence[ParameterValue]) -> None:
-        """Use the codebook of a response if it was announced, otherwise the announced one."""
+        """Use the codebook in a response if it was announced, otherwise the announced one."""
         self._fetched = self._announced
         assert self._announcement
         codebook = self._announcement
@@ -126,20 +124,20 @@ class CodebookClient:
             self._on_codebook(codebook)
 
 
-# Period at which the end of a state of the emulated world is awaited [s].
+# With simulated time, the period of looking for the end of a state of the emulated world [s].
 _WORLD_POLL_S = 0.002
-# Maximum number of senders whose wrong scenario is logged, which bounds the log.
+# Maximum number of senders with another scenario that are logged.
 _MAX_LOGGED = 16
 
 _RoleT = TypeVar('_RoleT', bound=Role)
 
 
 class Clocks:
-    """Two clocks of a node, which begin at the same time and never go back.
+    """The clocks of the emulated world and of the roles, which start together and never go back.
 
-    The world moves with the clock of ROS if the node uses the time of a simulation, otherwise with
-    the steady clock. The clock of the roles is steady, but for the states of a role that belong to
-    the world, such as the rest between cycles.
+    The world follows the clock of ROS if the node uses simulated time, otherwise the steady clock.
+    The clock of the roles follows the steady clock, except in states that belong to the world,
+    such as the rest between cycles.
     """
 
     def __init__(self, node: Node) -> None:
@@ -149,7 +147,7 @@ class Clocks:
 
     @property
     def is_simulated(self) -> bool:
-        """Whether the node uses the time of a simulation."""
+        """Whether the node uses simulated time."""
         return bool(self._clock.ros_time_is_active)  # type: ignore[attr-defined]
 
     def world_s(self) -> float:
@@ -158,7 +156,7 @@ class Clocks:
         return self._world_s
 
     def role_s(self, in_world: bool) -> float:
-        """Return the time of the roles [s]; `in_world` if they have waited for the world."""
+        """Return the time of the roles [s]; `in_world` if their state belongs to the world."""
         self._advance(in_world)
         return self._role_s
 
@@ -173,17 +171,17 @@ class Clocks:
         simulated_s = 1e-9 * self._clock.now().nanoseconds
         before_s = simulated_s if self._simulated_s is None else self._simulated_s
         self._simulated_s = simulated_s
-        # A simulation that starts again goes back; the world then stands still once.
+        # When a simulation restarts, its time goes back; the world then pauses once.
         world_s = max(simulated_s - before_s, 0.0)
         self._world_s += world_s
         self._role_s += world_s if in_world else elapsed_s
 
 
 class RoleNode(ParameterizedNode, Generic[_RoleT]):
-    """A node that passes messages to a role and performs the actions that it returns.
+    """A node that passes messages to a role and performs the returned actions.
 
-    A subclass makes its `role` from the parameters and the `scenario` and passes it to `start`.
-    `Message.sender` describes the `instance`. Raises ParameterError or ScenarioError if a
+    A subclass creates the role from the parameters and the `scenario`, and passes it to `start`.
+    The `instance` is the value of `Message.sender`. Raises ParameterError or ScenarioError if a
     parameter or the scenario file is invalid.
     """
 
@@ -206,21 +204,21 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._has_optimizer = True
         self._sending: dict[type[m.Message], Publisher] = {}
         self._receiving: set[type[m.Message]] = set()
-        # Errors that were logged, so that a faulty sender cannot fill the disk.
+        # Subjects of logged errors: a faulty sender must not fill the disk.
         self._logged: set[str] = set()
         self._statistics = RoleStatistics()
-        # One timer serves all deadlines. It is set again only if it would expire too late, or
-        # when it has expired too early.
+        # The same timer serves all deadlines. It is set only if it would expire too late, or after
+        # it has expired too early.
         self._timer = endpoints.steady_timer(self, 3600.0, self._on_timer)
         self._timer.cancel()
         self._timer_due_s: float | None = None
 
     def start(
             self, role: _RoleT, *, subscribe: bool = True, needs_codebook: bool = False) -> None:
-        """Connect the role to its topics and publish its diagnostics.
+        """Connect a role to its topics, and publish its diagnostics.
 
-        A role that is not ready yet calls `subscribe` later; one that needs a codebook advertises
-        and subscribes when the first one arrives.
+        With `needs_codebook`, the node advertises and subscribes when the first codebook arrives.
+        Without `subscribe`, the subclass calls the method `subscribe` when the role is ready.
         """
         self.role, self._needs_codebook = role, needs_codebook
         if not needs_codebook:
@@ -235,7 +233,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             self._codebook_client = CodebookClient(self, self.scenario, self._on_codebook)
 
     def advertise(self) -> None:
-        """Create the publishers of the role; the graph then shows that the role is present.
+        """Create the publishers, so that the graph shows that the role is present.
 
         A node that stands by creates them when it resumes.
         """
@@ -246,7 +244,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                     self, convert.ros_type(kind), topics.NAMES[kind], endpoints.profile_for(kind))
 
     def subscribe(self) -> None:
-        """Create the subscriptions of the role; the graph then shows that the role is ready."""
+        """Create the subscriptions, so that the graph shows that the role is ready."""
         kinds = [kind for kind in self.role.RECEIVES if kind not in self._receiving]
         self._receiving.update(kinds)
         endpoints.subscribe_messages(
@@ -254,7 +252,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             on_foreign=self._on_foreign, on_arrival=self._statistics.count_received)
 
     def report(self) -> Report:
-        """Return the diagnostics of the role, which count the faults since the last report."""
+        """Return the diagnostics of the role, with the faults since the last report."""
         state = self.role.state
         return self._statistics.report(
             '' if state is None else state.value, self.role.counters,
@@ -262,10 +260,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             {**self.role.status(), **self._peers.conflicts()})
 
     def stand_by(self) -> None:
-        """React to a newer node in the same role; a node with further tasks overrides this."""
+        """Handle a newer node that takes over the role."""
 
     def resume(self) -> None:
-        """React when the node serves again."""
+        """Handle the return to service, after the newer node has gone."""
 
     def _on_missing(self, missing: dict[str, str]) -> None:
         if self.stands_by:
@@ -284,10 +282,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 f'{self._codebook_client.codebook_id or "none"}')
 
     def set_lacking(self, text: str) -> None:
-        """Describe what the role lacks besides other roles; an empty text means nothing."""
+        """Describe what the role lacks apart from other roles; empty if it lacks nothing."""
         if text != self._lacking:
             self._lacking = text
-            # What is missing is not known before discovery.
+            # Before discovery, it is unknown which roles are missing.
             if self._missing is not None:
                 self._report_missing(self._missing)
 
@@ -305,7 +303,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self.stands_by = stands_by
         if stands_by:
             self.stand_by()
-            # Subscriptions remain: the executor may hold messages for them. They are ignored.
+            # Subscriptions remain, because the executor may hold messages for them.
             for publisher in self._sending.values():
                 self.destroy_publisher(publisher)
             self._sending.clear()
@@ -313,7 +311,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             if self._is_advertised:
                 self.advertise()
             self.resume()
-            # The other nodes have to discover the publishers again.
+            # The other nodes have to discover the new publishers.
             self._peers.restart()
 
     def on_settings_changed(self, settings: Any) -> None:
@@ -344,10 +342,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             self._set_timer(deadline_s - now_s, deadline_s)
 
     def publish(self, message: m.Message) -> bool:
-        """Publish a valid message and return True, or log its error and return False.
-
-        A node that stands by publishes nothing.
-        """
+        """Publish a message; return False if it is invalid (logged) or the node stands by."""
         if self.stands_by:
             return False
         stamp_ns = message.stamp_ns or self.get_clock().now().nanoseconds
@@ -362,7 +357,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         return True
 
     def execute(self, action: events.Action) -> None:
-        """Execute an action of the role; nodes of roles with own actions override this."""
+        """Execute an action that only some roles have; their nodes override this method."""
         raise TypeError(f'{type(action).__name__} is not an action of {self.get_name()}')
 
     def _on_message(self, message: m.Message) -> None:
@@ -403,7 +398,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 self.execute(action)
 
     def _log_error(self, consequence: str, error: m.MessageError) -> None:
-        """Log an error once for each field, whose name comes first in the text of the error."""
+        """Log an error once for each field; the text starts with the name of the field."""
         subject = f'{consequence} {str(error).partition(":")[0]}'
         if subject not in self._logged:
             self._logged.add(subject)
@@ -411,7 +406,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 f'{consequence}: {error}')
 
     def _set_timer(self, delay_s: float, due_s: float) -> None:
-        # The timer is steady, and the pace of a simulation is unknown.
+        # The timer follows the steady clock, and the speed of a simulation is unknown.
         if self.clocks.is_simulated and self._in_world():
             delay_s = min(delay_s, _WORLD_POLL_S)
         self._timer.timer_period_ns = max(int(delay_s * 1e9), 1)

@@ -1,7 +1,7 @@
-"""The roles of a network, each declared once.
+"""The roles of a network.
 
-Parameters, launch files, permissions, readiness, the fault trials and the topics in
-the documentation derive from `ROSTER`.
+Parameters, launch files, permissions, readiness, fault trials and the documented topics derive
+from their declarations in `ROSTER`.
 """
 
 import dataclasses
@@ -27,11 +27,11 @@ from rhs_isac_ros.ros import topics
 class Member:
     """Declaration of a role."""
 
-    role: Any = None  # class that lists its messages, if it has any of the protocol
+    role: Any = None  # class of the role, if it exchanges messages of the protocol
     settings: type | None = None  # dataclass of the settings that are parameters, if any
-    requires: tuple[str, ...] = ()  # roles without which it does not start to serve
-    is_unique: bool = True  # whether only one node may serve in the role; others stand by
-    has_codebook: bool = False  # whether it follows the codebook of the optimizer
+    requires: tuple[str, ...] = ()  # roles that must be present before it serves
+    is_unique: bool = True  # whether only one node serves in the role; others stand by
+    has_codebook: bool = False  # whether it uses the codebook of the optimizer
     publishes: tuple[str, ...] = ()  # further topics; {user} stands for the number of a user
 
     @property
@@ -54,7 +54,7 @@ class Member:
         return (*self.requires, *((topics.OPTIMIZER_NODE,) if self.has_codebook else ()))
 
 
-# In the order in which the nodes of a network start.
+# The nodes of a network start in this order.
 ROSTER: Mapping[str, Member] = {
     'rhs_controller': Member(role=RhsController, has_codebook=True),
     'positioner': Member(
@@ -70,15 +70,15 @@ ROSTER: Mapping[str, Member] = {
         role=BaseStation, settings=BaseStationSettings, has_codebook=True,
         requires=('rhs_controller', 'channel', 'positioner', 'transmission')),
 }
-# Roles of which a network has one node.
+# Roles with only one node in a network.
 UNIQUE = tuple(name for name, member in ROSTER.items() if member.is_unique)
 
 
 def identifying_endpoints(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the topics that a present role publishes, and those to which it subscribes.
+    """Return the topics that show that a role is present: published ones and subscribed ones.
 
-    These are the first that no other role publishes, and the first to which no other role
-    subscribes. One of each is enough, because a node creates them together.
+    Each tuple contains the first topic that no other role publishes, or subscribes to, if any. One
+    topic is enough, because a node creates all of them together.
     """
     others = [member for other, member in ROSTER.items() if other != name]
     sent = {topic for member in others for topic in member.sent}

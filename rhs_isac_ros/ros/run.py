@@ -1,4 +1,4 @@
-"""Command lines with ROS arguments, and spinning and shutdown of the nodes of an executable."""
+"""Command lines with ROS arguments, and the spinning and shutdown of nodes."""
 
 import argparse
 import gc
@@ -35,15 +35,15 @@ _ROS_OPTIONS = {'-p', '--param', '-r', '--remap', '--params-file', '--log-level'
 
 
 def parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
-    """Parse a command line, without the name of the program, that may contain ROS arguments.
+    """Parse the arguments of a command line, which may include ROS arguments.
 
-    Print an error as one line and exit with code 2 if an argument or the domain is invalid.
+    If an argument or the domain is invalid, print one line and exit with code 2.
     """
     check_domain(parser)
     try:
         words = remove_ros_args([parser.prog, *arguments])[1:]
     except RuntimeError as error:
-        # Positions in the sources of ROS and the tokens of its parser do not help the user.
+        # Omit positions in the sources of ROS and tokens of the parser.
         reason = re.sub(r',? at \S+:\d+|\.? Error: Expected lexeme.*', '', str(error))
         parser.error('invalid ROS arguments: '
                      + reason.removeprefix('Failed to parse ROS arguments: '))
@@ -65,9 +65,9 @@ def check_domain(parser: argparse.ArgumentParser) -> None:
 
 
 def node_parser(executable: str, description: str) -> ArgumentParser:
-    """Return a parser for an executable whose arguments are all ROS arguments.
+    """Return a parser for an executable that has only ROS arguments.
 
-    The description is a sentence, which may be preceded by the name of the executable and a colon.
+    The description is the first line of a docstring; its start up to a colon is omitted.
     """
     text = description.rpartition('``: ')[2]
     return ArgumentParser(
@@ -80,8 +80,7 @@ def check_parameters(
         parser: argparse.ArgumentParser, executable: str, arguments: Sequence[str]) -> None:
     """Exit with a usage error if ``-p`` sets a parameter that the executable does not have.
 
-    A parameter file may do so, because several nodes may share it; see
-    `parameters.check_overrides`.
+    A parameter file may set parameters of several executables; see `parameters.check_overrides`.
     """
     accepted = set(_names(executable)).union(*map(_names, _composed(executable)))
     for name in _assigned(arguments):
@@ -95,20 +94,20 @@ def check_parameters(
 
 
 def _names(executable: str) -> list[str]:
-    """Return the names of the parameters of an executable, without those of composed nodes."""
+    """Return the names of the parameters of an executable, without its composed nodes."""
     names = [parameter.name for parameter in NODES[executable]]
     return [*names, *CODEBOOK] if executable == 'optimizer' else names
 
 
 def _assigned(arguments: Sequence[str]) -> Iterator[str]:
-    """Yield the parameters that options set for all nodes of the process."""
+    """Yield the parameters that the options set for all nodes of the process."""
     in_ros_arguments = False
     for word, following in itertools.pairwise(arguments):
         if word in ('--ros-args', '--'):
             in_ros_arguments = word == '--ros-args'
         elif in_ros_arguments and word in ('-p', '--param'):
             name, _, _ = following.partition(':=')
-            # A name with a colon begins with the name of the node that it is for.
+            # A name with a colon sets a parameter of a single node.
             if ':' not in name:
                 yield name
 
@@ -126,7 +125,7 @@ def parameter_help(executable: str) -> str:
     if executable == 'optimizer':
         lines += [f'  {name}\n      {text}' for name, text in CODEBOOK.items()]
     elif composed := _composed(executable):
-        # The network numbers its users itself.
+        # `network` sets user_id itself.
         others = {parameter.name: parameter for name in composed for parameter in NODES[name]
                   if parameter.name != 'user_id'}
         lines += ['', 'ROS parameters of the composed nodes:', *map(_describe, others.values())]
@@ -144,23 +143,23 @@ def _describe(parameter: Parameter) -> str:
 
 
 def _example(parameters: Sequence[Parameter]) -> str:
-    """Return an assignment to the most specific parameter with a default."""
+    """Return an assignment to the first parameter that is not common to most executables."""
     chosen = next((parameter for parameter in parameters
                    if parameter.name not in ('scenario_file', 'seed')), parameters[0])
     value = 'my.yaml' if chosen.default == '' else chosen.default_text
     return f'{chosen.name}:={value}'
 
 
-# Time for the destruction of the nodes [s]. Fast DDS 2.14 can wait for itself for ever when a
-# publisher is destroyed while another participant times out.
+# Maximum time to destroy the nodes [s]. Fast DDS 2.14 can deadlock if a publisher is destroyed
+# while another participant times out.
 _DESTRUCTION_S = 10
 # Maximum time between two checks for a signal.
 _POLL_S = 0.1
 
 
 def collect_signals() -> list[int]:
-    """Handle SIGINT and SIGTERM by adding their numbers to a list, which is returned."""
-    # A handler may interrupt the other one and must not take a lock.
+    """Return a list to which handlers of SIGINT and SIGTERM append the signals that arrive."""
+    # A handler may interrupt the other one, so it must not take a lock.
     signals: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: signals.append(number))
@@ -169,23 +168,12 @@ def collect_signals() -> list[int]:
 
 def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         done: Callable[[], bool] = lambda: False) -> int:
-    """Create nodes, spin them in this thread until a signal arrives, and destroy them.
+    """Create nodes, spin them until a signal arrives or `done` returns True, and destroy them.
 
-    SIGINT and SIGTERM only set a flag: the handlers of rclpy would invalidate the context while a
-    callback publishes.
-
-    Parameters
-    ----------
-    args
-        Command line with the name of the program; by default that of the process.
-    done
-        Polled; the nodes stop spinning when it returns True.
-
-    Returns
-    -------
-    int
-        Exit code: 0 after a signal, a shutdown or when done; 2 if a parameter or a file is
-        invalid.
+    SIGINT and SIGTERM only set a flag, because the handlers of rclpy would invalidate the context
+    while a callback publishes. `args` is a command line with the name of the program, by default
+    the command line of the process. The returned exit code is 2 if a parameter or a file is
+    invalid, otherwise 0.
     """
     program = os.path.basename(args[0]) if args else ''
     signals = collect_signals()
@@ -208,13 +196,13 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         executor = EventsExecutor()
         for node in nodes:
             executor.add_node(node)
-        # Without this, every collection examines all objects of the imported modules, which takes
-        # tens of milliseconds, at any time during a cycle.
+        # Otherwise, each garbage collection would examine the objects of all imported modules,
+        # which takes tens of milliseconds at any time during a cycle.
         gc.collect()
         gc.freeze()
         while ok() and not signals and not done():
-            # Returns after each message. Other ways of spinning never return while the queue is
-            # not empty, so that a busy node would not see signals.
+            # This call returns after each message. Other ways of spinning do not return until the
+            # queue is empty, so that a busy node would not notice signals.
             executor.spin_once(timeout_sec=_POLL_S)
     except ExternalShutdownException:
         pass
@@ -223,8 +211,8 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         print_error(error, program)
         return 2
     finally:
-        # Without a handler, the signal also ends a process whose threads wait for each other in
-        # the middleware, where no handler in Python would run.
+        # The default action also ends a process that is deadlocked in the middleware, where a
+        # Python handler would never run.
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(_DESTRUCTION_S)
         leave()
@@ -234,17 +222,17 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
             executor.shutdown()
         try_shutdown()
         signal.alarm(0)
-        # Python restores the default handlers when it exits. A further signal, as from Ctrl-C on
-        # a launch, would then kill a process that is about to exit normally.
+        # Python restores the default handlers at exit. A further signal, for instance from a
+        # launch after Ctrl-C, would then kill a process that is about to exit normally.
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
     return 0
 
 
 def entry(executable: str, make: Callable[[], Sequence[Node]]) -> Callable[..., int]:
-    """Return the main function of an executable, a key of `NODES`, without own arguments.
+    """Return the main function of an executable that has only ROS arguments.
 
-    The docstring of the module of `make` describes the executable.
+    The executable is a key of `NODES`; the docstring of the module of `make` describes it.
     """
     def main(args: Sequence[str] | None = None) -> int:
         arguments = sys.argv[1:] if args is None else list(args)

@@ -28,22 +28,22 @@ NAMES: Mapping[type[m.Message], str] = {
 # Topics without a message of the protocol.
 POSITION = 'position'
 CODEBOOK = 'codebook'
-# Absolute, as the aggregator of the diagnostics expects it.
+# Absolute, because the diagnostic aggregator expects this name.
 DIAGNOSTICS = '/diagnostics'
 MARKERS = 'markers'
 PRESENCE = 'presence'
 
-# Pose, odometry, true odometry, estimated path and true path of a user.
+# Estimated pose and odometry, true odometry, estimated and true path of a user.
 POSE = 'users/user_{user}/pose'
 ODOMETRY = 'users/user_{user}/odometry'
 TRUE_ODOMETRY = 'users/user_{user}/true_odometry'
 PATH = 'users/user_{user}/path'
 TRUE_PATH = 'users/user_{user}/true_path'
 
-# Transforms. The names are absolute, as those of tf2.
+# Transforms; absolute, as in tf2.
 TF = '/tf'
 TF_STATIC = '/tf_static'
-# Time of a simulation; absolute, as rclpy expects it.
+# Simulated time; absolute, because rclpy expects this name.
 CLOCK = '/clock'
 
 # Action of the base station, and its services.
@@ -54,10 +54,10 @@ STEP = '~/step'
 
 # Node whose parameters are the codebook.
 OPTIMIZER_NODE = 'optimizer'
-# Frame of standard messages, unless the parameter frame_id names another.
+# Default of the parameter frame_id, the frame of standard messages.
 MAP_FRAME = 'map'
-# Frame of the messages of the protocol: the origin is the centre of the surface, x points outward,
-# z up. A namespace precedes this name and the next.
+# Frame of the messages of the protocol: the origin is the centre of the surface, x points outward
+# and z points up. The namespace precedes this name and the next one.
 RHS_FRAME = 'rhs_link'
-# Frame at the estimated position of a user, with the axes of the frame of standard messages.
+# Frame at the estimated position of a user, with the axes of the frame frame_id.
 USER_FRAME = 'user_{user}'
