@@ -1,4 +1,4 @@
-"""Records of the cycles of a network, assembled from its messages."""
+"""Records of the cycles of a network, assembled from messages."""
 
 import dataclasses
 import math
@@ -8,16 +8,16 @@ import numpy as np
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome
 
-# Older cycles that still lack a message are discarded, because it will no longer arrive.
+# Maximum number of incomplete cycles; the missing messages of older ones will not arrive.
 _MAX_OPEN_CYCLES = 16
-# Messages that the log needs.
+# Types of the messages that the log uses.
 RECEIVES = (m.Beacon, m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Capacity,
             m.ProtocolState)
 
 
 @dataclasses.dataclass
 class CycleTimes:
-    """The times of one cycle: arrivals of messages at a subscriber [s], NaN before."""
+    """The times of one cycle at which a subscriber received messages [s]; NaN if it has not."""
 
     cycle_id: int
     user: int = 0  # 0 before the grant
@@ -25,18 +25,18 @@ class CycleTimes:
     # First message of each later phase.
     phase_s: dict[m.Phase, float] = dataclasses.field(default_factory=dict)
     ended_s: float = math.nan  # outcome
-    # The latest state, which contains the times of the base station.
+    # The latest state, with the times that the base station measured.
     state: m.ProtocolState | None = None
 
     @property
     def duration_s(self) -> float:
-        """Time from the last beacon to the outcome at the base station [s]; NaN before."""
+        """Time from the last beacon to the outcome at the base station [s]; NaN if unknown."""
         return self.state.elapsed_s if self.state and self.state.outcome else math.nan
 
     def durations_s(self) -> dict[m.Phase, float]:
-        """Return the duration of each phase that has begun at the base station [s].
+        """Return the duration of each phase, as measured by the base station [s].
 
-        Their sum is `duration_s`: the times do not depend on when messages arrive.
+        The sum of the durations is `duration_s`.
         """
         if self.state is None:
             return {}
@@ -48,7 +48,7 @@ class CycleTimes:
 
 @dataclasses.dataclass
 class CompleteCycle(CycleTimes):
-    """A cycle that was served and whose messages were all received."""
+    """A cycle that was served, with all its messages."""
 
     _: dataclasses.KW_ONLY
     truth: m.GroundTruth
@@ -63,13 +63,13 @@ class CompleteCycle(CycleTimes):
 
     @property
     def sigma_m(self) -> float:
-        """Square root of the trace of the covariance [m], to compare with the error."""
+        """Square root of the trace of the covariance [m], comparable with the error."""
         return math.sqrt(max(np.trace(self.estimate.covariance_m2), 0.0))
 
 
 @dataclasses.dataclass
 class CycleRecord(CycleTimes):
-    """A cycle that is still running, was given up, or lacks messages, which are None."""
+    """A cycle that may be running, given up or incomplete; missing messages are None."""
 
     outcome: str = ''  # served, or the reason why it was given up; empty while it runs
     # True positions by the instance of the user that sent them.
@@ -80,13 +80,13 @@ class CycleRecord(CycleTimes):
 
     @property
     def truth(self) -> m.GroundTruth | None:
-        """The true position of the instance whose position was estimated; None if unknown."""
+        """True position of the instance that was located; None if unknown."""
         instance = self.estimate.user_instance if self.estimate else 0
         return next((truth for sender, truth in reversed(self.truths.items())
                      if m.same_instance(sender, instance)), None)
 
     def completed(self) -> CompleteCycle | None:
-        """Return the complete cycle; None unless it was served and no message is missing."""
+        """Return the complete cycle, or None if it was not served or a message is missing."""
         truth = self.truth
         if (self.outcome != 'served' or truth is None or self.signals is None
                 or self.estimate is None or self.capacity is None):
@@ -97,10 +97,10 @@ class CycleRecord(CycleTimes):
 
 
 class CycleLog:
-    """Collects the cycles of one network, also across restarts of its base station.
+    """Collects the cycles of one network, even if its base station restarts.
 
-    `ended` lists all cycles that have ended, in order, and `complete` those that were served and
-    received completely.
+    `ended` lists all cycles that have ended, in order; `complete` lists the served cycles of which
+    no message is missing.
     """
 
     def __init__(self) -> None:
@@ -115,9 +115,9 @@ class CycleLog:
 
     @property
     def failed(self) -> list[CycleRecord]:
-        """Cycles that were given up for another reason than signals without a position.
+        """Cycles that were given up, except for a lack of a fix.
 
-        Such signals are a result: the network works, and the user may be outside of the region.
+        A lack of a fix is a result: the network works, but the user may be outside of the region.
         """
         return [record for record in self.given_up if record.outcome != Outcome.NO_FIX.value]
 

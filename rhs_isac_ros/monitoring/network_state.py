@@ -1,4 +1,4 @@
-"""State of a network, from its messages: `Overview` for a terminal, `SceneState` for a scene."""
+"""State of a network from its messages: `Overview` for the terminal, `SceneState` for pictures."""
 
 import collections
 import dataclasses
@@ -14,9 +14,9 @@ from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 
 RESTING = 'resting'
-# The rate of cycles is averaged over this time [s].
+# Time over which the rate of cycles is averaged [s].
 _RATE_WINDOW_S = 10.0
-# Nodes report once a second; a node is silent after three missing reports.
+# Nodes report once a second. A node counts as silent after three missing reports.
 _REPORT_TIMEOUT_S = 3.5
 _MAX_NODES = 4096
 # Longer strings of digits in a report are not counts.
@@ -42,11 +42,11 @@ class NodeStatus(NamedTuple):
 
 
 class Overview:
-    """Phase, cycles, users and nodes of one network; what is unknown is 0, empty or None.
+    """Phase, cycles, users and nodes of one network; unknown values are 0, empty or None.
 
-    The `phase` is that of the base station, `RESTING` between cycles, and the codebook is that of
+    `phase` is the phase of the base station, or `RESTING` between cycles. `codebook_id` belongs to
     the latest signals. `users` holds the latest complete cycle of each user by id, and `nodes` the
-    status of each node by name. Both are limited in number, because they come from messages.
+    status of each node by name; both are limited in number, because they come from messages.
     """
 
     def __init__(self) -> None:
@@ -117,7 +117,7 @@ class Overview:
             self.last_failure = f'cycle {state.cycle_id}{user}: {state.outcome}'
 
 
-# Messages that the state of the scene needs.
+# Types of the messages that the state of the scene uses.
 SCENE_RECEIVES = (m.RhsConfiguration, m.GroundTruth, m.GroundTruths, m.PositionEstimate, m.Beam)
 # Maximum number of positions in a path, and minimum distance between consecutive true positions.
 _MAX_PATH_LENGTH = 200
@@ -125,13 +125,13 @@ _MIN_STEP_M = 0.05
 
 
 def new_path() -> collections.deque[np.ndarray]:
-    """Return an empty path, which keeps its latest 200 positions."""
+    """Return an empty path, which keeps the latest 200 positions."""
     return collections.deque(maxlen=_MAX_PATH_LENGTH)
 
 
 @dataclasses.dataclass
 class UserState:
-    """Position, estimate and paths of one user; the latest position of a path is its last."""
+    """Position, estimate and paths of one user; a path ends with the latest position."""
 
     user: int
     updated_s: float  # arrival of the latest message about the user [s]
@@ -139,12 +139,12 @@ class UserState:
     estimate: m.PositionEstimate | None = None
     true_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=new_path)
     estimated_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=new_path)
-    # The true position at which the pilots of the latest cycle were sent.
+    # The true position in the latest cycle.
     _cycle_truth: m.GroundTruth | None = None
 
     @property
     def error_m(self) -> float:
-        """Distance of the estimate from the true position of its cycle [m]; NaN if unknown."""
+        """Distance of the estimate from the true position of the cycle [m]; NaN if unknown."""
         truth, estimate = self._cycle_truth, self.estimate
         if truth is None or estimate is None or truth.cycle_id != estimate.cycle_id:
             return math.nan
@@ -165,7 +165,7 @@ class UserState:
 
 
 class SceneState:
-    """What the surface applies, the latest beam of a transmission, and the users by id.
+    """The configuration of the surface, the latest beam, and the users by id.
 
     There are at most `MAX_USERS`, because the ids come from messages. Further users are ignored
     until others are discarded.
@@ -193,9 +193,9 @@ class SceneState:
                         message, now_s)
 
     def discard_stale(self, before_s: float) -> list[int]:
-        """Discard users and a beam without a message since `before_s` [s]; return the users.
+        """Discard users without a message since `before_s` [s], and return their ids.
 
-        A beam to a discarded user is discarded as well.
+        Also discard a beam that is as old or that is steered to one of these users.
         """
         stale = [user for user, state in self.users.items() if state.updated_s < before_s]
         for user in stale:
@@ -216,12 +216,12 @@ class SceneState:
 
     @property
     def without_estimate(self) -> list[int]:
-        """Ids of the users without an estimate, sorted."""
+        """Sorted ids of the users without an estimate."""
         return sorted(user for user, state in self.users.items() if not state.estimate)
 
     @property
     def shown_user(self) -> UserState | None:
-        """The user of the latest cycle with estimate and beam, or else with an estimate."""
+        """The user of the latest beam if it has an estimate, or else of the latest estimate."""
         state = self.users.get(self.beam.user) if self.beam else None
         if state and state.estimate and self.beam and (
                 state.estimate.cycle_id == self.beam.cycle_id):
@@ -232,7 +232,7 @@ class SceneState:
 
     @property
     def shown_beam(self) -> m.Beam | None:
-        """The beam of the cycle in which the shown user was estimated; None if it is unknown."""
+        """The beam of the cycle that located the shown user; None if it is unknown."""
         shown, beam = self.shown_user, self.beam
         if shown and shown.estimate and beam and (
                 (shown.user, shown.estimate.cycle_id) == (beam.user, beam.cycle_id)):

@@ -1,4 +1,4 @@
-"""A network in three dimensions and in charts, over its cycles."""
+"""The view of a network in three dimensions and in charts, over its cycles."""
 
 import collections
 import math
@@ -28,7 +28,7 @@ from rhs_isac_ros.positioning.alternatives import describe_doubts
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.role import NewestDict
 
-# Messages that the view needs.
+# Types of the messages that the view uses.
 RECEIVES = (*cycle_log.RECEIVES, m.RhsConfiguration, m.Beam, m.NoFix)
 # Paths of the entities.
 WORLD = 'world'
@@ -36,7 +36,7 @@ MODES = 'modes'
 POSITIONING = 'surface/positioning'
 TRANSMISSION = 'surface/transmission'
 LOG = 'log'
-# Title of each chart by the path that its series begin with.
+# Title of each chart, by the prefix of the paths of its series.
 TITLES = {
     'error': 'Position error [m]',
     'capacity': 'Capacity [Mbit/s]',
@@ -44,13 +44,13 @@ TITLES = {
     'latency': 'Latency [ms]',
     'drops': 'Drops and given-up cycles',
 }
-# Number of users and of nodes with a series of their own: a longer legend hides the chart.
+# Maximum number of users, and of nodes, with their own series: a longer legend hides the chart.
 _MAX_SERIES = 4
-# Number of nodes whose messages are counted; their names come from messages.
+# Maximum number of nodes in the counts, because the names come from messages.
 _MAX_NODES = 4096
-# Further users are in the charts only, because the ids come from messages.
+# Maximum number of users in the scene, because the ids come from messages.
 _MAX_USERS = 64
-# Names of more users hide the scene.
+# Maximum number of users with a name in the scene: more names hide it.
 _MAX_NAMES = 8
 # Number of latest cycles whose messages may still arrive.
 _MAX_CYCLES = 64
@@ -59,7 +59,7 @@ _RED, _WHITE, _GREEN, _BLUE, _ORANGE, _GREY = (
     (0.95, 0.3, 0.3), (0.95, 0.95, 0.95), (0.35, 0.8, 0.4), (0.4, 0.6, 1.0), (1.0, 0.65, 0.2),
     (0.6, 0.6, 0.6))
 _PHASE_COLOURS = dict(zip(m.Phase, (_BLUE, _GREEN, _ORANGE, _RED), strict=True))
-# Half the width of the chart of the modes, the distance of its labels, and the height of the
+# In the chart of the modes: half the width, the distance between lines, and the height of the
 # probability 1 [m].
 REACH_M, _STEP_M, HEIGHT_M = 3.0, 0.6, 3.0
 _LABEL_OFFSET_M = 0.2
@@ -75,7 +75,7 @@ class Charts:
     """Computes the samples of the charts."""
 
     def __init__(self) -> None:
-        # Root of the global bound [m] by the id of the codebook, as far as it is known.
+        # Known global bounds on the root mean square [m], by the id of the codebook.
         self.bounds_m: dict[str, float] = {}
         self._drawn: set[str] = set()
         self._square_m2 = 0.0
@@ -86,7 +86,7 @@ class Charts:
         self._nodes: set[str] = set()
 
     def entries(self, cycle: int, samples: Iterable[Sample]) -> Iterator[Entry]:
-        """Yield the finite samples of a cycle; the first of a series comes with its style."""
+        """Yield the finite samples of a cycle, and the style of each new series."""
         for path, value, style in samples:
             if math.isfinite(value):
                 if path not in self._drawn:
@@ -95,9 +95,9 @@ class Charts:
                 yield Entry(cycle, path, Number(float(value)))
 
     def dropped(self, node: str, count: int) -> Iterator[Sample]:
-        """Yield the number of messages that a node dropped since its start, and that of all.
+        """Yield how many messages all nodes have dropped since they started, and this node.
 
-        Only the first four nodes that dropped a message have a series of their own.
+        Only the first four nodes that dropped a message have their own series.
         """
         self._n_dropped.put(node, count)
         yield 'drops/all', sum(self._n_dropped.values()), Series('all nodes', _WHITE)
@@ -109,14 +109,14 @@ class Charts:
             yield f'drops/{name}', count, Series(name, user_colour(sum(name.encode())))
 
     def given_up(self) -> Iterator[Sample]:
-        """Count a cycle that was given up, and yield their number."""
+        """Count a cycle that was given up, and yield the number of such cycles."""
         self._n_given_up += 1
         yield 'drops/given_up', self._n_given_up, Series('cycles given up', _RED)
 
     def of_cycle(self, cycle: CompleteCycle) -> Iterator[Sample]:
         """Yield the samples of a complete cycle.
 
-        Only the first four users have a series of their own; the others share one.
+        Only the first four users have their own series; the others share one.
         """
         if len(self._users) < _MAX_SERIES:
             self._users.add(cycle.user)
@@ -133,7 +133,7 @@ class Charts:
         yield 'error/crlb', math.sqrt(max(estimate.crlb_m2, 0.0)), Series('sqrt(CRLB)', _GREEN)
         yield ('error/global_bound', self.bounds_m.get(estimate.codebook_id, math.nan),
                Series('global bound', _WHITE))
-        # A small loss would hide one of two lines behind the other, so the actual values are dots.
+        # If the loss is small, the lines would coincide, so the actual values are dots.
         for name, value, colour in (
                 ('perfect', capacity.perfect_bps, _WHITE),
                 ('actual', capacity.actual_bps, _GREEN),
@@ -160,7 +160,7 @@ def mode_axes() -> tuple[Lines, Points]:
 
 
 def mode_bars(user: int, found: WeightedModes, origin: np.ndarray) -> Lines:
-    """Return the modes as bars in the colour of a user, at their ranges minus the origin's."""
+    """Return the modes as bars in the colour of a user, at their range error from the origin."""
     errors = np.linalg.norm(found.positions, axis=1) - np.linalg.norm(origin)
     return Lines(tuple(_line(error, HEIGHT_M * probability) for error, probability in zip(
         errors.tolist(), found.probabilities.tolist(), strict=True)),
@@ -168,7 +168,7 @@ def mode_bars(user: int, found: WeightedModes, origin: np.ndarray) -> Lines:
 
 
 def mode_estimate(position: np.ndarray, origin: np.ndarray) -> Lines:
-    """Return an estimate, float64 [3] [m], as a white line; the origin is as in `mode_bars`."""
+    """Return an estimate, float64 [3] [m], as a white line at its range error from the origin."""
     error = float(np.linalg.norm(position) - np.linalg.norm(origin))
     return Lines((_line(error, HEIGHT_M),), (1.0, 1.0, 1.0), _LINE_WIDTH)
 
@@ -178,7 +178,7 @@ def _line(place: float, height: float) -> np.ndarray:
 
 
 class TrackPoint(NamedTuple):
-    """Position [m], its covariance [m^2] and the velocity [m/s] of a user that is tracked."""
+    """Position [m] with its covariance [m^2], and velocity [m/s], of a tracked user."""
 
     user: int
     position: np.ndarray
@@ -187,9 +187,10 @@ class TrackPoint(NamedTuple):
 
 
 class NetworkView:
-    """Converts the messages of a network to entries, in the order in which they arrive.
+    """Converts the messages of a network to entries, in the order of arrival.
 
-    `n_cycles` counts the observed cycles, and `n_ended` those received completely or given up.
+    `n_cycles` counts the observed cycles; `n_ended` counts the complete cycles and the cycles that
+    were given up.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -200,11 +201,11 @@ class NetworkView:
         self._users: list[int] = []
         self._tracks: dict[int, collections.deque[np.ndarray]] = {}
         self._configurations: dict[int, np.ndarray] = {}
-        # True position of the user in each cycle, the origin of the chart of the modes.
+        # The true position in each cycle, which is the origin of the chart of the modes.
         self._origins: NewestDict[int, np.ndarray] = NewestDict(_MAX_CYCLES)
 
     def begin(self) -> list[Entry]:
-        """Return the entries that are shown at all times."""
+        """Return the entries that are always shown."""
         grid, labels = mode_axes()
         return [Entry(0, f'{WORLD}/region', shapes.region(self._scenario)),
                 Entry(0, f'{MODES}/grid', grid), Entry(0, f'{MODES}/labels', labels)]
@@ -227,7 +228,7 @@ class NetworkView:
         return [*self._charts.entries(self._count(0), self._charts.dropped(node, count))]
 
     def add_modes(self, received: m.ReceivedSignals, found: WeightedModes | None) -> list[Entry]:
-        """Add the modes of the posterior for received signals; None if they give no position."""
+        """Add the modes of the posterior for received signals; None if there is no position."""
         if not self._shows(received.user):
             return []
         cycle, path = self._count(received.cycle_id), f'{_path(received.user)}/modes'
@@ -239,7 +240,7 @@ class NetworkView:
                 Entry(cycle, f'{MODES}/found', mode_bars(received.user, found, origin))]
 
     def add_track(self, cycle_id: int, point: TrackPoint) -> list[Entry]:
-        """Add a position of a track; the id of its cycle is 0 if it is unknown."""
+        """Add a position of a track; `cycle_id` is 0 if it is unknown."""
         if not self._shows(point.user):
             return []
         positions = self._tracks.setdefault(point.user, new_path())
@@ -316,7 +317,7 @@ class NetworkView:
         return user in self._users
 
     def _count(self, cycle_id: int) -> int:
-        """Return the number of a cycle; messages outside of cycles belong to the latest."""
+        """Return the number of a cycle; messages outside of cycles belong to the latest one."""
         if not cycle_id:
             return max(self.n_cycles, 1)
         if cycle_id not in self._cycles:

@@ -11,10 +11,10 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Outcome, Send, kind_of
 
-# Percentiles are computed over this number of latest durations.
+# Number of latest durations in the percentiles.
 _MAX_DURATIONS = 512
 _PERCENTS = (50, 95, 99)
-# Counters of what occurs without a fault.
+# Counters that are no faults.
 _NO_FAULTS = {Outcome.UNANSWERED.value}
 # Maximum number of reasons in a summary.
 _MAX_REASONS = 3
@@ -27,15 +27,11 @@ class Report:
     Attributes
     ----------
     fault
-        Whether something is missing, or something was dropped or given up since the last report.
+        Whether a fault persists, or faults have occurred since the last report.
     summary
-        One line: what is missing, or the most frequent new faults.
+        One line with the missing roles, or with the most frequent new faults.
     values
-        Settings: ``parameter.<name>`` (in use), ``pending.<name>`` (not in use yet) and
-        ``failed.<name>`` (why a change failed). Lasting faults: ``warning.<subject>``. Counts:
-        ``cycles.<outcome>``, ``dropped.<reason>``, ``retries.<step>``, ``beacons.<reason>``,
-        ``received.<message>`` and ``sent.<message>``. Also ``phase``, ``codebook_id`` and
-        percentiles such as ``handling_ms.p95``.
+        Values by the keys that ``docs/interfaces.rst`` lists.
     """
 
     fault: bool
@@ -49,7 +45,7 @@ class RoleStatistics:
     def __init__(self) -> None:
         # Descriptions of the roles that are missing.
         self.missing: tuple[str, ...] = ()
-        # Messages by section of the report and type, and faults until the last report.
+        # Number of messages by section of the report and by type; faults up to the last report.
         self._messages: dict[str, collections.Counter[str]] = {
             'received': collections.Counter(), 'sent': collections.Counter()}
         self._faults: collections.Counter[str] = collections.Counter()
@@ -80,10 +76,10 @@ class RoleStatistics:
     def report(
             self, phase: str, counters: Mapping[str, int], blocked: bool = False,
             status: Mapping[str, str] = types.MappingProxyType({})) -> Report:
-        """Create a report; new faults are those since the previous call.
+        """Create a report, with the faults since the previous call.
 
-        A role is `blocked` if its state, the `phase`, shows that something is missing. The
-        `counters` are by reason; `status` is that of the role, with conflicts of the node.
+        The `phase` is the state of the role, which is `blocked` if it lacks something in this
+        state. `status` contains the status of the role and the conflicts of the node.
         """
         values = {'phase': phase} if phase else {}
         values |= self._codebook_ids(status.get('codebook_id', ''))
@@ -118,7 +114,7 @@ class RoleStatistics:
         return Report(True, summary, values)
 
     def _codebook_ids(self, in_use: str) -> dict[str, str]:
-        """Return the ids of the codebook in use (at first, the offered one) and a pending one."""
+        """Return the ids of the codebook in use, or else offered, and of a pending codebook."""
         if not self._codebook_id:
             return {}
         if in_use in ('', self._codebook_id):
@@ -128,7 +124,7 @@ class RoleStatistics:
 
 def _summary(faults: collections.Counter[str]) -> str:
     """Return a line with the most frequent faults, such as ``new faults: late_ack 9, stale 1``."""
-    # Sorted, so that faults of equal number have a fixed order.
+    # Equally frequent faults are in alphabetical order.
     ordered = sorted(faults.items(), key=lambda item: (-item[1], item[0]))
     shown = [f'{reason} {count}' for reason, count in ordered[:_MAX_REASONS]]
     others = sum(count for _, count in ordered[_MAX_REASONS:])

@@ -1,8 +1,8 @@
-"""The shapes of a network: in space, in planes and in charts.
+"""The shapes that represent a network in space, in planes and in charts.
 
-Rerun, RViz and Matplotlib show the same shapes; `tools.rerun_stream`, `nodes.visualizer` and
-`tools.pictures` translate them. Lengths are in metres, positions float64 [N, 3], or [N, 2] in a
-plane; colours are red, green and blue from 0 to 1, float64 [N, 3] for N shapes.
+Rerun, RViz and Matplotlib draw the same shapes, which `tools.rerun_stream`, `nodes.visualizer` and
+`tools.pictures` convert. Positions are float64 [N, 3] [m], or [N, 2] in a plane. Colours are red,
+green and blue from 0 to 1, float64 [N, 3] for N shapes.
 """
 
 import colorsys
@@ -22,7 +22,7 @@ Colour: TypeAlias = tuple[float, float, float]
 
 
 class Points(NamedTuple):
-    """Balls, or discs in a plane, with one label each or none."""
+    """Balls, or discs in a plane, with one label for each or no labels."""
 
     positions: np.ndarray
     colours: np.ndarray
@@ -31,9 +31,9 @@ class Points(NamedTuple):
 
 
 class Ellipsoids(NamedTuple):
-    """Ellipsoids with half the lengths of their axes, float64 [N, 3].
+    """Ellipsoids; `half_sizes_m` contains the semi-axes, float64 [N, 3].
 
-    Unit quaternions, float64 [N, 4] (x, y, z, w), rotate the coordinate axes to theirs.
+    The unit quaternions, float64 [N, 4] (x, y, z, w), rotate the coordinate axes to the semi-axes.
     """
 
     centres: np.ndarray
@@ -67,13 +67,13 @@ class Mesh(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A picture in shades of grey, uint8 [height, width], the top row first."""
+    """A picture in shades of grey, uint8 [height, width], from the top row to the bottom row."""
 
     pixels: np.ndarray
 
 
 class Series(NamedTuple):
-    """The style of the numbers on a path: a line, or dots."""
+    """The name and the style of the numbers on a path, a line or dots."""
 
     name: str
     colour: Colour
@@ -102,9 +102,9 @@ Entity: TypeAlias = (
 
 
 class Entry(NamedTuple):
-    """An entity, the path that it is shown on, and the cycle from which on it is shown.
+    """An entity, its path, and the first cycle that shows it.
 
-    Cycles are counted from 1, as a view observes them; an entry of cycle 0 is shown at all times.
+    A view counts the cycles that it observes from 1; an entry of cycle 0 is always shown.
     """
 
     cycle: int
@@ -112,24 +112,24 @@ class Entry(NamedTuple):
     entity: Entity
 
 
-# Level relative to the maximum of a beam at which a lobe has zero length.
+# Level relative to the maximum of a beam that corresponds to zero length of a lobe.
 MIN_LEVEL_DB = -20.0
-# Labels have a ball of this radius, which is invisible.
+# Radius of the invisible balls of labels.
 INVISIBLE_M = 1e-3
 # The hues of consecutive users differ by the golden ratio.
 _HUE_STEP = 0.618034
 _GREY = (0.5, 0.5, 0.5)
 _TRUTH_RADIUS_M, _ESTIMATE_RADIUS_M = 0.18, 0.12
-# The volume of the ball of a mode is proportional to its probability.
+# Radius of the ball of a mode of probability 1. The volume is proportional to the probability.
 _MODE_RADIUS_M = 0.2
-# Modes of a smaller probability are not shown.
+# Modes with a smaller probability are not shown.
 _MIN_PROBABILITY = 0.005
 _LINE_WIDTH, _PATH_WIDTH = 2.0, 0.8
-# Brightness of true paths, so that other entities in front of them stand out.
+# Brightness of paths, so that other entities stand out against them.
 _DIM = 0.45
-# Height of the name above the user; a name on the user hides the estimate.
+# Height of the name above the user, where it does not hide the estimate.
 _NAME_HEIGHT_M = 1.0
-# Edge of the enlarged surface relative to the distance of the region.
+# Edge of the enlarged surface, relative to the distance of the region.
 _BOARD_SIZE = 0.2
 # Viewers do not show bodies without extent.
 _MIN_HALF_SIZE_M = 1e-3
@@ -154,10 +154,10 @@ def distance_95(n: int) -> float:
 
 
 def axes_95(covariance_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the axes of the ellipse or ellipsoid that contains 95 % of a Gaussian.
+    """Return the ellipse or ellipsoid that contains 95 % of a Gaussian.
 
-    For a covariance [n, n] [m^2], these are half their lengths, float64 [n] [m], and a rotation,
-    float64 [n, n], whose columns are their directions.
+    For a covariance [n, n] [m^2], the result contains the lengths of the semi-axes, float64 [n]
+    [m], and a rotation matrix, float64 [n, n], whose columns are their directions.
     """
     variances_m2, axes = np.linalg.eigh(covariance_m2)
     # The eigenvectors may form a reflection.
@@ -174,14 +174,8 @@ def region(scenario: Scenario) -> Boxes:
 def board(scenario: Scenario, configuration: np.ndarray | None, enlarged: bool = False) -> Boxes:
     """Return the surface as one plate for each element, from dark for 0 to bright for 1.
 
-    Parameters
-    ----------
-    configuration
-        Applied configuration, float64 [F, N_E] in [0, 1], of which the mean over the frames is
-        shown; None if unknown.
-    enlarged
-        Whether to enlarge the surface about its centre, so that single elements are visible from
-        a distance at which the whole region is.
+    The brightness is the mean over the frames of a configuration, float64 [F, N_E] in [0, 1], or
+    None. The `enlarged` surface shows single elements in a view of the whole region.
     """
     positions, interval_m = element_positions(scenario), element_interval_m(scenario)
     if enlarged:
@@ -196,13 +190,10 @@ def board(scenario: Scenario, configuration: np.ndarray | None, enlarged: bool =
 
 
 def configurations(scenario: Scenario, bands: Iterable[np.ndarray]) -> Picture:
-    """Return configurations as a picture from the front: y to the right, z up.
+    """Return configurations as a picture from the front, with y to the right and z up.
 
-    Parameters
-    ----------
-    bands
-        Configurations by band, float64 [F, N_E] in [0, 1] each. Each band is a row of the
-        picture, each frame a column; black lines separate them.
+    `bands` contains the configuration of each band, float64 [F, N_E] in [0, 1]. Each band is a row
+    of the picture and each frame a column, with black lines between them.
     """
     rows = []
     for analog in bands:
@@ -213,7 +204,7 @@ def configurations(scenario: Scenario, bands: Iterable[np.ndarray]) -> Picture:
 
 
 def truth(message: m.GroundTruth) -> tuple[Points, Points]:
-    """Return the true position of a user as a ball, and the name of the user above the ball."""
+    """Return the true position of a user as a ball, and the name above the ball."""
     colour = np.array([user_colour(message.user)])
     name = message.position[None] + np.array([0.0, 0.0, _NAME_HEIGHT_M])
     return (Points(message.position[None], colour, np.array([_TRUTH_RADIUS_M])),
@@ -228,9 +219,9 @@ def estimate(message: m.PositionEstimate) -> tuple[Points, Ellipsoids]:
 
 
 def modes(user: int, found: WeightedModes) -> tuple[Points, Ellipsoids]:
-    """Return the modes of a posterior as balls and their 95 % ellipsoids.
+    """Return the modes of a posterior as balls, and their 95 % ellipsoids.
 
-    The more probable a mode, the larger the ball and the closer its colour to that of the user.
+    A more probable mode has a larger ball, in a colour closer to the colour of the user.
     """
     chosen = found.probabilities >= _MIN_PROBABILITY
     probabilities, positions, covariances = (field[chosen] for field in found)
@@ -246,11 +237,10 @@ def path(user: int, positions: Iterable[np.ndarray]) -> Lines:
 
 
 def traced(scenario: Scenario, message: m.GroundTruth) -> Lines:
-    """Return the propagation paths from a user to the surface if the scenario has a file of them.
+    """Return the propagation paths to the surface from the traced position nearest to a user.
 
-    They are those of the nearest traced position. The virtual source of a path with a single
-    reflection determines the wall, which is halfway between the source and the user. Paths with
-    more reflections are left out.
+    For a path with one reflection, the wall is halfway between the virtual source and the user.
+    Paths with more reflections are left out. Without a channel file, there are no paths.
     """
     strips: list[np.ndarray] = []
     if channel := scenario.channel:
@@ -268,9 +258,9 @@ def traced(scenario: Scenario, message: m.GroundTruth) -> Lines:
 def track(
         user: int, positions: Iterable[np.ndarray], velocity: np.ndarray,
         covariance_m2: np.ndarray) -> tuple[Lines, Ellipsoids]:
-    """Return a track, the distance covered in the next second, and its 95 % ellipsoid.
+    """Return a track with the motion in the next second, and the 95 % ellipsoid.
 
-    The latest position, float64 [3] [m], comes last.
+    The positions, float64 [3] [m] each, end with the latest one.
     """
     places = np.array(list(positions))
     colour = user_colour(user)
@@ -279,7 +269,7 @@ def track(
 
 
 def pattern(scenario: Scenario, message: m.Beam, step_deg: float = 5.0) -> BeamPattern:
-    """Return the pattern of a beam at the distance of the centre of the region."""
+    """Return the pattern of a beam at the distance of the region's centre."""
     return beam_pattern(scenario, Beam(message.analog, message.digital, message.band),
                         math.hypot(*scenario.roi_center_m), step_deg)
 
@@ -296,7 +286,7 @@ def lobe(shown: BeamPattern, user: int) -> Mesh:
 
 def _ellipsoids(
         centres: np.ndarray, covariances_m2: np.ndarray, colours: np.ndarray) -> Ellipsoids:
-    # The import takes as long as that of the rest of a program, which may never need it.
+    # This import takes long, and a program may never need it.
     from scipy.spatial.transform import Rotation
 
     shapes = [axes_95(covariance) for covariance in covariances_m2]

@@ -2,8 +2,7 @@
 
 import os
 
-# The matrix products are small and there are many processes, so additional threads would only
-# compete for the cores. The libraries read these variables when NumPy is first imported, which
-# happens after this module is imported.
+# Many processes compute small matrix products, so additional threads would only compete for the
+# cores. The libraries read these variables when NumPy is imported, which must happen later.
 for _name in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS'):
     os.environ.setdefault(_name, '1')

@@ -34,7 +34,7 @@ _MAX_GOALS = 100
 
 @dataclasses.dataclass(eq=False)
 class _Goal:
-    """A goal in progress, and the cycle that serves its user; 0 before it."""
+    """A goal in progress, and the cycle that serves its user; 0 until this cycle begins."""
 
     handle: Any
     future: Future
@@ -42,10 +42,9 @@ class _Goal:
 
 
 class LocateServer:
-    """Serves the action, from the messages that the base station sends and receives.
+    """Serves the action ``locate``, following the messages of the base station.
 
-    It calls `request` with the user of each accepted goal, and `pose` with the estimate of a
-    position.
+    It calls `request` with the user of each accepted goal, and `pose` to convert an estimate.
     """
 
     def __init__(
@@ -60,7 +59,7 @@ class LocateServer:
             cancel_callback=self._cancel))
 
     def observe(self, message: m.ProtocolState | m.PositionEstimate | m.NoFix) -> None:
-        """Process a message of the base station."""
+        """Process a message that the base station has sent or received."""
         phase = message.phase if isinstance(message, m.ProtocolState) else None
         for goal in [one for one in self._goals if one.handle.request.user == message.user]:
             if phase is m.Phase.POSITIONING:
@@ -68,7 +67,7 @@ class LocateServer:
             if goal.cycle_id != message.cycle_id:
                 continue
             if phase is m.Phase.BEACONING:
-                # The next cycle of the user tries again.
+                # The cycle has ended without a position, so the user needs another one.
                 goal.cycle_id = 0
                 self._request(message.user)
             match message:
@@ -81,10 +80,7 @@ class LocateServer:
                     self._end(goal, f'no fix: {message.reason}')
 
     def destroy(self, delay_s: float = 0.0) -> None:
-        """Abort all goals, and withdraw the action.
-
-        The node sends the results of the goals within `delay_s`; without it, it sends none.
-        """
+        """Abort all goals, then withdraw the action after `delay_s`, which the results need."""
         for goal in list(self._goals):
             self._end(goal, 'the base station ends or stands by')
         server, self._server = self._server, None
@@ -107,7 +103,7 @@ class LocateServer:
     def _cancel(self, handle: Any) -> CancelResponse:
         for goal in self._goals:
             if goal.handle.goal_id == handle.goal_id:
-                # Afterwards, when the handle has the state CANCELING.
+                # Later, when the handle has the state CANCELING.
                 self._later(0.0, functools.partial(self._end, goal, 'canceled'))
         return CancelResponse.ACCEPT
 
@@ -134,7 +130,7 @@ class LocateServer:
         goal.handle.publish_feedback(Locate.Feedback(phase=int(phase), cycle_id=goal.cycle_id))
 
     def _end(self, goal: _Goal, reason: str, result: Locate.Result | None = None) -> None:
-        """End a goal: with a result, canceled if that was requested, or aborted."""
+        """End a goal as canceled (if requested), as successful (with a result) or as aborted."""
         if goal not in self._goals:
             return
         self._goals.remove(goal)
@@ -147,7 +143,7 @@ class LocateServer:
         goal.future.set_result(result or Locate.Result(reason=reason))
 
 
-# Time in which a node that stands by sends the results of its goals [s].
+# Time for a node that stands by to send the results of its goals [s].
 _FAREWELL_S = 0.5
 
 
@@ -175,12 +171,12 @@ class BsNode(RoleNode[BaseStation]):
                 self.create_service, Trigger, name, functools.partial(self._on_request, request)))
 
     def stand_by(self) -> None:
-        """Abandon the cycle, and wait."""
+        """End the action, and abandon the cycle."""
         self._end_locate(_FAREWELL_S)
         self.dispatch(events.StoodBy())
 
     def resume(self) -> None:
-        """Begin cycles once the other nodes are known to be present."""
+        """Offer the action again, and begin cycles once the other nodes are present."""
         self.dispatch(events.Resumed(_cycle_from_clock()))
         self._locate = self._make_locate()
 
@@ -231,7 +227,7 @@ class BsNode(RoleNode[BaseStation]):
 
 
 def _cycle_from_clock() -> int:
-    """Return the time since 1970 [ms]. Cycles take longer than 1 ms, so no id is reused."""
+    """Return the milliseconds since 1970. A cycle takes longer than 1 ms, so no id is reused."""
     return time.time_ns() // 1_000_000
 
 

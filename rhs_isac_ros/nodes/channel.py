@@ -1,4 +1,4 @@
-"""The executable ``channel``: the emulated radio channel and surface."""
+"""The executable ``channel``: emulates the radio channel and the surface."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from rhs_isac_ros.ros.run import entry
 
 
 class ChannelNode(RoleNode[Channel]):
-    """The ROS node of the emulated channel, impairments included."""
+    """The ROS node of the emulated channel and its impairments."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('channel', **node_options)

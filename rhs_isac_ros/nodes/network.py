@@ -1,4 +1,4 @@
-"""The executable ``network``: all nodes composed in one process."""
+"""The executable ``network``: runs all nodes in one process."""
 
 import importlib
 
@@ -13,7 +13,7 @@ from rhs_isac_ros.ros.run import entry
 
 
 def _make(role: str) -> Node:
-    """Create the node of a role, whose class has its name."""
+    """Create the node of a role; its class is called after the role."""
     module = importlib.import_module(f'rhs_isac_ros.nodes.{role}')
     node: Node = getattr(module, f'{role.title().replace("_", "")}Node')()
     return node

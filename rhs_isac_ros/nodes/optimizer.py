@@ -1,4 +1,4 @@
-"""The executable ``optimizer``: optimises a codebook, holds it as its parameters, or pushes it."""
+"""The executable ``optimizer``: optimises a codebook, and holds it as parameters or pushes it."""
 
 import argparse
 import sys
@@ -37,18 +37,18 @@ from rhs_isac_ros.support.arguments import ArgumentParser, HelpFormatter, input_
 
 
 class GroupParameterService(ParameterService):
-    """The parameter services of a node of which some parameters belong together.
+    """Parameter services of a node with a group of parameters that only change together.
 
-    The service ``set_parameters`` of rclpy, which ``ros2 param load`` uses, sets the parameters of
-    a request one by one. Here, those whose names begin with a prefix are set together, or not at
-    all. The node is created with ``start_parameter_services=False``.
+    The service ``set_parameters`` of rclpy, which ``ros2 param load`` uses, sets parameters one by
+    one. Here, all parameters in a request whose names begin with `prefix` are set, or none. Create
+    the node with ``start_parameter_services=False``.
     """
 
     def __init__(self, node: Node, prefix: str) -> None:
         super().__init__(node)  # type: ignore[no-untyped-call]
         self._prefix = prefix
 
-    # Overrides the callback of rclpy, which creates the services in its constructor.
+    # Overrides the callback of rclpy's service.
     def _set_parameters_callback(
             self, request: SetParameters.Request,
             response: SetParameters.Response) -> SetParameters.Response:
@@ -67,7 +67,7 @@ class GroupParameterService(ParameterService):
 
 
 def ros_parameters(values: Mapping[str, Any]) -> list[Parameter]:
-    """Return parameters with values by name."""
+    """Convert values by name to parameters."""
     return [Parameter(name, value=value) for name, value in values.items()]
 
 
@@ -76,10 +76,10 @@ class PushError(RuntimeError):
 
 
 def push(node: Node, codebook: Codebook, timeout_s: float = 10.0) -> None:
-    """Set a codebook as the parameters of the optimizer in the namespace of the node.
+    """Set the parameters of the optimizer in the namespace of a node to a codebook.
 
-    This function blocks and spins the node, so it must not be called from a callback. It raises
-    PushError if there is no optimizer, if it does not respond, or if it rejects the codebook.
+    This function spins the node, so it must not be called from a callback. It raises PushError if
+    there is no optimizer, or if the optimizer does not respond or rejects the codebook.
     """
     optimizer = f'{node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
     client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)
@@ -100,7 +100,7 @@ def push(node: Node, codebook: Codebook, timeout_s: float = 10.0) -> None:
 
 
 class OptimizerNode(ParameterizedNode):
-    """Holds the codebook as parameters, sets them as a whole only, and publishes it latched.
+    """Holds the codebook as parameters that only change together, and announces it.
 
     The first codebook comes from a parameter file on the command line or from ``codebook_file``.
     While a newer optimizer is present, this one withdraws its announcement.
@@ -152,14 +152,14 @@ class OptimizerNode(ParameterizedNode):
         return codebook
 
     def _normalize(self, changes: list[Parameter]) -> list[Parameter]:
-        """Give a valid codebook the types and the id that the parameters have."""
+        """Convert a valid codebook to the types of the parameters, and fill in its id."""
         given = _given_codebook_values(changes)
         if given.keys() != CODEBOOK.keys():
             return changes
         try:
             normal = self._codebook_of(given).to_parameters()
         except CodebookError:
-            # The check returns the reason.
+            # `_check_codebook` returns the reason.
             return changes
         return [Parameter(p.name, value=normal[p.name]) if p.name in normal else p
                 for p in changes]
@@ -181,7 +181,7 @@ class OptimizerNode(ParameterizedNode):
 
     def _on_codebook_set(self, changes: list[Parameter]) -> None:
         given = _given_codebook_values(changes)
-        # A request that repeats some of the values changes nothing.
+        # A request with only some of the values has changed nothing.
         if given.keys() == CODEBOOK.keys():
             self._publish(self._codebook_of(given))
 
@@ -192,7 +192,7 @@ class OptimizerNode(ParameterizedNode):
         return Report(bool(conflicts), '; '.join(conflicts.values()) or 'no fault', values)
 
     def _announce(self, stands_by: bool) -> None:
-        """Announce the codebook, also again, or withdraw the announcement."""
+        """Announce the codebook, or withdraw the announcement if the node stands by."""
         if self._publisher is not None and stands_by:
             self.destroy_publisher(self._publisher)
             self._publisher = None
@@ -219,10 +219,10 @@ def _given_codebook_values(changes: list[Parameter]) -> dict[str, Any]:
 def main(args: Sequence[str] | None = None) -> int:
     """Run the executable, and return its exit code.
 
-    Without options, this holds a codebook. With options, it first optimises a codebook, writes it
-    to a file and holds it; with ``--push``, it instead sends the codebook to the optimizer of a
-    running network. The exit code is 0 on success or after a signal; 1 if a network did not accept
-    the codebook; 2 if an argument or a file is invalid.
+    Without options, hold a codebook. With options, optimise one and write it to a file first; with
+    ``--push``, send it to a running optimizer instead of holding it. The exit code is 0 on success
+    or after a signal, 1 if a network does not accept the codebook, and 2 if an argument or a file
+    is invalid.
     """
     args = sys.argv if args is None else [topics.OPTIMIZER_NODE, *args]
     parser = _parser()

@@ -1,4 +1,4 @@
-"""The executable ``positioner``: estimates the user's position."""
+"""The executable ``positioner``: estimates the positions of users."""
 
 import dataclasses
 import functools
@@ -30,12 +30,12 @@ from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.fields import ParameterError
 
-# Interval between reports of the progress of a table.
+# Minimum time between reports of the progress of a table.
 _LOG_PERIOD_S = 5.0
 
 
 class PositionerNode(RoleNode[Positioner]):
-    """The positioner; it subscribes to received signals once its first estimator is built."""
+    """The positioner, which serves once its first estimator is built."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('positioner', **node_options)
@@ -50,9 +50,9 @@ class PositionerNode(RoleNode[Positioner]):
         self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
 
     def make_settings(self, values: types.SimpleNamespace) -> PositionerSettings:
-        """Return the settings for parameter values, with files and plug-ins that can be loaded.
+        """Return the settings for parameters whose files and plug-ins can be loaded.
 
-        Whether a model fits the codebook is only checked when the estimator is built.
+        Only the construction of the estimator checks whether a model fits the codebook.
         """
         settings: PositionerSettings = super().make_settings(values)
         calibrated_surface(values, self.scenario)
@@ -60,8 +60,7 @@ class PositionerNode(RoleNode[Positioner]):
             self._check_plugin(settings.estimator)
             return settings
         if settings.estimator != positioning.NeuralEstimator.name:
-            # Other estimators do not use the file. Clear it, so that a change of the file does not
-            # rebuild them.
+            # Other estimators do not use the file, so a change of it must not rebuild them.
             return dataclasses.replace(settings, model_file='')
         if settings.calibration_file:
             raise ParameterError(
@@ -78,7 +77,7 @@ class PositionerNode(RoleNode[Positioner]):
 
     @staticmethod
     def _check_plugin(name: str) -> None:
-        """Check that a plug-in can be imported; it may still fail when the estimator is built."""
+        """Check that a plug-in can be imported; building the estimator may still fail."""
         try:
             plugins.load(plugins.ESTIMATORS, name)
         except plugins.PluginError as error:
@@ -97,21 +96,21 @@ class PositionerNode(RoleNode[Positioner]):
             options['surface'] = load_surface(settings.calibration_file, self.scenario)
         estimator = positioning.make_estimator(
             settings.estimator, self.scenario, codebook, **options)
-        # The first estimate takes longer than all others. A user does not wait for it.
+        # The first estimate takes longer than later ones, so it is not left to a user.
         center = np.array([self.scenario.roi_center_m])
         estimator.estimate(simulate_received(
             self.scenario, codebook, center, np.random.default_rng(0))[0])
         return estimator
 
     def _on_progress(self, share: float) -> None:
-        """Log the progress of a table that takes long, in the background thread."""
+        """Log the progress of a long computation of a table, in the background thread."""
         self._table = f'{100 * share:.0f} %' if share < 1 else ''
         self.get_logger().info(  # type: ignore[no-untyped-call]
             f'table of templates: {100 * share:.0f} % computed',
             throttle_duration_sec=_LOG_PERIOD_S, skip_first=True)
 
     def report(self) -> Report:
-        """Return the diagnostics, with the progress of a table that is being computed."""
+        """Return the diagnostics, including the progress while a table is computed."""
         report = super().report()
         if not self._table:
             return report
@@ -145,7 +144,7 @@ class PositionerNode(RoleNode[Positioner]):
             self.subscribe()
 
     def publish(self, message: m.Message) -> bool:
-        """Publish a message, and poses for an estimate; return False if it is invalid."""
+        """Publish a message, and the poses of an estimate; return whether this succeeded."""
         is_published = super().publish(message)
         if is_published and isinstance(message, m.PositionEstimate):
             pose = convert.pose(message, convert.stamp_of(message, self), self._frame)

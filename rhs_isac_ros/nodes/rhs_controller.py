@@ -8,7 +8,7 @@ from rhs_isac_ros.ros.run import entry
 
 
 class RhsControllerNode(RoleNode[RhsController]):
-    """The controller of the surface; it serves once it has a codebook."""
+    """The controller of the surface, which serves once it has a codebook."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('rhs_controller', **node_options)

@@ -13,18 +13,18 @@ from rhs_isac_ros.support.fields import ParameterError
 
 
 class TransmissionNode(RoleNode[Transmission]):
-    """The transmission; it creates its publishers and subscriptions once it has a codebook."""
+    """The transmission, which serves once it has a codebook."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('transmission', **node_options)
-        # Surfaces by calibration file, as they were when the parameter was checked.
+        # Surfaces by calibration file, as read when the parameter was checked.
         self._surfaces: dict[str, SurfaceEstimate | None] = {}
         settings = self.make_settings(self.values)
         self.start(Transmission(self.scenario, settings, self._surfaces.__getitem__),
                    needs_codebook=True)
 
     def make_settings(self, values: types.SimpleNamespace) -> Any:
-        """Return the settings for parameter values, with a band and a calibration that fit."""
+        """Return the settings for parameters whose band and calibration fit the scenario."""
         n_bands = self.scenario.n_bands
         if values.band >= n_bands:
             raise ParameterError(

@@ -1,4 +1,4 @@
-"""The executable ``user``: one or many users of the system."""
+"""The executable ``user``: one or many users of the network."""
 
 import functools
 import time
@@ -27,9 +27,9 @@ _MAX_AGE_S = 5.0
 
 
 class RobotMobility:
-    """Mobility of a robot: the latest position, extrapolated with its velocity.
+    """Mobility of a robot: the latest position, extrapolated with the velocity.
 
-    The `source` describes where the positions come from; they are valid for `timeout_s`.
+    A position is valid for `timeout_s`. Texts contain the `source` of the positions.
     """
 
     def __init__(self, node: Node, frame: Frame, source: str, timeout_s: float) -> None:
@@ -48,7 +48,7 @@ class RobotMobility:
         self._velocity = self._frame.rotation.T @ velocity
 
     def reject(self, error: str) -> None:
-        """Store why a position cannot be used."""
+        """Store the reason why a position is unusable."""
         self._error = error
 
     @property
@@ -99,7 +99,7 @@ def follow_odometry(node: Node, frame: Frame, topic: str, timeout_s: float) -> R
 
 
 def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> RobotMobility:
-    """Return the mobility of a frame of tf2; its velocity is the difference of two transforms.
+    """Return the mobility of a frame of tf2, with velocities from consecutive transforms.
 
     Raises ParameterError if ``tf2_ros`` is not installed.
     """
@@ -123,7 +123,7 @@ def _lookup(
     last: list[tuple[int, np.ndarray]] = []
 
     def look() -> None:
-        # The listener lives as long as this function.
+        # This reference keeps the listener alive.
         if not listener or not buffer.can_transform(parent, child, Time()):  # type: ignore[attr-defined]
             return
         found = buffer.lookup_transform(parent, child, Time())  # type: ignore[attr-defined]
@@ -139,7 +139,7 @@ def _lookup(
     return look
 
 
-# Period at which the positions of a robot are watched [s].
+# Period of checking whether a robot has a position [s].
 _WATCH_S = 0.1
 
 
@@ -159,7 +159,7 @@ class UserNode(RoleNode[User]):
             self.clocks.world_s))
         self._true_odometry = endpoints.UserTopics(
             self, {topics.TRUE_ODOMETRY: Odometry}, values.user_topics)
-        # On the clock of ROS, as the mobilities.
+        # On the clock of ROS, like the mobilities.
         endpoints.create_timer(self, values.ground_truth_period_s, self._publish_ground_truth)
         if robot := self._robot:
             self._watch_robot(robot)
@@ -220,7 +220,7 @@ class UserNode(RoleNode[User]):
             raise ParameterError(f'mobility: {error}') from None
 
     def _points(self, name: str) -> np.ndarray:
-        """Return the points of a parameter, [N, 3], checked to be in front of the surface."""
+        """Return the points of a parameter, [N, 3], which must be in front of the surface."""
         numbers = np.array(getattr(self.values, name))
         if numbers.size % 3:
             raise ParameterError(f'{name}: {numbers.size} numbers, expected three for each point')

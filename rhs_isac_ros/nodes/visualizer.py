@@ -1,4 +1,4 @@
-"""The executable ``visualizer``: shows a network in RViz and Foxglove."""
+"""The executable ``visualizer``: publishes what RViz and Foxglove show of a network."""
 
 import copy
 import itertools
@@ -30,9 +30,9 @@ from rhs_isac_ros.ros.frames import Frame, to_ros
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.ros.topics import RHS_FRAME, TF, TF_STATIC
 
-# Opacity of bodies through which others remain visible.
+# Opacity of translucent bodies.
 _ELLIPSOID, _OUTLINE, _MESH = 0.35, 0.15, 0.25
-# Width of a line for a point of the screen [m].
+# Width in the scene of one screen point of line width [m].
 _LINE_M = 0.02
 
 
@@ -40,10 +40,7 @@ def marker(
         namespace: str, number: int,
         shape: shapes.Points | shapes.Ellipsoids | shapes.Boxes | shapes.Lines | shapes.Mesh,
         stamp: Time) -> Marker:
-    """Return a ball, an ellipsoid, cuboids, lines or a mesh as a marker.
-
-    Rerun draws an ellipsoid and a box that is not solid as outlines; here they are translucent.
-    """
+    """Convert a shape to a marker; ellipsoids and boxes that are not solid are translucent."""
     match shape:
         case shapes.Points():
             found = _marker(namespace, number, Marker.SPHERE, stamp)
@@ -58,7 +55,7 @@ def marker(
             found.scale = to_ros(Vector3, 2 * shape.half_sizes_m[0])
             found.color = _colour(shape.colours[0], _ELLIPSOID)
         case shapes.Boxes():
-            # All cuboids have the size of the first.
+            # A marker has one size for all its cuboids.
             found = _marker(namespace, number, Marker.CUBE_LIST, stamp)
             found.scale = to_ros(Vector3, 2 * shape.half_sizes_m[0])
             found.points = [to_ros(Point, centre) for centre in shape.centres]
@@ -79,21 +76,21 @@ def marker(
 
 
 def deletion(namespace: str, number: int, stamp: Time) -> Marker:
-    """Return a marker that deletes the marker with the given namespace and id."""
+    """Return a message that deletes the marker with a namespace and an id."""
     marker = _marker(namespace, number, Marker.SPHERE, stamp)
     marker.action = Marker.DELETE
     return marker
 
 
 def place(marker: Marker, frame: Frame) -> Marker:
-    """Return a marker in the frame of standard messages; its points are relative to its pose."""
+    """Move a marker to the frame of standard messages; its points are relative to its pose."""
     marker.header.frame_id = frame.name
     marker.pose = frame.pose(marker.pose)
     return marker
 
 
 def path(positions: Iterable[np.ndarray], stamp: Time, frame: Frame) -> Path:
-    """Return positions, float64 [3] [m] each, as a path in a frame, with unknown orientation."""
+    """Return positions, float64 [3] [m] each, as a path in a frame, without orientations."""
     header = Header(stamp=stamp, frame_id=frame.name)
     return Path(header=header, poses=[
         PoseStamped(header=header, pose=Pose(position=to_ros(Point, frame.from_surface(position))))
@@ -101,10 +98,10 @@ def path(positions: Iterable[np.ndarray], stamp: Time, frame: Frame) -> Path:
 
 
 def _triangles(points: np.ndarray) -> np.ndarray:
-    """Return the corners of the triangles of a mesh, float64 [N, 3], front sides outward."""
+    """Return the vertices of the triangles of a mesh, float64 [N, 3], with outward normals."""
     a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
     corners = np.stack([a, b, c, a, c, d], axis=2).reshape(-1, 3, 3)
-    # Triangles without area are invisible and need not be sent.
+    # Triangles without area are invisible.
     areas = np.linalg.norm(np.cross(
         corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     return corners[areas > 0].reshape(-1, 3)
@@ -129,7 +126,7 @@ _NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 def transform(
         frame: Frame, child: str, position: np.ndarray, stamp: Time,
         orientation: np.ndarray = _NO_TURN) -> TransformStamped:
-    """Return the transform of a child of a frame, by default of unknown orientation."""
+    """Return the transform from a frame to a child, by default without rotation."""
     return TransformStamped(
         header=Header(stamp=stamp, frame_id=frame.name), child_frame_id=child,
         transform=Transform(translation=to_ros(Vector3, position),
@@ -137,9 +134,9 @@ def transform(
 
 
 class TransformPublisher:
-    """Publishes transforms, provided that ``tf2_msgs`` is `available`, which has no wheel.
+    """Publishes transforms if ``tf2_msgs`` is `available`; there is no wheel of it.
 
-    The constructor publishes the transform of the surface, latched.
+    The constructor publishes the static transform of the surface.
     """
 
     def __init__(self, node: Node, frame: Frame) -> None:
@@ -157,13 +154,13 @@ class TransformPublisher:
                       frame.orientation)]))
 
     def publish(self, transform: TransformStamped) -> None:
-        """Publish a transform that changes."""
+        """Publish a transform that is not static."""
         if self.available:
             self._dynamic.publish(self._message(transforms=[transform]))
 
 
 class VisualizerNode(Node):
-    """Publishes surface, region, users, estimates and beam as markers, paths and transforms."""
+    """Publishes the scene of a network as markers, paths and transforms."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('visualizer', **node_options)
@@ -172,7 +169,7 @@ class VisualizerNode(Node):
         self._frame = Frame.of(self, values)
         self._forget_s = values.forget_s
         self._scene = SceneState()
-        # The latest beam and its marker, cached because a beam pattern is slow to compute.
+        # The latest beam and its marker, because a beam pattern takes long to compute.
         self._drawn: tuple[m.Beam, Marker] | None = None
         self._shown: set[tuple[str, int]] = set()
         self._publisher = endpoints.create_publisher(
@@ -190,7 +187,7 @@ class VisualizerNode(Node):
 
     def _on_message(self, message: m.Message) -> None:
         self._scene.add(message, time.monotonic())
-        # As for the topics, the number of frames is bounded: tf2 keeps every frame.
+        # The number of frames is limited like the number of topics, because tf2 keeps every frame.
         if isinstance(message, m.PositionEstimate) and self._paths.publishers(message.user):
             self._transforms.publish(transform(
                 self._frame, self._frame.user(message.user),
