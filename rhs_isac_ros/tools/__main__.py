@@ -1,4 +1,4 @@
-"""Runs a command, as the scripts do: ``python3 -m rhs_isac_ros.tools COMMAND [ARGUMENT ...]``."""
+"""Runs a command: ``python3 -m rhs_isac_ros.tools COMMAND [ARGUMENT ...]``."""
 
 import importlib
 import sys

@@ -1,7 +1,7 @@
 """``scripts/calibrate``: estimates a surface, or the multipath, from pilots at known positions.
 
-The pilots are the received signals of a recording, or of a running network, whose users
-publish their true positions, or arrays in a file.
+The pilots come from a recording or a running network whose users publish their true positions, or
+from arrays in a file.
 """
 
 import argparse
@@ -46,19 +46,19 @@ from rhs_isac_ros.support.arguments import (
 from rhs_isac_ros.support.files import ArchiveError, read_arrays
 from rhs_isac_ros.tools import command
 
-# Messages that the log needs.
+# Types of the messages that the log uses.
 RECEIVES = (m.GroundTruth, m.ReceivedSignals)
 _CYCLES = 200
 _TIMEOUT_S = 600.0
-# Pilots whose positions are estimated for comparison.
+# Number of pilots for which the errors before and after are compared.
 _N_COMPARED = 200
 
 
 class PilotLog:
     """Collects the signals, true positions and codebooks of one user, or of all users for 0.
 
-    Unlike in a `CycleLog`, cycles without a fix count: before a calibration, there may be no
-    others.
+    Unlike `CycleLog`, it includes cycles without a fix: before a calibration, there may be only
+    such cycles.
     """
 
     def __init__(self, user: int = 0) -> None:
@@ -79,7 +79,7 @@ class PilotLog:
 
     def has_pilots(self, n: int) -> bool:
         """Return whether the positions and codebooks of `n` pilots are known."""
-        # There are at most as many as signals, which are quicker to count.
+        # Counting the signals first is quicker.
         return len(self._signals) >= n and self.n_pilots >= n
 
     @property
@@ -89,7 +89,7 @@ class PilotLog:
 
     @property
     def missing_codebooks(self) -> list[str]:
-        """Ids of codebooks that are not known, although signals were received with them."""
+        """Ids of unknown codebooks with which signals were received."""
         return sorted({signals.codebook_id for signals in self._signals.values()}
                       - self.codebooks.keys())
 
@@ -208,7 +208,7 @@ def _prior(scenario: Scenario, options: argparse.Namespace) -> SurfacePrior:
 
 
 def _error(scenario: Scenario, pilots: Sequence[Pilots], surface: SurfaceEstimate | None) -> str:
-    """Return root mean square error and number of missing fixes as text."""
+    """Return the root mean square error and the number of missing fixes as text."""
     distances = np.empty(0)
     for group in pilots:
         left = _N_COMPARED - len(distances)

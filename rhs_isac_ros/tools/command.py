@@ -1,4 +1,4 @@
-"""The entry of the commands, and what several of them use: nodes, recordings and tables."""
+"""The entry point of the commands, and their shared code for nodes, recordings and tables."""
 
 import argparse
 import contextlib
@@ -34,15 +34,15 @@ from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import check_distinct, input_file
 from rhs_isac_ros.support.optional import MissingLibraryError
 
-# Changes of the graph do not wake the executor, so the graph is polled with this period [s].
+# Period of polling the graph [s], whose changes do not wake the executor.
 _POLL_PERIOD_S = 0.02
-# Discovery is complete when the graph has not changed for this time [s]. It pauses while DDS
-# security exchanges keys.
+# Discovery is complete when the graph has not changed for this time [s]. With DDS security, it
+# pauses for the exchange of keys.
 _SETTLE_S = 1.0 if startup.is_enabled() else 0.4
-# Errors of arguments and files.
+# Errors in arguments and files.
 INVALID = (RecordingError, ScenarioError, CodebookError, CalibrationError, ModelError,
            plugins.PluginError, OSError)
-# End of the error that messages do not match the scenario.
+# Advice after an error about messages that do not match the scenario.
 OTHER_SCENARIO = '; if the network uses another scenario, pass it with --config FILE'
 _NodeT = TypeVar('_NodeT', bound=Node)
 _FILES = {
@@ -63,18 +63,18 @@ def entry(
 ) -> Callable[..., int]:
     """Return the main function of a command whose command line may contain ROS arguments.
 
-    The function takes a command line, by default that of the process. It returns the exit code of
-    `work`, usually 0, including after a signal or when the reader closes the output; 1 after a
-    `ToolError`; 2 if an argument or a file is invalid.
+    The function takes the arguments, by default those of the process. It returns the exit code of
+    `work`; 0 after a signal or if the reader closes the output; 1 after a `ToolError`; 2 if an
+    argument or a file is invalid.
 
     Parameters
     ----------
     work
-        Takes the options, and the name of the program with its command line; returns an exit code.
+        Takes the options, and the command line with the name of the program.
     inputs, outputs
-        Options with names of files; no output may be an input or another output.
+        Options with names of files. All outputs must differ from each other and from the inputs.
     conflict
-        Returns the error if options contradict each other, otherwise ''.
+        Returns an error if options contradict each other, otherwise ''.
     """
     def main(arguments: Sequence[str] | None = None) -> int:
         parser, arguments = make_parser(), sys.argv[1:] if arguments is None else list(arguments)
@@ -101,18 +101,18 @@ def entry(
 
 
 def add_files(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Add options for files of what is known of a network: keys of `_FILES`."""
+    """Add options for files that describe a network; the names are keys of `_FILES`."""
     for name in names:
         parser.add_argument(f'--{name}', type=input_file, metavar='FILE', help=_FILES[name])
 
 
 def print_now(*values: object, end: str = '\n') -> None:
-    """Print and flush, so that a pipe receives the text at once."""
+    """Print and flush, so that the reader of a pipe receives the text at once."""
     print(*values, end=end, flush=True)
 
 
 def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> str:
-    """Return a table, aligned by ``<`` or ``>`` for each column; heads may have several lines."""
+    """Return a table; `align` has ``<`` or ``>`` for each column; heads may have several lines."""
     lines = [*itertools.zip_longest(*(head.split('\n') for head in heads), fillvalue=''), *rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return '\n'.join('  '.join(
@@ -121,7 +121,7 @@ def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) 
 
 
 def none_within(what: str, timeout_s: float) -> ToolError:
-    """Return the error for what a network did not provide within a time [s]."""
+    """Return the error that a network did not provide something within a time [s]."""
     return ToolError(f'{what} within {timeout_s:g} s, in the domain '
                      f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace')
 
@@ -129,9 +129,9 @@ def none_within(what: str, timeout_s: float) -> ToolError:
 def observe(
         make: Callable[[], _NodeT], arguments: Sequence[str],
         done: Callable[[_NodeT], bool] = lambda node: False) -> tuple[int, _NodeT | None]:
-    """Spin a node until a signal arrives or it is done.
+    """Create a node, and spin it until a signal arrives or `done` returns True.
 
-    Return the exit code of `rhs_isac_ros.ros.run.run`, and the node, or None if that fails.
+    Return the exit code of `run`, and the node, or None if its creation failed.
     """
     nodes: list[_NodeT] = []
 
@@ -144,7 +144,7 @@ def observe(
 
 def subscribe_codebooks(
         node: Node, scenario: Scenario, on_codebook: Callable[[Codebook], None]) -> None:
-    """Subscribe to the codebooks of a network; those that do not fit the scenario are dropped."""
+    """Subscribe to the codebooks of a network that fit the scenario; drop all others."""
     def receive(message: ros.Codebook) -> None:
         try:
             codebook = convert.codebook_from_ros(message)
@@ -171,18 +171,11 @@ def topic_prefix(namespace: str) -> str:
 def recorded(
         path: Path, namespace: str, scenario: Scenario, kinds: Collection[type]
 ) -> Iterator[tuple[Any, float]]:
-    """Yield what a network published, and when [s], in the order in which it was recorded.
+    """Yield the recorded messages of a network and their times [s], in order.
 
-    Parameters
-    ----------
-    kinds
-        Messages of the protocol; also `Codebook`, and `Report` for pairs of the name of a node and
-        its report.
-
-    Raises
-    ------
-    RecordingError
-        If the file is not a recording, or a message is malformed or does not fit the scenario.
+    The `kinds` are classes of messages, `Codebook`, or `Report`, which yields pairs of a node's
+    name and its report. Raises RecordingError if the file is not a recording, or a message is
+    malformed or does not fit the scenario.
     """
     prefix = topic_prefix(namespace)
     names: dict[type, str] = {**topics.NAMES, Codebook: topics.CODEBOOK}
@@ -209,7 +202,7 @@ def recorded(
 
 
 class Session(contextlib.AbstractContextManager['Session']):
-    """A context manager with one node, which the command itself spins."""
+    """A context manager with a node that the command itself spins."""
 
     def __init__(self, arguments: Sequence[str] = ('',)) -> None:
         startup.use_discovery_profile()
@@ -226,7 +219,7 @@ class Session(contextlib.AbstractContextManager['Session']):
         try_shutdown()
 
     def spin_until(self, condition: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Spin until a condition holds, or for a time [s] if given; return whether it holds."""
+        """Spin until a condition holds, at most for `timeout_s`; return whether it holds."""
         end_s = None if timeout_s is None else time.monotonic() + timeout_s
         while not condition():
             if end_s is not None and time.monotonic() >= end_s:
@@ -235,7 +228,7 @@ class Session(contextlib.AbstractContextManager['Session']):
         return True
 
     def discover(self, timeout_s: float) -> None:
-        """Spin until the graph has other nodes and no longer changes, or for a time [s]."""
+        """Spin until the graph has other nodes and has settled, at most for `timeout_s`."""
         graph, changed_s = self._graph(), time.monotonic()
 
         def settled() -> bool:
@@ -252,7 +245,7 @@ class Session(contextlib.AbstractContextManager['Session']):
                        *self.node.get_node_names_and_namespaces()], key=repr)
 
     def full_name(self, topic: str) -> str:
-        """Return the full name of a topic whose name may be relative, or raise `ToolError`."""
+        """Return the full name of a topic, or raise `ToolError` if its name is invalid."""
         try:
             name = expand_topic_name(topic, self.node.get_name(), self.node.get_namespace())
             validate_full_topic_name(name)
@@ -265,7 +258,7 @@ class Session(contextlib.AbstractContextManager['Session']):
 def run_verb(options: argparse.Namespace, arguments: list[str]) -> int:
     """Call ``options.verb`` with a session and the options, and return the exit code.
 
-    Errors have no name of a program in front, as those of ``ros2``.
+    As in ``ros2``, errors do not start with the name of the program.
     """
     try:
         with Session(arguments) as session, startup.one_line():

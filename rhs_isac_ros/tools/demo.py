@@ -1,4 +1,4 @@
-"""The executable ``demo``: runs a whole network as processes and reports on its cycles."""
+"""The executable ``demo``: runs each node of a network as a process, and reports the cycles."""
 
 import argparse
 import contextlib
@@ -44,19 +44,19 @@ from rhs_isac_ros.tools.pictures import compose_cycles, prepare_drawing
 
 # Maximum time between two complete cycles [s].
 _CYCLE_TIMEOUT_S = 60.0
-# Time between two looks at the nodes that have been discovered, and at the others [s].
+# Period of checks until all nodes are discovered, and afterwards [s].
 _DISCOVERY_PERIOD_S, _PERIOD_S = 0.02, 0.5
 _PHASES = (Phase.BEACONING, Phase.POSITIONING, Phase.ESTIMATING, Phase.TRANSMITTING)
 _HEADS = ('cycle', 'user', 'true position [m]', 'estimate [m]', 'error\n[m]', '√CRLB\n[m]',
           'beacon\n[ms]', 'sound\n[ms]', 'locate\n[ms]', 'data\n[ms]', 'capacity\n[Mbit/s]',
           'loss\n[%]')
 _STAT_FILE = Path('/proc/self/stat')
-# Index of the time of the start among the fields that follow the name of the program.
+# Index of the start time among the fields after the name of the program.
 _START_FIELD = 19
 
 
 def add_network_options(parser: argparse.ArgumentParser) -> None:
-    """Add the seed and the files of a network to the options of a command."""
+    """Add the options for the seed and the files of a network."""
     parser.add_argument('--seed', type=seed, default=0, help='seed of all random numbers')
     parser.add_argument('--config', '--scenario', type=input_file, metavar='FILE',
                         help="scenario file; by default the paper's Table I")
@@ -65,7 +65,7 @@ def add_network_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_users(parser: argparse.ArgumentParser, users: int) -> None:
-    """Exit with a usage error if a process for each user would overload this machine."""
+    """Exit with a usage error if one process for each user would overload this machine."""
     limit = max_user_processes()
     if users > limit:
         parser.error(f'argument --users: {users}, expected at most {limit} on this machine, '
@@ -73,17 +73,14 @@ def check_users(parser: argparse.ArgumentParser, users: int) -> None:
 
 
 def max_user_processes() -> int:
-    """Return the number of users that this machine can run as processes of their own."""
+    """Return the number of users that this machine can run as separate processes."""
     return max_processes() - len(UNIQUE)
 
 
 def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Path]:
-    """Return a scenario, and the absolute path of a codebook file that matches it.
+    """Return a scenario, and the absolute path of a codebook file that fits it.
 
-    Raises
-    ------
-    ScenarioError, CodebookError
-        If a file is invalid, or the codebook does not match the scenario.
+    Raises ScenarioError or CodebookError if a file is invalid or the codebook does not fit.
     """
     scenario = choose_scenario(config)
     codebook_file = Path(codebook or default_codebook_file()).resolve()
@@ -94,19 +91,19 @@ def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Pa
 def start_network(
         processes: Processes, users: int, scenario: Scenario, *, together: bool = False,
         **given: Any) -> None:
-    """Start each node of a network in a process of its own.
+    """Start each node of a network in a separate process.
 
     Parameters
     ----------
     users
-        Number of users; they walk at random at the scenario's maximum speed.
+        Number of users, who walk at random at the scenario's maximum speed.
     scenario
-        Scenario of the parameter ``scenario_file``.
+        Scenario in the file of the parameter ``scenario_file``.
     together
-        Whether the users share one node, named ``users``, instead of a node for each.
+        Whether all users share the node ``users``.
     given
-        Parameters, for each node that has them; None stands for the default. With
-        ``first_cycle=1``, cycles are reproducible for a seed.
+        Parameters of all nodes that have them; None selects the default. With ``first_cycle=1``,
+        cycles are reproducible for a seed.
     """
     for role, member in ROSTER.items():
         known = {parameter.name for parameter in parameters.NODES[role]}
@@ -128,17 +125,9 @@ def watch(
         on_discovered: Callable[[], None] | None = None) -> str:
     """Spin an observer until it has received a number of complete cycles.
 
-    Parameters
-    ----------
-    on_progress
-        Called with the number of complete cycles and `cycles` when the former changes.
-    on_discovered
-        Called when the observer has discovered all nodes.
-
-    Returns
-    -------
-    str
-        The error that ended the wait; empty if there was none.
+    `on_progress` is called with the present and the final number whenever the former changes, and
+    `on_discovered` when the observer has discovered all nodes. Return the error that ended the
+    wait, or ''.
     """
     seen, changed_s = -1, time.monotonic()
     while seen < cycles:
@@ -160,7 +149,7 @@ def watch(
 
 
 def table(cycles: Sequence[CompleteCycle]) -> str:
-    """Return a table with one line for each cycle."""
+    """Return a table of cycles, one in each line."""
     return text_table(_HEADS, map(_row, cycles), '>' * len(_HEADS))
 
 
@@ -176,7 +165,7 @@ def _row(cycle: CompleteCycle) -> list[str]:
 
 
 def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) -> str:
-    """Return statistics of at least one complete cycle, and a line for each that was given up."""
+    """Return statistics of at least one complete cycle, and a line for each cycle given up."""
     errors = np.array([cycle.error_m for cycle in cycles])
     bounds = np.sqrt([cycle.estimate.crlb_m2 for cycle in cycles])
     lengths = np.array([cycle.duration_s for cycle in cycles])
@@ -195,12 +184,12 @@ def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) ->
 
 
 def process_age_s() -> float | None:
-    """Return the time since the start of this process [s]; None if the system does not provide it.
+    """Return the time since this process started [s], or None if it is not available.
 
-    A script that ends with ``exec`` is part of the process.
+    This includes the time of a script that ended with ``exec``.
     """
     try:
-        # The name of the program, in parentheses, may have spaces.
+        # The name of the program, in parentheses, may contain spaces.
         fields = _STAT_FILE.read_text(encoding='utf-8').rpartition(')')[2].split()
         started_s = int(fields[_START_FIELD]) / os.sysconf('SC_CLK_TCK')
         return max(time.clock_gettime(time.CLOCK_BOOTTIME) - started_s, 0.0)
@@ -211,12 +200,7 @@ def process_age_s() -> float | None:
 def parts_text(begin_s: float, parts: Sequence[tuple[str, float]]) -> str:
     """Return a line with the total and the parts, such as ``time: 2.1 s (first 0.40, ...)``.
 
-    Parameters
-    ----------
-    begin_s
-        Time at which the first part began [s].
-    parts
-        Name of each part, and the time at which it ended [s].
+    The first part began at `begin_s`; `parts` contains the name and the end [s] of each part.
     """
     times_s = [begin_s, *(end_s for _, end_s in parts)]
     texts = [f'{name} {end_s - start_s:.2f}' for (name, end_s), start_s in zip(
@@ -225,13 +209,10 @@ def parts_text(begin_s: float, parts: Sequence[tuple[str, float]]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the demonstration.
+    """Run the demonstration, and return its exit code.
 
-    Returns
-    -------
-    int
-        Exit code: 0 if every cycle was served or its signals gave no position, including after
-        Ctrl-C; 1 if not; 2 if an argument or a file is invalid.
+    It is 0 if every cycle was served or had no fix, even after Ctrl-C; 1 otherwise; 2 if an
+    argument or a file is invalid.
     """
     parser = _parser()
     options = parser.parse_args(arguments)
@@ -255,7 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(
         scenario: Scenario, codebook_file: Path, recorder: Recorder | None,
         options: argparse.Namespace) -> int:
-    """Run the network until its cycles are complete, and report on them; return the exit code."""
+    """Run the network until the cycles are complete, report them, and return the exit code."""
     log, code = CycleLog(), 0
     now_s, age_s = time.monotonic(), process_age_s()
     parts = [('imports', now_s)]
@@ -265,7 +246,7 @@ def _run(
     if together:
         print(f'the {options.users} users share one process', file=sys.stderr)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
-        # The log of the cycles is complete when the processes are about to end.
+        # The processes run until the cycles are observed.
         with Processes(Path(logs), {'ROS_LOG_DIR': logs}, fork=True) as processes:
             problem = ''
             try:
@@ -279,7 +260,7 @@ def _run(
                             scenario.max_user_speed_mps, 0.01))
                     problem = _observe(log, processes, recorder, options.cycles, parts)
             finally:
-                # Also if a signal arrives before the observer exists.
+                # A signal may arrive before the observer exists.
                 if recorder is not None:
                     recorder.close()
             processes.interrupt()
@@ -294,11 +275,11 @@ def _run(
 def _observe(
         log: CycleLog, processes: Processes, recorder: Recorder | None, cycles: int,
         parts: list[tuple[str, float]]) -> str:
-    """Observe a number of cycles, and return the error that ended them; empty if none did."""
+    """Observe a number of cycles, and return the error that ended the observation, or ''."""
     rclpy.init(args=startup.prepare(['demo']))
     with startup.one_line():
         observer = CycleObserver(recorder, log=log, **startup.WITHOUT_SERVICES)
-    # The network needs a moment to start.
+    # Use the time in which the network starts.
     prepare_drawing()
     discovered_s: list[float] = []
     try:

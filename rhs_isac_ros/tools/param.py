@@ -1,4 +1,4 @@
-"""``scripts/param``: ``ros2 param``, which the wheels lack, with the same output."""
+"""``scripts/param``: replaces ``ros2 param``, which has no wheel, with the same output."""
 
 import argparse
 import sys
@@ -18,7 +18,7 @@ from rclpy.task import Future
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run_verb
 
-# Maximum time to discover a node [s]. With DDS security, keys are exchanged first.
+# Maximum time to discover a node [s], including the exchange of keys for DDS security.
 _DISCOVERY_TIMEOUT_S = 10.0
 # Maximum time to discover a node's services, and for a response [s].
 _SERVICE_TIMEOUT_S = 5.0
@@ -35,7 +35,7 @@ _LABELS = {
 }
 
 
-# Each of the following raises a ToolError if the node does not exist or does not respond.
+# Each of the following functions raises ToolError if the node does not exist or does not respond.
 
 def get(session: Session, options: argparse.Namespace) -> None:
     """Print the value of a parameter."""
@@ -59,7 +59,7 @@ def set_value(session: Session, options: argparse.Namespace) -> None:
 
 
 def show_list(session: Session, options: argparse.Namespace) -> None:
-    """Print the names of the parameters of one node or of all nodes."""
+    """Print the names of the parameters of one node, or of all nodes."""
     if options.node_name:
         nodes = [_find(session, options)]
     else:
@@ -88,7 +88,7 @@ def dump(session: Session, options: argparse.Namespace) -> None:
 
 
 def load(session: Session, options: argparse.Namespace) -> None:
-    """Set the parameters that a parameter file contains for any node."""
+    """Set the parameters in a parameter file, whatever their nodes."""
     file = options.parameter_file
     try:
         names = list(parameter_dict_from_yaml_file(file, use_wildcard=True))

@@ -16,26 +16,26 @@ from rhs_isac_ros.monitoring.shapes import MIN_LEVEL_DB
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.support.pictures import PAGE_IN, label_decades, look, new_figure, paper_style
 
-# Height of the errors and of all that surrounds the panels [in], and the share of the width that
-# the view from above has.
+# Height of the panel of errors, and of everything around the panels [in]; share of the width for
+# the view from above.
 _ERRORS_IN, _REST_IN, _VIEW_SHARE = 1.4, 1.9, 0.94
 _SCENE_IN = 5.7
-# Space around the region and the surface [m]; ellipses may need more, up to a share of the region.
+# Space around the region and the surface [m]; for ellipses, up to a share of the region is added.
 _MARGIN_M, _CYCLES_MAX_MARGIN, _SCENE_MAX_MARGIN = 0.8, 0.4, 0.25
-# Height of an axes for the legend relative to the others; the layout adds that of the legend. A
-# legend of the figure gets room from the layout only since Matplotlib 3.7.
+# Relative height of the axes for the legend, to which the layout adds the legend itself. For the
+# legend of a figure, the layout has reserved space only since Matplotlib 3.7.
 _LEGEND_ROW = 0.001
-# Maximum numbers of cycles with a number in the view, and of users in the legends.
+# Maximum number of cycles with a number in the view, and of users in each legend.
 _MAX_NUMBERS, _CYCLES_MAX_LABELS, _SCENE_MAX_LABELS = 60, 6, 8
-# Line width of the surface: to scale, a surface of some decimetres would be too thin to see.
+# Line width of the surface, which is too small to be visible to scale.
 _SURFACE_WIDTH_POINTS = 5
 _PATTERN_STEP_DEG = 1.0
 _REGION: dict[str, Any] = {'facecolor': '0.95', 'edgecolor': '0.4', 'linestyle': '--'}
 
 
 def prepare_drawing() -> None:
-    """Import what the pictures need, so that drawing does not have to wait for it."""
-    # Not at the start of the program, which has more urgent imports.
+    """Import the libraries for the pictures, so that drawing does not have to wait for them."""
+    # Imported here, because the program has more urgent imports at its start.
     from matplotlib import figure, patches, style
     from matplotlib.backends import backend_agg
 
@@ -46,7 +46,7 @@ def prepare_drawing() -> None:
 def compose_cycles(cycles: Sequence[CompleteCycle], scenario: Scenario) -> Any:
     """Return the `matplotlib.figure.Figure` of at least one cycle."""
     low, high = _limits_m(scenario, [cycle.estimate for cycle in cycles], _CYCLES_MAX_MARGIN)
-    # So that the view with its equal scales fills the width.
+    # With this height and equal scales, the view fills the width.
     view_in = PAGE_IN * _VIEW_SHARE * (high[1] - low[1]) / (high[0] - low[0])
     figure = new_figure(PAGE_IN, view_in + _ERRORS_IN + _REST_IN)
     above, view, errors = figure.subplots(
@@ -83,7 +83,7 @@ def compose_cycles(cycles: Sequence[CompleteCycle], scenario: Scenario) -> Any:
 
 @paper_style()
 def compose_scene(scene: SceneState, scenario: Scenario) -> Any:
-    """Return the `matplotlib.figure.Figure` of a scene as far as it is known."""
+    """Return the `matplotlib.figure.Figure` of a scene, of which parts may be unknown."""
     figure = new_figure(PAGE_IN, _SCENE_IN)
     limits_m = _limits_m(scenario, [user.estimate for user in scene.users.values()
                                     if user.estimate], _SCENE_MAX_MARGIN)
@@ -118,11 +118,11 @@ def compose_scene(scene: SceneState, scenario: Scenario) -> Any:
 def _limits_m(
         scenario: Scenario, estimates: Collection[m.PositionEstimate], max_margin: float
 ) -> np.ndarray:
-    """Return the corners of a view of region, surface and ellipses, float64 [2, 3] [m]."""
+    """Return the limits of a view of region, surface and ellipses, float64 [2, 3] [m]."""
     region, board = scenario.roi_bounds_m, shapes.board(scenario, None).centres
     means = np.reshape([estimate.position for estimate in estimates], (-1, 3))
     variances = np.reshape([estimate.covariance_m2.diagonal() for estimate in estimates], (-1, 3))
-    # Half the extent of an ellipse depends on the variance along the axis alone.
+    # The extent of an ellipse along an axis depends only on the variance along this axis.
     halves = shapes.distance_95(2) * np.sqrt(np.maximum(variances, 0))
     margin = max_margin * (region[1] - region[0])
     low = np.maximum((means - halves).min(axis=0, initial=np.inf), region[0] - margin)
@@ -133,7 +133,7 @@ def _limits_m(
 
 
 def _draw_room(axes: Any, plane: list[int], scenario: Scenario) -> None:
-    """Draw the region and the surface in the plane of two axes."""
+    """Draw the region and the surface in a plane of two coordinates."""
     from matplotlib.patches import Rectangle
 
     region, board = shapes.region(scenario), shapes.board(scenario, None)
@@ -149,7 +149,7 @@ def _draw_room(axes: Any, plane: list[int], scenario: Scenario) -> None:
 
 def _draw_ellipse(
         axes: Any, plane: list[int], estimate: m.PositionEstimate, **style: Any) -> None:
-    """Draw the ellipse that contains 95 % of the posterior in the plane of two axes."""
+    """Draw the ellipse that contains 95 % of the posterior in a plane of two coordinates."""
     from matplotlib.patches import Ellipse
 
     half_m, directions = shapes.axes_95(estimate.covariance_m2[np.ix_(plane, plane)])
@@ -172,7 +172,7 @@ def _draw_positions(view: Any, user: int, cycles: Sequence[CompleteCycle]) -> No
 
 
 def _number(view: Any, cycle: CompleteCycle) -> None:
-    """Write the number of a cycle beside the true position, on the side without estimate."""
+    """Write the number of a cycle beside the true position, opposite to the estimate."""
     from matplotlib.patheffects import withStroke
 
     right = cycle.estimate.position[0] < cycle.truth.position[0]
@@ -297,5 +297,5 @@ def _patch(label: str, **style: Any) -> Any:
 
 
 def _further(users: Sequence[int], n_shown: int) -> list[Any]:
-    """Return a line of a legend with the number of users that are not shown."""
+    """Return a line for a legend with the number of users that are not shown."""
     return [_mark(f'and {len(users) - n_shown} more users')] if len(users) > n_shown else []

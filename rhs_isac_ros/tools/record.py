@@ -11,7 +11,7 @@ from rhs_isac_ros.tools.command import ToolError, choose_scenario, entry, observ
 
 
 class RecorderNode(Node):
-    """Records the topics of its namespace until it is destroyed; the caller closes the file."""
+    """Records the topics in its namespace; the caller closes the file."""
 
     def __init__(self, recorder: Recorder) -> None:
         super().__init__('recorder', **WITHOUT_SERVICES)

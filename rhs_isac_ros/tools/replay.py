@@ -1,6 +1,6 @@
-"""``scripts/replay FILE``: feeds the received signals of a recording to estimators.
+"""``scripts/replay FILE``: passes the received signals in a recording to estimators.
 
-With ``--publish``, it publishes them to running nodes instead.
+With ``--publish``, it publishes the signals to running nodes instead.
 """
 
 import argparse
@@ -48,17 +48,17 @@ from rhs_isac_ros.tools.command import ToolError
 
 _SIGNALS = topics.NAMES[m.ReceivedSignals]
 _ESTIMATES = topics.NAMES[m.PositionEstimate]
-# Period of looking for subscribers; maximum time to discover an optimizer, also while DDS security
-# exchanges keys [s].
+# Period of looking for subscribers; maximum time to discover an optimizer, without and with DDS
+# security [s].
 _POLL_PERIOD_S = 0.05
 _DISCOVERY_TIMEOUT_S = 2.0
 _SECURE_DISCOVERY_TIMEOUT_S = 8.0
-# Time without a new endpoint after which the publishers and subscribers of a network are taken as
-# complete [s]. Another publisher may be discovered after the first subscriber.
+# All publishers and subscribers of a network are assumed to be known if none has appeared for this
+# time [s]. Another publisher may be discovered after the first subscriber.
 _SETTLING_TIME_S = 1.0
 _ACK_TIMEOUT = Duration(seconds=5)
-# Topics that can be published again. The codebook is sent as a parameter instead, and diagnostics
-# and announcements of nodes would contradict those of the running nodes.
+# Topics that can be published again. The codebook is sent as a parameter; recorded diagnostics and
+# announcements would contradict the running nodes.
 _TOPICS = sorted(set(recorded_topics()) - {topics.CODEBOOK, topics.DIAGNOSTICS, topics.PRESENCE})
 # Defaults of the options for running nodes.
 _RATE = 1.0
@@ -66,25 +66,25 @@ _TIMEOUT_S = 60.0
 
 
 class RepublisherNode(Node):
-    """Publishes messages at their recorded times once all topics have subscribers.
+    """Publishes messages at their recorded times, once all topics have subscribers.
 
     Parameters
     ----------
     messages
         Relative name of the topic, message and time [s], sorted by time.
     names
-        Relative names of the topics; codebooks are passed to the optimizer instead.
+        Relative names of the topics to publish.
     rate
         Speed relative to the recording.
 
     Attributes
     ----------
     optimizer
-        Provides the codebooks; None if another node does.
+        Receives the codebooks; None if another node provides them.
     count
         Number of messages published.
     waits_for
-        First topic without subscribers; empty once messages are published.
+        First topic without subscribers, or ''.
     finished
         Whether all messages have been published.
     """
@@ -96,7 +96,7 @@ class RepublisherNode(Node):
         self.optimizer: OptimizerNode | None = None
         self.count, self.finished, self.waits_for = 0, False, next(iter(names))
         self._waits_s = self._publish(messages, rate)
-        # Endpoints at the last poll, and the time since when they are the same [s].
+        # Endpoints at the last poll, and the time of their last change [s].
         self._endpoints: list[tuple[int, int]] = []
         self._unchanged_since_s = time.monotonic()
         kinds = recorded_topics()
@@ -113,7 +113,7 @@ class RepublisherNode(Node):
             self._continue()
 
     def _endpoints_settled(self) -> bool:
-        """Return whether no endpoint of the topics has appeared or gone for some time."""
+        """Return whether no endpoint of the topics has appeared or disappeared for some time."""
         now_s = time.monotonic()
         endpoints = [
             (self.count_publishers(name), self.count_subscribers(name))
@@ -126,8 +126,8 @@ class RepublisherNode(Node):
         """Return whether the subscribers of a topic are present."""
         publisher, n_expected = self._message_publishers[name], 1
         if name == _SIGNALS:
-            # Observers may subscribe to the signals as well. Wait for the nodes that publish
-            # estimates, which subscribe to the signals only once their tables are complete.
+            # Observers may subscribe to the signals, too. Wait for the nodes that publish
+            # estimates, which subscribe to the signals when their tables are complete.
             estimators = {*map(full_name, self.get_publishers_info_by_topic(
                 self.resolve_topic_name(_ESTIMATES)))} - {self.get_fully_qualified_name()}
             subscribers = {*map(
@@ -150,9 +150,8 @@ class RepublisherNode(Node):
 
     def _publish(
             self, messages: Iterable[tuple[str, Any, float]], rate: float) -> Iterator[float]:
-        """Publish messages; yield the time until the next one is due, whenever it is not [s]."""
-        # Time on the steady clock at the recorded time 0 [s]. Codebooks before the first message
-        # are due at once.
+        """Publish messages; yield the time until the next one is due [s], unless it is due."""
+        # Steady time at the recorded time 0 [s]. Codebooks before the first message are due now.
         origin_s = -math.inf
         for name, message, time_s in messages:
             if origin_s == -math.inf and name != topics.CODEBOOK:
@@ -167,7 +166,7 @@ class RepublisherNode(Node):
                     ros_parameters(convert.codebook_from_ros(message).to_parameters()))
 
     def check(self, end_s: float, timeout_s: float) -> None:
-        """Raise a ToolError if the messages cannot be published, or not until `end_s` [s]."""
+        """Raise ToolError if another node publishes, or there is no subscriber by `end_s`."""
         for name, publisher in self._message_publishers.items():
             if self.count_publishers(publisher.topic_name) > 1:
                 raise ToolError(f'{name}: already published by another node')
@@ -176,7 +175,7 @@ class RepublisherNode(Node):
 
 
 def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
-    """Publish a recording to running nodes; return the exit code of `run`."""
+    """Publish a recording to running nodes, and return the exit code."""
     names = options.topic or [_SIGNALS]
     scenario = command.choose_scenario(options.config, options.file)
     first_codebook = _first_codebook(options) if _SIGNALS in names else None
@@ -208,14 +207,14 @@ def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
 
 def _messages(
         options: argparse.Namespace, names: Iterable[str]) -> Iterator[tuple[str, Any, float]]:
-    """Yield messages of a recording with the relative names of their topics."""
+    """Yield the topic (relative name), message and time [s] of the messages in a recording."""
     full_names = {f'{command.topic_prefix(options.namespace)}{name}': name for name in names}
     for topic, message, time_s in read(options.file, full_names):
         yield full_names[topic], message, time_s
 
 
 def _first_codebook(options: argparse.Namespace) -> Codebook:
-    """Return the codebook with which the first signals were received."""
+    """Return the codebook that was used to receive the first signals."""
     used = ''
     codebooks: dict[str, Any] = {}
     for name, message, _ in _messages(options, [_SIGNALS, topics.CODEBOOK]):
@@ -240,7 +239,7 @@ def _first_codebook(options: argparse.Namespace) -> Codebook:
 
 
 def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
-    """Create an optimizer that provides a codebook; it reads the scenario from a file once."""
+    """Create an optimizer that provides a codebook."""
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
         file = Path(folder) / 'scenario.yaml'
         file.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
@@ -265,15 +264,8 @@ class Recording:
 def load(path: Path, namespace: str = '/', config: Path | None = None) -> Recording:
     """Load the complete cycles of a network from a recording.
 
-    Parameters
-    ----------
-    config
-        File of the scenario to use instead of the recorded one.
-
-    Raises
-    ------
-    RecordingError, ScenarioError
-        If a file is invalid, as for `recorded`, or there is no complete cycle in the namespace.
+    The scenario file `config` replaces the recorded scenario. Raises RecordingError or
+    ScenarioError if a file is invalid, or there is no complete cycle in the namespace.
     """
     scenario = command.choose_scenario(config, path)
     log = CycleLog()
@@ -291,14 +283,12 @@ def load(path: Path, namespace: str = '/', config: Path | None = None) -> Record
 def errors_m(
         cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator],
         track_speed_mps: float | None = None) -> np.ndarray:
-    """Estimate the position of every cycle again, and return the errors.
+    """Repeat the position estimate of each cycle, and return the errors.
 
     Parameters
     ----------
-    cycles
-        Complete cycles, with their received signals and true positions.
     estimators
-        Estimators by the id of the codebook with which the signals were received.
+        Estimators, by the id of the codebook for the signals.
     track_speed_mps
         Typical speed of the users [m/s], to track them over the cycles; None: no tracks.
 
@@ -341,7 +331,7 @@ def _conflict(options: argparse.Namespace) -> str:
 
 
 def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
-    """Publish a recording, or print a table of its errors and of those of estimators."""
+    """Publish a recording, or print a table of recorded and repeated errors."""
     if options.publish:
         return _republish(options, arguments)
     recording = load(options.file, options.namespace, options.config)
@@ -374,7 +364,7 @@ def _row(name: str, errors: np.ndarray) -> list[str]:
 
 
 def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
-    """Return the codebooks to assume, by the id of the codebook used for the signals."""
+    """Return the codebooks to assume, by the id of the recorded codebook."""
     used = sorted({cycle.signals.codebook_id for cycle in recording.cycles})
     if file:
         codebook = Codebook.load(file)

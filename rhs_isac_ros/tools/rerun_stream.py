@@ -1,4 +1,4 @@
-"""A view as a recording of Rerun: in a file, or served to browsers. Needs the library rerun."""
+"""Output of a view to Rerun: a file, or a server for browsers. Requires the library rerun."""
 
 import os
 import socket
@@ -21,18 +21,18 @@ _VERSION = '0.22'
 _TIMELINE = 'cycle'
 # Number of coordinates in a plane.
 _PLANE = 2
-# Sizes in points of the screen.
+# Sizes in screen points.
 _DOT_SIZE, _LINE_WIDTH, _OUTLINE_WIDTH = 4.0, 2.0, 1.2
-# A mesh is a grid of thin dim lines, of which only every second is drawn, so that entities behind
-# it remain visible.
+# A mesh is drawn as every second line of its grid, thin and dim, so that entities behind it remain
+# visible.
 _MESH_WIDTH, _MESH_STEP, _MESH_DIM = 0.6, 2, 0.45
 _BACKGROUND = (16, 18, 22)
-# Maximum time until the server of the viewer listens, and the period of the attempts [s].
+# Maximum time for the server of the viewer to start, and period of checking [s].
 _START_S, _POLL_S = 20.0, 0.05
 
 
 class RerunStream:
-    """Writes the entries of a view, or raises MissingLibraryError without rerun-sdk 0.22."""
+    """Writes the entries of a view; raises MissingLibraryError if rerun-sdk 0.22 is missing."""
 
     def __init__(self) -> None:
         with optional_import('view', extra='view'):
@@ -44,12 +44,12 @@ class RerunStream:
         self._rerun = rerun
         rerun.set_strict_mode(True)
         self._stream = rerun.new_recording('rhs_isac_ros')
-        # The file until it is complete, and its final path.
+        # The incomplete file, and its final path.
         self._files: tuple[Path, Path] | None = None
         self._server: subprocess.Popen[bytes] | None = None
 
     def save(self, path: Path) -> None:
-        """Write to a file, which is ``<name>.part`` until `close`; raise OSError if this fails."""
+        """Write to ``<name>.part``, which `close` renames; raise OSError if this fails."""
         partial = path.with_name(f'{path.name}.part')
         self._files = partial, path
         # Rerun reports an unwritable file without its reason.
@@ -58,29 +58,19 @@ class RerunStream:
         self._begin()
 
     def serve(self, port: int, bind: str) -> str:
-        """Serve the viewer on a port and the data on the next one; return the address.
+        """Serve the viewer on a port, and the data on the next one; return the address.
 
-        The port after these receives the data from this process.
-
-        Parameters
-        ----------
-        bind
-            Address of the network interface; ``0.0.0.0`` stands for all.
-
-        Raises
-        ------
-        OSError
-            If a port is not free, or the address is not one of this machine.
-        RuntimeError
-            If the server does not start.
+        The third port receives the data from this process. `bind` is the address of the network
+        interface, or ``0.0.0.0`` for all. Raises OSError if a port is not free or the address does
+        not belong to this machine, and RuntimeError if the server does not start.
         """
         ports = range(port, port + 3)
         for number in ports:
             with socket.socket() as probe:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind((bind, number))
-        # A process, because a server in this one would listen on all network interfaces. It ends
-        # with this process. `python -m rerun` would run it as a child of its own.
+        # A server in this process would listen on all network interfaces. The kernel ends the new
+        # process with this one, unlike a server that `python -m rerun` starts.
         program = Path(self._rerun.__file__).parents[1] / 'rerun_cli' / 'rerun'
         self._server = subprocess.Popen(
             ['setpriv', '--pdeathsig', 'TERM', program, '--serve-web', '--bind', bind,
@@ -115,13 +105,13 @@ class RerunStream:
                 path, _archetype(entity), static=not cycle, recording=self._stream)
 
     def close(self) -> None:
-        """Complete the file, or end the service."""
+        """Complete the file, or stop the server."""
         self._disconnect()
         if self._files:
             os.replace(*self._files)
 
     def discard(self) -> None:
-        """Remove the incomplete file, or end the service."""
+        """Remove the incomplete file, or stop the server."""
         self._disconnect()
         if self._files:
             self._files[0].unlink(missing_ok=True)
@@ -155,7 +145,7 @@ def blueprint() -> 'rerun.blueprint.Blueprint':
             x_range=[-1.25 * reach, 1.1 * reach], y_range=[-1.1 * height, 0.2 * height]))
     positioning = rrb.Spatial2DView(origin=network_view.POSITIONING, name='Surface: pilots')
     transmission = rrb.Spatial2DView(origin=network_view.TRANSMISSION, name='Surface: data')
-    # New values appear on the right, where a legend would hide them; a single series needs none.
+    # On the right, the legend would hide new values. A single series needs no legend.
     error, *others = (
         rrb.TimeSeriesView(origin=path, name=title, plot_legend=rrb.PlotLegend(
             rrb.Corner2D.LeftTop, visible=path != 'loss'))
@@ -199,7 +189,7 @@ def _archetype(entity: shapes.Entity) -> Any:
             return lines(strips, colors=_colours([colour]), radii=_radius(width))
         case shapes.Mesh(points, colour):
             grid = [*points[::_MESH_STEP], *np.swapaxes(points, 0, 1)[::_MESH_STEP]]
-            # Most lines of a lobe have no extent.
+            # Most lines of a lobe are a single point.
             return rr.LineStrips3D(
                 [line for line in grid if line.any()], radii=_radius(_MESH_WIDTH),
                 colors=_colours(_MESH_DIM * np.array([colour])))
@@ -220,7 +210,7 @@ def _archetype(entity: shapes.Entity) -> Any:
 
 
 def _radius(width: float) -> float:
-    """Convert a width in points of the screen: Rerun uses negative radii for these."""
+    """Convert a width in screen points to a radius, which is negative in Rerun."""
     return -width / 2
 
 

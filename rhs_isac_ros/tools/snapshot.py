@@ -21,25 +21,22 @@ from rhs_isac_ros.tools.command import ToolError
 from rhs_isac_ros.tools.pictures import compose_scene
 
 _PROGRAM = 'snapshot'
-# Within this time [s], every user publishes its true position; within twice this time, the
-# surface publishes its configuration.
+# Every user publishes its true position within this time [s]. The surface publishes its
+# configuration within twice this time.
 _REPORT_PERIOD_S = 0.5
 
 
 class SnapshotNode(Node):
-    """Collects the scene of its namespace, with times of `time.monotonic`.
+    """Collects the scene in its namespace, with times of `time.monotonic`.
 
-    Attributes
-    ----------
-    mismatch
-        Error of the last message that does not match the scenario; empty if there was none.
+    `mismatch` is the error of the last message that did not match the scenario, or ''.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__('snapshot', **WITHOUT_SERVICES)
         self.scene = SceneState()
         self.mismatch = ''
-        # Times of the first message, and at which the scene could be drawn first.
+        # Time of the first message, and first time at which the scene was drawable.
         self._began_s = self._drawable_s = math.inf
         subscribe_messages(
             self, SCENE_RECEIVES, scenario.sizes, self._on_message, self._on_mismatch)
@@ -57,8 +54,8 @@ class SnapshotNode(Node):
     def is_ready(self, wait_s: float) -> bool:
         """Return whether to draw the scene.
 
-        This is the case when every user has had time to report and the scene is complete, or has
-        been incomplete for longer than `wait_s` [s].
+        Every user must have had time to report. The scene must be complete, or drawable for longer
+        than `wait_s`.
         """
         now_s, scene = time.monotonic(), self.scene
         return now_s > self._began_s + _REPORT_PERIOD_S and (
@@ -66,7 +63,7 @@ class SnapshotNode(Node):
 
     @property
     def has_other_scenario(self) -> bool:
-        """Whether the network uses another scenario: no surface configuration matches."""
+        """Whether the network seems to use another scenario: no configuration matches."""
         return bool(self.mismatch and self.scene.configuration is None
                     and time.monotonic() > self._began_s + 2 * _REPORT_PERIOD_S)
 
@@ -89,7 +86,7 @@ def _snapshot(options: argparse.Namespace, arguments: list[str]) -> int:
 
 
 def draw(scene: SceneState, scenario: Scenario, path: Path) -> None:
-    """Draw a scene and print what it lacks, or raise ToolError if the file cannot be written."""
+    """Draw a scene, and print the missing parts; raise ToolError if the file is not writable."""
     missing = _missing(scene)
     if missing:
         print(f'{_PROGRAM}: not in the picture: {"; ".join(missing)}', file=sys.stderr)
@@ -101,7 +98,7 @@ def draw(scene: SceneState, scenario: Scenario, path: Path) -> None:
 
 
 def _missing(scene: SceneState) -> list[str]:
-    """Describe each part that a scene lacks."""
+    """Return a description of each part that is missing in a scene."""
     parts = []
     if scene.configuration is None:
         parts.append('the configuration of the surface')

@@ -1,4 +1,4 @@
-"""``scripts/topic``: ``ros2 topic``, which the wheels lack, with the same output."""
+"""``scripts/topic``: replaces ``ros2 topic``, which has no wheel, with the same output."""
 
 import argparse
 import array
@@ -20,20 +20,16 @@ from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run_verb
 
 _MAX_LENGTH = 128
-# Number of messages whose rate is measured.
+# Maximum number of latest messages in a rate.
 _MAX_TIMES = 10001
-# Time for the discovery of other nodes [s]: unlike ``ros2``, there is no daemon with their names.
+# Time for the discovery of other nodes [s]: unlike for ``ros2``, no daemon knows them already.
 _DISCOVERY_TIMEOUT_S = 3.0
 
 
 def as_yaml(message: Any, max_length: int | None = None) -> str:
-    """Return a ROS message as YAML, ending with a newline.
+    """Return a ROS message as YAML that ends with a newline.
 
-    Parameters
-    ----------
-    max_length
-        Maximum number of entries of an array or characters of a string; the rest is replaced by
-        dots. None: unlimited.
+    Dots replace the entries of an array or the characters of a string beyond `max_length`, if any.
     """
     return yaml.dump(_plain(message, max_length), sort_keys=False, allow_unicode=True,
                      width=sys.maxsize, default_flow_style=False)
@@ -59,7 +55,7 @@ def _plain(value: Any, max_length: int | None) -> Any:
 
 
 def rate_text(times_ns: Sequence[int]) -> str:
-    """Return the two lines that ``ros2 topic hz`` prints for the times of messages [ns]."""
+    """Return the two lines that ``ros2 topic hz`` prints for messages at given times [ns]."""
     intervals_s = 1e-9 * np.diff(times_ns)
     mean_s = intervals_s.mean()
     return (f'average rate: {1 / mean_s if mean_s else 0.0:.3f}\n\tmin: {intervals_s.min():.3f}s '
@@ -76,7 +72,7 @@ def show_list(session: Session, options: argparse.Namespace) -> None:
 
 
 def show_info(session: Session, options: argparse.Namespace) -> None:
-    """Print type, publishers and subscriptions of a topic, or raise `ToolError`."""
+    """Print the type, the publishers and the subscriptions of a topic, or raise `ToolError`."""
     session.discover(options.spin_time)
     node, name = session.node, session.full_name(options.topic_name)
     types = dict(node.get_topic_names_and_types()).get(name)
@@ -101,7 +97,7 @@ def echo(session: Session, options: argparse.Namespace) -> None:
 
     def show(message: Any) -> None:
         nonlocal printed
-        # With --once, further messages may be waiting already.
+        # With --once, further messages may already have arrived.
         if options.once and printed:
             return
         try:
@@ -112,7 +108,7 @@ def echo(session: Session, options: argparse.Namespace) -> None:
                 else f'{value}\n')
         print_now(f'{text}---')
         printed += 1
-    # The strictest profile that all publishers match; without any, the one that all would match.
+    # The strictest profile that all publishers match, or one that any future publisher matches.
     profile = (QoSPresetProfiles.BEST_AVAILABLE.value
                if session.node.get_publishers_info_by_topic(name) else qos_profile_sensor_data)
     subscription = session.node.create_subscription(kind, name, show, profile)
@@ -128,7 +124,7 @@ def show_rate(session: Session, options: argparse.Namespace) -> None:
     kind = _published_type(session, name, options.topic_name, None)
     times_ns: collections.deque[int] = collections.deque(maxlen=_MAX_TIMES)
     reported_ns = 0
-    # Raw messages: long ones would take time to deserialize.
+    # Raw messages, because deserialization of long messages takes time.
     session.node.create_subscription(
         kind, name, lambda _: times_ns.append(time.monotonic_ns()), qos_profile_sensor_data,
         raw=True)

@@ -53,15 +53,15 @@ from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.command import ToolError
 from rhs_isac_ros.tools.rerun_stream import RerunStream
 
-# Number of codebooks, each with tables of some megabytes; more are unusual even in a recording.
+# Maximum number of codebooks, whose tables take some megabytes each.
 _MAX_CODEBOOKS = 32
 # With Table I, the bound on the root mean squared error then has a standard error of 2.4 %.
 _N_PHASES = 256
-# If no cycle is observed for this time, the reason is logged.
+# If no cycle is observed in this time, the reason is logged [s].
 _SILENCE_S = 5.0
-# Maximum number of users whose tracks are followed, because their numbers come from messages.
+# Maximum number of tracks that the view shows; the numbers of users come from messages.
 _MAX_TRACKS = 64
-# Beam patterns take most of the time of a view, so that of a fast network shows fewer of them.
+# Minimum time between two beams [s]: their patterns take most of the computing time of a view.
 _BEAM_PERIOD_S = 0.2
 _PROGRAM = 'view'
 _PORT = 9090
@@ -70,14 +70,10 @@ _SWITCH_INTERVAL_S = 5e-4
 
 
 class Posteriors:
-    """The posteriors of received signals, for the latest codebooks that were added.
+    """Computes the posteriors of received signals, for the latest codebooks.
 
-    The messages of the network do not contain the modes: sending them would lengthen every cycle.
-
-    Parameters
-    ----------
-    surface
-        What is known of the surface, as in `make_estimator`.
+    The messages of the network do not contain the modes, because this would lengthen every cycle.
+    `surface` is as in `make_estimator`.
     """
 
     def __init__(self, scenario: Scenario, surface: Surface | None = None) -> None:
@@ -86,21 +82,21 @@ class Posteriors:
         self._tracks = Tracks()
 
     def __contains__(self, codebook_id: str) -> bool:
-        """Return whether a codebook was added, as one of the latest 32."""
+        """Return whether a codebook is one of the latest 32 that were added."""
         return codebook_id in self._estimators
 
     def add(self, codebook: Codebook) -> None:
-        """Prepare for signals received with a codebook, which fits the scenario."""
+        """Prepare for signals that are received with a codebook, which must fit the scenario."""
         self._estimators.put(codebook.id, BayesEstimator(
             self._scenario, codebook, default_folder(), surface=self._surface))
 
     def bound_m2(self, codebook: Codebook) -> float:
-        """Compute the global bound on the mean squared error [m^2], which takes some seconds."""
+        """Compute the global bound on the mean squared error [m^2], in some seconds."""
         return global_bound(
             self._scenario, codebook, np.random.default_rng(0), _N_PHASES).value
 
     def modes(self, received: m.ReceivedSignals) -> WeightedModes | None:
-        """Return the modes of the posterior; None without a position or a known codebook."""
+        """Return the modes of the posterior, or None without a position or a known codebook."""
         estimator = self._estimators.get(received.codebook_id)
         with contextlib.suppress(SignalError):
             return weighted_modes(estimator, received.signals) if estimator else None
@@ -109,10 +105,10 @@ class Posteriors:
     def track(
             self, received: m.ReceivedSignals, now_s: float, speed_mps: float
     ) -> TrackPoint | None:
-        """Continue the track of a user whose signals arrived at `now_s` [s].
+        """Continue the track of a user with signals that arrived at `now_s` [s].
 
-        Return None before the second position, or without a known codebook. Users move at
-        `speed_mps` [m/s], typically.
+        The typical speed of users is `speed_mps`. Return None before the second position, or
+        without a known codebook.
         """
         estimator = self._estimators.get(received.codebook_id)
         with contextlib.suppress(SignalError):
@@ -124,17 +120,17 @@ class Posteriors:
 
 
 class ViewNode(Node):
-    """Converts the messages of its namespace to entries, with which it calls `write`.
+    """Converts the messages in its namespace to entries, and passes them to `write`.
 
-    Modes and bounds are computed in the background. If cycles are faster, the modes and the beam
-    of some are left out.
+    Modes and bounds are computed in the background. If cycles are faster, the modes and the beams
+    of some cycles are left out.
 
     Attributes
     ----------
     view
         The view, with times of `time.monotonic`.
     mismatch
-        Error of the last message that does not match the scenario; empty if there was none.
+        Error of the last message that did not match the scenario, or ''.
     """
 
     def __init__(
@@ -143,7 +139,7 @@ class ViewNode(Node):
         super().__init__('view', **WITHOUT_SERVICES)
         self.view, self._scenario_id = NetworkView(scenario), scenario.id
         self.mismatch = ''
-        # Names of a destroyed node are not available.
+        # Stored, because a destroyed node has no namespace.
         self._namespace = self.get_namespace()
         self._posteriors, self._write = posteriors, write
         self._worker, self._bounds = (endpoints.BackgroundWorker(self) for _ in range(2))
@@ -163,7 +159,7 @@ class ViewNode(Node):
 
     @property
     def silence(self) -> str:
-        """Reason why no cycle is observed."""
+        """The reason why no cycle is observed."""
         domain = os.environ.get('ROS_DOMAIN_ID', '0')
         return (f'the network uses another scenario ({self.mismatch})' if self.mismatch else
                 f'no cycle in the domain {domain} and the namespace {self._namespace}')
@@ -228,7 +224,7 @@ class ViewNode(Node):
         self._search()
 
     def _follow_track(self, user: int) -> None:
-        """Subscribe to the track of a user, published if the positioner has ``prior:=track``."""
+        """Subscribe to the track of a user, which the positioner may publish."""
         if user in self._users or len(self._users) >= _MAX_TRACKS:
             return
         self._users.add(user)
@@ -254,21 +250,19 @@ class ViewNode(Node):
 def entries(
         path: Path, namespace: str, scenario: Scenario, posteriors: Posteriors,
         track_speed_mps: float | None = None, max_cycles: int = 0) -> Iterator[Entry]:
-    """Yield the entries of a recording.
+    """Yield the entries for a recording, whose codebooks are added to `posteriors`.
 
     Parameters
     ----------
-    posteriors
-        Receives the recorded codebooks.
     track_speed_mps
         Typical speed of the users [m/s], to track them; None: no tracks.
     max_cycles
-        Number of cycles after which to end; 0: read all.
+        Number of cycles to show; 0: all.
 
     Raises
     ------
     RecordingError
-        If the file is invalid, as for `recorded`, or there is no cycle in the namespace.
+        If the file is invalid, or there is no cycle in the namespace.
     """
     view = NetworkView(scenario)
     for codebook, _ in command.recorded(path, namespace, scenario, [Codebook]):
@@ -320,12 +314,12 @@ def _view(options: argparse.Namespace, arguments: list[str]) -> int:
                 print(options.save)
         return code
     finally:
-        # After `close`, there is nothing left to discard.
+        # This has no effect after `close`.
         stream.discard()
 
 
 def _open(stream: RerunStream, options: argparse.Namespace) -> None:
-    """Open the file, or serve the viewer and print its address."""
+    """Open a file, or serve the viewer and print its address."""
     if options.save:
         stream.save(options.save)
         return
@@ -340,7 +334,7 @@ def _open(stream: RerunStream, options: argparse.Namespace) -> None:
 def _show_live(
         stream: RerunStream, scenario: Scenario, posteriors: Posteriors,
         options: argparse.Namespace, arguments: Sequence[str]) -> int:
-    # With many messages, the background threads would otherwise wait 5 ms for each step.
+    # Otherwise, with many messages, the background threads would wait 5 ms for each step.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     code, node = command.observe(
         lambda: ViewNode(scenario, posteriors, stream.write), arguments,
@@ -391,7 +385,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _recording_file(text: str) -> Path:
-    """Parse the path of a file that Rerun recognises by its suffix, for argparse."""
+    """Parse a path with the suffix by which Rerun recognises its files, for argparse."""
     path = output_file(text)
     if path.suffix != '.rrd':
         raise argparse.ArgumentTypeError(f'{text!r}, expected a name that ends with .rrd')

@@ -23,18 +23,18 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table
 
-# Further users are counted, not shown.
+# Maximum number of users in the table; the others are counted.
 _MAX_USERS = 20
 _PROGRAM = 'watch'
 _REFRESH_PERIOD_S = 0.25
 # Refresh period when the output is not a terminal [s].
 _PRINT_PERIOD_S = 1.0
-# Every node has reported its diagnostics after this time: they are published once a second.
+# After this time, every node has published its diagnostics, which it does once a second [s].
 _DIAGNOSTICS_TIMEOUT_S = 1.3
 
 
 def render(overview: Overview, now_s: float) -> 'RenderableType':
-    """Return the view at a time [s], on the clock of the overview, for a console of rich."""
+    """Return the view at a time [s] on the clock of the overview, for a console of rich."""
     from rich.console import Group
 
     return Group(_header(overview, now_s), _users(overview, now_s), _nodes(overview, now_s))
@@ -72,7 +72,7 @@ def _table(title: str, justify: Literal['left', 'right'], *heads: str) -> 'Table
 def _users(overview: Overview, now_s: float) -> 'RenderableType':
     table = _table('Users', 'right', 'user', 'position\n[m]', 'error\n[m]', 'sigma\n[m]',
                    'out/blk\n[%]', 'capacity\n[Mbit/s]', 'loss\n[%]', 'age\n[s]')
-    # In order of their numbers, so that each user keeps its row.
+    # Sorted, so that each user keeps the same row.
     for user, cycle in sorted(overview.users.items())[:_MAX_USERS]:
         table.add_row(str(user), *(_results(cycle, now_s) if cycle else ['no fix yet']))
     notes = [f'and {len(overview.users) - _MAX_USERS} more'] * (len(overview.users) > _MAX_USERS)
@@ -109,7 +109,7 @@ def _nodes(overview: Overview, now_s: float) -> 'RenderableType':
         state = Text(_printable(report.summary), style='yellow' if report.fault else 'green')
         if status.silent(now_s):
             state = Text(f'silent for {now_s - status.received_s:.0f} s', style='red')
-        # Received strings are not markup, so they are wrapped in Text.
+        # `Text` prevents rich from interpreting received strings as markup.
         table.add_row(
             Text(_printable(name)), Text(_printable(report.values.get('phase', ''))), state,
             Text(_counts(given_up)), Text(_counts(status.counts('dropped'))))
@@ -121,17 +121,17 @@ def _counts(counts: dict[str, int]) -> str:
 
 
 def _printable(text: str) -> str:
-    """Replace characters that would control the terminal."""
+    """Replace characters that could control the terminal."""
     return ''.join(char if char.isprintable() else '?' for char in text)
 
 
 class WatchNode(Node):
-    """Maintains an overview of its namespace, with times of `time.monotonic`."""
+    """Maintains an overview of the network in its namespace, with times of `time.monotonic`."""
 
     def __init__(self) -> None:
         super().__init__('watch', **WITHOUT_SERVICES)
         self.overview = Overview()
-        # Log messages would disturb the view; the nodes themselves count malformed messages.
+        # Log messages would disturb the view, and the nodes already count malformed messages.
         subscribe_messages(
             self, RECEIVES, None,
             lambda message: self.overview.add(message, time.monotonic()), lambda error: None)
@@ -146,7 +146,7 @@ def _watch(options: argparse.Namespace, arguments: list[str]) -> int:
 
 
 def _show_live(arguments: Sequence[str]) -> int:
-    """Replace the view on a terminal; print the views one after the other elsewhere."""
+    """Redraw the view on a terminal, or print the views one after the other."""
     from rich.console import Console
     from rich.live import Live
 
@@ -156,7 +156,7 @@ def _show_live(arguments: Sequence[str]) -> int:
         period_s = _REFRESH_PERIOD_S if live else _PRINT_PERIOD_S
 
         def refresh(node: WatchNode) -> bool:
-            """Draw between two executor iterations; an exception here ends the program."""
+            """Draw between two iterations of the executor; an exception here ends the program."""
             nonlocal drawn_s
             now_s = time.monotonic()
             if now_s > drawn_s + period_s:
