@@ -22,16 +22,10 @@ _MAX_REASONS = 3
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """Diagnostics of a node.
+    """Diagnostics of a node: whether there is a fault, a line about it, and all values.
 
-    Attributes
-    ----------
-    fault
-        Whether a fault persists, or faults have occurred since the last report.
-    summary
-        One line with the missing roles, or with the most frequent new faults.
-    values
-        Values by the keys that ``docs/interfaces.rst`` lists.
+    A fault is one that persists or has occurred since the last report. ``docs/interfaces.rst``
+    lists the keys of the values.
     """
 
     fault: bool

@@ -57,7 +57,11 @@ class PositionerNode(RoleNode[Positioner]):
         settings: PositionerSettings = super().make_settings(values)
         calibrated_surface(values, self.scenario)
         if settings.estimator not in positioning.ESTIMATORS:
-            self._check_plugin(settings.estimator)
+            # A plug-in that can be imported may still fail when the estimator is built.
+            try:
+                plugins.load(plugins.ESTIMATORS, settings.estimator)
+            except plugins.PluginError as error:
+                raise ParameterError(f'estimator: {error}') from None
             return settings
         if settings.estimator != positioning.NeuralEstimator.name:
             # Other estimators do not use the file, so a change of it must not rebuild them.
@@ -74,14 +78,6 @@ class PositionerNode(RoleNode[Positioner]):
         except positioning.ModelError as error:
             raise ParameterError(f'model_file: {error}') from None
         return settings
-
-    @staticmethod
-    def _check_plugin(name: str) -> None:
-        """Check that a plug-in can be imported; building the estimator may still fail."""
-        try:
-            plugins.load(plugins.ESTIMATORS, name)
-        except plugins.PluginError as error:
-            raise ParameterError(f'estimator: {error}') from None
 
     def _make_estimator(
             self, settings: PositionerSettings, codebook: Codebook) -> positioning.Estimator:

@@ -2,7 +2,6 @@
 
 import functools
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -113,20 +112,13 @@ def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> Robo
     buffer = tf2_ros.Buffer(node=node)
     listener = endpoints.create_or_refuse(
         node, f'subscription to {topics.TF}', lambda: tf2_ros.TransformListener(buffer, node))
-    endpoints.steady_timer(node, _LOOKUP_S, _lookup(mobility, buffer, listener, frame.name, child))
-    return mobility
-
-
-def _lookup(
-        mobility: RobotMobility, buffer: object, listener: object, parent: str, child: str
-) -> Callable[[], None]:
     last: list[tuple[int, np.ndarray]] = []
 
     def look() -> None:
         # This reference keeps the listener alive.
-        if not listener or not buffer.can_transform(parent, child, Time()):  # type: ignore[attr-defined]
+        if not listener or not buffer.can_transform(frame.name, child, Time()):
             return
-        found = buffer.lookup_transform(parent, child, Time())  # type: ignore[attr-defined]
+        found = buffer.lookup_transform(frame.name, child, Time())
         stamp_ns = Time.from_msg(found.header.stamp).nanoseconds
         position = vector(found.transform.translation)
         before_ns, before = last[0] if last else (stamp_ns, position)
@@ -136,7 +128,8 @@ def _lookup(
         elapsed_s = 1e-9 * (stamp_ns - before_ns)
         velocity = (position - before) / elapsed_s if elapsed_s > 0 else np.zeros(3)
         mobility.put(stamp_ns, position, velocity)
-    return look
+    endpoints.steady_timer(node, _LOOKUP_S, look)
+    return mobility
 
 
 # Period of checking whether a robot has a position [s].

@@ -196,14 +196,7 @@ class Positioner(Role):
     time in the background. Meanwhile, existing estimators remain in use, and the latest signals
     without an estimator wait for it. New settings replace an estimator once the new one is built;
     if it cannot be built, the old one remains. Tracks of the users, which the prior ``track``
-    requires, do not survive a restart.
-
-    Parameters
-    ----------
-    stopwatch
-        Callable that returns a time [s], to measure the latency of the estimators.
-    settings
-        Initial settings; by default those of `PositionerSettings`.
+    requires, do not survive a restart. `stopwatch` returns a time [s], to measure latencies.
     """
 
     SENDS = (m.PositionEstimate, m.NoFix)

@@ -57,14 +57,8 @@ class Transmission(Role):
     """The role that steers the beam.
 
     The true position affects only the reported capacities, never the beam. A report takes as
-    long as a beam, so the role computes it between cycles.
-
-    Parameters
-    ----------
-    settings
-        Initial settings; by default those of `TransmissionSettings`.
-    surface_of
-        Callable that returns the surface in a calibration file; None for an empty name.
+    long as a beam, so the role computes it between cycles. `surface_of` returns the surface in a
+    calibration file, or None for an empty name.
     """
 
     SENDS = (m.Beam, m.Capacity, m.CapacityStatistics)

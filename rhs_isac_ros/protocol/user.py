@@ -29,18 +29,16 @@ class State(enum.Enum):
 class User(StateMachine):
     """The role of all users of a node, usually one.
 
-    A cycle serves one user, so one state is enough for all of them.
+    A cycle serves one user, so one state is enough for all of them. The node has an `instance`,
+    and ignores grants to other instances.
 
     Parameters
     ----------
     mobilities
         Mobility of each user, by id from 1.
-    step_s
-        Time that the base station waits for each step [s].
-    beacon_s
-        Time without a beacon after which the user logs a warning [s].
-    instance
-        Instance of the node, which ignores grants to other instances.
+    step_s, beacon_s
+        Time that the base station waits for each step, and time without a beacon after which the
+        user logs a warning [s].
     world_s
         Returns the time for the mobilities [s]; by default the time passed to `handle`.
     """

@@ -236,17 +236,11 @@ def _opened(path: str | Path) -> Iterator[Any]:
 
 
 class CycleObserver(Node):
-    """Collects the cycles of the network in the namespace of this node.
+    """Collects the cycles of the network in its namespace, with times of `time.monotonic`.
 
-    Parameters
-    ----------
-    recorder
-        Records all topics of the namespace; the caller closes it. The observer then receives the
-        recorded messages of the types `cycle_log.RECEIVES`, and ignores the next three parameters.
-    receives, sizes, on_malformed
-        As in `subscribe_messages`.
-    log
-        Collects the cycles, with times of `time.monotonic`; by default a new log.
+    With a `recorder`, which the caller closes, the observer also records all topics of the
+    namespace. It then receives exactly the recorded messages of the types `cycle_log.RECEIVES`,
+    and ignores `receives`, `sizes` and `on_malformed`, which are as in `subscribe_messages`.
     """
 
     def __init__(

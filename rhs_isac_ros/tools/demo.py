@@ -91,19 +91,11 @@ def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Pa
 def start_network(
         processes: Processes, users: int, scenario: Scenario, *, together: bool = False,
         **given: Any) -> None:
-    """Start each node of a network in a separate process.
+    """Start each node of a network in a separate process; `together`, the users share a node.
 
-    Parameters
-    ----------
-    users
-        Number of users, who walk at random at the scenario's maximum speed.
-    scenario
-        Scenario in the file of the parameter ``scenario_file``.
-    together
-        Whether all users share the node ``users``.
-    given
-        Parameters of all nodes that have them; None selects the default. With ``first_cycle=1``,
-        cycles are reproducible for a seed.
+    Users walk at random at the scenario's maximum speed. The parameters `given`, which should
+    include the file of the scenario, apply to all nodes that have them; None selects the default.
+    With ``first_cycle=1``, cycles are reproducible for a seed.
     """
     for role, member in ROSTER.items():
         known = {parameter.name for parameter in parameters.NODES[role]}

@@ -68,25 +68,10 @@ _TIMEOUT_S = 60.0
 class RepublisherNode(Node):
     """Publishes messages at their recorded times, once all topics have subscribers.
 
-    Parameters
-    ----------
-    messages
-        Relative name of the topic, message and time [s], sorted by time.
-    names
-        Relative names of the topics to publish.
-    rate
-        Speed relative to the recording.
-
-    Attributes
-    ----------
-    optimizer
-        Receives the codebooks; None if another node provides them.
-    count
-        Number of messages published.
-    waits_for
-        First topic without subscribers, or ''.
-    finished
-        Whether all messages have been published.
+    `messages` contains the topic, the message and the time [s] of each message, sorted by time.
+    All `names` of topics are relative. `rate` is the speed relative to the recording. The
+    `optimizer` receives the codebooks, or is None if another node provides them. `waits_for` is
+    the first topic without subscribers, or ''; `count` messages have been published.
     """
 
     def __init__(
@@ -283,19 +268,10 @@ def load(path: Path, namespace: str = '/', config: Path | None = None) -> Record
 def errors_m(
         cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator],
         track_speed_mps: float | None = None) -> np.ndarray:
-    """Repeat the position estimate of each cycle, and return the errors.
+    """Repeat the position estimate of each cycle, and return the errors, float64 [N] [m].
 
-    Parameters
-    ----------
-    estimators
-        Estimators, by the id of the codebook for the signals.
-    track_speed_mps
-        Typical speed of the users [m/s], to track them over the cycles; None: no tracks.
-
-    Returns
-    -------
-    numpy.ndarray
-        Distances from the true positions, float64 [len(cycles)] [m]; NaN without a fix.
+    Without a fix, the error is NaN. The keys of `estimators` are ids of codebooks. If the typical
+    speed `track_speed_mps` is given, users are tracked over the cycles.
     """
     tracks, errors = Tracks(), []
     for cycle in cycles:

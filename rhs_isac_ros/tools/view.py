@@ -123,14 +123,8 @@ class ViewNode(Node):
     """Converts the messages in its namespace to entries, and passes them to `write`.
 
     Modes and bounds are computed in the background. If cycles are faster, the modes and the beams
-    of some cycles are left out.
-
-    Attributes
-    ----------
-    view
-        The view, with times of `time.monotonic`.
-    mismatch
-        Error of the last message that did not match the scenario, or ''.
+    of some cycles are left out. `mismatch` is the error of the last message that did not match the
+    scenario, or ''.
     """
 
     def __init__(
@@ -252,17 +246,9 @@ def entries(
         track_speed_mps: float | None = None, max_cycles: int = 0) -> Iterator[Entry]:
     """Yield the entries for a recording, whose codebooks are added to `posteriors`.
 
-    Parameters
-    ----------
-    track_speed_mps
-        Typical speed of the users [m/s], to track them; None: no tracks.
-    max_cycles
-        Number of cycles to show; 0: all.
-
-    Raises
-    ------
-    RecordingError
-        If the file is invalid, or there is no cycle in the namespace.
+    If the typical speed `track_speed_mps` is given, users are tracked. `max_cycles` limits the
+    number of cycles unless it is 0. Raises RecordingError if the file is invalid, or there is no
+    cycle in the namespace.
     """
     view = NetworkView(scenario)
     for codebook, _ in command.recorded(path, namespace, scenario, [Codebook]):
