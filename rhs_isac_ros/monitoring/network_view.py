@@ -81,7 +81,7 @@ class Charts:
         self._square_m2 = 0.0
         self._n_fixes = self._n_given_up = 0
         self._n_dropped: NewestDict[str, int] = NewestDict(_MAX_NODES)
-        # Users and nodes with a series of their own.
+        # Users and nodes with separate series.
         self._users: set[int] = set()
         self._nodes: set[str] = set()
 

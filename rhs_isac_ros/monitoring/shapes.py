@@ -277,7 +277,8 @@ def pattern(scenario: Scenario, message: m.Beam, step_deg: float = 5.0) -> BeamP
 def lobe(shown: BeamPattern, user: int) -> Mesh:
     """Return a beam pattern as a surface in the colour of its user.
 
-    The radius is the level in decibels, from 0 at `MIN_LEVEL_DB` to the distance of the pattern.
+    The radius grows linearly with the level in decibels, from 0 at `MIN_LEVEL_DB` to the distance
+    of the pattern at the maximum.
     """
     level_db = 10 * np.log10(np.maximum(shown.relative, 10**(MIN_LEVEL_DB / 10)))
     radius_m = shown.distance_m * (1 - level_db / MIN_LEVEL_DB)

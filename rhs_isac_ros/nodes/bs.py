@@ -171,7 +171,7 @@ class BsNode(RoleNode[BaseStation]):
                 self.create_service, Trigger, name, functools.partial(self._on_request, request)))
 
     def stand_by(self) -> None:
-        """End the action, and abandon the cycle."""
+        """End the action ``locate``, and abandon the cycle."""
         self._end_locate(_FAREWELL_S)
         self.dispatch(events.StoodBy())
 

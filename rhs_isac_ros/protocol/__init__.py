@@ -1,1 +1,1 @@
-"""The position-then-transmit protocol, without any input or output of its own."""
+"""The position-then-transmit protocol, independent of ROS and without input or output."""

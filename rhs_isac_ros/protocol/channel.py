@@ -73,7 +73,7 @@ class Fading:
 
 
 class Air:
-    """Loses, duplicates and delays messages at random."""
+    """The emulated transmission of messages, which loses, duplicates and delays some at random."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng, self._serial = rng, itertools.count()
@@ -294,6 +294,6 @@ class Channel(Role):
 
 
 def _is_from_other_instance(event: m.Pilot | m.Data, truth: m.GroundTruth) -> bool:
-    """Return whether a user's message comes from a node other than the sender of the position."""
+    """Return whether a user's message comes from a node that did not send the true position."""
     is_downlink = isinstance(event, m.Data) and event.direction is m.Direction.DOWNLINK
     return not is_downlink and not m.same_instance(event.sender, truth.sender)

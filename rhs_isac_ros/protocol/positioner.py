@@ -135,7 +135,7 @@ class ResidualWatch:
         self._warning = ''
 
     def status(self) -> dict[str, str]:
-        """Return values for the diagnostics, including those of `Diagnosis.status`.
+        """Return values for the diagnostics, including the result of `Diagnosis.status`.
 
         ``residual.ratio`` and ``residual.spread`` are the mean and the variance of the energy of
         the residuals relative to the expectation, ``residual.fixes`` is the number of fixes that

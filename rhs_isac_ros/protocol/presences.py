@@ -71,8 +71,8 @@ class Presences:
         """Return the names of nodes in conflict that have gone.
 
         If one of several nodes with the same name has gone, it is unknown which one. The caller
-        forgets them all; those that remain announce themselves again. `announcing` counts the
-        nodes that announce themselves, by fully qualified name, or '' for an unknown name.
+        forgets them all, and the remaining nodes announce themselves again. `announcing` counts
+        the nodes that announce themselves by fully qualified name, or '' for an unknown name.
         """
         known = collections.Counter(other.node for other in self._others.values())
         return {name for name, count in known.items()

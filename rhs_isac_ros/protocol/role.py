@@ -17,7 +17,7 @@ class Role:
     A subclass defines `react`, which appends actions through `send`, `log` and `act`.
     """
 
-    # Messages that the role sends, and those that it handles.
+    # Messages that the role sends, and messages that it handles.
     SENDS: ClassVar[tuple[type[Message], ...]] = ()
     RECEIVES: ClassVar[tuple[type[Message], ...]] = ()
     # States in which the role lacks something that it needs.
@@ -45,7 +45,7 @@ class Role:
         raise NotImplementedError
 
     def act(self, action: Action) -> None:
-        """Append an action to those that `handle` returns."""
+        """Append an action to the result of `handle`."""
         self._actions.append(action)
 
     def send(self, message: Message) -> None:

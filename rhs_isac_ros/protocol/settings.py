@@ -65,7 +65,7 @@ class BaseStationSettings:
 
 
 def _calibration_file() -> Any:
-    return setting('', 'Calibration file; empty: the surface is that of the scenario.')
+    return setting('', 'Calibration file; empty: the surface of the scenario.')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +121,7 @@ def _of_scenario(name: str) -> Any:
 class Impairments:
     """Impairments of the air interface, and deviations of the signals from their model.
 
-    The other roles do not know the values that replace those of the scenario.
+    The other roles do not know the values that replace fields of the scenario.
     """
 
     loss_probability: float = setting(

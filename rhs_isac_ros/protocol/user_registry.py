@@ -115,9 +115,10 @@ class UserRegistry:
     def register(self, number: int, instance: int = 0, now_s: float = 0.0) -> str:
         """Register a user that may have answered too late for this cycle.
 
-        An invited user that answers too late loses its turn. Otherwise, a user that is always late
-        would have its range invited in every cycle, and no other range. Returns a warning at the
-        first ack of the owner after another instance was rejected, otherwise ''.
+        An invited user that answers too late loses the turn. Without this rule, a user that is
+        always late would keep the turn forever, and users in other ranges would not be invited.
+        Returns a warning at the first ack of the owner after the rejection of another instance,
+        otherwise ''.
         """
         user = self._users.get(number)
         # A new user takes its turn after all waiting users and before the one served last, so that
@@ -184,7 +185,7 @@ class UserRegistry:
         return lost
 
     def select(self) -> int:
-        """Return the user to serve, who is one of those that answered."""
+        """Choose the user to serve among the users that answered."""
         if requested := [user for user in self._requested if user in self.answered]:
             chosen = requested[0]
             del self._requested[chosen]
@@ -224,13 +225,7 @@ MAX_NAMED = 8
 
 
 def join_users(users: Iterable[int]) -> str:
-    """Return the numbers of users as a text, with a count in place of those beyond `MAX_NAMED`.
-
-    Examples
-    --------
-    >>> join_users(range(1, 12))
-    '1, 2, 3, 4, 5, 6, 7, 8 and 3 others'
-    """
+    """Return a list of up to `MAX_NAMED` users as text, such as ``1, 2, 3 and 4 others``."""
     names = [str(user) for user in users]
     n_others = len(names) - MAX_NAMED
     others = f' and {n_others} other{"s" * (n_others > 1)}' if n_others > 0 else ''

@@ -74,8 +74,8 @@ def to_bytes(
         frame: str = RHS_FRAME) -> bytes:
     """Serialize a message (CDR) for a publisher of `ros_type`.
 
-    The `identity` consists of the sender and the id of the scenario, by default those of the
-    message. Raises MessageError if a string has no UTF-8 encoding.
+    The `identity`, a sender and the id of a scenario, replaces these two fields of the message.
+    Raises MessageError if a string has no UTF-8 encoding.
     """
     sender, scenario_id = identity or (message.sender, message.scenario_id)
     return _CODECS[type(message)].encode(message, frame, stamp_ns, sender, scenario_id)

@@ -86,10 +86,10 @@ _SCENARIO = _parameter(
     'scenario_file', '', "YAML file of the scenario; empty: Table I of the paper.")
 _SEED = _parameter('seed', 0, 'Seed of all random numbers.', low=0, high=2**31 - 1)
 _USER_TOPICS = _parameter(
-    'user_topics', 64, 'Highest number of a user that has topics of its own.',
+    'user_topics', 64, 'Highest number of a user with separate topics.',
     low=0, high=MAX_USERS)
 
-# Mobilities of robots, in addition to those of the library.
+# Mobilities of robots. The library has further mobilities.
 ODOMETRY, TF = ROBOTS = ('odometry', 'tf')
 _FRAME = (
     _parameter(

@@ -36,14 +36,14 @@ class Member:
 
     @property
     def sent(self) -> tuple[str, ...]:
-        """Topics that the nodes of the role publish, those of the protocol first."""
+        """Topics that the nodes of the role publish, starting with messages of the protocol."""
         return (*(topics.NAMES[kind] for kind in (self.role.SENDS if self.role else ())),
                 *self.publishes, topics.DIAGNOSTICS,
                 *((topics.PRESENCE,) if self.is_unique else ()))
 
     @property
     def received(self) -> tuple[str, ...]:
-        """Topics to which the nodes of the role subscribe, those of the protocol first."""
+        """Topics to which the nodes subscribe, starting with messages of the protocol."""
         return (*(topics.NAMES[kind] for kind in (self.role.RECEIVES if self.role else ())),
                 *((topics.CODEBOOK,) if self.has_codebook else ()),
                 *((topics.PRESENCE,) if self.is_unique else ()))

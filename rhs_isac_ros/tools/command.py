@@ -46,9 +46,9 @@ INVALID = (RecordingError, ScenarioError, CodebookError, CalibrationError, Model
 OTHER_SCENARIO = '; if the network uses another scenario, pass it with --config FILE'
 _NodeT = TypeVar('_NodeT', bound=Node)
 _FILES = {
-    'config': "scenario file; by default that of the recording, or the paper's Table I",
+    'config': "scenario file; by default the recorded scenario, or the paper's Table I",
     'codebook': 'codebook to assume; by default the recorded one',
-    'calibration': 'calibration of the surface; by default that of the scenario'}
+    'calibration': 'calibration of the surface; by default the surface of the scenario'}
 
 
 class ToolError(RuntimeError):
@@ -63,7 +63,7 @@ def entry(
 ) -> Callable[..., int]:
     """Return the main function of a command whose command line may contain ROS arguments.
 
-    The function takes the arguments, by default those of the process. It returns the exit code of
+    The function takes arguments, by default from the command line. It returns the exit code of
     `work`; 0 after a signal or if the reader closes the output; 1 after a `ToolError`; 2 if an
     argument or a file is invalid.
 
@@ -157,7 +157,7 @@ def subscribe_codebooks(
 
 
 def choose_scenario(config: Path | None, recording: Path | None = None) -> Scenario:
-    """Return the scenario of a file, by default that of a recording, or the paper's Table I."""
+    """Return the scenario in a file, or else in a recording, or else the paper's Table I."""
     if config:
         return Scenario.from_yaml(config)
     return (read_scenario(recording) if recording else None) or Scenario()

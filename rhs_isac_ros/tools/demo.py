@@ -61,7 +61,7 @@ def add_network_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--config', '--scenario', type=input_file, metavar='FILE',
                         help="scenario file; by default the paper's Table I")
     parser.add_argument('--codebook', type=input_file, metavar='FILE',
-                        help='codebook file; by default that of the package')
+                        help='codebook file; by default the codebook of the package')
 
 
 def check_users(parser: argparse.ArgumentParser, users: int) -> None:

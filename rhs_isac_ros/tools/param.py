@@ -88,7 +88,7 @@ def dump(session: Session, options: argparse.Namespace) -> None:
 
 
 def load(session: Session, options: argparse.Namespace) -> None:
-    """Set the parameters in a parameter file, whatever their nodes."""
+    """Set all parameters in a parameter file, even if they are for other nodes."""
     file = options.parameter_file
     try:
         names = list(parameter_dict_from_yaml_file(file, use_wildcard=True))

@@ -307,7 +307,7 @@ def _conflict(options: argparse.Namespace) -> str:
 
 
 def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
-    """Publish a recording, or print a table of recorded and repeated errors."""
+    """Publish a recording, or compare the errors of estimators with the recorded errors."""
     if options.publish:
         return _republish(options, arguments)
     recording = load(options.file, options.namespace, options.config)
@@ -360,7 +360,7 @@ def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog='replay', description='Feed the received signals of a recording to estimators, and '
-        'compare their errors with those of the recorded network.')
+        'compare their errors with the errors of the recorded network.')
     add = parser.add_argument
     add('file', type=input_file, help='recording')
     add('--estimator', action='append',
