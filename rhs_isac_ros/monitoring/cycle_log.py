@@ -115,10 +115,7 @@ class CycleLog:
 
     @property
     def failed(self) -> list[CycleRecord]:
-        """Cycles that were given up, except for a lack of a fix.
-
-        A lack of a fix is a result: the network works, but the user may be outside of the region.
-        """
+        """Cycles that were given up for any reason except ``no_fix``, which is not a fault."""
         return [record for record in self.given_up if record.outcome != Outcome.NO_FIX.value]
 
     def add(self, message: m.Message, now_s: float) -> None:

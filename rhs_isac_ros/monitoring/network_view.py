@@ -3,7 +3,7 @@
 import collections
 import math
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -177,15 +177,6 @@ def _line(place: float, height: float) -> np.ndarray:
     return np.array([[place, 0.0], [place, -height]])
 
 
-class TrackPoint(NamedTuple):
-    """Position [m] with its covariance [m^2], and velocity [m/s], of a tracked user."""
-
-    user: int
-    position: np.ndarray
-    covariance_m2: np.ndarray
-    velocity: np.ndarray
-
-
 class NetworkView:
     """Converts the messages of a network to entries, in the order of arrival.
 
@@ -239,15 +230,16 @@ class NetworkView:
         return [Entry(cycle, path, points), Entry(cycle, f'{path}/ellipsoids', ellipsoids),
                 Entry(cycle, f'{MODES}/found', mode_bars(received.user, found, origin))]
 
-    def add_track(self, cycle_id: int, point: TrackPoint) -> list[Entry]:
-        """Add a position of a track; `cycle_id` is 0 if it is unknown."""
-        if not self._shows(point.user):
+    def add_track(
+            self, cycle_id: int, user: int, position: np.ndarray, covariance_m2: np.ndarray,
+            velocity: np.ndarray) -> list[Entry]:
+        """Add a position [m] and a velocity [m/s] of a track; `cycle_id` 0 stands for unknown."""
+        if not self._shows(user):
             return []
-        positions = self._tracks.setdefault(point.user, new_path())
-        positions.append(point.position)
-        lines, ellipsoid = shapes.track(
-            point.user, positions, point.velocity, point.covariance_m2)
-        cycle, path = self._count(cycle_id), f'{_path(point.user)}/track'
+        positions = self._tracks.setdefault(user, new_path())
+        positions.append(position)
+        lines, ellipsoid = shapes.track(user, positions, velocity, covariance_m2)
+        cycle, path = self._count(cycle_id), f'{_path(user)}/track'
         return [Entry(cycle, path, lines), Entry(cycle, f'{path}/ellipsoid', ellipsoid)]
 
     def set_bound(self, codebook_id: str, mean_square_m2: float) -> None:
@@ -294,7 +286,6 @@ class NetworkView:
                     yield part, Clear()
 
     def _ended(self) -> Iterator[Entry]:
-        """Yield the results of the cycles that have ended."""
         for record in self._log.given_up:
             cycle = self._count(record.cycle_id)
             user = f'user {record.user}: ' if record.user else ''

@@ -27,14 +27,11 @@ def make_network() -> list[Node]:
     head = Node('network')
     users = parameters.declare(head, 'network').users
     nodes = [head, *map(_make, UNIQUE)]
-    if users > MAX_USER_NODES:
-        return [*nodes, _user_node('users', 1, users)]
-    return [*nodes, *(_user_node(f'user_{n}', n, 1) for n in range(1, users + 1))]
-
-
-def _user_node(name: str, first: int, count: int) -> UserNode:
-    return UserNode(name, parameter_overrides=[
+    together = [('users', 1, users)] if users > MAX_USER_NODES else [
+        (f'user_{n}', n, 1) for n in range(1, users + 1)]
+    return [*nodes, *(UserNode(name, parameter_overrides=[
         Parameter('user_id', value=first), Parameter('user_count', value=count)])
+        for name, first, count in together)]
 
 
 main = entry('network', make_network)

@@ -27,7 +27,7 @@ from rhs_isac_ros.codebook.optimize import INTERRUPTED
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, topics
-from rhs_isac_ros.ros.diagnostics import Diagnostics
+from rhs_isac_ros.ros.diagnostics import publish_reports
 from rhs_isac_ros.ros.endpoints import LATCHED, create_publisher
 from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX, ParameterizedNode, same_value
 from rhs_isac_ros.ros.peers import Peers, new_instance
@@ -125,7 +125,7 @@ class OptimizerNode(ParameterizedNode):
         self._peers = Peers(
             self, topics.OPTIMIZER_NODE, self._instance, self._scenario, lambda missing: None,
             self._announce)
-        self._diagnostics = Diagnostics(self, self._report)
+        publish_reports(self, self._report)
         self.add_pre_set_parameters_callback(self._normalize)
         self.add_on_set_parameters_callback(self._check_codebook)
         self.add_post_set_parameters_callback(self._on_codebook_set)

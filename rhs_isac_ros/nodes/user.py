@@ -159,7 +159,6 @@ class UserNode(RoleNode[User]):
             endpoints.steady_timer(self, _WATCH_S, functools.partial(self._watch_robot, robot))
 
     def _mobilities(self) -> dict[int, mobility.Mobility]:
-        """Return the mobility of each user by id."""
         values = self.values
         count = values.user_count
         starts = self._points('position_m')

@@ -83,7 +83,7 @@ def deletion(namespace: str, number: int, stamp: Time) -> Marker:
 
 
 def place(marker: Marker, frame: Frame) -> Marker:
-    """Move a marker to the frame of standard messages; its points are relative to its pose."""
+    """Move the pose of a marker, to which its points are relative, to a frame."""
     marker.header.frame_id = frame.name
     marker.pose = frame.pose(marker.pose)
     return marker

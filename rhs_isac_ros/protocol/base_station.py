@@ -93,8 +93,6 @@ class BaseStation(StateMachine):
 
     Parameters
     ----------
-    rng
-        For the policy ``random``.
     receiver
         Callable that takes (codebook, feeds [N_B, F, N_SB, K], user, cycle_id, whether to add
         noise) and returns the received signals, complex128 [N_B, N_SB, F].
@@ -263,7 +261,7 @@ class BaseStation(StateMachine):
                 self.log(f'waiting for {", ".join(lacking)}', warning=True)
 
     def fill(self, text: str) -> str:
-        """Fill in ``{cycle}`` (its id), ``{lacking}`` (what the next one lacks), ``{waiting}``."""
+        """Fill in ``{cycle}``, an id, and ``{lacking}`` or ``{waiting}``, missing roles."""
         lacking = ', '.join(self._lacking())
         return text.format(cycle=self._cycle.cycle_id, lacking=lacking,
                            waiting=f'; waiting for {lacking}' if lacking else '')
@@ -329,7 +327,6 @@ class BaseStation(StateMachine):
         self.log(self._users.register(event.user, event.sender, self.now_s), warning=True)
 
     def _grant(self, event: m.Ack | Timeout) -> None:
-        """Grant the cycle to one of the users that answered, and begin to locate this user."""
         self._lose_absent()
         self._cycle.user = self._users.select()
         self._cycle.user_instance = self._users.owner(self._cycle.user)
@@ -370,7 +367,6 @@ class BaseStation(StateMachine):
         cycle.signals[event.band] = event.signals
 
     def _send_signals(self, event: m.FeedSignals) -> None:
-        """Combine the signals of all bands and send the received signals to the positioner."""
         cycle = self._cycle
         assert cycle.codebook
         feeds = np.stack([cycle.signals[band] for band in sorted(self._bands)])
@@ -438,7 +434,6 @@ class BaseStation(StateMachine):
         self._report(phase)
 
     def _report(self, phase: m.Phase, outcome: str = '') -> None:
-        """Publish that a phase has begun, or that the cycle has ended."""
         began_s = self._cycle.began_s
         beacon_s = began_s[m.Phase.BEACONING]
         self._send(m.ProtocolState, phase=phase, outcome=outcome, began_s=began_s - beacon_s,

@@ -231,7 +231,6 @@ class Channel(Role):
         return _Cycle(truth, multipath, blocked, los, factors)
 
     def _answer_pending(self, cycle: _Cycle) -> None:
-        """Answer the pending messages of the cycle that lack no related message."""
         for key, event in list(self._pending.items()):
             answer = None
             if event.cycle_id != cycle.truth.cycle_id:
@@ -248,7 +247,6 @@ class Channel(Role):
             del self._pending[key]
 
     def _answer(self, event: m.Pilot | m.Data, cycle: _Cycle) -> m.Message | None:
-        """Return the answer to a message of the cycle, or None if something is missing."""
         if isinstance(event, m.Pilot):
             applied = self._applied(cycle, m.Mode.POSITIONING, event.band)
             return None if applied is None else self._propagate(event, cycle, applied)

@@ -149,7 +149,6 @@ class ResidualWatch:
         return values | ({'warning.residual': self._warning} if self._warning else {})
 
     def _describe(self) -> str:
-        """Return a description of the deviation; empty if there is none."""
         users = sorted(user for user, monitor in self._users.items() if monitor.drifts)
         parts = [_deviation('', self._all)] if self._all.drifts else []
         parts += [_deviation(f'user {user}: ', self._users[user]) for user in users[:MAX_NAMED]]
@@ -289,7 +288,6 @@ class Positioner(Role):
             self.act(events.RevertSettings(kept))
 
     def _continue(self) -> None:
-        """Request the next estimator, and process the signals that waited for the last one."""
         waiting, job = self._waiting, self._next
         self._building = self._next = self._waiting = None
         if job:
@@ -339,7 +337,6 @@ class Positioner(Role):
         self.log(*self._residuals.add(received.user, received.codebook_id, estimate))
 
     def _publish_track(self, received: m.ReceivedSignals, estimate: Estimate) -> None:
-        """Publish the track, if there is one; log if it replaces the signals of a blocked user."""
         user, loss = received.user, None
         if isinstance(estimate, TrackEstimate):
             self.act(events.PublishTrack(user, estimate, received.stamp_ns))

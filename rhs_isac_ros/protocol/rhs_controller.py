@@ -55,11 +55,9 @@ class RhsController(StateMachine):
     # Guards
 
     def _unknown_codebook(self, event: m.RhsCommand) -> bool:
-        """Return whether the codebook of a command was never offered, or was discarded."""
         return event.codebook_id not in self._codebooks
 
     def _repeats_command(self, event: m.RhsCommand) -> bool:
-        """Return whether a command repeats an executed one of the current cycle."""
         return (self.state is State.POSITIONING and event.cycle_id == self._cycle_id
                 and self._was_executed(event))
 
@@ -70,11 +68,9 @@ class RhsController(StateMachine):
         return event.cycle_id != self._cycle_id
 
     def _wrong_user(self, event: m.Beam) -> bool:
-        """Return whether the cycle of a beam is known to be granted to another user."""
         return self._granted.get(event.cycle_id, event.user) != event.user
 
     def _wrong_instance(self, event: m.Beam) -> bool:
-        """Return whether a beam from another sender is already applied in the cycle."""
         return (self.state is State.TRANSMITTING
                 and not m.same_instance(self._beam_sender, event.sender))
 

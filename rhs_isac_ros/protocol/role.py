@@ -107,7 +107,7 @@ _MAX_OFFERED = 3
 
 
 class CodebookCache(NewestDict[str, Value]):
-    """Items by codebook id. The item in use is the one taken last, and is never discarded."""
+    """Items by codebook id; the item that was taken last is in use, and never discarded."""
 
     def __init__(self) -> None:
         super().__init__(_MAX_OFFERED)

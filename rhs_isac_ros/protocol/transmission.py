@@ -185,7 +185,6 @@ class Transmission(Role):
         return found[-1] if found else None
 
     def _summarize(self, report: m.Capacity) -> None:
-        """Add a report to the statistics, once for each cycle, and publish them."""
         if not math.isfinite(report.loss_percent) or report.cycle_id in self._counted:
             return
         self._counted.put(report.cycle_id, None)

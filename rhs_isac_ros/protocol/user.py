@@ -92,7 +92,6 @@ class User(StateMachine):
         return bool(event.missing)
 
     def _stale_beacon(self, event: m.Beacon) -> bool:
-        """Return whether a beacon is late or a duplicate."""
         granted = self.state is State.GRANTED and event.cycle_id == self._cycle_id
         return granted or event.attempt <= self._attempts.get(event.cycle_id, -1)
 
@@ -122,7 +121,6 @@ class User(StateMachine):
         return self.state is State.GRANTED and (event.cycle_id, event.user) not in self._truths
 
     def _not_granted(self, event: m.Data) -> bool:
-        """Return whether the cycle was not granted to the user."""
         return (event.cycle_id, event.user) not in self._truths
 
     def _wrong_cycle(self, event: m.Grant | m.PilotRequest | m.Data) -> bool:
@@ -136,7 +134,6 @@ class User(StateMachine):
         return self._sounded != (event.cycle_id, event.band, event.last_band)
 
     def _not_delivered_downlink(self, event: m.Data) -> bool:
-        """Return whether data are anything other than downlink data delivered by the channel."""
         return event.stage is m.Stage.OFFERED or event.direction is m.Direction.UPLINK
 
     # Steps
@@ -154,7 +151,6 @@ class User(StateMachine):
         self.log('beacons resumed')
 
     def _log_other_instance(self, event: m.Grant) -> None:
-        """Log once that another node with the same number is served."""
         text = m.describe_conflict(event.user, event.user_instance)
         self.log('' if event.user in self._conflicts else text, warning=True)
         self._conflicts[event.user] = text
@@ -170,7 +166,6 @@ class User(StateMachine):
             self.send(m.Ack(cycle_id=event.cycle_id, user=user))
 
     def _publish_position(self, event: m.Grant | m.PilotRequest) -> None:
-        """Publish the position that applies to the cycle."""
         self._conflicts.pop(event.user, None)
         key = event.cycle_id, event.user
         truth = self._truths.get(key)
@@ -181,14 +176,12 @@ class User(StateMachine):
         self.send(truth)
 
     def _send_pilots(self, event: m.PilotRequest) -> None:
-        """Send the pilots of the bands, one for each frame."""
         self._sounded = event.cycle_id, event.band, event.last_band
         for band in range(event.band, event.last_band + 1):
             self.send(m.derive(
                 m.Pilot, event, band=band, symbols=np.ones(event.n_frames, complex)))
 
     def _send_uplink(self, event: m.Data) -> None:
-        """Answer downlink data with the same amount of uplink data."""
         self.send(m.derive(m.Data, event, direction=m.Direction.UPLINK, stage=m.Stage.OFFERED,
                            duration_s=event.duration_s, bits=event.bits))
 

@@ -44,16 +44,11 @@ def subscribe_reports(node: Node, on_report: Callable[[str, Report], None]) -> N
     subscribe(node, DiagnosticArray, topics.DIAGNOSTICS, receive, EXCHANGE)
 
 
-class Diagnostics:
-    """Publishes the report of a node once a second."""
+def publish_reports(node: Node, report: Callable[[], Report]) -> None:
+    """Publish the report of a node once a second."""
+    publisher = create_publisher(node, DiagnosticArray, topics.DIAGNOSTICS, EXCHANGE)
 
-    def __init__(self, node: Node, report: Callable[[], Report]) -> None:
-        self._node, self._report = node, report
-        self._publisher = create_publisher(
-            node, DiagnosticArray, topics.DIAGNOSTICS, EXCHANGE)
-        steady_timer(node, _PERIOD_S, self._publish)
-
-    def _publish(self) -> None:
-        stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(
-            to_ros(self._report(), self._node.get_fully_qualified_name(), stamp))
+    def publish() -> None:
+        stamp = node.get_clock().now().to_msg()
+        publisher.publish(to_ros(report(), node.get_fully_qualified_name(), stamp))
+    steady_timer(node, _PERIOD_S, publish)

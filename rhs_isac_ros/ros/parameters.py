@@ -189,9 +189,9 @@ def declare(node: Node, executable: str) -> types.SimpleNamespace:
 
 
 def check_overrides(node: Node) -> None:
-    """Warn if a node was started with parameters that are unknown to all executables.
+    """Warn if a node was started with parameters that no executable has.
 
-    A parameter file may contain the parameters of several nodes.
+    Parameters of other executables are accepted, because nodes may share a parameter file.
     """
     known = known_names()
     # rclpy has no public access to all overrides. Publishers declare qos_overrides themselves.

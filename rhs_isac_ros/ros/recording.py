@@ -80,7 +80,6 @@ def _offered_qos(profile: QoSProfile) -> str:
 
 
 def _parts(text: str, package: str) -> Iterator[str]:
-    """Yield the names of the messages that a definition refers to."""
     for line in text.splitlines():
         field = re.match(r'\s*([A-Za-z][\w/]*)', line)
         if field and not _BUILT_IN.match(field[1]):
@@ -183,7 +182,6 @@ def read(
 
 
 def _check_schema(path: str | Path, found: Any, kind: type) -> None:
-    """Raise RecordingError unless a recorded message has the fields of the installed one."""
     if found.encoding == 'ros2msg' and _fields(found.data.decode(errors='replace')) != _fields(
             schema(kind)):
         raise RecordingError(
@@ -219,7 +217,6 @@ def read_scenario(path: str | Path) -> Scenario | None:
 
 @contextlib.contextmanager
 def _opened(path: str | Path) -> Iterator[Any]:
-    """Yield a reader, and convert exceptions to RecordingError."""
     try:
         with optional_import('reading a recording', extra='recording'):
             from mcap.exceptions import McapError

@@ -22,7 +22,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, endpoints, topics
-from rhs_isac_ros.ros.diagnostics import Diagnostics
+from rhs_isac_ros.ros.diagnostics import publish_reports
 from rhs_isac_ros.ros.frames import surface_frame
 from rhs_isac_ros.ros.parameters import CODEBOOK, ParameterizedNode, scenario_of
 from rhs_isac_ros.ros.peers import Peers, new_instance
@@ -223,7 +223,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self.role, self._needs_codebook = role, needs_codebook
         if not needs_codebook:
             self.advertise()
-        self._diagnostics = Diagnostics(self, self.report)
+        publish_reports(self, self.report)
         self._peers = Peers(
             self, self._executable, self.instance, self.scenario, self._on_missing,
             self._on_rival)
@@ -282,7 +282,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 f'{self._codebook_client.codebook_id or "none"}')
 
     def set_lacking(self, text: str) -> None:
-        """Describe what the role lacks apart from other roles; empty if it lacks nothing."""
+        """Describe what is missing for the role apart from other roles; '' if nothing is."""
         if text != self._lacking:
             self._lacking = text
             # Before discovery, it is unknown which roles are missing.
@@ -335,6 +335,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         """Pass an event to the role, then a `Timeout` for each deadline that has passed."""
         now_s = self.now_s()
         self._handle(event, now_s)
+        self._expire(now_s)
+
+    def _expire(self, now_s: float) -> None:
+        """Handle the deadlines that have passed, and set the timer for the next one."""
         while (deadline_s := self.role.next_deadline()) is not None and deadline_s <= now_s:
             self._handle(events.Timeout(), now_s)
         if deadline_s is not None and (
@@ -414,13 +418,6 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._timer_due_s = due_s
 
     def _on_timer(self) -> None:
-        now_s = self.now_s()
         self._timer.cancel()
         self._timer_due_s = None
-        deadline_s = self.role.next_deadline()
-        if deadline_s is None:
-            return
-        if deadline_s <= now_s:
-            self.dispatch(events.Timeout())
-        else:
-            self._set_timer(deadline_s - now_s, deadline_s)
+        self._expire(self.now_s())

@@ -113,7 +113,6 @@ def _assigned(arguments: Sequence[str]) -> Iterator[str]:
 
 
 def _composed(executable: str) -> list[str]:
-    """Return the other executables whose nodes run in the process of an executable."""
     return [name for name in NODES if name not in ('network', 'visualizer')
             ] if executable == 'network' else []
 

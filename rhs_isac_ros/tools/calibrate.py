@@ -151,7 +151,6 @@ def _arrays(options: argparse.Namespace) -> Pilots:
 
 def _collected(
         options: argparse.Namespace, scenario: Scenario, arguments: list[str]) -> list[Pilots]:
-    """Return the pilots of a recording, or of a running network."""
     log = PilotLog(options.user)
     if options.file:
         for found, _ in command.recorded(

@@ -123,7 +123,6 @@ def _get_values(session: Session, node: str, names: list[str]) -> list[Any]:
 
 
 def _nodes(session: Session) -> set[str]:
-    """Return the full names of all nodes that are not hidden."""
     return {f'{namespace.rstrip("/")}/{name}'
             for name, namespace in session.node.get_node_names_and_namespaces()
             if not name.startswith('_')}
@@ -138,7 +137,6 @@ def _find(session: Session, options: argparse.Namespace) -> str:
 
 
 def _call(session: Session, node: str, request: Callable[[AsyncParameterClient], Future]) -> Any:
-    """Send a request to a node's parameter services, and return the response."""
     client = AsyncParameterClient(session.node, node)
     if not session.spin_until(client.services_are_ready, _SERVICE_TIMEOUT_S):
         raise ToolError('Wait for service timed out waiting for parameter services for node '

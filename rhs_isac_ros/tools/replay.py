@@ -108,7 +108,6 @@ class RepublisherNode(Node):
         return now_s >= self._unchanged_since_s + _SETTLING_TIME_S
 
     def _has_subscribers(self, name: str) -> bool:
-        """Return whether the subscribers of a topic are present."""
         publisher, n_expected = self._message_publishers[name], 1
         if name == _SIGNALS:
             # Observers may subscribe to the signals, too. Wait for the nodes that publish
@@ -160,7 +159,6 @@ class RepublisherNode(Node):
 
 
 def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
-    """Publish a recording to running nodes, and return the exit code."""
     names = options.topic or [_SIGNALS]
     scenario = command.choose_scenario(options.config, options.file)
     first_codebook = _first_codebook(options) if _SIGNALS in names else None
@@ -224,7 +222,6 @@ def _first_codebook(options: argparse.Namespace) -> Codebook:
 
 
 def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
-    """Create an optimizer that provides a codebook."""
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
         file = Path(folder) / 'scenario.yaml'
         file.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')

@@ -164,7 +164,6 @@ def blueprint() -> 'rerun.blueprint.Blueprint':
 
 
 def _archetype(entity: shapes.Entity) -> Any:
-    """Convert an entity to an archetype of Rerun."""
     import rerun as rr
 
     mode = rr.components.FillMode
@@ -215,5 +214,4 @@ def _radius(width: float) -> float:
 
 
 def _colours(values: Any) -> np.ndarray:
-    """Convert colours from 0 to 1 to uint8."""
     return np.rint(255 * np.array(values)).astype(np.uint8)

@@ -98,7 +98,6 @@ def draw(scene: SceneState, scenario: Scenario, path: Path) -> None:
 
 
 def _missing(scene: SceneState) -> list[str]:
-    """Return a description of each part that is missing in a scene."""
     parts = []
     if scene.configuration is None:
         parts.append('the configuration of the surface')

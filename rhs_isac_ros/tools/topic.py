@@ -36,7 +36,6 @@ def as_yaml(message: Any, max_length: int | None = None) -> str:
 
 
 def _plain(value: Any, max_length: int | None) -> Any:
-    """Convert a value to types that YAML supports."""
     match value:
         case bytes():
             return _plain(''.join(map(chr, value)), max_length)

@@ -20,7 +20,7 @@ from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import Surface
-from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView, TrackPoint
+from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.monitoring.shapes import Entry
 from rhs_isac_ros.positioning import (
@@ -104,7 +104,7 @@ class Posteriors:
 
     def track(
             self, received: m.ReceivedSignals, now_s: float, speed_mps: float
-    ) -> TrackPoint | None:
+    ) -> TrackEstimate | None:
         """Continue the track of a user with signals that arrived at `now_s` [s].
 
         The typical speed of users is `speed_mps`. Return None before the second position, or
@@ -114,8 +114,7 @@ class Posteriors:
         with contextlib.suppress(SignalError):
             estimate = estimator and self._tracks.locate(received, estimator, speed_mps, now_s)
             if isinstance(estimate, TrackEstimate) and estimate.fix:
-                return TrackPoint(
-                    received.user, estimate.mean, estimate.covariance, estimate.velocity)
+                return estimate
         return None
 
 
@@ -226,13 +225,11 @@ class ViewNode(Node):
                             functools.partial(self._on_track, user), endpoints.EXCHANGE)
 
     def _on_track(self, user: int, message: Odometry) -> None:
-        point = TrackPoint(
-            user, vector(message.pose.pose.position),
-            np.reshape(message.pose.covariance, (6, 6))[:3, :3],
-            vector(message.twist.twist.linear))
-        if all(np.isfinite(field).all() for field in (
-                point.position, point.covariance_m2, point.velocity)):
-            self._write(self.view.add_track(0, point))
+        point = (vector(message.pose.pose.position),
+                 np.reshape(message.pose.covariance, (6, 6))[:3, :3],
+                 vector(message.twist.twist.linear))
+        if all(np.isfinite(field).all() for field in point):
+            self._write(self.view.add_track(0, user, *point))
 
     def destroy_node(self) -> None:
         """End the background threads, then destroy the node."""
@@ -267,8 +264,9 @@ def entries(
         if isinstance(found, m.ReceivedSignals):
             yield from view.add_modes(found, posteriors.modes(found))
             if track_speed_mps is not None and (
-                    point := posteriors.track(found, time_s, track_speed_mps)):
-                yield from view.add_track(found.cycle_id, point)
+                    track := posteriors.track(found, time_s, track_speed_mps)):
+                yield from view.add_track(
+                    found.cycle_id, found.user, track.mean, track.covariance, track.velocity)
         if max_cycles and view.n_ended >= max_cycles:
             break
     if not view.n_cycles:
@@ -305,7 +303,6 @@ def _view(options: argparse.Namespace, arguments: list[str]) -> int:
 
 
 def _open(stream: RerunStream, options: argparse.Namespace) -> None:
-    """Open a file, or serve the viewer and print its address."""
     if options.save:
         stream.save(options.save)
         return

@@ -9,7 +9,7 @@ import pytest
 
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.monitoring import network_view
-from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView, TrackPoint
+from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.monitoring.shapes import Clear, Number, Series, Text
 from rhs_isac_ros.positioning import WeightedModes
@@ -154,8 +154,8 @@ def test_signals_without_a_position_end_what_was_shown_of_the_user(watched):
 def test_a_track_continues(watched):
     path = f'{network_view.WORLD}/user_1/track'
     for step in range(3):
-        entries = watched.view.add_track(0, TrackPoint(
-            1, np.array([9.0, step, 0.0]), np.eye(3), np.array([0.0, 1.0, 0.0])))
+        entries = watched.view.add_track(
+            0, 1, np.array([9.0, step, 0.0]), np.eye(3), np.array([0.0, 1.0, 0.0]))
     ((cycle, lines),) = on(entries, path)
     assert cycle == watched.view.n_cycles
     places, velocity = lines.strips

@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import topics
-from rhs_isac_ros.ros.diagnostics import Diagnostics, from_ros, to_ros
+from rhs_isac_ros.ros.diagnostics import from_ros, publish_reports, to_ros
 from rhs_isac_ros.ros.endpoints import EXCHANGE
 
 
@@ -37,7 +37,7 @@ def test_a_report_is_published_once_a_second(bench, probe):
     def report():
         reports.append(None)
         return Report(False, str(len(reports)), {})
-    Diagnostics(probe, report)
+    publish_reports(probe, report)
     bench.until(lambda: len(received) == 2, 'the second report')
     assert [message.status[0].message for message in received] == ['1', '2']
     stamps = [message.header.stamp for message in received]
