@@ -24,13 +24,13 @@ _MAX_DIGITS = 18
 
 
 class NodeStatus(NamedTuple):
-    """The latest report of a node, and its arrival [s]."""
+    """The latest report of a node, and the time of its arrival [s]."""
 
     report: Report
     received_s: float
 
     def silent(self, now_s: float) -> bool:
-        """Return whether reports are missing at the time `now_s` [s]."""
+        """Return whether the node has stopped reporting, at the time `now_s` [s]."""
         return now_s - self.received_s > _REPORT_TIMEOUT_S
 
     def counts(self, section: str) -> dict[str, int]:

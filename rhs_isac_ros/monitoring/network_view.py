@@ -243,7 +243,7 @@ class NetworkView:
         return [Entry(cycle, path, lines), Entry(cycle, f'{path}/ellipsoid', ellipsoid)]
 
     def set_bound(self, codebook_id: str, mean_square_m2: float) -> None:
-        """Set the global bound on the mean squared error with a codebook [m^2]."""
+        """Set the global bound on the mean squared error for a codebook [m^2]."""
         self._charts.bounds_m[codebook_id] = math.sqrt(mean_square_m2)
 
     def _entities(self, message: m.Message) -> Iterator[tuple[str, Entity]]:

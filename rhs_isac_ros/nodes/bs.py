@@ -181,13 +181,13 @@ class BsNode(RoleNode[BaseStation]):
         self._locate = self._make_locate()
 
     def dispatch(self, event: events.Event) -> None:
-        """Pass an event to the role, and to the action."""
+        """Pass an event to the role and to the action ``locate``."""
         super().dispatch(event)
         if self._locate and isinstance(event, m.PositionEstimate | m.NoFix):
             self._locate.observe(event)
 
     def publish(self, message: m.Message) -> bool:
-        """Publish a message, and pass it to the action."""
+        """Publish a message, and pass it to the action ``locate``."""
         is_published = super().publish(message)
         if is_published and self._locate and isinstance(message, m.ProtocolState):
             self._locate.observe(message)

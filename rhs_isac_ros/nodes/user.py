@@ -65,7 +65,7 @@ class RobotMobility:
         return ''
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [3] [m] and velocity [3] [m/s] in the frame of the surface, now."""
+        """Return the present position [3] [m] and velocity [3] [m/s] in the surface's frame."""
         age_s = min(max(self._age_s(), 0.0), self._timeout_s)
         return self._position + age_s * self._velocity, self._velocity.copy()
 
@@ -74,7 +74,7 @@ class RobotMobility:
 
 
 def follow_odometry(node: Node, frame: Frame, topic: str, timeout_s: float) -> RobotMobility:
-    """Return the mobility of a robot that publishes its odometry in the frame `frame`."""
+    """Return the mobility of a robot whose odometry is in the frame `frame`."""
     full_name = node.resolve_topic_name(topic)
     mobility = RobotMobility(node, frame, f'odometry on {full_name}', timeout_s)
 
@@ -175,7 +175,7 @@ class UserNode(RoleNode[User]):
         return users
 
     def _mobility(self, user: int, position: np.ndarray | None) -> mobility.Mobility:
-        """Return the mobility of a user that starts at `position`; None: anywhere."""
+        """Return the mobility of a user that starts at a position, by default a random one."""
         values = self.values
         if values.mobility in ROBOTS:
             if position is not None:

@@ -48,7 +48,7 @@ _USER_REASONS = (Outcome.USER_GONE, Outcome.NO_FIX)
 
 @dataclasses.dataclass
 class Cycle:
-    """The memory of one cycle."""
+    """The state of one cycle, as known to the base station."""
 
     cycle_id: int
     codebook: Codebook | None = None  # the latest one when the latest beacon was sent

@@ -116,7 +116,7 @@ class Mode(enum.IntEnum):
 
 
 class Direction(enum.IntEnum):
-    """Direction of a transmission."""
+    """Direction of a data transmission."""
 
     DOWNLINK = 0
     UPLINK = 1
@@ -240,7 +240,7 @@ class RhsConfiguration(Message):
     analog: np.ndarray = array('FRAMES N_E', low=0, high=1)
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return the number of frames, FRAMES: 1 for a transmission."""
+        """Return the number of frames FRAMES, which is 1 for a transmission."""
         return {'FRAMES': sizes['F'] if self.mode is Mode.POSITIONING else 1}
 
 

@@ -30,7 +30,7 @@ class Presence:
     scenario: Mapping[str, Any]  # as `Scenario.fields` returns it
 
     def __str__(self) -> str:
-        """Return name and start of the node, for log messages."""
+        """Return the name and the start of the node, for log messages."""
         return f'{self.node}, {started(self.sender)}'
 
 

@@ -1,4 +1,4 @@
-"""The transmission role, which steers a beam to the estimate and reports its capacity."""
+"""The transmission, which steers a beam towards the estimate and reports the capacity."""
 
 import collections
 import math

@@ -64,7 +64,7 @@ def ros_type(kind: type[_MessageT]) -> Any:
 
 def to_ros(
         message: _MessageT, stamp: Time | None, identity: tuple[int, str] | None = None) -> Any:
-    """Convert a message to ROS; see `to_bytes`."""
+    """Convert a dataclass to a ROS message; the identity is as in `to_bytes`."""
     stamp_ns = 10**9 * stamp.sec + stamp.nanosec if stamp is not None else 0
     return deserialize_message(to_bytes(message, stamp_ns, identity), ros_type(type(message)))
 

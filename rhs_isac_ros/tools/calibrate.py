@@ -94,7 +94,7 @@ class PilotLog:
                       - self.codebooks.keys())
 
     def pilots(self) -> list[Pilots]:
-        """Return the pilots of each codebook."""
+        """Return the pilots, grouped by codebook."""
         groups: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
         for signals in self._signals.values():
             truth = self._truth_of(signals)

@@ -44,7 +44,7 @@ def prepare_drawing() -> None:
 
 @paper_style()
 def compose_cycles(cycles: Sequence[CompleteCycle], scenario: Scenario) -> Any:
-    """Return the `matplotlib.figure.Figure` of at least one cycle."""
+    """Return a `matplotlib.figure.Figure` of one or more cycles."""
     low, high = _limits_m(scenario, [cycle.estimate for cycle in cycles], _CYCLES_MAX_MARGIN)
     # With this height and equal scales, the view fills the width.
     view_in = PAGE_IN * _VIEW_SHARE * (high[1] - low[1]) / (high[0] - low[0])
@@ -83,7 +83,7 @@ def compose_cycles(cycles: Sequence[CompleteCycle], scenario: Scenario) -> Any:
 
 @paper_style()
 def compose_scene(scene: SceneState, scenario: Scenario) -> Any:
-    """Return the `matplotlib.figure.Figure` of a scene, of which parts may be unknown."""
+    """Return a `matplotlib.figure.Figure` of a scene, parts of which may be unknown."""
     figure = new_figure(PAGE_IN, _SCENE_IN)
     limits_m = _limits_m(scenario, [user.estimate for user in scene.users.values()
                                     if user.estimate], _SCENE_MAX_MARGIN)
