@@ -195,7 +195,7 @@ class SceneState:
     def discard_stale(self, before_s: float) -> list[int]:
         """Discard users without a message since `before_s` [s], and return their ids.
 
-        Also discard a beam that is as old or that is steered to one of these users.
+        Also discard a beam of the same age, or a beam to one of these users.
         """
         stale = [user for user, state in self.users.items() if state.updated_s < before_s]
         for user in stale:
