@@ -80,7 +80,7 @@ class CycleRecord(CycleTimes):
 
     @property
     def truth(self) -> m.GroundTruth | None:
-        """True position from the node whose user was located; None if unknown."""
+        """True position of the located user, sent by the same node; None if unknown."""
         instance = self.estimate.user_instance if self.estimate else 0
         return next((truth for sender, truth in reversed(self.truths.items())
                      if m.same_instance(sender, instance)), None)

@@ -239,7 +239,7 @@ def path(user: int, positions: Iterable[np.ndarray]) -> Lines:
 def traced(scenario: Scenario, message: m.GroundTruth) -> Lines:
     """Return the propagation paths to the surface from the traced position nearest to a user.
 
-    For a path with one reflection, the wall is halfway between the virtual source and the user.
+    A reflecting wall is halfway between the virtual source of a path and the user.
     Paths with more reflections are left out. Without a channel file, there are no paths.
     """
     strips: list[np.ndarray] = []
