@@ -221,7 +221,7 @@ class SceneState:
 
     @property
     def shown_user(self) -> UserState | None:
-        """The user of the latest beam if its cycle has an estimate, else of the latest estimate."""
+        """The user of the latest beam if its cycle has an estimate, or of the latest estimate."""
         state = self.users.get(self.beam.user) if self.beam else None
         if state and state.estimate and self.beam and (
                 state.estimate.cycle_id == self.beam.cycle_id):
