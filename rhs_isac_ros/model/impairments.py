@@ -1,15 +1,14 @@
 """Impairments of the signals: unknown gains, phases, and offsets of timing and carrier.
 
-Given the position, the signals of a cycle are Gaussian if a few Gaussian numbers and the elements
-of the surface (see `elements`) are known. Each of the numbers, a nuisance parameter x, has an
-exponent P of the signals: they are multiplied by ``exp(x P)``. A real exponent is a gain in
-nepers, an imaginary one a phase. The factor applies to the direct path and to the multipath, but
-not to the thermal noise. The exponential wraps phases, so that a phase whose standard deviation is
-a turn is uniform.
+Given the position, the elements of the surface (see `elements`) and a few Gaussian numbers, the
+signals of a cycle are Gaussian. Each of the numbers is a nuisance parameter x with an exponent P:
+the signals are multiplied by ``exp(x P)``. A real exponent is a gain in nepers, an imaginary one a
+phase. The factor applies to the direct path and to the multipath, but not to the thermal noise.
+The exponential wraps phases, so a phase whose standard deviation is a whole turn is uniform.
 
-Simulation, estimators, bounds and calibration use the results of an `Impairment` only. Another
-one is a plug-in of the group ``rhs_isac_ros.impairments``, or a `Factor` in `BUILT_IN` and the
-field of the scenario that declares it.
+Simulation, estimators, bounds and calibration depend only on the interface `Impairment`. A new
+impairment is a plug-in of the group ``rhs_isac_ros.impairments``, or a `Factor` in `BUILT_IN` with
+a field of the scenario that declares it.
 """
 
 import dataclasses
@@ -47,9 +46,9 @@ class Linear(NamedTuple):
     patterns
         Exponent of the signals per unit of each value, complex128 [q, N_B, N_SB F].
     root
-        Factor L of the covariance L L^T of the values, float64 [q, q], regular.
+        Factor L of the covariance L L^T of the values, float64 [q, q], invertible.
     needs_search
-        Whether the likelihood of a value has several maxima within its prior, so that estimators
+        Whether the likelihood of a value has several maxima within its prior. Estimators then
         compare values on a grid before they refine one.
     """
 
@@ -62,8 +61,8 @@ class Impairment:
     """An impairment of the signals.
 
     A subclass defines `size` and `linear`. Its values are Gaussian unless it overrides `values`;
-    estimators and bounds always assume the Gaussian prior of `linear`. They are drawn anew as
-    often as `scope` states.
+    estimators and bounds always assume the Gaussian prior of `linear`. `scope` states how often
+    values are drawn anew.
     """
 
     scope: Scope = Scope.CYCLE
@@ -84,8 +83,8 @@ class Impairment:
 class Nuisance:
     """The nuisance parameters of all impairments of a scenario.
 
-    The parameters are x = L z with standard normal z. Bounds and estimators use z, which needs no
-    units.
+    The parameters are x = L z with standard normal z. Bounds and estimators use z, which is
+    dimensionless.
 
     Attributes
     ----------
@@ -94,11 +93,11 @@ class Nuisance:
     needs_search
         As in `Linear`, bool [Q].
     moves_multipath
-        Which of z change measurements of one band relative to each other, bool [Q]. These move the
-        multipath out of the nulls of its covariance.
+        Whether z changes the measurements of one band relative to each other, bool [Q]. Such a
+        change moves the multipath out of the nulls of its covariance.
     phases
-        Phase of each band per unit of those z that only turn whole bands, and 0 for all others,
-        float64 [N_B, Q].
+        Phase of each band per unit of z, float64 [N_B, Q]; 0 for every z that does more than
+        rotate the phases of whole bands.
     """
 
     def __init__(self, scenario: Scenario, parts: Sequence[Linear]) -> None:
@@ -165,7 +164,7 @@ class Factor(Impairment):
     field: str
     # Function that returns the exponents per unit of the values.
     patterns: Callable[[Scenario], np.ndarray]
-    # Unit of the field, in the unit of the values.
+    # One unit of the field, expressed in the unit of the values.
     unit: float = 1.0
     needs_search: bool = False
     scope: Scope = Scope.CYCLE
@@ -213,8 +212,8 @@ def draw_factors(
 ) -> np.ndarray | None:
     """Draw the factors of the signals of n users and cycles, complex128 [n, N_B, N_SB F].
 
-    Impairments of users and of cycles have a generator each. The values of a built-in impairment
-    do not depend on others. The result is None if the scenario declares no impairment.
+    Users and cycles each have a generator. The values of a built-in impairment do not depend on
+    which others are declared. The result is None if the scenario declares no impairment.
     """
     declared = impairments_of(scenario)
     if not declared:
@@ -238,9 +237,9 @@ def draw_impairments(
 ) -> tuple[ElementErrors | None, np.ndarray | None]:
     """Draw a surface, and the factors of the signals of n phases, complex128 [n, N_B, N_SB F].
 
-    Each phase has another user. Either result is None if the scenario does not declare it. The
-    numbers come from children of the generator, whose own numbers, of multipath and noise, do not
-    depend on what is declared.
+    Each phase has a new user. Either result is None if the scenario does not declare it. The
+    numbers come from children of the generator, so that the multipath and noise drawn from `rng`
+    itself do not depend on the declared impairments.
     """
     if not has_errors(scenario) and not impairments_of(scenario):
         return None, None
