@@ -7,7 +7,7 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.threads import map_blocks
 
-# Pairs that share a random generator and every matrix product. A different size changes the pairs
+# Pairs that share a random generator and all matrix products. Another size would change the pairs
 # of every seed.
 _CHUNK = 512
 
@@ -17,8 +17,8 @@ def simulate_pairs(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate positioning phases at random positions of the region of interest.
 
-    A seed defines an infinite sequence of pairs. This function returns the n pairs from `first`
-    on, which are identical bit for bit however the sequence is divided.
+    A seed defines an infinite sequence of pairs, of which this function returns n, beginning with
+    `first`. However the sequence is divided, the pairs are identical bit for bit.
 
     Returns
     -------
