@@ -163,8 +163,7 @@ def _matrix(lattice: np.ndarray, scenario: Scenario) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def _lattice(scenario: Scenario) -> np.ndarray:
-    """Compute V_i by lattice offset, complex128 [N_B, 2 rows - 1, 2 columns - 1], 0 in the middle.
-    """
+    """Compute V_i by lattice offset, 0 in the middle, [N_B, 2 rows - 1, 2 columns - 1]."""
     is_even = [not angle for angle in scenario.multipath_direction_deg]
     lattice = np.empty((scenario.n_bands, 2 * scenario.n_rows - 1, 2 * scenario.n_columns - 1),
                        complex)

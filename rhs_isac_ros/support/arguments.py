@@ -1,4 +1,4 @@
-"""Command lines: a parser with errors of one line, types of arguments, and exit codes."""
+"""Command lines: a parser with one-line errors, and types of arguments."""
 
 import argparse
 import math
@@ -27,7 +27,7 @@ class ArgumentParser(argparse.ArgumentParser):
 
 class HelpFormatter(
         argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
-    """Shows defaults, and keeps the lines of the description and of the text below."""
+    """Shows defaults, and keeps the line breaks of the description and of the epilog."""
 
 
 def _number(declared: Field) -> Callable[[str], Any]:
@@ -121,13 +121,7 @@ def output_folder(text: str) -> Path:
 def check_distinct(
         parser: argparse.ArgumentParser, inputs: Mapping[str, Path | None],
         outputs: Mapping[str, Path | None]) -> None:
-    """Exit with a usage error if an output file is also an input or another output.
-
-    Parameters
-    ----------
-    inputs, outputs
-        Values by the name of the argument; None if it was not given.
-    """
+    """Exit with a usage error if an output file is also an input or another output."""
     names = {path.resolve(): name for name, path in inputs.items() if path}
     for name, path in outputs.items():
         if path:

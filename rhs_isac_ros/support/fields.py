@@ -74,7 +74,7 @@ class Field:
         return f'{words}, {self.range}' if self.range else words
 
     def problem(self, value: Any) -> str:
-        """Return an invalid value and what is expected instead; empty for a valid value."""
+        """Return a text with an invalid value and the expected ones, or '' for a valid value."""
         if not self._has_type(value):
             return f'{value!r}, expected {self.expected}'
         if self.choices:
