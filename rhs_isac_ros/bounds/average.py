@@ -165,11 +165,7 @@ def average_crlb(
 
     `positions` are at least one position of the user, float64 [N, 3] [m]. The value and its
     derivative with respect to C are in m^2, the derivative with respect to S in m^2/sqrt(W).
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array, or contains no position.
+    Raises ValueError if `positions` is not a finite [N, 3] array, or contains no position.
     """
     return AverageCrlb(scenario, positions)(codebook)
 
@@ -214,11 +210,9 @@ class AverageCrlb(Average):
 
 
 def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
-    """Derive the rows of all parameters from those of the gain and its derivative.
-
-    A parameter whose pattern is constant in each band is a multiple of the gain; each other
-    parameter has its own row. Without nuisance parameters, the derivative suffices.
-    """
+    """Derive the rows of all parameters from those of the gain and its derivative."""
+    # A parameter whose pattern is constant in each band is a multiple of the gain; each other
+    # parameter has its own row. Without nuisance parameters, the derivative suffices.
     scaled = nuisance_of(scenario).scaled_patterns
     if not len(scaled):
         return [], None

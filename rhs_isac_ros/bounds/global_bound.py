@@ -47,25 +47,14 @@ _N_CHECKS = 64
 
 
 class GlobalBound(NamedTuple):
-    """Bound on the mean squared error of any estimator, for a uniform prior on the region.
+    """Bound on the mean squared error of any estimator, for a uniform prior on the region."""
 
-    Attributes
-    ----------
-    value, standard_error
-        The bound and the standard error of its Monte-Carlo average [m^2].
-    positions
-        Positions of the simulated phases, float64 [n, 3] [m].
-    squared_errors
-        Squared error of the informed estimator in each phase, float64 [n] [m^2].
-    coarseness
-        Factor by which the limit on the number of lattice points has enlarged the steps; 1 if the
-        lattice resolves the posterior. Above about 3, the bound is loose.
-    """
-
-    value: float
-    standard_error: float
-    positions: np.ndarray
-    squared_errors: np.ndarray
+    value: float  #: The bound [m^2].
+    standard_error: float  #: Standard error of its Monte-Carlo average [m^2].
+    positions: np.ndarray  #: Positions of the simulated phases, float64 [n, 3] [m].
+    squared_errors: np.ndarray  #: Squared errors of the informed estimator, float64 [n] [m^2].
+    #: Factor by which the limit on the number of lattice points has enlarged the steps; 1 if the
+    #: lattice resolves the posterior. Above about 3, the bound is loose.
     coarseness: float
 
 

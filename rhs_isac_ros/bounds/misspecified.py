@@ -41,22 +41,13 @@ _MAX_AMBIGUITY, _MIN_BORDER, _MAX_NONLINEARITY = 0.01, 3.0, 0.25
 
 
 class Misspecified(NamedTuple):
-    """Errors of the maximum-likelihood estimator of an assumed model under a true one.
+    """Errors of the maximum-likelihood estimator of an assumed model under a true one."""
 
-    Attributes
-    ----------
-    bias
-        Pseudo-true position minus true position, float64 [N, 3] [m].
-    covariance
-        Covariance of the errors about the pseudo-true position, float64 [N, 3, 3] [m^2].
-    valid
-        Whether the result describes the estimator, bool [N]: ambiguities of the range are
-        improbable, the mean is linear over the errors, the border of the region is far away, and
-        estimators accept the residual of the signals.
-    """
-
-    bias: np.ndarray
-    covariance: np.ndarray
+    bias: np.ndarray  #: Pseudo-true position minus true position, float64 [N, 3] [m].
+    covariance: np.ndarray  #: Of errors about the pseudo-true position, [N, 3, 3] [m^2].
+    #: Whether the result describes the estimator, bool [N]: ambiguities of the range are
+    #: improbable, the mean is linear over the errors, the border of the region is far away, and
+    #: estimators accept the residual of the signals.
     valid: np.ndarray
 
     @property
@@ -180,11 +171,8 @@ def _is_valid(model: MeasurementModel, places: np.ndarray, bias: np.ndarray,
 
 def _ambiguities(model: MeasurementModel, place: np.ndarray, mean: np.ndarray,
                  residual: np.ndarray, white: np.ndarray, covariance: np.ndarray) -> float:
-    """Bound the squared error from other ranges in the same direction [m^2].
-
-    The bound is a sum over maxima: the squared distance of a range, times the probability that it
-    is more likely than the true range.
-    """
+    """Bound the squared error from other ranges in the same direction [m^2]."""
+    # A sum over maxima: squared distance times the probability of being likelier than the truth.
     from scipy.special import ndtr
 
     scenario = model.scenario

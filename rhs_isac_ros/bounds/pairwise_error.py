@@ -32,21 +32,9 @@ class PairwiseErrorCost(Average):
     cost is the average of ``|p - p'|^2 Q(sqrt(q / 2))``, in m^2 like the bound. In its quadratic
     form, the difference h(p) - h(p') replaces the derivative of Eq. (12). If the scenario declares
     unknown phases, the form is minimised over them; other nuisance parameters are not included.
-
-    Parameters
-    ----------
-    first_positions, second_positions
-        The two positions of each pair, float64 [N, 3] [m].
-    weights
-        Weights of the pairs, float64 [N].
-    tolerance, tick
-        As in `Average`, for the differences.
-
-    Raises
-    ------
-    ValueError
-        If an argument has a wrong shape or is not finite, there are no pairs, or a weight is
-        negative.
+    Pairs have positions, float64 [N, 3] [m], and weights, float64 [N]. `tolerance` and `tick` are
+    those of `Average`. Raises ValueError if an argument has a wrong shape or is not finite, there
+    are no pairs, or a weight is negative.
     """
 
     def __init__(

@@ -33,14 +33,8 @@ def range_confusion_error(
     positions for which the lag stays inside the region. The estimate is sum w r^2 / (1/2 + sum w),
     averaged over energies E: the mean of r^2 over the confused ranges and the true one.
 
-    Parameters
-    ----------
-    frequencies_hz
-        Centre frequencies of each plan, float64 [P, N_B] [Hz].
-    energies
-        Energies of the whitened mean signals of all bands at some positions, float64 [N].
-    max_lag_m
-        Longest lag r_max [m].
+    Takes the centre frequencies of each plan, float64 [P, N_B] [Hz], the energies E of the
+    whitened mean signals of all bands at some positions, float64 [N], and r_max [m].
     """
     # A slow import, not needed to load a codebook.
     from scipy.special import ndtr

@@ -31,25 +31,14 @@ class CalibrationError(ValueError):
 class Calibration:
     """An estimate of a surface.
 
-    Attributes
-    ----------
-    surface
-        The estimate, as used by estimators, bounds and beams.
-    scenario_id
-        `Scenario.id` of the scenario to which it applies, without the files of a hall.
-    about
-        Record of the calibration: ``pilots``, their number; ``codebooks``, their ids; ``prior`` of
-        the elements; ``scenario``, the fields that differ from Table I; ``rounds`` of the
-        estimation, and whether it ``converged``; ``version``.
-
-    Raises
-    ------
-    CalibrationError
-        If sizes disagree or a number is not finite.
+    Raises CalibrationError if sizes disagree or a number is not finite.
     """
 
-    surface: SurfaceEstimate
-    scenario_id: str
+    surface: SurfaceEstimate  #: The estimate, as used by estimators, bounds and beams.
+    scenario_id: str  #: `Scenario.id` of its scenario, without the files of a hall.
+    #: Record of the calibration: ``pilots``, their number; ``codebooks``, their ids; ``prior`` of
+    #: the elements; ``scenario``, the fields that differ from Table I; ``rounds`` of the
+    #: estimation, and whether it ``converged``; ``version``.
     about: dict[str, Any]
 
     def __post_init__(self) -> None:

@@ -68,18 +68,10 @@ def prior_of(scenario: Scenario) -> SurfacePrior:
 def estimate_surface(
         scenario: Scenario, pilots: Sequence[Pilots], prior: SurfacePrior | None = None,
         progress: Callable[[int, float], None] | None = None) -> SurfaceEstimate:
-    """Estimate a surface from pilots.
+    """Estimate a surface from pilots of one or several codebooks; without pilots, from the prior.
 
-    Parameters
-    ----------
-    pilots
-        Pilots of one or several codebooks with the scenario's sizes. Without pilots, the result is
-        the prior.
-    prior
-        By default the result of `prior_of`.
-    progress
-        Called after each round with its number and the largest change of a parameter, in
-        standard deviations.
+    The default prior is that of `prior_of`. `progress` is called after each round with its number
+    and the largest change of a parameter, in standard deviations.
     """
     prior = prior or prior_of(scenario)
     statistics = PilotStatistics(scenario, pilots)
@@ -149,11 +141,9 @@ class Alignment:
 
 
 def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
-    """Return the RMS of the real and imaginary parts of the bands' relative errors, [2, N_B].
-
-    Pilots cannot distinguish a random gain or phase of the user from those of the bands. The gains
-    or phases of as many bands are therefore fixed.
-    """
+    """Return the RMS of the real and imaginary parts of the bands' relative errors, [2, N_B]."""
+    # Pilots cannot distinguish a random gain or phase of the user from those of the bands. The
+    # gains or phases of as many bands are therefore fixed.
     rms = np.full((2, scenario.n_bands), prior.band_gain_rms / np.sqrt(2))
     nuisance = nuisance_of(scenario)
     phases = nuisance.phases

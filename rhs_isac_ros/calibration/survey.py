@@ -66,35 +66,14 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
            received: np.ndarray, surface: Surface | None = None) -> MultipathEstimate:
     """Estimate the covariance of the multipath from signals at known positions.
 
-    Parameters
-    ----------
-    scenario
-        The scenario of the signals. Its multipath fields are only starting points; its declared
-        impairments are estimated for each position.
-    positions
-        Float64 [N, 3] [m], spread over the region of interest.
-    received
-        Complex128 [N, N_B, N_SB F], sub-band-major.
-    surface
-        Knowledge of the surface, as in `MeasurementModel`.
+    `positions`, float64 [N, 3] [m], should be spread over the region of interest; `received` are
+    complex128 [N, N_B, N_SB F], sub-band-major. Multipath fields of the scenario are only starting
+    points; declared impairments are estimated for each position. The result is a value of the
+    field `Scenario.multipath`, and its `about` contains the expected coverage.
 
-    Returns
-    -------
-    MultipathEstimate
-        The value of a scenario's field `multipath`:
-        ``dataclasses.replace(scenario, multipath=estimate)``. `MultipathEstimate.about` contains
-        the expected coverage and other properties.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a number is not finite, or there is no position.
-
-    Warns
-    -----
-    SurveyWarning
-        If there are fewer than `MIN_POSITIONS` positions, or they span less than half of a side of
-        the region of interest.
+    Raises ValueError if a shape is wrong, a number is not finite, or there is no position. Warns
+    with SurveyWarning if there are fewer than `MIN_POSITIONS` positions, or if they span less than
+    half of a side of the region.
     """
     pilots = Pilots(codebook, np.asarray(positions, float), np.asarray(received, complex))
     n = len(pilots.positions)

@@ -124,19 +124,11 @@ _MIN_DIFFERENCE = 4
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
-    """A band plan that was compared with others, with its ascending centre frequencies.
-
-    Attributes
-    ----------
-    screening_m2
-        Squared error from confusing ranges, according to the range ambiguity function.
-    error_m2
-        Expected squared error with an optimised codebook; see `expected_error`.
-    """
+    """A band plan that was compared with others, with its ascending centre frequencies."""
 
     frequencies_hz: tuple[float, ...]
-    screening_m2: float
-    error_m2: float
+    screening_m2: float  #: Squared error from confusing ranges, by the range ambiguity function.
+    error_m2: float  #: Expected squared error with an optimised codebook; see `expected_error`.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,26 +180,11 @@ def choose_bands(
         report: Callable[[Candidate], None] | None = None) -> tuple[Candidate, ...]:
     """Choose centre frequencies with which users can be located accurately.
 
-    Parameters
-    ----------
-    spectrum_hz
-        Intervals of centre frequencies [Hz], including their ends.
-    raster_hz
-        Spacing of possible centre frequencies, from the low end of each interval [Hz].
-    min_gap_hz
-        Smallest distance of two centre frequencies [Hz]; by default, the width of a band.
-    report
-        Called with each plan for which a codebook is optimised.
-
-    Returns
-    -------
-    tuple of Candidate
-        The plans with codebooks, the best one first.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of range, or no plan has the gap.
+    `spectrum_hz` are intervals of centre frequencies, including their ends, `raster_hz` is the
+    spacing of frequencies from the low end of each interval, and `min_gap_hz` the smallest
+    distance of two frequencies, by default the width of a band. Returns the plans for which
+    codebooks were compared, the best one first; `report` is called with each. Raises ValueError if
+    an argument is out of range, or no plan has the gap.
     """
     if n_bands < 1 or scenario.n_bands * scenario.n_frames % n_bands:
         raise ValueError(

@@ -38,28 +38,14 @@ class CodebookError(ValueError):
 class Codebook:
     """Analog and digital beamforming of a positioning phase.
 
-    Attributes
-    ----------
-    analog
-        Configurations C, float64 [N_B, F, N_E], each entry in [0, 1].
-    digital
-        Combining vectors S, complex128 [N_B, N_SB, F, K] [sqrt(W)].
-    average_crlb_m2
-        Measured average bound [m^2]; NaN if unknown.
-    provenance
-        Origin of the codebook; see `Provenance`.
-
-    Raises
-    ------
-    CodebookError
-        If an array has the wrong number of dimensions or entries that are not finite, the sizes
-        disagree, or a configuration is outside [0, 1].
+    Raises CodebookError if an array has the wrong number of dimensions or entries that are not
+    finite, the sizes disagree, or a configuration is outside [0, 1].
     """
 
-    analog: np.ndarray
-    digital: np.ndarray
-    average_crlb_m2: float = math.nan
-    provenance: str = ''
+    analog: np.ndarray  #: Configurations C, float64 [N_B, F, N_E], each entry in [0, 1].
+    digital: np.ndarray  #: Combining vectors S, complex128 [N_B, N_SB, F, K] [sqrt(W)].
+    average_crlb_m2: float = math.nan  #: Measured average bound; NaN if unknown.
+    provenance: str = ''  #: Origin of the codebook; see `Provenance`.
 
     def __post_init__(self) -> None:
         """Copy the arrays, check them, and make them read-only."""
@@ -231,33 +217,19 @@ def default_codebook_file() -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class Provenance:
-    """The arguments of an optimisation and its progress.
-
-    Attributes
-    ----------
-    positions
-        Number of positions.
-    scenario
-        Fields of the scenario that differ from Table I.
-    calibration
-        Id of the calibration, or ''.
-    steps, evaluations
-        Totals, including the runs that were resumed.
-    value_m2
-        The objective [m^2].
-    """
+    """The arguments of an optimisation and its progress."""
 
     method: str
     objective: str
     seed: int
     sampling: str
-    positions: int
-    scenario: dict[str, Any]
+    positions: int  #: Number of positions.
+    scenario: dict[str, Any]  #: Fields that differ from Table I.
     version: str = __version__
-    calibration: str = ''
-    steps: int = 0
+    calibration: str = ''  #: Id of the calibration, if any.
+    steps: int = 0  #: Total, including the runs that were resumed; as for `evaluations`.
     evaluations: int = 0
-    value_m2: float = math.nan
+    value_m2: float = math.nan  #: The objective.
     reason: str = ''
 
     def to_text(self) -> str:

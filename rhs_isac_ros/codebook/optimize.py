@@ -57,21 +57,11 @@ METHODS: Mapping[str, Method] = {
 
 @dataclasses.dataclass(frozen=True)
 class OptimizeResult:
-    """Result of an optimisation.
+    """Result of an optimisation."""
 
-    Attributes
-    ----------
-    codebook
-        The best codebook evaluated; its `average_crlb_m2` is for the sampled positions.
-    history
-        Progress after each step; step 0 is the start.
-    reason
-        The reason for stopping.
-    """
-
-    codebook: Codebook
-    history: tuple[Progress, ...]
-    reason: str
+    codebook: Codebook  #: The best evaluated; `average_crlb_m2` is for the sampled positions.
+    history: tuple[Progress, ...]  #: Progress after each step; step 0 is the start.
+    reason: str  #: The reason for stopping.
 
 
 @one_blas_thread
@@ -86,7 +76,11 @@ def optimize(
 
     If the scenario has ``amplitude_levels``, configurations are optimised over these levels, by
     `minimize_levels` for the method ``lbfgs`` and by ``genetic``. After a KeyboardInterrupt, the
-    best codebook so far is returned.
+    best codebook so far is returned. Raises ValueError if a name is unknown, a number or the
+    positions are out of range, `resume` was made with other arguments, the calibration belongs to
+    another scenario, or the signals do not determine the positions; MissingLibraryError if the
+    method needs a library that is not installed; and CodebookError if `start` does not fit the
+    scenario.
 
     Parameters
     ----------
@@ -121,17 +115,6 @@ def optimize(
         returns the start.
     keep
         Called at most every ten seconds with the result so far.
-
-    Raises
-    ------
-    ValueError
-        If a name is unknown, a number or the positions are out of range, `resume` was made with
-        other arguments, the calibration belongs to another scenario, or the signals do not
-        determine the positions.
-    MissingLibraryError
-        If the method needs a library that is not installed.
-    CodebookError
-        If `start` does not fit the scenario.
     """
     for name, value, known in (('method', method, METHODS), ('objective', objective, OBJECTIVES),
                                ('sampling', sampling, SAMPLINGS)):

@@ -178,30 +178,15 @@ def run_jobs(
         n_jobs: int = -1, dask: str | None = None, label: str = '') -> list[dict[str, Any]]:
     """Run the jobs that have no stored result; return all results in order, decoded from JSON.
 
-    Each result is stored as soon as it is available. After an interruption or an error, the same
-    call resumes the experiment. A terminal shows a progress bar with a label.
+    `function` takes the arguments of a job and returns a dict that JSON can represent. Each result
+    is stored as soon as it is available, in a file in `folder`. After an interruption or an error,
+    the same call resumes the experiment. `n_jobs` jobs run in parallel on this machine, by default
+    one per core; `dask` is the address of the scheduler of a Dask cluster to use instead. A
+    terminal shows a progress bar with a label.
 
-    Parameters
-    ----------
-    function
-        Function of the arguments of a job that returns a dict which JSON can represent.
-    folder
-        Folder with one JSON file for each result.
-    n_jobs
-        Number of parallel jobs on this machine; -1 for one per core.
-    dask
-        Address of the scheduler of a Dask cluster to use instead.
-
-    Raises
-    ------
-    JobError
-        If a job fails, or its worker has another version of this package.
-    ConnectionError
-        If the cluster does not respond.
-    OSError
-        If a result cannot be read or stored.
-    MissingLibraryError
-        If a library is not installed.
+    Raises JobError if a job fails or its worker has another version of this package,
+    ConnectionError if the cluster does not respond, OSError if a result cannot be read or stored,
+    and MissingLibraryError if a library is not installed.
     """
     if len({job.name for job in jobs}) < len(jobs):
         raise ValueError('jobs: two have the same name, expected unique names')

@@ -15,18 +15,12 @@ class Replicates(NamedTuple):
     """A statistic over several members and cases, with its replicates from the bootstrap.
 
     A member is a repetition, such as another training or another random codebook.
-
-    Attributes
-    ----------
-    values
-        The statistic, then its replicates, which resample cases and members, float64
-        [1 + replicates]; NaN where a replicate has no result.
-    by_member
-        Likewise, but the replicates resample only the members.
     """
 
+    #: The statistic, then its replicates, which resample cases and members, float64
+    #: [1 + replicates]; NaN where a replicate has no result.
     values: np.ndarray
-    by_member: np.ndarray
+    by_member: np.ndarray  #: Likewise, but the replicates resample only the members.
     n_members: int
 
     def minus(self, other: 'Replicates') -> 'Replicates':
@@ -55,18 +49,11 @@ class Replicates(NamedTuple):
 def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -> list[Replicates]:
     """Return the mean of results, or quantiles, with replicates over cases and members.
 
-    Of M members, M - 1 are drawn with replacement, which makes the variance of the replicates
-    unbiased (Rao and Wu, Resampling inference with complex survey data, 1988). A single member
-    contributes no variance. Results with the same number of cases share the resampled cases.
-
-    Parameters
-    ----------
-    results
-        Float64 [members, cases]; NaN where a member has no result for a case.
-    seed
-        Seed of the resampled members, to be different for other members.
-    quantiles
-        Quantiles from 0 to 1; by default, the mean is computed.
+    `results` are float64 [members, cases], NaN where a member has no result for a case. Of M
+    members, M - 1 are drawn with replacement, which makes the variance of the replicates unbiased
+    (Rao and Wu, Resampling inference with complex survey data, 1988). A single member contributes
+    no variance. The seed should differ for other members. Results with the same number of cases
+    share the resampled cases. Quantiles are from 0 to 1; by default, the mean is computed.
     """
     if results.ndim != 2 or not np.isfinite(results).any():
         raise ValueError(f'results: shape {results.shape}, expected [members, cases] with a '

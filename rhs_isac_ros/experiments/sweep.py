@@ -186,6 +186,10 @@ class Point(NamedTuple):
 class Sweep:
     """The measures of a sweep, its settings, and the options of its codebooks.
 
+    Raises ValueError if a measure is unknown, a number is out of range, a file has no codebook
+    that fits its settings, or base values contradict those that an optimisation takes from a
+    setting.
+
     Attributes
     ----------
     base
@@ -206,12 +210,6 @@ class Sweep:
         fits.
     repeats
         Number of codebooks in each setting, with successive seeds, if optimised or random.
-
-    Raises
-    ------
-    ValueError
-        If a measure is unknown, a number is out of range, a file has no codebook that fits its
-        settings, or base values contradict those that an optimisation takes from a setting.
     """
 
     base: Scenario

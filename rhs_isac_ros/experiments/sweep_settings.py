@@ -21,26 +21,14 @@ _INFINITE = 1e300
 
 
 class Measure(NamedTuple):
-    """A statistic of one quantity over the positions.
-
-    Attributes
-    ----------
-    label
-        Axis label without the unit.
-    quantile
-        The quantile, from 0 to 1; None for the mean.
-    root
-        Whether to take the square root of the statistic.
-    share
-        Whether the quantity is 0 or 1, and the measure its share in per cent.
-    """
+    """A statistic of one quantity over the positions."""
 
     quantity: str
-    label: str
+    label: str  #: Axis label without the unit.
     unit: str
-    quantile: float | None = None
-    root: bool = False
-    share: bool = False
+    quantile: float | None = None  #: From 0 to 1; None for the mean.
+    root: bool = False  #: Whether to take the square root of the statistic.
+    share: bool = False  #: Whether the quantity is 0 or 1, and the measure its share in per cent.
 
 
 MEASURES: Mapping[str, Measure] = {

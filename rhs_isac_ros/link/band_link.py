@@ -58,27 +58,14 @@ class BandLink:
 
     With several bands, all arrays except `fixed` have a leading axis for the band, and
     configurations are float64 [N_B, n, N_E]. In one band, they have any number of leading axes.
-
-    Attributes
-    ----------
-    onboard
-        B_j, complex128 [N_SB, K, N_E].
-    los
-        Line-of-sight gains, complex128 [N_SB, N_E].
-    spatial
-        V_i.
-    noise_power_w, power_w
-        Noise power of a sub-band, and power of the digital part summed over sub-bands [W].
-    fixed
-        Elements whose configuration is always 1, bool [N_E].
     """
 
-    onboard: np.ndarray
-    los: np.ndarray
-    spatial: SpatialCovariance
-    noise_power_w: float
-    power_w: float
-    fixed: np.ndarray
+    onboard: np.ndarray  #: B_j, complex128 [N_SB, K, N_E].
+    los: np.ndarray  #: Line-of-sight gains, complex128 [N_SB, N_E].
+    spatial: SpatialCovariance  #: V_i.
+    noise_power_w: float  #: Noise power of a sub-band.
+    power_w: float  #: Power of the digital part, summed over sub-bands.
+    fixed: np.ndarray  #: Elements whose configuration is always 1, bool [N_E].
 
     @classmethod
     def to(cls, scenario: Scenario, position: np.ndarray, bands: int | Sequence[int],

@@ -23,33 +23,19 @@ _MAX_SPREAD_M = 1e6
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Beam:
-    """Beamforming of one band in the transmission phase.
+    """Beamforming of one band in the transmission phase."""
 
-    Attributes
-    ----------
-    analog
-        Configuration c-hat, float64 [N_E], each entry in [0, 1].
-    digital
-        Digital beamforming vectors s-hat, complex128 [N_SB, K] [sqrt(W)].
-    band
-        Index of the band, from 0.
-    """
-
-    analog: np.ndarray
-    digital: np.ndarray
-    band: int = 0
+    analog: np.ndarray  #: Configuration c-hat, float64 [N_E], each entry in [0, 1].
+    digital: np.ndarray  #: Digital beamforming vectors s-hat, complex128 [N_SB, K] [sqrt(W)].
+    band: int = 0  #: Index of the band, from 0.
 
 
 @one_blas_thread
 def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
     """Implements Eq. (10). Capacity R_i of a beam at `positions`, float64 [N, 3] [m].
 
-    The result is float64 [N] [bit/s].
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array, or the beam does not fit the scenario.
+    The result is float64 [N] [bit/s]. Raises ValueError if `positions` is not a finite [N, 3]
+    array, or the beam does not fit the scenario.
     """
     return capacities(scenario, [beam], positions)[0]
 
@@ -84,13 +70,9 @@ def expected_capacities(
 ) -> np.ndarray:
     """Average Eq. (10) of n beams over a Gaussian posterior of the position, float64 [n] [bit/s].
 
-    The posterior has the mean, float64 [3] [m], and the covariance, float64 [3, 3] [m^2].
-
-    Raises
-    ------
-    ValueError
-        If `mean` or `covariance` has a wrong shape or is not finite, or a beam does not fit the
-        scenario.
+    The posterior has the mean, float64 [3] [m], and the covariance, float64 [3, 3] [m^2]. Raises
+    ValueError if `mean` or `covariance` has a wrong shape or is not finite, or a beam does not fit
+    the scenario.
     """
     points, weights = posterior_points(scenario, mean, covariance)
     # Separate products, so that the number of beams does not affect the rounding.
@@ -110,12 +92,8 @@ def posterior_points(
     would contribute impossible capacities.
 
     Of the covariance, only the symmetric part is used; negative variances count as 0. Returns
-    positions, float64 [n, 3] [m], and weights with the sum 1, float64 [n].
-
-    Raises
-    ------
-    ValueError
-        If `mean` or `covariance` has a wrong shape or is not finite.
+    positions, float64 [n, 3] [m], and weights with the sum 1, float64 [n]. Raises ValueError if
+    `mean` or `covariance` has a wrong shape or is not finite.
     """
     for name, value, shape in (('mean', mean, (3,)), ('covariance', covariance, (3, 3))):
         if np.shape(value) != shape or not np.isfinite(value).all():
@@ -158,19 +136,12 @@ def _rate(scenario: Scenario, power_w: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BeamPattern:
-    """Power of a beam over the directions in front of the surface, at one distance.
+    """Power of a beam over the directions in front of the surface, at one distance."""
 
-    Attributes
-    ----------
-    directions
-        Unit vectors from the centre of the surface, float64 [n_el, n_az, 3]; elevation grows along
-        the first axis, azimuth along the second, both from -90 to 90 degrees.
-    relative
-        Line-of-sight power relative to the strongest direction, float64 [n_el, n_az]; zeros if the
-        beam is off.
-    """
-
+    #: Unit vectors from the centre of the surface, float64 [n_el, n_az, 3]; elevation grows along
+    #: the first axis, azimuth along the second, both from -90 to 90 degrees.
     directions: np.ndarray
+    #: Line-of-sight power relative to the strongest direction, [n_el, n_az]; 0 if the beam is off.
     relative: np.ndarray
     distance_m: float
 
@@ -197,12 +168,8 @@ def beam_pattern(
         scenario: Scenario, beam: Beam, distance_m: float, step_deg: float = 5.0) -> BeamPattern:
     """Compute the near-field pattern of a beam at a distance from the centre of the surface.
 
-    Neighbouring azimuths, and elevations, are at most `step_deg` apart.
-
-    Raises
-    ------
-    ValueError
-        If the distance or the step is not positive, or the beam does not fit the scenario.
+    Neighbouring azimuths, and elevations, are at most `step_deg` apart. Raises ValueError if the
+    distance or the step is not positive, or the beam does not fit the scenario.
     """
     for name, value in (('distance_m', distance_m), ('step_deg', step_deg)):
         if not value > 0:

@@ -41,35 +41,18 @@ _MIN_NORM = 1e-30
 
 
 class Tables(NamedTuple):
-    """The arrays of the search that do not depend on the position, for all bands.
+    """The arrays of the search that do not depend on the position, for all bands."""
 
-    Attributes
-    ----------
-    subbands
-        Indices of the representative sub-bands, int [J].
-    onboard
-        Gains on the board, complex64 [N_B, N_E, J, K].
-    paths
-        Gains from each feed via each element to each wave in the air, complex64
-        [N_B, N_E, J, K, L]. The first wave, the line of sight, is zero here. The others are the
-        strongest modes of the multipath, the columns of G with G G^T close to V_i.
-    starts
-        Waves on the board with which the search starts, float32 [S, 2 J K].
-    peaks
-        Upper limits of the amplitude of a mode at a feed, float64 [N_B].
-    scattered
-        Configurations with a high capacity over the multipath alone, float32 [N_B, n, N_E].
-    fixed
-        As in `BandLink`.
-    """
-
-    subbands: np.ndarray
-    onboard: np.ndarray
+    subbands: np.ndarray  # Indices of the representative sub-bands, int [J].
+    onboard: np.ndarray  # Gains on the board, complex64 [N_B, N_E, J, K].
+    # Gains from each feed via each element to each wave in the air, complex64 [N_B, N_E, J, K, L].
+    # The first wave, the line of sight, is zero here. The others are the strongest modes of the
+    # multipath, the columns of G with G G^T close to V_i.
     paths: np.ndarray
-    starts: np.ndarray
-    peaks: np.ndarray
-    scattered: np.ndarray
-    fixed: np.ndarray
+    starts: np.ndarray  # Waves on the board with which the search starts, float32 [S, 2 J K].
+    peaks: np.ndarray  # Upper limits of the amplitude of a mode at a feed, float64 [N_B].
+    scattered: np.ndarray  # Good configurations for the multipath alone, float32 [N_B, n, N_E].
+    fixed: np.ndarray  # Elements whose configuration is always 1, bool [N_E].
 
 
 def candidate_configurations(
@@ -205,21 +188,12 @@ def _matched(tables: Tables, direct: np.ndarray) -> np.ndarray:
 
 
 class _Waves(NamedTuple):
-    """Configurations, float32 [N_B, n, N_E], with their capacities and a pair of waves for each.
-
-    Attributes
-    ----------
-        Capacities [nat/symbol], float32 [N_B, n].
-    on_board
-        Conjugates of unit waves on the board, complex64 [N_B, n, J, K, 1].
-    in_air
-        Best waves in the air for them, divided by 1 plus the signal-to-noise ratio, complex64
-        [N_B, n, J, 1, L].
-    """
+    """Configurations, float32 [N_B, n, N_E], each with its capacity and a pair of waves."""
 
     analog: np.ndarray
-    rate: np.ndarray
-    on_board: np.ndarray
+    rate: np.ndarray  # Capacities [nat/symbol], float32 [N_B, n].
+    on_board: np.ndarray  # Conjugates of unit waves on the board, complex64 [N_B, n, J, K, 1].
+    # Best waves in the air for them over 1 plus the signal-to-noise ratio, [N_B, n, J, 1, L].
     in_air: np.ndarray
 
     @classmethod

@@ -64,27 +64,14 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _Point(NamedTuple):
-    """Configurations, float64 [N_B, n, N_E], and the capacity with their best digital parts.
-
-    Attributes
-    ----------
-    rate
-        Capacities [nat/symbol], float64 [N_B, n].
-    vertex
-        Vertex in the direction of the gradient, float64 [N_B, n, N_E].
-    snr
-        Signal-to-noise ratios, float64 [N_B, n, N_SB].
-    slope, curvature
-        Derivative of the ratios by each element, and coefficient of the square of its change,
-        float64 [N_B, n, N_SB, N_E].
-    """
+    """Configurations, float64 [N_B, n, N_E], and the capacity with their best digital parts."""
 
     analog: np.ndarray
-    rate: np.ndarray
-    vertex: np.ndarray
-    snr: np.ndarray
-    slope: np.ndarray
-    curvature: np.ndarray
+    rate: np.ndarray  # Capacities [nat/symbol], float64 [N_B, n].
+    vertex: np.ndarray  # Vertex in the direction of the gradient, float64 [N_B, n, N_E].
+    snr: np.ndarray  # Signal-to-noise ratios, float64 [N_B, n, N_SB].
+    slope: np.ndarray  # Derivative of the ratios by each element, float64 [N_B, n, N_SB, N_E].
+    curvature: np.ndarray  # Coefficient of the square of an element's change, of the same shape.
 
     @classmethod
     def at(cls, link: BandLink, spread: np.ndarray, analog: np.ndarray) -> '_Point':
@@ -170,11 +157,7 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
     are improved together with the digital part. Amplitudes are 0 or 1, which exist for any number
     of amplitude levels. The power over all sub-bands is P_max. The beam is deterministic. Bands
     are counted from 0. A calibrated surface applies its own coefficients to the configuration.
-
-    Raises
-    ------
-    ValueError
-        If the position is not a finite [3] array, or the band is out of range.
+    Raises ValueError if the position is not a finite [3] array, or the band is out of range.
     """
     return steer_bands(scenario, position, [band], surface)[0]
 
@@ -218,24 +201,12 @@ def choose_beam(
         bands: Sequence[int] | None = None, surface: SurfaceEstimate | None = None) -> Choice:
     """Steer a beam of each band to the mean position, and choose the one of highest mean capacity.
 
-    The capacity at the mean position would mislead: a stronger but narrower beam may lose more
-    capacity to the positioning error than it gains. The first of equal bands is chosen.
-
-    Parameters
-    ----------
-    mean, covariance
-        Posterior of the position, float64 [3] [m] and [3, 3] [m^2]; the position is exact without
-        a covariance.
-    bands
-        Bands to choose from, counted from 0; None for all.
-    surface
-        A calibrated surface; by default that of the scenario.
-
-    Raises
-    ------
-    ValueError
-        If `mean` or `covariance` has a wrong shape or is not finite, there is no band, or a band
-        is out of range.
+    The posterior is Gaussian, with the mean, float64 [3] [m], and the covariance, float64 [3, 3]
+    [m^2]; without a covariance, the position is exact. The capacity at the mean position alone
+    would mislead: a stronger but narrower beam may lose more capacity to the positioning error
+    than it gains. `bands` are counted from 0, and all by default; the first of equal bands is
+    chosen. Raises ValueError if `mean` or `covariance` has a wrong shape or is not finite, there
+    is no band, or a band is out of range.
     """
     covariance = np.zeros((3, 3)) if covariance is None else covariance
     bands = range(scenario.n_bands) if bands is None else bands
@@ -256,12 +227,8 @@ def capacity_report(
     Both beams transmit over the paths of a channel file, if the scenario has one. The search for a
     beam ends slightly below the maximum. With an accurate estimate, the loss may therefore be
     negative, typically by less than a tenth of a per cent. `bands` and `surface` are those of
-    `choose_beam`.
-
-    Raises
-    ------
-    ValueError
-        If the position is not a finite [3] array, or the beam does not fit the scenario.
+    `choose_beam`. Raises ValueError if the position is not a finite [3] array, or the beam does
+    not fit the scenario.
     """
     def actual_bps(beam: Beam) -> float:
         place = np.asarray(position, dtype=float)[None]

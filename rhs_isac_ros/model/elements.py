@@ -94,18 +94,10 @@ class SurfaceModel:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ElementErrors(SurfaceModel):
-    """Errors of the elements of one surface, the same in all bands and frames.
+    """Errors of the elements of one surface, the same in all bands and frames."""
 
-    Attributes
-    ----------
-    gains
-        Factor of the coefficient of each element, complex128 [N_E]; 1 without an error.
-    stuck
-        Amplitude of each failed element, float64 [N_E]; NaN where an element works.
-    """
-
-    gains: np.ndarray
-    stuck: np.ndarray
+    gains: np.ndarray  #: Factors of the coefficients, complex128 [N_E]; 1 without an error.
+    stuck: np.ndarray  #: Amplitudes of failed elements, float64 [N_E]; NaN if an element works.
 
     @property
     def id(self) -> str:
@@ -171,26 +163,15 @@ class DeclaredElements(SurfaceModel):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SurfaceEstimate(SurfaceModel):
-    """Mean and covariance of the coefficients of a surface.
+    """Mean and covariance of the coefficients of a surface, ``gain c + offset``."""
 
-    Attributes
-    ----------
-    gains, offsets
-        Expected coefficient of each element, ``gain c + offset``, complex128 [N_E].
-    band_gains
-        Expected gain of each band, complex128 [N_B].
-    factor
-        F such that F F^H is the covariance of gains, offsets and relative errors of the band
-        gains, complex128 [2 N_E + N_B, R].
-    failed_probability
-        Probability that each element has failed, float64 [N_E].
-    """
-
-    gains: np.ndarray
-    offsets: np.ndarray
-    band_gains: np.ndarray
+    gains: np.ndarray  #: Expected gains of the elements, complex128 [N_E].
+    offsets: np.ndarray  #: Expected offsets of the elements, complex128 [N_E].
+    band_gains: np.ndarray  #: Expected gain of each band, complex128 [N_B].
+    #: F such that F F^H is the covariance of gains, offsets and relative errors of the band gains,
+    #: complex128 [2 N_E + N_B, R].
     factor: np.ndarray
-    failed_probability: np.ndarray
+    failed_probability: np.ndarray  #: Probability that each element has failed, float64 [N_E].
 
     @property
     def is_exact(self) -> bool:

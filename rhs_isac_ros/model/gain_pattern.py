@@ -32,6 +32,8 @@ class GainPattern(External):
     """Amplitude gain that depends only on the angle from the boresight.
 
     Patterns whose gains agree to seven digits are equal, even if they use different functions.
+    Raises PatternError if a function fails, or returns a wrong shape, complex values or values out
+    of range.
 
     Parameters
     ----------
@@ -44,11 +46,6 @@ class GainPattern(External):
         degrees.
     origin
         Name of the plug-in; empty for other functions.
-
-    Raises
-    ------
-    PatternError
-        If a function fails, or returns a wrong shape, complex values or values out of range.
     """
 
     WORDS = 'a function', f'a number or the name of a plug-in of {plugins.GAIN_PATTERNS}'

@@ -60,6 +60,8 @@ _FILE_TYPES = {'a': np.complex64, 'gains': np.complex64, 'src': np.float32, 'n':
 class MultipathEstimate(ArrayFile):
     """A measured covariance of the multipath, as a value of the field `Scenario.multipath`.
 
+    Raises ArchiveError if sizes disagree or a number is not finite.
+
     Attributes
     ----------
     multipath_to_los_db, delay_spread_s, angular_spread_deg
@@ -75,11 +77,6 @@ class MultipathEstimate(ArrayFile):
         ``inflation`` t; ``level_std_db``, the standard deviation of the power among users [dB];
         ``coverage``, the expected share of positions in the 95 % region, with its interval;
         ``warnings``; ``codebook``, its id; ``version``.
-
-    Raises
-    ------
-    ArchiveError
-        If sizes disagree or a number is not finite.
     """
 
     multipath_to_los_db: float
@@ -148,7 +145,8 @@ class MultipathEstimate(ArrayFile):
 class PathChannel(ArrayFile):
     """Propagation paths between users and the surface, as a value of `Scenario.channel`.
 
-    Users have at most P paths; the amplitude of missing ones is 0.
+    Users have at most P paths; the amplitude of missing ones is 0. Raises ArchiveError if sizes
+    disagree, or a number is not finite or physically impossible.
 
     Attributes
     ----------
@@ -167,11 +165,6 @@ class PathChannel(ArrayFile):
     gains
         Factors of the paths at each element, complex128 [N, P, N_E], for objects that are visible
         from only a part of the surface; None if all factors are 1.
-
-    Raises
-    ------
-    ArchiveError
-        If sizes disagree, or a number is not finite or physically impossible.
     """
 
     users: np.ndarray

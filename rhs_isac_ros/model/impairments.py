@@ -39,21 +39,12 @@ class Scope(enum.Enum):
 
 
 class Linear(NamedTuple):
-    """The exponents of an impairment and the prior of its values.
+    """The exponents of an impairment and the prior of its values."""
 
-    Attributes
-    ----------
-    patterns
-        Exponent of the signals per unit of each value, complex128 [q, N_B, N_SB F].
-    root
-        Factor L of the covariance L L^T of the values, float64 [q, q], invertible.
-    needs_search
-        Whether the likelihood of a value has several maxima within its prior. Estimators then
-        compare values on a grid before they refine one.
-    """
-
-    patterns: np.ndarray
-    root: np.ndarray
+    patterns: np.ndarray  #: Exponents per unit of each value, complex128 [q, N_B, N_SB F].
+    root: np.ndarray  #: Invertible factor L of the values' covariance L L^T, float64 [q, q].
+    #: Whether the likelihood of a value has several maxima within its prior. Estimators then
+    #: compare values on a grid before they refine one.
     needs_search: bool = False
 
 

@@ -85,12 +85,8 @@ def simulate_received(
     The user's position in each phase is a row of `positions`, float64 [N, 3] [m]. Returns
     complex128 [N, N_B, N_SB F], sub-band-major. Declared impairments are drawn too: a new user and
     a new cycle for each position, and one surface for all positions unless `surface` is given.
-    With a channel file, the nearest user of the file replaces each position.
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array, or a size differs from the scenario's.
+    With a channel file, the nearest user of the file replaces each position. Raises ValueError if
+    `positions` is not a finite [N, 3] array, or a size differs from the scenario's.
     """
     positions = checked_positions(positions)
     drawn, factors = draw_impairments(scenario, len(positions), rng)
@@ -150,7 +146,8 @@ class MeasurementModel:
     and the weights of `mean_and_jacobian` are computed at first use, or by `prepare`.
 
     Methods take positions of the user, float64 [N, 3] [m], and raise ValueError if the shape is
-    wrong or a value is not finite. Measurements are sub-band-major.
+    wrong or a value is not finite. Measurements are sub-band-major. Raises ValueError if the
+    beamforming or the surface does not have the sizes of the scenario.
 
     Parameters
     ----------
@@ -166,11 +163,6 @@ class MeasurementModel:
         `surface`, or the distribution that the scenario declares.
     radiation
         T_i of Eq. (9) for the coefficients in effect, complex128 [N_B, N_SB F, N_E], read-only.
-
-    Raises
-    ------
-    ValueError
-        If the beamforming or the surface does not have the sizes of the scenario.
     """
 
     @one_blas_thread

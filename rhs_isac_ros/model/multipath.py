@@ -50,23 +50,12 @@ class SpatialCovariance:
     The declared covariance of two elements depends only on their offset on the lattice, so a
     product with V_i is a convolution. For few elements, a matrix is as fast. A measured covariance
     adds a term of low rank.
-
-    Attributes
-    ----------
-    shape
-        Numbers of rows and columns of the elements.
-    is_real
-        Whether V_i is real, as it is for an even profile without a measured covariance.
-    power
-        Power of the gain of each element, float64 [N_E] or [N_B, N_E].
-    matrix
-        V_i [..., N_E, N_E]; None for many elements.
     """
 
-    shape: tuple[int, int]
-    is_real: bool
-    power: np.ndarray
-    matrix: np.ndarray | None = None
+    shape: tuple[int, int]  #: Numbers of rows and columns of the elements.
+    is_real: bool  #: Whether V_i is real, as it is for an even profile that is not measured.
+    power: np.ndarray  #: Power of the gain of each element, float64 [N_E] or [N_B, N_E].
+    matrix: np.ndarray | None = None  #: V_i [..., N_E, N_E]; None for many elements.
     # Fourier transform over the offsets of the elements; None for few elements.
     spectrum: np.ndarray | None = None
     # W F and F of the term of low rank (`plus`) if there is no matrix.
@@ -201,11 +190,7 @@ class _PlaneWaves(NamedTuple):
 def _plane_waves(
         scenario: Scenario, band: int, is_even: Sequence[bool], n_draws: int = 1
 ) -> Iterator[_PlaneWaves]:
-    """Yield the plane waves of a quadrature over the profile, in blocks of elevations.
-
-    An even profile needs only positive angles. A block leaves memory for `n_draws` amplitudes of
-    each wave.
-    """
+    """Yield plane waves of a quadrature, by elevations, for `n_draws` amplitudes in memory."""
     wavenumber = 2 * np.pi * scenario.center_frequencies_hz[band] / SPEED_OF_LIGHT_MPS
     columns, rows = (np.arange(n) * element_interval_m(scenario)
                      for n in (scenario.n_columns, scenario.n_rows))

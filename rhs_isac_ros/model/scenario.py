@@ -215,12 +215,8 @@ class Scenario(Extensions, Table1):
 
     A gain is a number, a `GainPattern`, a function of the angle from boresight, or the name of an
     installed plug-in; in a file, it is a number or a name. `multipath` and `channel` are objects
-    or paths of files.
-
-    Raises
-    ------
-    ScenarioError
-        If a value has the wrong type, is out of range, or contradicts another one.
+    or paths of files. Raises ScenarioError if a value has the wrong type, is out of range, or
+    contradicts another one.
     """
 
     def __post_init__(self) -> None:

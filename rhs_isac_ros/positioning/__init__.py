@@ -58,16 +58,10 @@ def make_estimator(
     `REGION_ESTIMATORS` take the options of `SearchEstimator`. `neural` requires ``model_file``, a
     `Network` or its file. Plug-ins define their own options.
 
-    Raises
-    ------
-    ValueError
-        If there is no estimator of that name.
-    PluginError
-        If a plug-in cannot be loaded, fails, or does not return an estimator.
-    ModelError
-        If a model cannot be read or was trained for another codebook or scenario.
-    CodebookError
-        If the codebook does not fit the scenario.
+    Raises ValueError if there is no estimator of that name, PluginError if a plug-in cannot be
+    loaded, fails, or does not return an estimator, ModelError if a model cannot be read or was
+    trained for another codebook or scenario, and CodebookError if the codebook does not fit the
+    scenario.
     """
     if name in ESTIMATORS:
         return ESTIMATORS[name](scenario, codebook, **options)

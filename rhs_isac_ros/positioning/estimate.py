@@ -84,12 +84,8 @@ def estimate_each(
     """Check received signals, locate every phase, and match the result to the signals' shape.
 
     `locate` yields the values of `Located` for each phase of checked signals [N, N_B, N_SB F]. If
-    the reason is not empty, mean and covariance are ignored.
-
-    Raises
-    ------
-    SignalError
-        If the shape is wrong, a value is not finite, or a magnitude exceeds 1000.
+    the reason is not empty, mean and covariance are ignored. Raises SignalError if the shape is
+    wrong, a value is not finite, or a magnitude exceeds 1000.
     """
     batch = checked_received(codebook, received)
     mean, covariance = np.full((len(batch), 3), np.nan), np.full((len(batch), 3, 3), np.nan)

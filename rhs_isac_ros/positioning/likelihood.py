@@ -290,17 +290,11 @@ def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
              information_of_covariance: np.ndarray | None = None, n_linear: int = 0) -> Local:
     """Combine whitened columns into the likelihood and its derivatives at parameters [M, Q].
 
-    Parameters
-    ----------
-    white
-        The columns of `NuisancePrior.columns`, complex128 [M, C, n]. The last Q may be absent; the
-        gradient then uses derivatives of the mean, and predicts no more than the whole energy.
-    information_of_covariance
-        Information of the covariance about the parameters, float64 [Q, Q]; by default of the
-        average covariance.
-    n_linear
-        Number of further standard normal parameters in which the mean is linear. They are
-        integrated out.
+    `white`, complex128 [M, C, n], are the columns of `NuisancePrior.columns`. The last Q may be
+    absent; the gradient then uses derivatives of the mean, and predicts no more than the whole
+    energy. `information_of_covariance`, float64 [Q, Q], is the information of the covariance about
+    the parameters; by default, that of the average covariance. `n_linear` is the number of further
+    standard normal parameters in which the mean is linear; they are integrated out.
     """
     n, end = 3 + len(prior), 4 + len(prior) + n_linear
     expected, observed = white[:, 1:end], white[:, end:]

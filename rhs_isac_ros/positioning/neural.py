@@ -132,14 +132,9 @@ class NeuralEstimator:
     """Positions from a trained network, all with the covariance of the validation residuals.
 
     The network cannot test whether signals fit its position. Only signals weaker than noise, or
-    stronger than any position could explain, give no position.
-
-    Raises
-    ------
-    CodebookError
-        If the codebook does not fit the scenario.
-    ModelError
-        If the model cannot be read or was trained for another codebook or scenario.
+    stronger than any position could explain, give no position. Raises CodebookError if the
+    codebook does not fit the scenario, and ModelError if the model cannot be read or was trained
+    for another codebook or scenario.
     """
 
     name = 'neural'
@@ -205,16 +200,9 @@ def train(
     """Train a network, and return the state with the smallest validation error.
 
     The seed determines the pairs (at least 20), their order and the initial weights. `n_hidden` is
-    the number of hidden units, and `inputs` a key of `INPUTS`.
-
-    Raises
-    ------
-    CodebookError
-        If the codebook does not fit the scenario.
-    ValueError
-        If a number is too small, or the inputs are unknown.
-    MissingLibraryError
-        If scikit-learn is not installed.
+    the number of hidden units, and `inputs` a key of `INPUTS`. Raises CodebookError if the
+    codebook does not fit the scenario, ValueError if a number is too small or the inputs are
+    unknown, and MissingLibraryError if scikit-learn is not installed.
     """
     for name, value, minimum in (('n_pairs', n_pairs, 20), ('n_hidden', n_hidden, 1),
                                  ('max_epochs', max_epochs, 1)):

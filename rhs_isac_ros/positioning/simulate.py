@@ -18,21 +18,10 @@ def simulate_pairs(
     """Simulate positioning phases at random positions of the region of interest.
 
     A seed defines an infinite sequence of pairs, of which this function returns n, beginning with
-    `first`. However the sequence is divided, the pairs are identical bit for bit.
-
-    Returns
-    -------
-    positions : numpy.ndarray
-        Uniform in the region of interest, float64 [n, 3] [m].
-    received : numpy.ndarray
-        Complex128 [n, N_B, N_SB F], sub-band-major.
-
-    Raises
-    ------
-    CodebookError
-        If the codebook does not fit the scenario.
-    ValueError
-        If `n`, `seed` or `first` is negative.
+    `first`. However it is divided, its pairs are the same bit for bit. Returns positions,
+    float64 [n, 3] [m], uniform in the region, and received signals, complex128 [n, N_B, N_SB F],
+    sub-band-major. Raises CodebookError if the codebook does not fit the scenario, and ValueError
+    if `n`, `seed` or `first` is negative.
     """
     for name, value in (('n', n), ('seed', seed), ('first', first)):
         if value < 0:
