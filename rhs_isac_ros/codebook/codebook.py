@@ -18,6 +18,7 @@ import yaml
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.scenario import check_shape
 from rhs_isac_ros.model.surface import on_levels
 from rhs_isac_ros.support.files import read_yaml, write_whole
@@ -59,8 +60,7 @@ class Codebook:
                 raise CodebookError(f'{name}: shape {array.shape}, expected [{dims}]')
             if not np.isfinite(array).all():
                 raise CodebookError(f'{name}: not finite, expected finite numbers')
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, read_only(array))
         if self.analog.min() < 0 or self.analog.max() > 1:
             raise CodebookError(
                 f'analog: {self.analog.min():g} to {self.analog.max():g}, expected 0 to 1')

@@ -105,20 +105,9 @@ class Search:
     """The objective that a method minimises; counts evaluations and keeps the best point.
 
     Each method defines its own update steps. `done` are the steps and evaluations of the search
-    that is resumed, which count towards the limits.
-
-    Attributes
-    ----------
-    start
-        First point, float64 [n].
-    max_steps
-        Number of update steps that remain.
-    value_m2
-        Lowest objective evaluated [m^2].
-    best
-        Point with the lowest objective, float64 [n].
-    history
-        Progress after each step, beginning with the start.
+    that is resumed, which count towards the limits. `start`, float64 [n], is the first point;
+    `max_steps` is the number of steps that remain; `best` is the point with the lowest objective,
+    `value_m2`; and `history` is the progress after each step, beginning with the start.
     """
 
     def __init__(

@@ -21,9 +21,6 @@ from rhs_isac_ros.support.arguments import integer, output_folder
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
-# Exit code of shells after Ctrl-C.
-_INTERRUPTED = 130
-
 
 class JobError(Exception):
     """A job failed; the message begins with the name of the job."""
@@ -96,12 +93,14 @@ def run_locally(
     with optional_import('running jobs', extra='experiments'):
         import joblib
 
+    release = tuple(int(part) for part in joblib.__version__.split('.')[:2])
     results, threads_before = None, set(threading.enumerate())
     try:
         with _interrupts_ignored(), joblib.parallel_config(
                 backend='loky', inner_max_num_threads=1):
             results = joblib.Parallel(
-                n_jobs=n_jobs, batch_size=1, return_as=_return_as(joblib.__version__))(
+                n_jobs=n_jobs, batch_size=1,
+                return_as='generator_unordered' if release >= (1, 4) else 'generator')(
                     joblib.delayed(attempt)(function, job) for job in jobs)
         # `yield from` would close the generator outside of the filter for warnings below.
         while result := next(results, None):
@@ -147,12 +146,6 @@ def run_on_cluster(
                 yield future.result()
             except Exception as error:  # The job killed its worker or could not be sent to one.
                 yield JobResult(jobs_by_future[future], error=f'{type(error).__name__}: {error}')
-
-
-def _return_as(version: str) -> str:
-    """Return the option with which a version of joblib yields results as early as possible."""
-    release = tuple(int(part) for part in version.split('.')[:2])
-    return 'generator_unordered' if release >= (1, 4) else 'generator'
 
 
 @contextlib.contextmanager
@@ -249,7 +242,8 @@ def run_command(experiment: Callable[[], None]) -> int:
     except KeyboardInterrupt:
         print('interrupted: finished jobs are kept; repeat the command to resume',
               file=sys.stderr)
-        return _INTERRUPTED
+        # As shells report it.
+        return 130
     except (JobError, MissingLibraryError, OSError) as error:
         print_error(f'{error}; finished jobs are kept; repeat the command to resume')
         return 1

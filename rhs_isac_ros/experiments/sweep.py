@@ -189,38 +189,20 @@ class Sweep:
     Raises ValueError if a measure is unknown, a number is out of range, a file has no codebook
     that fits its settings, or base values contradict those that an optimisation takes from a
     setting.
-
-    Attributes
-    ----------
-    base
-        Scenario with the values that are not varied.
-    settings
-        Result of `settings_of`.
-    measures
-        Keys of `MEASURES`.
-    n_positions
-        Positions in each setting, which are the same in all settings with the same region.
-    seed
-        Seed of positions, signals and codebooks.
-    objective, steps
-        Objective and maximum number of steps of an optimisation.
-    optimize_for
-        Fields whose values the optimisation of a codebook takes from the setting; None for all.
-        Other fields have their base values, except those on which it depends whether a codebook
-        fits.
-    repeats
-        Number of codebooks in each setting, with successive seeds, if optimised or random.
     """
 
-    base: Scenario
-    settings: Sequence[Setting]
-    measures: Sequence[str]
-    n_positions: int = 2000
-    seed: int = 0
-    objective: str = 'ambiguity'
-    steps: int = 300
+    base: Scenario  #: Scenario with the values that are not varied.
+    settings: Sequence[Setting]  #: Result of `settings_of`.
+    measures: Sequence[str]  #: Keys of `MEASURES`.
+    n_positions: int = 2000  #: In each setting; the same for all settings with the same region.
+    seed: int = 0  #: Seed of positions, signals and codebooks.
+    objective: str = 'ambiguity'  #: Objective of an optimisation.
+    steps: int = 300  #: Maximum number of steps of an optimisation.
+    #: Fields whose values the optimisation of a codebook takes from the setting; None for all.
+    #: Other fields have their base values, except those on which it depends whether a codebook
+    #: fits.
     optimize_for: Sequence[str] | None = None
-    repeats: int = 1
+    repeats: int = 1  #: Codebooks in each setting, with successive seeds, if optimised or random.
 
     def __post_init__(self) -> None:
         """Check names, numbers and codebooks."""

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.geometry import element_positions, feed_positions
 from rhs_isac_ros.model.los import los_gain
@@ -145,9 +146,7 @@ def arrays(scenario: Scenario, surface: SurfaceEstimate | None
         fixed = surface.failed
         coefficients = np.where(fixed, surface.offsets, surface.gains)
         onboard = surface.band_gains[:, None, None, None] * coefficients * onboard
-    for array in (onboard, fixed):
-        array.flags.writeable = False
-    return onboard, fixed
+    return read_only(onboard), read_only(fixed)
 
 
 @functools.lru_cache(maxsize=16)

@@ -9,6 +9,7 @@ import numpy as np
 
 from rhs_isac_ros.link.band_link import band_index
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.los import direct_gain, los_sums
 from rhs_isac_ros.model.multipath import spatial_covariance
 from rhs_isac_ros.model.scenario import check_shape
@@ -189,7 +190,5 @@ def _directions(step_deg: float) -> np.ndarray:
     # An odd number of angles places the middle ones on boresight.
     angles = np.linspace(-np.pi / 2, np.pi / 2, 2 * n_half + 1)
     elevation, azimuth = np.meshgrid(angles, angles, indexing='ij')
-    directions = np.stack([np.cos(elevation) * np.cos(azimuth),
-                           np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1)
-    directions.flags.writeable = False
-    return directions
+    return read_only(np.stack([np.cos(elevation) * np.cos(azimuth),
+                               np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1))

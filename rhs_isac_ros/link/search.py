@@ -81,9 +81,11 @@ def candidate_configurations(
     direct = (scale * direct).astype(np.complex64, order='C')
     paths = tables.paths[index] * scale[..., None].astype(np.float32)
     paths[..., 0] = direct
+    interference = direct.real.sum(axis=(2, 3))[:, None]
+    loudest = np.abs(interference).max(axis=-1, keepdims=True) + np.float32(_MIN_NORM)
+    matched = np.where(tables.fixed, np.float32(1), (interference / loudest + 1) / 2)
     analog = np.concatenate([
-        _direct_configurations(tables, direct), tables.scattered[index],
-        _matched(tables, direct)], axis=1)
+        _direct_configurations(tables, direct), tables.scattered[index], matched], axis=1)
     gains = np.ascontiguousarray(paths[..., :1 + _N_STRONGEST])
     waves = _Waves.at(gains, analog)
     for _ in range(_N_STEPS):
@@ -178,13 +180,6 @@ def _direct_configurations(tables: Tables, direct: np.ndarray) -> np.ndarray:
     received /= (1 + snr)[..., None]
     waves = received[np.arange(n_bands)[:, None], best].reshape(n_bands, _N_DIRECT, -1)
     return _in_phase(waves @ np.swapaxes(gains, 1, 2), tables.fixed)
-
-
-def _matched(tables: Tables, direct: np.ndarray) -> np.ndarray:
-    """Return the matched filter for line-of-sight gains, float32 [N_B, 1, N_E]."""
-    interference = direct.real.sum(axis=(2, 3))[:, None]
-    peak = np.abs(interference).max(axis=-1, keepdims=True) + np.float32(_MIN_NORM)
-    return np.where(tables.fixed, np.float32(1), (interference / peak + 1) / 2)
 
 
 class _Waves(NamedTuple):

@@ -89,7 +89,9 @@ def output_file(text: str) -> Path:
             raise OSError("'', expected a file")
         check_writable(Path(text))
     except (OSError, ValueError) as error:
-        raise argparse.ArgumentTypeError(_reason(error)) from None
+        raise argparse.ArgumentTypeError(
+            f'{error.filename}: {error.strerror}'
+            if isinstance(error, OSError) and error.strerror else str(error)) from None
     return Path(text)
 
 
@@ -128,9 +130,3 @@ def check_distinct(
             other = names.setdefault(path.resolve(), name)
             if other != name:
                 parser.error(f'argument {name}: {path}, expected another file than {other}')
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return f'{error.filename}: {error.strerror}'
-    return str(error)
