@@ -68,11 +68,11 @@ class Combination(NamedTuple):
     scale: np.ndarray
 
     def forward(self, band: int, whitened: np.ndarray) -> np.ndarray:
-        """Return the rows, complex128 [n, G, R], for the source rows, [n, S, R]."""
+        """Compute the rows, complex128 [n, G, R], from the source rows, [n, S, R]."""
         return whitened[:, self.sources] * self.scale[band, :, None]
 
     def backward(self, band: int, weighted: np.ndarray, n_rows: int) -> np.ndarray:
-        """Return derivatives with respect to the source rows, [n, S, R], from [n, G, R]."""
+        """Convert derivatives by rows, [n, G, R], to derivatives by source rows, [n, S, R]."""
         gathered = np.zeros((len(weighted), n_rows, weighted.shape[2]), complex)
         for row, (source, scale) in enumerate(zip(self.sources, self.scale[band], strict=True)):
             gathered[:, source] += np.conj(scale) * weighted[:, row]

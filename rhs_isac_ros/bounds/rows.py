@@ -157,7 +157,7 @@ class Evaluation:
                 np.moveaxis(grouped[:, part], 2, 0).reshape(n_groups, chosen.shape[1], -1))
 
     def sums(self, band: int) -> GradientSums:
-        """Return the sums over the accumulated blocks."""
+        """Return the sums over all blocks passed to `accumulate`."""
         whitener, products = self._whitener[band], self._products[band]
         total = np.zeros(())
         for (_, pattern), filters, gathered in zip(
@@ -192,7 +192,7 @@ def rows_within(
 
 def _rank_of_some(scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
                   tolerance: float, band: int) -> int:
-    """Return the rank, to a tolerance, of slightly more than `_MAX_RANK` rows and columns."""
+    """Return the rank, within a tolerance, of more than `_MAX_RANK` of the rows and columns."""
     size, width = 2 * _MAX_RANK, scenario.n_subbands * scenario.n_elements
     if n_items * n_rows <= size or width <= 3 * size:
         return 0
@@ -278,7 +278,7 @@ class CompressedRows(MeasurementRows):
 
     @property
     def ranks(self) -> tuple[int, ...]:
-        """Dimensions of the basis of each band."""
+        """Number of basis vectors in each band."""
         return tuple(coefficients.shape[1] for coefficients in self.coefficients)
 
     def in_block(self, block: slice, band: int) -> np.ndarray:
@@ -326,7 +326,7 @@ def _compress(rows_of: Callable[[slice], np.ndarray], every: list[slice], n_rows
 
 def _project(rows_of: Callable[[slice], np.ndarray], chosen: Sequence[slice],
              basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients [n, R] of rows in blocks, and of nonzero rows at unit length."""
+    """Return coefficients [n, R] of the rows of blocks, and of nonzero rows scaled to length 1."""
     coefficients, norms = [], []
     for block in chosen:
         rows = rows_of(block)
@@ -337,7 +337,7 @@ def _project(rows_of: Callable[[slice], np.ndarray], chosen: Sequence[slice],
 
 
 def _leading(relative: np.ndarray, tolerance: float) -> tuple[np.ndarray, float]:
-    """Return the directions to keep [S, R], and the relative error with all of them."""
+    """Return the basis directions to keep [S, R], and the relative error if all were kept."""
     values, vectors = np.linalg.eigh(np.conj(relative.T) @ relative / max(len(relative), 1))
     missing = _missing(relative)
     tails = missing + np.concatenate([[0.0], np.cumsum(np.maximum(values, 0.0))])

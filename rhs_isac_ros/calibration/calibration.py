@@ -136,7 +136,7 @@ def load_surface(path: str, scenario: Scenario) -> SurfaceEstimate | None:
 
 
 def report(calibration: Calibration, scenario: Scenario) -> str:
-    """Describe failed elements, the largest errors, and gains and phases, with deviations."""
+    """Describe failed elements, the largest errors, and the bands, with standard deviations."""
     surface, about = calibration.surface, calibration.about
     n = scenario.n_elements
     std = surface.std()

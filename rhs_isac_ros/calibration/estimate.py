@@ -126,7 +126,7 @@ class Alignment:
 
     def step(self, whiten: Callable[[np.ndarray], np.ndarray], signals: np.ndarray,
              mean: np.ndarray, values: np.ndarray) -> None:
-        """Improve the values for signals and their mean, both [N, N_B, N_SB F]."""
+        """Improve the values by one scoring step, for signals and their mean [N, N_B, N_SB F]."""
         aligned = self.aligned(signals, values)
         slopes = whiten(self.slopes(aligned, mean))
         residual = whiten(aligned) - whiten(mean)
@@ -135,7 +135,7 @@ class Alignment:
         values += eliminate(curvature, curvature[..., :0], gradient)[1]
 
     def curvature(self, slopes: np.ndarray) -> np.ndarray:
-        """Return the curvature [N, Q, Q] of whitened slopes and prior."""
+        """Return the curvature [N, Q, Q] that results from whitened slopes and the prior."""
         n, n_values = slopes.shape[:2]
         return quadratic_form(slopes.reshape(n, n_values, -1)) + np.eye(n_values)
 
@@ -156,7 +156,7 @@ def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
 
 
 def _change(before: Posterior, after: Posterior, n_bands: int) -> float:
-    """Return the largest change of a parameter; those of the bands are changes already."""
+    """Return the largest change of a parameter; band parameters already are changes."""
     moved = np.abs(after.complex_mean() - before.complex_mean())
     moved[-n_bands:] = np.abs(after.complex_mean()[-n_bands:])
     std = np.sqrt(np.maximum(np.diagonal(after.complex_covariance()).real, 1e-300))
@@ -246,7 +246,7 @@ class PilotStatistics:
 
     def _integrated(self, part: '_Block', signals: np.ndarray, slopes: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the information [2 P, 2 P] and shift [2 P] that unknown values remove."""
+        """Return the information [2 P, 2 P] and shift [2 P] lost because values are unknown."""
         coupling = sum(np.einsum('nqr,nrp->nqp', np.conj(slopes[:, :, band]), columns)
                        for band, columns in enumerate(part.columns))
         coupling = 2 * np.concatenate([coupling.real, -coupling.imag], axis=2)

@@ -186,7 +186,7 @@ class _Search:
 
     def _log_evidence(
             self, indices: np.ndarray, curvature: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Return the log evidence for two parameters of each element over their absence, [N_E]."""
+        """Return the log evidence for two parameters of each element against their absence."""
         precision, mean = self._precision[indices], self._mean[indices]
         best = np.linalg.solve(curvature, gradient[..., None])[..., 0]
         exponents = np.log(precision) + gradient * best - precision * mean**2

@@ -127,7 +127,7 @@ def survey_report(estimate: MultipathEstimate) -> str:
 
 
 class _Fit(NamedTuple):
-    """The most likely fields of a scenario, and residuals with these."""
+    """The most likely fields of the scenario, and the residuals for these fields."""
 
     # Scenario with the fields, and weight of the prior in positions.
     fields: Scenario
@@ -168,7 +168,7 @@ def _residuals(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
 
 def _most_likely(scenario: Scenario, model: MeasurementModel, sample: np.ndarray, n: int
                  ) -> tuple[Scenario, float]:
-    """Return the scenario with the fields and the prior weight of the highest evidence."""
+    """Return the scenario fields and the prior weight with the highest evidence."""
     from scipy.optimize import minimize
 
     bandwidth_hz = scenario.n_subbands * scenario.subband_width_hz

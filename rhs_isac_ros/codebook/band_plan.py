@@ -63,7 +63,7 @@ def _coordinate_search(
         frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
         errors: Callable[[np.ndarray], np.ndarray], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Search from random starts with the gap, and from the lowest frequencies."""
+    """Search from random plans that respect the gap, and from the lowest frequencies."""
     drawn = np.sort([rng.choice(frequencies_hz, n_bands, replace=False)
                      for _ in range(_STARTS)], axis=1)
     first = first_fit(frequencies_hz, n_bands, gap_hz)
@@ -222,7 +222,7 @@ def _proposals(
         scenario: Scenario, frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
         difference_hz: float, rng: np.random.Generator
 ) -> list[tuple[tuple[float, ...], float]]:
-    """Return different plans, from the energy levels in turn, with their screening errors."""
+    """Return plans, taken alternately from the energy levels, with their screening errors."""
     spread = np.linspace(frequencies_hz[0], frequencies_hz[-1], n_bands)
     energies = _energies(with_bands(scenario, spread.tolist()))
     low, high = scenario.roi_bounds_m

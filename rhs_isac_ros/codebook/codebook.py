@@ -290,7 +290,7 @@ def decode(text: str) -> dict[str, Any]:
 
 
 def to_parameter(text: str) -> str:
-    """Return any text as a string that YAML parses as the same string."""
+    """Return a text in a form that YAML parses as the same string."""
     if not text or _parse_yaml(text) == text and not text.startswith(_NOTE):
         return text
     return _NOTE + _to_json(text)

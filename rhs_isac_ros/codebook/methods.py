@@ -99,7 +99,7 @@ def minimize_sampled(search: Search) -> str:
 
 
 def _round(search: Search, start: np.ndarray, n_pairs: int, steps: int) -> tuple[int, np.ndarray]:
-    """Minimise on one sample; return the number of steps and the point."""
+    """Minimise the objective on one sample; return the number of steps and the best point."""
     scale = np.ones(len(start))
     scale[search.n_analog:] = _DIGITAL_SCALE
     sample = search.sample(start, n_pairs)
@@ -160,7 +160,7 @@ def minimize_levels(search: Search) -> str:
 
 
 def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int) -> np.ndarray:
-    """Minimise the relaxed objective plus a penalty, and evaluate the rounded result."""
+    """Minimise the objective of continuous amplitudes plus a penalty; evaluate it rounded."""
     scale = weight * search.relaxed_value_and_gradient(start)[0] / search.n_analog
     frequency = np.pi * _top_level(search)
 

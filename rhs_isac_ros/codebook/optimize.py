@@ -208,7 +208,7 @@ def _minimizer(problem: Problem, method: str) -> Callable[[Search], str]:
 
 
 def _determined(value_m2: float) -> float:
-    """Return the objective at the start, or raise ValueError if it is not finite."""
+    """Return the objective at the start; raise ValueError if it is not finite."""
     if not np.isfinite(value_m2):
         raise ValueError(
             f'positions: objective {value_m2} at the start, expected a finite one: the signals '
@@ -248,7 +248,7 @@ class _Report:
             self.keep()
 
     def tick(self) -> None:
-        """Report the time since the beginning, at most once a second."""
+        """Report the elapsed time, at most once a second."""
         elapsed_s = time.perf_counter() - self._begin
         if not (self._is_searching or elapsed_s < self._before.elapsed_s + self._TICK_S):
             self._before = dataclasses.replace(self._before, elapsed_s=elapsed_s)

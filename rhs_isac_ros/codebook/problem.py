@@ -53,7 +53,7 @@ class Problem:
 
     @property
     def n_pairs(self) -> int:
-        """Number of pairs of the objective from which samples are drawn; 0 without pairs."""
+        """Number of pairs in the objective; 0 if it does not consist of pairs."""
         cost = self.objective
         return cost.rows.n_items if isinstance(cost, PairwiseErrorCost) else 0
 

@@ -174,7 +174,7 @@ class _Along(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
                  values: Any, option_string: str | None = None) -> None:
-        """Add the field."""
+        """Add the field of ``--with`` to the axis of the last ``--vary``."""
         if not getattr(namespace, 'vary', None):
             parser.error(f'argument {option_string}: expected after --vary')
         try:
@@ -184,7 +184,7 @@ class _Along(argparse.Action):
 
 
 def _type(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:
-    """Return a type for argparse from a function that raises ValueError for invalid text."""
+    """Convert a function that raises ValueError for invalid text to a type for argparse."""
     def parse_argument(text: str) -> _Parsed:
         try:
             return parse(text)

@@ -151,7 +151,7 @@ def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
 
 def _scattered_configurations(
         paths: np.ndarray, fixed: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Search for configurations without a line of sight, from random waves in the air."""
+    """Search from random waves in the air for configurations that suit the multipath alone."""
     shape = (len(paths), _N_STARTS, *paths.shape[2:])
     on_board = _complex_normal((*shape[:-1], 1), rng)
     in_air = _complex_normal((*shape[:-2], 1, shape[-1]), rng)
@@ -166,7 +166,7 @@ def _complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndar
 
 
 def _direct_configurations(tables: Tables, direct: np.ndarray) -> np.ndarray:
-    """Return configurations, float32 [N_B, n, N_E], for gains complex64 [N_B, N_E, J, K]."""
+    """Search for configurations [N_B, n, N_E] for line-of-sight gains [N_B, N_E, J, K]."""
     n_bands, n_elements, n_subbands, n_feeds = direct.shape
     # Real arithmetic suffices, because configurations are real and only the real part of the
     # product of the waves matters.

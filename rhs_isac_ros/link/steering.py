@@ -94,7 +94,7 @@ class _Point(NamedTuple):
         return cls(analog, np.log1p(snr).sum(axis=-1), vertex, snr, slope, curvature)
 
     def element_step(self, link: BandLink) -> tuple[np.ndarray, np.ndarray]:
-        """Return the best change of one element to an end of its range, and its gain [nat]."""
+        """Return the configurations after the best change of one element, and its gain [nat]."""
         # Axes: end, band, start, sub-band, element.
         steps = np.stack([-self.analog, 1 - self.analog])[:, :, :, None] * ~link.fixed
         # The power is quadratic in each element, so this is exact; only rounding can make it

@@ -2,7 +2,7 @@
 
 The coefficient of element m in frame q is (1 + e_m) x_{q,m}. The relative error e_m is complex
 normal with variance s^2. The amplitude x is the configuration c or, if the element has failed, a
-level that is uniform in [0, 1]; the probability of a failure is p. Over surfaces, the coefficient
+level that is uniform in [0, 1]; the probability of a failure is p. Among surfaces, the coefficient
 has the mean (1 - p) c + p / 2 and, between two frames, the covariance
 
     s^2 E[x_q] E[x_q'] + (1 + s^2) (p / 12 + p (1 - p) (1/2 - c_q) (1/2 - c_q')).
@@ -55,7 +55,7 @@ class SurfaceModel:
 
     @property
     def is_exact(self) -> bool:
-        """Whether there are no errors."""
+        """Whether the coefficients of the elements are known without errors."""
         return True
 
     def applied_beams(self, beams: Beamforming) -> AppliedBeams:
@@ -115,7 +115,7 @@ class ElementErrors(SurfaceModel):
         return np.where(np.isnan(self.stuck), analog, self.stuck) * self.gains
 
     def applied_beams(self, beams: Beamforming) -> AppliedBeams:
-        """Return the beamforming in effect."""
+        """Return the beamforming with the actual coefficients of the elements."""
         return AppliedBeams(self.applied(beams.analog), beams.digital)
 
 
@@ -132,7 +132,7 @@ class DeclaredElements(SurfaceModel):
         return self._is_exact
 
     def applied_beams(self, beams: Beamforming) -> AppliedBeams:
-        """Return the beamforming in effect, averaged over surfaces."""
+        """Return the beamforming with the coefficients averaged over surfaces."""
         share = self._failed_share
         analog = (1 - share) * beams.analog + share / 2 if share else beams.analog
         return AppliedBeams(analog, beams.digital)
@@ -186,7 +186,7 @@ class SurfaceEstimate(SurfaceModel):
 
     @property
     def failed(self) -> np.ndarray:
-        """Which elements have probably failed, bool [N_E]."""
+        """Whether each element has probably failed, bool [N_E]."""
         return self.failed_probability > 0.5
 
     def std(self) -> np.ndarray:
@@ -202,7 +202,7 @@ class SurfaceEstimate(SurfaceModel):
         return self.gains * analog + self.offsets
 
     def applied_beams(self, beams: Beamforming) -> AppliedBeams:
-        """Return the expected beamforming in effect, with the gains of the bands."""
+        """Return the beamforming with expected coefficients, times the gains of the bands."""
         return AppliedBeams(
             self.applied(beams.analog), self.band_gains[:, None, None, None] * beams.digital)
 

@@ -25,7 +25,7 @@ class External(abc.ABC):
     @classmethod
     @abc.abstractmethod
     def load(cls, origin: Any) -> 'External':
-        """Load the value; raise ValueError if there is no valid one."""
+        """Load the value from its origin; raise ValueError if there is no valid value."""
 
     @classmethod
     def named(cls, text: str) -> 'External':
@@ -62,12 +62,12 @@ class External(abc.ABC):
         return isinstance(other, type(self)) and self.digest == other.digest
 
     def __hash__(self) -> int:
-        """Hash the content."""
+        """Return a hash of the content."""
         return hash(self.digest)
 
 
 class ArrayFile(External):
-    """Arrays of a file."""
+    """A value that consists of arrays in a file."""
 
     WORDS = 'arrays', 'the path of a file, or null'
 

@@ -32,7 +32,7 @@ _NEPERS_PER_DB = np.log(10) / 20
 
 
 class Scope(enum.Enum):
-    """How often the value of an impairment is drawn anew."""
+    """When the values of an impairment are drawn anew: for every user, or in every cycle."""
 
     USER = 'user'
     CYCLE = 'cycle'
@@ -59,7 +59,7 @@ class Impairment:
     scope: Scope = Scope.CYCLE
 
     def size(self, scenario: Scenario) -> int:
-        """Return the number q of values."""
+        """Return the number q of values that an impairment has."""
         raise NotImplementedError
 
     def linear(self, scenario: Scenario) -> Linear:
@@ -141,7 +141,7 @@ def _shape(scenario: Scenario) -> tuple[int, int]:
 
 @dataclasses.dataclass(frozen=True)
 class Factor(Impairment):
-    """Independent values whose standard deviation is a field of the scenario."""
+    """An impairment with independent values, whose standard deviation is a scenario field."""
 
     field: str
     # Function that returns the exponents per unit of the values.

@@ -161,13 +161,13 @@ def _positions_first(scenario: Scenario, band: int, waves: np.ndarray) -> np.nda
 
 
 def _offsets(scenario: Scenario, positions: np.ndarray) -> np.ndarray:
-    """Vectors from every element to the user, float64 [N, N_E, 3] [m]."""
+    """Return the vectors from every element to the user, float64 [N, N_E, 3] [m]."""
     return positions[:, None, :] - element_positions(scenario)
 
 
 def _amplitude(
         scenario: Scenario, offsets: np.ndarray, *, slope: bool = False) -> float | np.ndarray:
-    """Return gain times distance and frequency, a number or [N, N_E], or its slope over angle."""
+    """Return gain times distance times frequency, a number or [N, N_E], or its slope by angle."""
     gains = scenario.element_gain, scenario.user_gain
     angles = np.zeros(())
     if has_pattern(scenario):

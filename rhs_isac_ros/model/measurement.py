@@ -238,7 +238,7 @@ class MeasurementModel:
 
     def _of_bands(self, positions: np.ndarray,
                   of_band: Callable[[np.ndarray, slice, int], np.ndarray]) -> np.ndarray:
-        """Evaluate a function of positions, block and band, for all blocks and bands."""
+        """Call a function of positions, block and band for all blocks of positions and bands."""
         positions = checked_positions(positions)
         result = np.empty((len(positions), *self.shape), complex)
 
@@ -280,7 +280,7 @@ class MeasurementModel:
         return mean, jacobian
 
     def fast_mean(self, positions: np.ndarray) -> np.ndarray:
-        """Compute the mean that `mean_and_jacobian` returns, in a third of its time."""
+        """Compute the mean of `mean_and_jacobian` without the Jacobian, in a third of the time."""
         positions, weights = checked_positions(positions), self._weights
         mean = np.empty((len(positions), *self.shape), complex)
         for block in blocks(len(positions), weights.block):

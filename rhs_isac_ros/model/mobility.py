@@ -27,7 +27,7 @@ class Mobility(Protocol):
 
 
 class Leg(NamedTuple):
-    """Part of a path with constant velocity [3] [m/s], from a position [3] [m], between times."""
+    """Part of a path between two times, with a first position [3] [m] and a velocity [3] [m/s]."""
 
     origin: np.ndarray
     velocity: np.ndarray
@@ -148,7 +148,7 @@ class RandomWalk(StraightMobility):
         return self._scenario.sample_positions(1, self._rng)[0]
 
     def _begin_leg(self) -> None:
-        """Compute the velocity and the duration of a leg once: a node may have many users."""
+        """Compute velocity and duration once per leg, because a node may have many users."""
         leg = self._target - self._origin
         length = float(np.linalg.norm(leg))
         self._velocity = leg / length * self._speed_mps
@@ -156,7 +156,7 @@ class RandomWalk(StraightMobility):
 
 
 class Traced:
-    """Replaces each position of another mobility by the nearest user of a channel file."""
+    """Path of another mobility, moved to the nearest user of a channel file."""
 
     def __init__(self, mobility: Mobility, channel: PathChannel) -> None:
         self._mobility, self._channel = mobility, channel

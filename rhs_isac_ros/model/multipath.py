@@ -67,7 +67,7 @@ class SpatialCovariance:
         return math.prod(self.shape)
 
     def __getitem__(self, bands: int | slice | list[int]) -> 'SpatialCovariance':
-        """Return V_i of some bands."""
+        """Return V_i for some of the bands."""
         return SpatialCovariance(
             self.shape, self.is_real, self.power[bands],
             None if self.matrix is None else self.matrix[bands],
@@ -190,7 +190,7 @@ class _PlaneWaves(NamedTuple):
 def _plane_waves(
         scenario: Scenario, band: int, is_even: Sequence[bool], n_draws: int = 1
 ) -> Iterator[_PlaneWaves]:
-    """Yield plane waves of a quadrature, by elevations, for `n_draws` amplitudes in memory."""
+    """Yield plane waves in blocks of elevations, sized for `n_draws` amplitudes per wave."""
     wavenumber = 2 * np.pi * scenario.center_frequencies_hz[band] / SPEED_OF_LIGHT_MPS
     columns, rows = (np.arange(n) * element_interval_m(scenario)
                      for n in (scenario.n_columns, scenario.n_rows))
@@ -379,13 +379,13 @@ def complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarr
 
 
 def _fields(scenario: Scenario) -> Scenario | MultipathEstimate:
-    """Return the object that has the three fields of the covariance."""
+    """Return the scenario or its survey, whichever declares the fields of the covariance."""
     return scenario.multipath or scenario
 
 
 def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase: float
                         ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute angles [n] and normalised weights [n] of a Laplacian; only positive ones if even."""
+    """Compute angles and normalised weights of a Laplacian [n]; if even, positive angles only."""
     nodes, weights = gauss_legendre(_ANGLE_NODES)
     mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)
     angles, density = [], []

@@ -124,7 +124,7 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
     A template is a whitened mean times range and carrier. It depends on the direction and, through
     the curvature of the wavefront and the delays of the sub-bands, slowly on the range. For T
     template ranges, R ranges and V directions, the arrays are ``outer_filters``, the conjugate
-    templates, complex64 [N_B, T V, N_SB F]; ``outer_energy`` of these [m^2], float32 [T, V];
+    templates, complex64 [N_B, T V, N_SB F]; ``outer_energy``, their energy [m^2], float32 [T, V];
     ``outer_index``, the template of each range, int64 [R]; and ``outer_weights``, the prior
     probability of ranges and directions, 0 inside the region, float64 [R, V].
     """
@@ -192,7 +192,7 @@ class Outside:
                 + prior.log_evidence_of_aligned(aligned))
 
     def log_evidence(self, whitened: np.ndarray, scales: Iterable[float] = (1.0,)) -> np.ndarray:
-        """Average ``exp(-|y - t|^2)`` over the prior, for scales of the signals; as logarithms."""
+        """Return logarithms of ``exp(-|y - t|^2)`` averaged over the prior, for scales of y."""
         filtered, energy = self._filter(whitened), float(np.sum(np.abs(whitened)**2))
         # At any range, the log-likelihood is at most that of outputs in phase.
         bound = (np.sum(filtered, axis=0)**2 / self._node_energy).max(axis=0)
@@ -243,7 +243,7 @@ def shares(log_weights: np.ndarray) -> np.ndarray:
 
 
 def rejection(alternative: Alternative, probability: float) -> str:
-    """Return the reason to reject signals for an alternative's probability alone, or ''."""
+    """Return a reason if the probability of an alternative alone rules out a fix, or ''."""
     if probability <= alternative.limit:
         return ''
     return (f'{alternative.reason}: probability {probability:.6g}, expected at most '

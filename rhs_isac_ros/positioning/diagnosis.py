@@ -88,7 +88,7 @@ class FitTest:
         return _excess(_ENERGY, energy, (max_mean_energy**0.5 + self.max_residual**0.5)**2)
 
     def weak_test(self, energy: float, residual: float) -> str:
-        """Reject signals that are weaker than the multipath, unless they are a direct path."""
+        """Reject signals weaker than the multipath, unless a direct path explains them."""
         # Multipath may be weaker than in the model, but then the direct path at the best position
         # explains most of the energy.
         excess = _excess(_RESIDUAL, residual, self._weak_share * energy)
@@ -212,13 +212,13 @@ def _spread_probability(total: _Residual, n: int) -> float:
 
 
 class Diagnosis:
-    """Fixes, residuals and probabilities of the latest cycles."""
+    """The estimates of the latest cycles, and the diagnostics that follow from them."""
 
     def __init__(self) -> None:
         self._estimates: collections.deque[Estimate] = collections.deque(maxlen=WINDOW)
 
     def add(self, estimate: Estimate) -> None:
-        """Add the estimate of a cycle."""
+        """Add the estimate of a cycle to the history."""
         self._estimates.append(estimate)
 
     def clear(self) -> None:

@@ -49,7 +49,7 @@ class Draws(NamedTuple):
 
 
 class _Rays(NamedTuple):
-    """Integrals of the likelihood over ranges in R directions, from one draw each."""
+    """Integrals of the likelihood over intervals of range, each in the direction of a draw."""
 
     draw: np.ndarray  # Number of the draw, int [R].
     direction: np.ndarray  # Unit vector, float64 [R, 3].
@@ -115,7 +115,7 @@ class DrawnPosterior:
             float(rays.highest[weights > 0].max()), float(weights @ rays.average))
 
     def _probabilities(self, query: Query, phase: int) -> np.ndarray:
-        """Return rough shares of the cells in the posterior, for random phases of bands."""
+        """Return approximate shares of the cells in the posterior, as if phases were random."""
         # The average of exp(2 A cos(phase)) is nearly exp(2 A) / sqrt(1 + 4 pi A).
         n_bands, bound = len(self._wavenumbers), query.bound[phase]
         amplitude = (bound + self._table.energy) / (2 * n_bands)
@@ -124,7 +124,7 @@ class DrawnPosterior:
         return shares / shares.sum()
 
     def _rays(self, query: Query, phase: int, cells: np.ndarray, places: np.ndarray) -> _Rays:
-        """Integrate along directions at places in the unit square, [K, 2], of cells [K]."""
+        """Integrate along directions, given by places [K, 2] in the unit squares of cells [K]."""
         directions = np.empty((len(cells), 3))
         directions[:, 1:] = self._low[cells] + places * self._extent[cells]
         directions[:, 0] = _boresight(directions[:, 1:])

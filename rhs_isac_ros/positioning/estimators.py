@@ -166,7 +166,7 @@ class SearchEstimator(abc.ABC):
 
     def _locate_block(self, signals: Signals, draws: bool
                       ) -> list[tuple[Located, Modes | None]]:
-        """Locate phases together; with `draws`, phases with too many modes do without them."""
+        """Locate phases together; with `draws`, draw positions if there are too many modes."""
         energies = np.sum(np.abs(signals.received)**2, axis=(1, 2)) / self.scenario.noise_power_w
         reasons = [self._test.min_energy_test(energy) for energy in energies.tolist()]
         results: list[tuple[Located, Modes | None]] = [
@@ -205,7 +205,7 @@ class SearchEstimator(abc.ABC):
         return [fits[phase] for phase in range(len(aligned))]
 
     def _fit(self, modes: Modes, signals: Signals, rows: list[int]) -> Iterator[_Fit]:
-        """Yield the posterior of each phase in `rows`, which ascend, from its modes."""
+        """Yield the posterior of each phase in `rows`, in ascending order, from its modes."""
         likelihood = self._likelihood
         conditionals: dict[int, Sequence[Conditional]] = dict.fromkeys(
             rows, [self._dispersed or likelihood])

@@ -100,7 +100,7 @@ class FailedElements:
         return self._converge(self._search(modes, signals), signals)
 
     def _search(self, modes: Modes, signals: Signals) -> 'FailureSearch':
-        """Search for probable sets at the modes and elsewhere."""
+        """Search for probable sets of failed elements, at the modes and elsewhere."""
         order = np.argsort(-modes.roi_log_likelihood)
         search = FailureSearch(self._model, signals, _MARGIN, self._usual_residual)
         keys = search.add(modes.roi_points[order], modes.values[order])
@@ -120,7 +120,7 @@ class FailedElements:
 
     def _converge(self, search: 'FailureSearch', signals: Signals
                   ) -> tuple[Modes, list['FailedSet']]:
-        """Take exact steps from the most probable hypotheses."""
+        """Take exact Gauss-Newton steps from the most probable sets and positions."""
         values, best = search.values, max(search.values.values())
         keys = sorted((key for key in values if values[key] >= best - _MARGIN),
                       key=lambda key: -values[key])[:_MAX_HYPOTHESES]
@@ -148,7 +148,7 @@ class Surface(NamedTuple):
     covariance: np.ndarray
 
     def whitening(self, prior: NuisancePrior) -> 'Whitening':
-        """Factor the covariance."""
+        """Return the inverse Cholesky factor of the covariance."""
         roots = np.linalg.cholesky(self.covariance)
         whitener = np.linalg.inv(roots)
         return Whitening(whitener[:, None], log_determinant(roots).sum(keepdims=True),
@@ -156,7 +156,7 @@ class Surface(NamedTuple):
 
 
 class Whitening(NamedTuple):
-    """Factors of the covariances of H sets."""
+    """Factors of the covariance matrices of H sets of failed elements."""
 
     whitener: np.ndarray  # Inverse Cholesky factors, complex128 [N_B, H, N_SB F, N_SB F].
     log_volume: np.ndarray  # Logarithms of the determinants, float64 [H].
@@ -402,7 +402,7 @@ class FailureSearch:
             parents = _diverse(ranked)
 
     def try_neighbours(self, key: Key) -> None:
-        """Weigh the sets with one element more, less, or exchanged."""
+        """Weigh the sets in which one element is added, removed or exchanged."""
         failed, index = key
         smaller = [tuple(sorted(set(failed) - {element})) for element in failed]
         self._weigh((one, index) for one in smaller)
@@ -432,7 +432,7 @@ class FailureSearch:
 
 
 def _diverse(ranked: list[Key]) -> list[Key]:
-    """Choose the first hypotheses to extend, few of each set and of each site."""
+    """Choose the best hypotheses to extend, but only a few per set and per site."""
     chosen: list[Key] = []
     for failed, index in ranked:
         if (sum(other == failed for other, _ in chosen) < _MAX_PER_SET

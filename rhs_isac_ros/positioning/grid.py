@@ -278,7 +278,7 @@ class TemplateTable:
         return np.stack(bounds) - self.energy
 
     def _peaks_of(self, phases: np.ndarray, cells: np.ndarray, query: 'Query') -> '_Peaks':
-        """Find all peaks along the range in pairs [K] of the grid, for ascending phases [K]."""
+        """Find all peaks along the range in pairs [K] of the grid; their phases [K] ascend."""
         grid, outputs, prior = self.grid, query.outputs, query.prior
         pair, window = self._windows_of(cells)
         phases, cells = phases[pair], cells[pair]
@@ -412,7 +412,7 @@ class TemplateTable:
 
 
 class Starts(NamedTuple):
-    """Points from which a search ascends to the modes of N phases, the most likely first."""
+    """Points at which the ascent to the modes of N phases starts, the most likely first."""
 
     phases: np.ndarray  # Phase of each point, int [M], ascending.
     points: np.ndarray  # (r [m], u, v), float64 [M, 3].

@@ -93,7 +93,7 @@ class Resolution(NamedTuple):
         return float(np.prod(self.bounds_m[1] - self.bounds_m[0]))
 
     def cell_width_m(self, range_m: float) -> float:
-        """Return the interval of ranges over which delays and amplitudes hardly change."""
+        """Return the interval of ranges in which delays and amplitudes hardly change."""
         return min(2 * _AMPLITUDE_ERROR * range_m, 2 * PHASE_ERROR * self.delay_m)
 
     def step_limits(self, is_coarse: bool) -> np.ndarray:
@@ -203,7 +203,7 @@ def groups(n: int, fits: Callable[[int, int], bool]) -> list[tuple[int, int]]:
 
 
 class Expansion(NamedTuple):
-    """Mean signals around n points, to first order apart from distance and carriers.
+    """First-order expansion of the mean signals around n points.
 
     The factor exp(-i k_n r) / r of a sub-band's mean is exact. The rest changes slowly with the
     direction and with the curvature of the wavefront, 1 / r.
@@ -216,7 +216,7 @@ class Expansion(NamedTuple):
 
     @classmethod
     def of(cls, model: MeasurementModel, points: np.ndarray) -> 'Expansion':
-        """Evaluate a model at points."""
+        """Expand the mean signals of a model around points."""
         wavenumbers = subband_wavenumbers(model.scenario)
         wavenumbers = np.repeat(wavenumbers, model.shape[1] // wavenumbers.shape[1], axis=1)
         mean, slopes = model.mean_and_jacobian(to_positions(points), jacobian(points))

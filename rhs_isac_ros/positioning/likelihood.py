@@ -185,7 +185,7 @@ class NuisancePrior:
         return -(values**2 @ self.precision / 2 + values @ self.volume)
 
     def log_evidence_of_aligned(self, aligned: np.ndarray) -> float:
-        """Integrate over parameters that move the multipath, relative to `aligned` [Q]."""
+        """Return the log integral over parameters that move the multipath, near `aligned`."""
         (moves,) = np.nonzero(self.moves_multipath)
         curvature = self.information[np.ix_(moves, moves)] + np.diag(self.precision[moves])
         return float(-self.precision @ aligned**2 - np.linalg.slogdet(curvature)[1]) / 2
@@ -200,11 +200,11 @@ class NuisancePrior:
 
     def over_gain(self, amplitude: np.ndarray, energy: float, n_rows: int
                   ) -> tuple[np.ndarray, np.ndarray]:
-        """Maximise the log-likelihood over the gain, up to the template's energy.
+        """Maximise the log-likelihood, without the template's energy, over the gain.
 
-        For an amplitude A, of any shape, and whitened signals of the given energy times a factor
-        h, the log-likelihood is ``-h^2 |y|^2 + 2 h A + 2 n log h``. Returns its maximum, without
-        the energy of the signals if the gain is known, and the gain [nepers].
+        If signals with the whitened energy |y|^2 are multiplied by h, the log-likelihood at the
+        amplitude A, of any shape, is ``-h^2 |y|^2 + 2 h A + 2 n log h``. Returns its maximum and
+        the gain [nepers]. If the gain is known, the maximum does not include the energy.
         """
         if not self.gain_std:
             return 2 * amplitude, np.zeros(1)
@@ -478,7 +478,7 @@ class Alignment:
         return values
 
     def _best_on_grid(self, received: np.ndarray) -> np.ndarray:
-        """Return the best of a grid of the parameters whose likelihood has several maxima."""
+        """Return the best grid values of parameters whose likelihood has several maxima."""
         prior = self._prior
         (searched,) = np.nonzero(prior.needs_search)
         n_grid = _N_GRID.get(len(searched), 5)

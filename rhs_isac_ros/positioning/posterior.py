@@ -49,7 +49,7 @@ class Posterior(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Samples of the Gaussians of M modes, S of each."""
+    """Samples of the Gaussians of M modes, S samples per mode."""
 
     positions: np.ndarray  # Float64 [M, S, 3] [m].
     log_weights: np.ndarray  # Not normalised, float64 [M, S]; -inf outside of the region.

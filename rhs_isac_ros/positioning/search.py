@@ -140,7 +140,7 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
 
 def _step(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
           state: int, moves: bool = True) -> tuple[Modes, np.ndarray]:
-    """Take one scoring step, or none without `moves`; also return its gain in the region, [M]."""
+    """Take one scoring step, or none without `moves`; also return the gain in likelihood, [M]."""
     points = starts.points
     values = likelihood.settle(points, starts.values, signals)
     local = conditional.local(points, values, signals)
@@ -182,7 +182,7 @@ def _newton(local: Local, likelihood: Likelihood) -> tuple[Marginal, np.ndarray,
 
 
 def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float) -> np.ndarray:
-    """Choose the probable and separate modes of each phase, the most likely first."""
+    """Return indices of the probable, separate modes of each phase, the most likely first."""
     # The likelihood of a mode is a prediction, and may be arbitrarily wrong before convergence.
     # The best is limited to the highest likelihood before the last step, which is computed.
     value = modes.roi_log_likelihood + np.maximum(gain, 0)

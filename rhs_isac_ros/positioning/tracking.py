@@ -130,7 +130,7 @@ def reduce(mixture: Mixture, max_components: int) -> Mixture:
 
 
 def _merge(mixture: Mixture, group: np.ndarray, n_groups: int) -> Mixture:
-    """Merge the components of each group, with their mean and covariance; discard group -1."""
+    """Merge the components of each group, preserving mean and covariance; discard group -1."""
     mixture = mixture.select(group >= 0)
     group = group[group >= 0]
     member = np.equal.outer(np.arange(n_groups), group)

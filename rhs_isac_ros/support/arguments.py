@@ -31,7 +31,7 @@ class HelpFormatter(
 
 
 def _number(declared: Field) -> Callable[[str], Any]:
-    """Return a type for argparse."""
+    """Return a type for argparse that parses and checks a declared number."""
     def parse(text: str) -> Any:
         try:
             number = declared.kind(text)
