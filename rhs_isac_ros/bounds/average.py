@@ -94,7 +94,7 @@ class Average:
     patterns
         Factors of the means of the rows.
     combination
-        Rows of the form, if they differ from those of the source.
+        Rows of the form, if they differ from the rows of the source.
     tick
         Called repeatedly while the rows are computed; an exception ends the computation.
 
@@ -174,7 +174,7 @@ class AverageCrlb(Average):
     """Average bound at fixed positions, float64 [N, 3] [m], for evaluation with many codebooks.
 
     Nuisance parameters, errors of the elements and `region_prior` are treated as in `crlb`;
-    `tolerance` and `tick` are those of `Average`.
+    `tolerance` and `tick` are passed to `Average`.
     """
 
     def __init__(self, scenario: Scenario, positions: np.ndarray, tolerance: float = 0.0, *,
@@ -210,7 +210,7 @@ class AverageCrlb(Average):
 
 
 def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
-    """Derive the rows of all parameters from those of the gain and its derivative."""
+    """Derive the rows of all parameters from the rows of the gain and its derivative."""
     # A parameter whose pattern is constant in each band is a multiple of the gain; each other
     # parameter has its own row. Without nuisance parameters, the derivative suffices.
     scaled = nuisance_of(scenario).scaled_patterns

@@ -33,7 +33,7 @@ class PairwiseErrorCost(Average):
     form, the difference h(p) - h(p') replaces the derivative of Eq. (12). If the scenario declares
     unknown phases, the form is minimised over them; other nuisance parameters are not included.
     Pairs have positions, float64 [N, 3] [m], and weights, float64 [N]. `tolerance` and `tick` are
-    those of `Average`. Raises ValueError if an argument has a wrong shape or is not finite, there
+    passed to `Average`. Raises ValueError if an argument has a wrong shape or is not finite, there
     are no pairs, or a weight is negative.
     """
 

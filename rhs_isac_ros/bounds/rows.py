@@ -266,8 +266,8 @@ class CompressedRows(MeasurementRows):
     def chosen(self, items: np.ndarray) -> 'CompressedRows':
         """Return the rows of some items, int [n], with coefficients in single precision.
 
-        They halve the time of products. Their rounding, 6e-8, is far below the relative error of
-        the rows.
+        Single precision halves the time of products. Its rounding, 6e-8, is far below the relative
+        error of the rows.
         """
         rows = copy.copy(self)
         rows.n_items = len(items)

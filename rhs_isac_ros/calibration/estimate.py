@@ -68,10 +68,11 @@ def prior_of(scenario: Scenario) -> SurfacePrior:
 def estimate_surface(
         scenario: Scenario, pilots: Sequence[Pilots], prior: SurfacePrior | None = None,
         progress: Callable[[int, float], None] | None = None) -> SurfaceEstimate:
-    """Estimate a surface from pilots of one or several codebooks; without pilots, from the prior.
+    """Estimate a surface from pilots of one or several codebooks.
 
-    The default prior is that of `prior_of`. `progress` is called after each round with its number
-    and the largest change of a parameter, in standard deviations.
+    The default prior is the result of `prior_of`; without pilots, it is also the estimate.
+    `progress` is called after each round with its number and the largest change of a parameter, in
+    standard deviations.
     """
     prior = prior or prior_of(scenario)
     statistics = PilotStatistics(scenario, pilots)

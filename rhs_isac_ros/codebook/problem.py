@@ -167,8 +167,8 @@ class Search:
     ) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
         """Return an estimate of `value_and_gradient` from a sample of the pairs at a point.
 
-        Its points do not become the best one. It also raises BudgetSpent if no evaluation would be
-        left for its result.
+        The points evaluated do not become the best one. The estimate also raises BudgetSpent if no
+        evaluation would be left for the final point.
         """
         problem = self.problem.sample(variables, n_pairs, self.rng)
 

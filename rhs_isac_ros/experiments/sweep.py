@@ -278,7 +278,7 @@ def run_blocks(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = 
                ) -> list[Results]:
     """Run the jobs of a sweep that have no stored result, and return the results in order.
 
-    Several sweeps may share a folder. The other arguments and the errors are those of `run_jobs`.
+    Several sweeps may share a folder. `run_jobs` describes the other arguments and the errors.
     """
     designs = [job for setting in sweep.settings for job in sweep.designs(setting)]
     made = _results(design, designs, folder, n_jobs, dask, 'codebooks')

@@ -154,8 +154,8 @@ def representative_subbands(
         scenario: Scenario, max_drift_rad: float, max_count: int) -> np.ndarray:
     """Return indices of evenly spread sub-bands, at most `max_count`.
 
-    Within this number, there are enough of them that the phases of the elements drift apart by at
-    most `max_drift_rad` between neighbours.
+    If this number suffices, the phases of the elements drift apart by at most `max_drift_rad` from
+    one of these sub-bands to the next.
     """
     elements, feeds = element_positions(scenario), feed_positions(scenario)
     on_board = np.linalg.norm(elements - feeds[:, None], axis=-1)

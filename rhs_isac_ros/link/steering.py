@@ -33,8 +33,8 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     vertex of the box [0, 1]^N_E in the direction of the gradient therefore receives more power,
     unless the point is that vertex. The capacity usually, but not always, increases with the
     power. If the vertex does not increase the capacity, the round moves a single element to an end
-    of its range, the one that increases the capacity most. The capacity never falls below that of
-    the start.
+    of its range, the one that increases the capacity most. The capacity never falls below its
+    value at the start.
 
     Takes links of several bands, and starts, float64 [N_B, n, N_E], each entry in [0, 1]. Returns
     configurations of the same shape and range, and their capacities [nat/symbol] summed over the
@@ -226,7 +226,7 @@ def capacity_report(
 
     Both beams transmit over the paths of a channel file, if the scenario has one. The search for a
     beam ends slightly below the maximum. With an accurate estimate, the loss may therefore be
-    negative, typically by less than a tenth of a per cent. `bands` and `surface` are those of
+    negative, typically by less than a tenth of a per cent. `bands` and `surface` are passed to
     `choose_beam`. Raises ValueError if the position is not a finite [3] array, or the beam does
     not fit the scenario.
     """

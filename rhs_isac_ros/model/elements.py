@@ -2,8 +2,8 @@
 
 The coefficient of element m in frame q is (1 + e_m) x_{q,m}. The relative error e_m is complex
 normal with variance s^2. The amplitude x is the configuration c or, if the element has failed, a
-level that is uniform in [0, 1]; the probability of a failure is p. Among surfaces, the coefficient
-has the mean (1 - p) c + p / 2 and, between two frames, the covariance
+level that is uniform in [0, 1]; the probability of a failure is p. Over all surfaces, the
+coefficient has the mean (1 - p) c + p / 2 and, between two frames, the covariance
 
     s^2 E[x_q] E[x_q'] + (1 + s^2) (p / 12 + p (1 - p) (1/2 - c_q) (1/2 - c_q')).
 

@@ -10,7 +10,7 @@ import numpy as np
 
 
 class External(abc.ABC):
-    """A value that a scenario writes as an origin and a digest; values with one digest are equal.
+    """A value that a scenario writes as an origin and a digest; equal digests mean equal values.
 
     Attributes
     ----------

@@ -40,10 +40,10 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
 
 
 def share_of_level(n: int, std_db: float) -> float:
-    """Return which share of the variance of a logarithmic energy is due to its level, 0 to 1.
+    """Return the share, from 0 to 1, of the variance of a log energy that is due to its level.
 
-    The energy is that of n complex Gaussian numbers whose unknown level is a log-normal power.
-    If an energy deviates from its median, this share of the deviation is expected in the level.
+    The energy is that of n complex Gaussian numbers whose unknown level is a log-normal power. If
+    an energy deviates from its median, this share of the deviation is attributed to the level.
     """
     variance = float(np.log(10) / 10 * std_db)**2
     return variance / (variance + 1 / n)

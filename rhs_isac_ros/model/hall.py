@@ -1,18 +1,17 @@
 """Data of one hall that replace declared multipath: a measured covariance, or traced paths.
 
-A survey measures a covariance. The scenario declares, by three fields, the covariance C_0 of the
-gains g of the elements in all measurements of a band; g is Gaussian. A survey with the radiation
-matrix T replaces the covariance L_0 of its signals, T g + noise, by the measured covariance L, and
-keeps the distribution of g given the signals. Apart from the noise, the result has the smallest
-Kullback-Leibler divergence from C_0 among all covariances of g that give the signals the
-covariance L:
+Let g be the Gaussian gains of the elements in all measurements of a band. Three fields of the
+scenario declare their covariance C_0. A survey with the radiation matrix T replaces the covariance
+L_0 of its signals, T g + noise, by the measured covariance L, and keeps the distribution of g
+given the signals. Apart from the noise, the result has the smallest Kullback-Leibler divergence
+from C_0 among all covariances of g that give the signals the covariance L:
 
     C = C_0 + C_0 T^H M T C_0    with    M = L_0^-1 (L - L_0) L_0^-1.
 
-From C follows the covariance of the signals for any other beams, and for single elements.
+C also gives the covariance of the signals for any other beams, and of single elements.
 
 Paths come from a ray tracer, for example. A path is a spherical wave from a virtual source, such
-as the mirror image of the user in a wall. Its gain is that of a line of sight to this source,
+as the mirror image of the user in a wall. Its gain is the line-of-sight gain to this source,
 including gain patterns of elements and users, times a complex reflection coefficient: the
 amplitude of the path at the centre of the surface, relative to free space over the same distance.
 """
@@ -161,7 +160,7 @@ class PathChannel(ArrayFile):
     n
         Number of reflections, int [N, P]; 0 for the direct path, and -1 for a missing path.
     f0
-        Frequency of the amplitudes [Hz]. At other frequencies they are scaled by its inverse.
+        Frequency of the amplitudes [Hz]. Amplitudes are inversely proportional to the frequency.
     gains
         Factors of the paths at each element, complex128 [N, P, N_E], for objects that are visible
         from only a part of the surface; None if all factors are 1.

@@ -76,10 +76,11 @@ class Nuisance:
 
     The parameters are x = L z with standard normal z. Bounds and estimators use z, which is
     dimensionless. `patterns` and `scaled_patterns`, complex128 [Q, N_B, N_SB F], are the exponents
-    per unit of x and of z. `needs_search`, bool [Q], is that of `Linear`. `moves_multipath`, bool
-    [Q], marks z that change the measurements of one band relative to each other, and so move the
-    multipath out of the nulls of its covariance. `phases`, float64 [N_B, Q], is the phase of each
-    band per unit of z, and 0 for every z that does more than rotate the phases of whole bands.
+    per unit of x and of z. `needs_search`, bool [Q], repeats the flag of `Linear`.
+    `moves_multipath`, bool [Q], marks values z that change the measurements of one band relative
+    to each other, and so move the multipath out of the nulls of its covariance. `phases`, float64
+    [N_B, Q], is the phase of each band per unit of z, and 0 for every z that does more than rotate
+    the phases of whole bands.
     """
 
     def __init__(self, scenario: Scenario, parts: Sequence[Linear]) -> None:

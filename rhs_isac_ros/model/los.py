@@ -1,7 +1,7 @@
 """Line-of-sight gains of the elements and their derivatives with respect to the user's position.
 
-`positions` are positions of users, float64 [N, 3] [m], and `band` is an index from 0. A function
-that takes positions raises ValueError if the shape is wrong or a value is not finite.
+`positions`, float64 [N, 3] [m], belong to users, and `band` is an index from 0. A function that
+takes positions raises ValueError if the shape is wrong or a value is not finite.
 """
 
 from collections.abc import Iterator, Sequence

@@ -254,9 +254,10 @@ class MeasurementModel:
             whitened: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Compute the mean and its derivative, complex128 [N, 3, N_B, N_SB F] [1/m]: Eq. (13).
 
-        The mean equals that of `mean` up to rounding, and is computed faster. Both results may be
-        `whitened`. Given the derivatives of the positions with respect to Q other coordinates,
-        float64 [N, 3, Q], the derivatives of the mean are with respect to those coordinates.
+        The mean equals the result of `mean` up to rounding, and is computed faster. Both results
+        may be `whitened`. Given the derivatives of the positions with respect to Q other
+        coordinates, float64 [N, 3, Q], the derivatives of the mean are with respect to those
+        coordinates.
         """
         positions, weights = checked_positions(positions), self._weights
         n, (n_bands, n_rows) = len(positions), self.shape
@@ -292,8 +293,8 @@ class MeasurementModel:
         """Draw signals of independent phases, one at each position, complex128 [N, N_B, N_SB F].
 
         The distribution is that of `simulate_received`, including declared impairments and channel
-        files. Multipath and noise are drawn together with the covariance Lambda_i, instead of the
-        gain of every element, which is a hundred times as fast.
+        files. Multipath and noise are drawn together, with the covariance Lambda_i. This is a
+        hundred times as fast as drawing the gain of every element.
         """
         scenario = self.scenario
         surface, factors = draw_impairments(scenario, len(positions), rng)
@@ -327,9 +328,9 @@ class MeasurementModel:
 class ElementSums:
     """Implements Eq. (13). Sums over the elements for the mean signals and their derivative.
 
-    The sum over elements of a T_i (p - p_m), with a factor a of each element, is computed as p
-    times the sum of a T_i, minus the sum of a T_i p_m. This avoids an array of N_E by 3. `block`
-    is the number of positions to evaluate at a time.
+    The sum of a_m T_m (p - p_m) over elements m, with factors a_m, is computed as p times the sum
+    of a_m T_m, minus the sum of a_m T_m p_m. This avoids an array of N_E by 3. `block` is the
+    number of positions to evaluate at a time.
     """
 
     def __init__(self, scenario: Scenario, radiation: np.ndarray) -> None:

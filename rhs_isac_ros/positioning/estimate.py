@@ -72,8 +72,8 @@ class Estimator(Protocol):
 
         The signals are complex128 [N_B, N_SB F], or [N, N_B, N_SB F] for N positions,
         sub-band-major; the estimate has a leading dimension N if the signals have one. Estimates
-        of a batch may differ from those of single phases: one in a thousand by more than five
-        hundredths of a standard deviation.
+        of a batch may differ from estimates of single phases; one in a thousand differs by more
+        than five hundredths of a standard deviation.
         """
         ...
 

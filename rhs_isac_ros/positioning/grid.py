@@ -488,7 +488,7 @@ def heaviest(phases: np.ndarray, value: np.ndarray, margin: float | np.ndarray) 
 
 def separate(phases: np.ndarray, points: np.ndarray, radii: np.ndarray,
              curvature: np.ndarray | None = None) -> np.ndarray:
-    """Choose the points that are not in the mode of a better one: non-maximum suppression.
+    """Choose the points that do not belong to the mode of a better point.
 
     `phases`, int [M], ascend; the best of the points (r [m], u, v), float64 [M, 3], of a phase
     comes first. An ellipsoid with the `radii` [3] around a mode contains no other mode. Given the

@@ -1,6 +1,6 @@
 """The likelihood of positions and nuisance parameters: one Gaussian for each state of the surface.
 
-Nuisance parameters z of the signals y are a factor exp(z P) of direct path and multipath; see
+Nuisance parameters z multiply the direct path and the multipath in the signals y by exp(z P); see
 `model.impairments`. Thermal noise is far weaker than the multipath. The divided signals y exp(-z
 P) therefore have the distribution of the model without the factor, apart from the change of
 volume. With mean mu(p) and covariance Lambda at a position p, the log-likelihood is, up to a
@@ -66,8 +66,8 @@ class Signals(NamedTuple):
 class Local(NamedTuple):
     """The log-likelihood of M points (r [m], u, v) with nuisance parameters, and its derivatives.
 
-    `information` is the expected one. Observed curvatures of range and phase differ by noise,
-    which would spoil the marginal, where the two nearly cancel.
+    `information` is the expected information. Observed curvatures of range and phase differ by
+    noise, which would spoil the marginal, where the two nearly cancel.
     """
 
     value: np.ndarray  # Logarithm of likelihood and prior of the parameters, float64 [M].
@@ -159,9 +159,9 @@ class NuisancePrior:
                 slopes: np.ndarray, *linear: np.ndarray) -> np.ndarray:
         """Return the residual and its derivatives at M points, complex128 [M, C, N_B, N_SB F].
 
-        The residual is followed by derivatives: of the mean by the point; of the signals with
-        information about the parameters, by these; of the mean by further `linear` parameters; and
-        of the received signals by the parameters.
+        The residual is followed by four groups of derivatives: of the mean by the point, of the
+        informative signals by the parameters, of the mean by further `linear` parameters, and of
+        the received signals by the parameters.
         """
         divided = self.divide(received, values)
         # A parameter that moves the multipath acts on the received multipath, so the information
@@ -293,7 +293,7 @@ def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
     `white`, complex128 [M, C, n], are the columns of `NuisancePrior.columns`. The last Q may be
     absent; the gradient then uses derivatives of the mean, and predicts no more than the whole
     energy. `information_of_covariance`, float64 [Q, Q], is the information of the covariance about
-    the parameters; by default, that of the average covariance. `n_linear` is the number of further
+    the parameters; by default, the average covariance is used. `n_linear` is the number of further
     standard normal parameters in which the mean is linear; they are integrated out.
     """
     n, end = 3 + len(prior), 4 + len(prior) + n_linear
@@ -336,7 +336,7 @@ class DispersedLikelihood:
 
     Errors of the direct path are stronger for near users. A surface has a whole number k of failed
     elements, and their covariance is k / E[k] times the average. The likelihood is averaged over
-    k, and its value is relative to that of `Likelihood`.
+    k, and its value is relative to `Likelihood`.
     """
 
     def __init__(self, likelihood: Likelihood) -> None:

@@ -206,7 +206,7 @@ class BandPhases:
                 ) -> tuple[np.ndarray, np.ndarray]:
         """Multiply the factors at P positions; if `averages`, average over a wavelength of range.
 
-        `outputs` are those of the matched filters, [N_B, P]. Returns the logarithm of the result,
+        `outputs`, [N_B, P], come from the matched filters. Returns the logarithm of the result,
         and the mean offset in range [m], [P].
         """
         ranges_m = self._ranges_m if averages else np.zeros(1)

@@ -98,7 +98,7 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     """Take Gauss-Newton steps from points to the modes of the posterior.
 
     `conditional` is the likelihood for the state of the surface. Modes that are less likely than
-    the best of a phase by more than the margin are dropped.
+    the best of their phase, by more than the margin, are dropped.
     """
     def step(starts: Starts, moves: bool = True) -> tuple[Modes, np.ndarray]:
         return _step(conditional, likelihood, starts, signals.take(starts.phases), state, moves)

@@ -3,7 +3,7 @@
 The signals of a phase often fit several positions, 0.6 m apart in range with Table I. The tracker
 keeps all of them, as a mixture of Gaussians over position and velocity, until the movement over
 several phases decides between them. Velocities are assumed to drift at random, with sudden turns.
-Coordinates are those of `coordinates`.
+Coordinates are described in `coordinates`.
 """
 
 import dataclasses
@@ -273,11 +273,11 @@ class Tracker:
 
     The first position of a track is the estimate itself. A track ends after a gap of more than
     `MAX_GAP_S`. A phase does not change the track if it has no position, or if its multipath is
-    almost equal to that of the previous phase. While the user is blocked, the position is a
+    almost the same as in the previous phase. While the user is blocked, the position is a
     prediction. Positions are inside the region of interest.
 
     The attribute `estimator` may be replaced between phases, for example for another codebook. The
-    estimates contain its probabilities that the user is outside or blocked.
+    estimates contain the probabilities of this estimator that the user is outside or blocked.
     """
 
     def __init__(self, estimator: SearchEstimator, motion: Motion | None = None) -> None:

@@ -1,4 +1,4 @@
-"""The declaration of a value, with one wording of what is expected.
+"""The declaration of a value, with uniform texts about expected values.
 
 Fields of scenarios and messages, settings of roles, ROS parameters and arguments of commands are
 declared in this way.
