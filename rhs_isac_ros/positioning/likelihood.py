@@ -202,9 +202,9 @@ class NuisancePrior:
                   ) -> tuple[np.ndarray, np.ndarray]:
         """Maximise the log-likelihood, without the template's energy, over the gain.
 
-        If signals with the whitened energy |y|^2 are multiplied by h, the log-likelihood at the
-        amplitude A, of any shape, is ``-h^2 |y|^2 + 2 h A + 2 n log h``. Returns its maximum and
-        the gain [nepers]. If the gain is known, the maximum does not include the energy.
+        If signals with the whitened energy ``|y|^2`` are multiplied by h, the log-likelihood at
+        the amplitude A, of any shape, is ``-h^2 |y|^2 + 2 h A + 2 n log h``. Returns its maximum
+        and the gain [nepers]. If the gain is known, the maximum does not include the energy.
         """
         if not self.gain_std:
             return 2 * amplitude, np.zeros(1)
