@@ -160,7 +160,7 @@ def minimize_levels(search: Search) -> str:
 
 
 def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int) -> np.ndarray:
-    """Minimise the objective of continuous amplitudes plus a penalty; evaluate it rounded."""
+    """Minimise over continuous amplitudes with a penalty, and evaluate the rounded result."""
     scale = weight * search.relaxed_value_and_gradient(start)[0] / search.n_analog
     frequency = np.pi * _top_level(search)
 

@@ -68,7 +68,7 @@ LOOKS = (
 
 
 def look(index: int) -> Look:
-    """Return the look of the series with an index from 0; after the last look, they repeat."""
+    """Return the look of a series by its index; beyond the last one, looks repeat."""
     return LOOKS[index % len(LOOKS)]
 
 
