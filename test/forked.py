@@ -25,6 +25,10 @@ class Forked:
         self._process = FORKS.Process(target=run, args=(command, log, environment))
         self._process.start()
 
+    @property
+    def pid(self):
+        return self._process.pid
+
     def poll(self):
         return self._process.exitcode
 

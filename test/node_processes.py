@@ -73,6 +73,11 @@ class Process:
     def running(self):
         return self._popen.poll() is None
 
+    @property
+    def open_files(self):
+        """Names of the open files."""
+        return [os.readlink(file) for file in Path(f'/proc/{self._popen.pid}/fd').iterdir()]
+
     def signal(self, number):
         self._popen.send_signal(number)
 

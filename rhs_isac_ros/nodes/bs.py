@@ -167,6 +167,7 @@ class BsNode(RoleNode[BaseStation]):
             lambda found: convert.pose(found, convert.stamp_of(found, self), frame),
             values.max_users)
         self._locate: LocateServer | None = self._make_locate()
+        self.endings.callback(self._end_locate)
         self._reply = events.Reply(False, '')
         for name, request in ((topics.PAUSE, events.PauseRequested()),
                               (topics.RESUME, events.ResumeRequested()),
@@ -196,11 +197,6 @@ class BsNode(RoleNode[BaseStation]):
         if is_published and self._locate and isinstance(message, m.ProtocolState):
             self._locate.observe(message)
         return is_published
-
-    def destroy_node(self) -> None:
-        """End the action, then destroy the node."""
-        self._end_locate()
-        super().destroy_node()  # type: ignore[no-untyped-call]
 
     def _end_locate(self, delay_s: float = 0.0) -> None:
         if self._locate:

@@ -125,6 +125,7 @@ class OptimizerNode(ParameterizedNode):
         self._peers = Peers(
             self, topics.OPTIMIZER_NODE, self._instance, self._scenario, lambda missing: None,
             self._announce)
+        self.endings.callback(self._peers.close)
         self._diagnostics = Diagnostics(self, self._report)
         self.add_pre_set_parameters_callback(self._normalize)
         self.add_on_set_parameters_callback(self._check_codebook)

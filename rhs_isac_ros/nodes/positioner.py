@@ -41,6 +41,7 @@ class PositionerNode(RoleNode[Positioner]):
         super().__init__('positioner', **node_options)
         settings = self.make_settings(self.values)
         self._worker, self._table = BackgroundWorker(self), ''
+        self.endings.callback(self._worker.close)
         self._frame = Frame.of(self, self.values)
         self._pose = create_publisher(
             self, PoseWithCovarianceStamped, topics.POSITION, EXCHANGE, overridable=True)
@@ -152,11 +153,6 @@ class PositionerNode(RoleNode[Positioner]):
             for publisher in (self._pose, *self._user_poses.publishers(message.user)):
                 publisher.publish(pose)
         return is_published
-
-    def destroy_node(self) -> None:
-        """End the background thread, then destroy the node."""
-        self._worker.close()
-        super().destroy_node()  # type: ignore[no-untyped-call]
 
 
 main = entry('positioner', lambda: [PositionerNode()])

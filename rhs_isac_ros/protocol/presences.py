@@ -1,7 +1,7 @@
 """Which instance of a role serves, and which stand by."""
 
-import collections
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,7 +9,11 @@ from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.role import NewestDict
 
-# Maximum number of nodes in conflict with this one, which bounds the memory.
+# Period of the announcements of a node, and the time without one after which it has gone [s].
+# Shorter times would load large networks, and mistake nodes of a busy machine for those that have
+# gone.
+PERIOD_S, SILENCE_S = 0.4, 1.6
+# Maximum number of other nodes, which bounds the memory.
 _MAX_OTHERS = 64
 # Maximum number of scenarios that are logged, which bounds the log.
 _MAX_LOGGED = 16
@@ -37,15 +41,19 @@ class Presence:
 class Presences:
     """Decides from the announcements of other nodes whether a node serves or stands by.
 
-    Of the nodes with the same role and scenario, the one that started last serves, as with the
-    fencing tokens of leases: a restarted node serves at once, and the older node resumes when the
-    newer one has gone. Nodes of another scenario are reported and otherwise ignored.
+    Nodes announce themselves periodically; one that has fallen silent has gone. Of the nodes with
+    the same role and scenario, the one that started last serves, as with the fencing tokens of
+    leases: a restarted node serves at once, and the older node resumes when the newer one has
+    gone. Nodes of another scenario are reported and otherwise ignored.
+
+    The clock of the arguments `now_s` [s] stops while this node cannot receive announcements.
     """
 
     def __init__(self, own: Presence) -> None:
         self.own = own
-        # Nodes in conflict with this one, by instance.
-        self._others: NewestDict[int, Presence] = NewestDict(_MAX_OTHERS)
+        # By instance: announcement and time of the last one.
+        self._known: NewestDict[int, tuple[Presence, float]] = NewestDict(_MAX_OTHERS)
+        self._now_s = -math.inf
         # The newest other node of the role, and the older one that was logged last, which is not
         # logged again if it returns after a suspension.
         self._rival: Presence | None = None
@@ -54,42 +62,34 @@ class Presences:
         self._scenarios: NewestDict[str, str] = NewestDict(_MAX_OTHERS)
         self._n_logged = 0
 
-    def add(self, other: Presence, now_ns: int) -> list[LogMessage]:
-        """Process an announcement that arrives at a time since 1970 [ns]."""
-        own = self.own
-        is_stranger = bool(other.scenario_id) and other.scenario_id != own.scenario_id
-        if other.sender in (0, own.sender) or other.sender > now_ns + _MAX_AHEAD_NS or not (
-                is_stranger or other.role == own.role):
+    def add(self, other: Presence, now_ns: int, now_s: float) -> list[LogMessage]:
+        """Process an announcement that arrives at `now_ns` since 1970."""
+        if other.sender in (0, self.own.sender) or other.sender > now_ns + _MAX_AHEAD_NS:
             return []
-        is_new = other.sender not in self._others
-        self._others.put(other.sender, other)
-        if is_stranger:
-            return self._report_scenario(other)
-        return self._update() if is_new else []
+        self._known.put(other.sender, (other, now_s))
+        return [*(self._report_scenario(other) if self._is_stranger(other) else []),
+                *self.update(now_s)]
 
-    def gone(self, announcing: Mapping[str, int]) -> set[str]:
-        """Return the names of nodes in conflict that have gone.
-
-        If several nodes share a name, it is unknown which of them has gone. The caller forgets all
-        of them; those that are still present announce themselves again. `announcing` counts the
-        nodes that announce themselves by fully qualified name, which is empty if it is unknown.
-        """
-        known = collections.Counter(other.node for other in self._others.values())
-        return {name for name, count in known.items()
-                if announcing.get(name, 0) + announcing.get('', 0)
-                < count + (name == self.own.node)}
-
-    def keep(self, announcing: Mapping[str, int]) -> list[LogMessage]:
-        """Forget the nodes that have gone, see `gone`, and choose the node that serves."""
-        gone = self.gone(announcing)
-        for sender in [sender for sender, other in self._others.items() if other.node in gone]:
-            del self._others[sender]
-        ended = sorted(self._scenarios.keys()
-                       - {other.scenario_id for other in self._others.values()})
+    def update(self, now_s: float) -> list[LogMessage]:
+        """Forget the conflicts with nodes that have gone, and choose the node that serves."""
+        self._now_s = now_s
+        ended = sorted(self._scenarios.keys() - {other.scenario_id for other in self._present()})
         for scenario_id in ended:
             del self._scenarios[scenario_id]
         return [*(LogMessage(f'no node with scenario {scenario_id} is left')
-                  for scenario_id in ended), *self._update()]
+                  for scenario_id in ended), *self._choose()]
+
+    def silent(self) -> set[str]:
+        """Return the names of the nodes that have announced themselves and have gone."""
+        return {other.node for other, _ in self._known.values()} - {
+            other.node for other in self._present()}
+
+    def _present(self) -> list[Presence]:
+        return [other for other, last_s in self._known.values()
+                if self._now_s - last_s < SILENCE_S]
+
+    def _is_stranger(self, other: Presence) -> bool:
+        return other.scenario_id not in ('', self.own.scenario_id)
 
     @property
     def stands_by(self) -> bool:
@@ -97,9 +97,9 @@ class Presences:
         return self.rival > self.own.sender
 
     @property
-    def others(self) -> frozenset[int]:
-        """Instances of the nodes in conflict with this one."""
-        return frozenset(self._others)
+    def has_conflicts(self) -> bool:
+        """Whether there are nodes of the same role or of another scenario."""
+        return bool(self._rival or self._scenarios)
 
     @property
     def rival(self) -> int:
@@ -115,11 +115,11 @@ class Presences:
     def _describe(self) -> str:
         return f'{"stands by for" if self.stands_by else "serves instead of"} {self._rival}'
 
-    def _update(self) -> list[LogMessage]:
+    def _choose(self) -> list[LogMessage]:
         """Find the newest other node of the role, and log whether this one serves."""
         own, before = self.own, self._rival if self.stands_by else None
-        rivals = [other for other in self._others.values()
-                  if other.role == own.role and other.scenario_id in ('', own.scenario_id)]
+        rivals = [other for other in self._present()
+                  if other.role == own.role and not self._is_stranger(other)]
         self._rival = max(rivals, key=lambda other: other.sender, default=None)
         rival = self._rival
         if rival and rival != before and rival.sender != self._logged_older:

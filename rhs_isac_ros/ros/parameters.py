@@ -4,6 +4,7 @@ Descriptors, checks and documentation derive from the declarations. Parameters t
 settings of a role are declared there.
 """
 
+import contextlib
 import dataclasses
 import difflib
 import functools
@@ -283,6 +284,8 @@ class ParameterizedNode(Node):
 
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
         super().__init__(name or executable, **node_options)
+        # Ends, before the node is destroyed, what it has started.
+        self.endings = contextlib.ExitStack()
         self._executable = executable
         self.values = declare(self, executable)
         self._dynamic = {parameter.name: parameter for parameter in NODES[executable]
@@ -293,6 +296,11 @@ class ParameterizedNode(Node):
         self._is_reverting = False
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._on_set)
+
+    def destroy_node(self) -> None:
+        """End what the node has started, then destroy it."""
+        self.endings.close()
+        super().destroy_node()  # type: ignore[no-untyped-call]
 
     def make_settings(self, values: types.SimpleNamespace) -> Any:
         """Return the settings of the role for parameter values, or raise ParameterError."""

@@ -1,19 +1,22 @@
-"""Who is in the network: the nodes and topics of the ROS graph."""
+"""Who is in the network: the topics of the ROS graph, and announcements of the nodes."""
 
-import collections
 import itertools
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from rclpy.exceptions import InvalidHandle
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, qos_check_compatible
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.messages import MessageError
-from rhs_isac_ros.protocol.presences import Presence, Presences
+from rhs_isac_ros.protocol.presences import PERIOD_S, Presence, Presences
 from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.ros.roster import ROSTER, identifying_endpoints
 
@@ -26,10 +29,8 @@ _GRACE_POLLS = 10
 _MAX_LOGGED = 16
 # Topics of every node, which are not ours.
 _FOREIGN = ('/rosout', '/parameter_events')
-# What the middleware returns instead of the name of a node: it has not arrived yet, or the
-# participant is unknown, which also endpoints of processes that have ended may be for a time.
-_NOT_YET = '_NODE_NAME_UNKNOWN_'
-_UNNAMED = (_NOT_YET, '_CREATED_BY_BARE_DDS_APP_')
+# What the middleware returns instead of the name of a node, which may arrive after its endpoints.
+_UNNAMED = ('_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_')
 # Number of bytes of the identity of an endpoint that identify its participant.
 _PREFIX_LENGTH = 12
 
@@ -47,10 +48,11 @@ class Peers:
     """Polls the ROS graph for what a node needs to know about the others.
 
     A role is missing if no node has all `identifying_endpoints`, and present once two polls in a
-    row have found them, which gives it time to discover this node as well. A node of a unique role
-    also announces its instance on a latched topic: of two with the same role, the newer serves
-    until it disappears from the graph. Endpoints that cannot exchange messages, because one
-    requests a quality of service that the other does not offer, are logged.
+    row have found them, which gives it time to discover this node as well. Nodes of unique roles
+    also announce themselves to each other periodically: one that has fallen silent does not count,
+    although the graph contains it for some time. Of two with the same role, the newer serves.
+    Endpoints that cannot exchange messages, because one requests a quality of service that the
+    other does not offer, are logged.
 
     Parameters
     ----------
@@ -71,8 +73,8 @@ class Peers:
             on_rival: Callable[[bool], None]) -> None:
         self._node, self._on_missing, self._on_rival = node, on_missing, on_rival
         self._required = {name: identifying_endpoints(name) for name in ROSTER[role].needed}
-        # By role that was found last: the number of endpoints of each topic then.
-        self._present: dict[str, tuple[int, ...]] = {}
+        # By role that was found last: the number of endpoints of each topic then, and the nodes.
+        self._present: dict[str, tuple[tuple[int, ...], set[str]]] = {}
         # Number of endpoints by topic at the last poll, and incompatible ones by topic and node.
         self._counts: list[tuple[str, int, int]] = []
         self._incompatible: dict[tuple[str, str], str] = {}
@@ -80,17 +82,29 @@ class Peers:
         self._logged: set[tuple[str, str]] = set()
         self._presences = Presences(Presence(
             instance, scenario.id, role, node.get_fully_qualified_name(), scenario.fields()))
-        self._is_announced = ROSTER[role].is_unique
-        # Whether the last poll found that a node in conflict has gone.
-        self._is_short = False
-        if self._is_announced:
-            self._publisher = endpoints.create_publisher(
-                node, ros.Presence, topics.PRESENCE, endpoints.LATCHED)
+        # Time of the last poll or announcement, and total of the times without [s].
+        self._last_s, self._missed_s = time.monotonic(), 0.0
+        # Nodes that the last poll found silent.
+        self._silent: set[str] = set()
+        # The rival of which `on_rival` was informed last.
+        self._rival = 0
+        self._closed, self._thread = threading.Event(), threading.Thread()
+        if ROSTER[role].is_unique:
             endpoints.subscribe(node, ros.Presence, topics.PRESENCE, self._receive,
                                 endpoints.PRESENCES, raw=True)
-            self._announce()
+            # A thread announces the node also while it computes.
+            self._thread = threading.Thread(
+                target=self._announce, daemon=True, args=[endpoints.create_publisher(
+                    node, ros.Presence, topics.PRESENCE, endpoints.LATCHED)])
+            self._thread.start()
         self._timer = endpoints.steady_timer(node, _POLL_S, self._poll)
         self.restart()
+
+    def close(self) -> None:
+        """End the announcements, before the node is destroyed."""
+        self._closed.set()
+        if self._thread.is_alive():
+            self._thread.join()
 
     def restart(self) -> None:
         """Report the missing roles anew, as after the start."""
@@ -109,12 +123,21 @@ class Peers:
 
     def _poll(self) -> None:
         self._polls += 1
+        self._apply(self._presences.update(self._now_s()))
+        self._silent = self._presences.silent()
         self._report_missing()
         self._examine_qos()
-        if self._presences.others:
-            self._look_for_rivals()
-        busy = self._reported != {} or self._presences.others
+        busy = self._reported != {} or self._presences.has_conflicts
         self._set_period(_POLL_S if busy else _IDLE_POLL_S)
+
+    def _now_s(self) -> float:
+        """Return a time that excludes those in which this process stood still [s]."""
+        now_s = time.monotonic()
+        if now_s - self._last_s > _IDLE_POLL_S + PERIOD_S:
+            # Announcements that arrived meanwhile may still be waiting.
+            self._missed_s += now_s - self._last_s
+        self._last_s = now_s
+        return now_s - self._missed_s
 
     def _set_period(self, period_s: float) -> None:
         if self._timer.timer_period_ns != int(1e9 * period_s):
@@ -142,19 +165,22 @@ class Peers:
                   *(('subscriber', node.resolve_topic_name(topic)) for topic in subscriptions)]
         counts = tuple(node.count_publishers(topic) if kind == 'publisher'
                        else node.count_subscribers(topic) for kind, topic in wanted)
-        if counts == self._present.get(name):
-            return ''
-        # Observers have single endpoints, so that only a node with all of them is present.
-        owners = [{_owner(info) for info in (
-            node.get_publishers_info_by_topic(topic) if kind == 'publisher'
-            else node.get_subscriptions_info_by_topic(topic))} for kind, topic in wanted]
-        absent = [f'no {kind} of {topic}' for (kind, topic), found in zip(
-            wanted, owners, strict=True) if not found & owners[0]]
-        if absent:
-            is_gone = len(absent) == len(wanted)
-            return name if is_gone else f'{name} ({", ".join(absent)})'
-        self._present[name] = counts
-        return ''
+        known_counts, found = self._present.get(name, ((), set()))
+        if counts != known_counts:
+            # Observers have single endpoints, so that only a node with all of them is present.
+            owners = [{_owner(info) for info in (
+                node.get_publishers_info_by_topic(topic) if kind == 'publisher'
+                else node.get_subscriptions_info_by_topic(topic))} for kind, topic in wanted]
+            absent = [f'no {kind} of {topic}' for (kind, topic), those in zip(
+                wanted, owners, strict=True) if not those & owners[0]]
+            if absent:
+                is_gone = len(absent) == len(wanted)
+                return name if is_gone else f'{name} ({", ".join(absent)})'
+            found = set.intersection(*owners)
+            # Names may arrive later.
+            are_named = all('/' in owner for owner in found)
+            self._present[name] = (counts if are_named else (), found)
+        return '' if found - self._silent else name
 
     # Quality of service
 
@@ -195,9 +221,16 @@ class Peers:
 
     # Other nodes of the same role
 
-    def _announce(self) -> None:
-        self._publisher.publish(convert.to_bytes(
-            self._presences.own, self._node.get_clock().now().nanoseconds, frame=''))
+    def _announce(self, publisher: Publisher) -> None:
+        """Announce this node periodically until it ends."""
+        while not self._closed.is_set():
+            try:
+                publisher.publish(convert.to_bytes(
+                    self._presences.own, self._node.get_clock().now().nanoseconds, frame=''))
+            # The node was destroyed, or its context was shut down.
+            except (InvalidHandle, rclpy_implementation.RCLError):
+                return
+            self._closed.wait(PERIOD_S)
 
     def _receive(self, content: bytes) -> None:
         try:
@@ -205,44 +238,34 @@ class Peers:
         # Anything may be published on the topic.
         except MessageError:
             return
-        self._apply(lambda presences: presences.add(presence, time.time_ns()))
-        if self._presences.others:
+        self._apply(self._presences.add(presence, time.time_ns(), self._now_s()))
+        if self._presences.silent() != self._silent:
+            self._poll()
+        elif self._presences.has_conflicts:
             self._set_period(_POLL_S)
 
-    def _look_for_rivals(self) -> None:
-        """Forget nodes in conflict that are absent in two polls in a row."""
-        infos = self._node.get_publishers_info_by_topic(self._publisher.topic_name)
-        present = collections.Counter(
-            '' if info.node_name == _NOT_YET else full_name(info) for info in infos)
-        was_short, self._is_short = self._is_short, bool(self._presences.gone(present))
-        if was_short and self._is_short:
-            self._apply(lambda presences: presences.keep(present))
-
-    def _apply(self, change: Callable[[Presences], list[LogMessage]]) -> None:
-        """Change the known nodes and log it; announce this node to those that have appeared."""
-        presences, logger = self._presences, self._node.get_logger()
-        others, rival = presences.others, presences.rival
-        for message in change(presences):
+    def _apply(self, changes: list[LogMessage]) -> None:
+        """Log changes of the known nodes, and serve or stand by."""
+        logger = self._node.get_logger()
+        for message in changes:
             # Not one line: rclpy requires a single severity for each line that logs.
             if message.warning:
                 logger.warning(message.text)
             else:
                 logger.info(message.text)
-        if presences.others != others:
-            self._announce()
-        if presences.rival != rival:
-            self._on_rival(presences.stands_by)
+        if self._presences.rival != self._rival:
+            self._rival = self._presences.rival
+            self._on_rival(self._presences.stands_by)
 
 
-def _owner(info: Any) -> str | bytes:
+def _owner(info: Any) -> str:
     """Return the node of an endpoint, or its participant while the node is unknown.
 
-    The name of a node may arrive after its endpoints. If the process stood still for longer than
-    the lease of discovery, its endpoints are discovered again, but Fast DDS does not deliver the
-    name again.
+    If the process was unreachable for longer than the lease of discovery, its endpoints are
+    discovered again, but Fast DDS does not deliver the name again.
     """
     if info.node_name in _UNNAMED:
-        return bytes(info.endpoint_gid[:_PREFIX_LENGTH])
+        return bytes(info.endpoint_gid[:_PREFIX_LENGTH]).hex()
     return full_name(info)
 
 

@@ -229,6 +229,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._peers = Peers(
             self, self._executable, self.instance, self.scenario, self._on_missing,
             self._on_rival)
+        self.endings.callback(self._peers.close)
         if subscribe and not needs_codebook:
             self.subscribe()
         if ROSTER[self._executable].has_codebook:

@@ -33,9 +33,8 @@ _holders: list[Node] = []
 
 
 def discovery_profile_file() -> Path:
-    """Return the path of the Fast DDS discovery profile, which depends on DDS security."""
-    name = 'discovery_security.xml' if is_enabled() else 'discovery.xml'
-    return Path(get_package_share_directory('rhs_isac_ros')) / 'config' / name
+    """Return the path of the Fast DDS discovery profile."""
+    return Path(get_package_share_directory('rhs_isac_ros')) / 'config' / 'discovery.xml'
 
 
 def use_discovery_profile() -> None:

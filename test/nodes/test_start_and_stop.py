@@ -38,11 +38,12 @@ def ended_network(request, module_processes, make_watch, small_files):
             # The first two are running before the others start.
             watch.wait_for_nodes(*running)
     watch.until_served(2, processes=running.values())
+    files = {file for process in running.values() for file in process.open_files}
     # The signal arrives while most nodes are busy.
     for process in running.values():
         process.signal(number)
     ends = {name: (process.wait(), process.log) for name, process in running.items()}
-    return types.SimpleNamespace(watch=watch, ends=ends)
+    return types.SimpleNamespace(watch=watch, ends=ends, files=files)
 
 
 def test_cycles_begin_whatever_the_order_of_the_starts(ended_network, small_files):
@@ -52,6 +53,13 @@ def test_cycles_begin_whatever_the_order_of_the_starts(ended_network, small_file
     assert {message.user for message in ended_network.watch.served} == {1}
     numbers = [message.cycle_id for message in received[m.Grant]]
     assert numbers == sorted(set(numbers))
+
+
+def test_no_process_receives_through_shared_memory(ended_network):
+    """Fast DDS 2.14 may write to the memory of a killed process instead of its successor's."""
+    # Fast DDS locks a file of each port on which it listens.
+    assert ended_network.files
+    assert not [file for file in ended_network.files if 'fastrtps_port' in file]
 
 
 def test_hardly_any_process_waits_for_itself_in_the_middleware(ended_network):

@@ -5,6 +5,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
@@ -19,7 +20,7 @@ from rhs_isac_ros.nodes.rhs_controller import RhsControllerNode
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.presences import Presence
+from rhs_isac_ros.protocol import presences
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, peers, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES
@@ -46,6 +47,8 @@ def create_endpoints(node, endpoints):
 def frequent_polls(monkeypatch):
     monkeypatch.setattr(peers, '_POLL_S', 0.01)
     monkeypatch.setattr(peers, '_IDLE_POLL_S', 0.1)
+    monkeypatch.setattr(peers, 'PERIOD_S', 0.1)
+    monkeypatch.setattr(presences, 'SILENCE_S', 0.5)
 
 
 @pytest.fixture
@@ -144,23 +147,20 @@ def test_an_observer_does_not_stand_for_a_role(bench, monitor):
     bench.until(lambda: 'positioner' not in reports[-1], 'presence')
 
 
-@pytest.mark.parametrize(('name', 'expected'), [
-    ('_NODE_NAME_UNKNOWN_', [True]), ('_CREATED_BY_BARE_DDS_APP_', [True, False])])
-def test_an_endpoint_whose_participant_is_unknown_keeps_no_node_standing_by(name, expected):
-    """It may belong to the newer node as long as its name may arrive, but not otherwise."""
-    node, standing_by = mock.MagicMock(), []
-    node.get_fully_qualified_name.return_value = '/channel'
-    node.get_clock.return_value.now.return_value.nanoseconds = 0
-    node.get_publishers_info_by_topic.return_value = [
-        mock.Mock(node_name=one, node_namespace='/') for one in ('channel', name)]
-    Peers(node, 'channel', 1, Scenario(), lambda missing: None, standing_by.append)
-    poll, receive = (create.call_args.args[index] for create, index in (
-        (node.create_timer, 1), (node.create_subscription, 2)))
-    receive(convert.to_bytes(Presence(2, Scenario().id, 'channel', '/channel',
-                                      Scenario().fields()), 0, frame=''))
-    for _ in range(3):
-        poll()
-    assert standing_by == expected
+def test_a_node_that_has_fallen_silent_is_missing_although_the_graph_contains_it(bench, monitor):
+    """Discovery forgets a killed process only after 20 s."""
+    positioner = bench.add(Node, 'positioner')
+    create_endpoints(positioner, REQUIRED['bs']['positioner'])
+    publisher = positioner.create_publisher(ros.Presence, topics.PRESENCE, LATCHED)
+    reports = monitor('bs')
+    bench.until(lambda: reports and 'positioner' not in reports[-1], 'presence')
+    for _ in range(2):
+        publisher.publish(ros.Presence(
+            sender=1, role='positioner', node='/positioner', scenario='{}'))
+        bench.until(lambda: reports[-1].get('positioner') == 'positioner', 'silence')
+        publisher.publish(ros.Presence(
+            sender=2, role='positioner', node='/positioner', scenario='{}'))
+        bench.until(lambda: 'positioner' not in reports[-1], 'presence of the second instance')
 
 
 @pytest.mark.parametrize('unknown', ['_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_'])
@@ -352,22 +352,36 @@ def test_the_older_node_stands_by_and_resumes(each_bench, capfd):
     assert log.count('this one serves instead of /older') == 1
 
 
-def test_nothing_is_announced_repeatedly_without_a_conflict(bench, probe, add_channel):
+def test_a_node_announces_itself_periodically_also_while_it_computes(bench, probe):
     received = []
     probe.create_subscription(ros.Presence, topics.PRESENCE, received.append, PRESENCES)
-    node = add_channel()
-    bench.until(lambda: received, 'the announcement')
-    assert received[0].sender == node.instance
-    assert received[0].node == '/channel'
-    assert received[0].scenario_id == node.scenario.id
-    # Another role is no conflict.
-    other = bench.add(Node, 'other')
-    Peers(other, 'bs', new_instance(), node.scenario, lambda missing: None,
-          lambda stands_by: None)
-    bench.until(lambda: len(received) == 2, 'the other announcement')
-    polls = node._peers._polls
-    bench.until(lambda: node._peers._polls >= polls + 3, 'some polls')
-    assert len(received) == 2
+    # Nobody executes the callbacks of this node.
+    busy = type(bench)(EventsExecutor)
+    node = busy.add(RoleNode, 'channel')
+    node.start(Radio())
+    bench.until(lambda: len(received) == 3, 'the announcements')
+    busy.close()
+    assert {(one.sender, one.node, one.scenario_id) for one in received} == {
+        (node.instance, '/channel', node.scenario.id)}
+
+
+def test_the_own_standstill_is_no_silence_of_others(bench, add_channel, monkeypatch):
+    older, newer = (add_channel(name) for name in ('older', 'newer'))
+    bench.until(lambda: older.stands_by, 'the newer node')
+    newer._peers.close()
+    now_s = time.monotonic()
+    monkeypatch.setattr(peers, 'time', mock.Mock(monotonic=lambda: now_s))
+
+    def poll(step_s):
+        nonlocal now_s
+        now_s += step_s
+        older._peers._poll()
+    for step_s in (0.0, 10.0, 10.0, *4 * [0.1]):
+        poll(step_s)
+        assert older.stands_by
+    for _ in range(5):
+        poll(0.1)
+    assert not older.stands_by
 
 
 @pytest.mark.parametrize('scenario', ['[', '3', 'a: b: c'])

@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import re
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +11,7 @@ from ament_index_python.packages import get_package_prefix
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from rhs_isac_ros.ros import startup
-from rhs_isac_ros.ros.startup import SecurityError, discovery_profile_file, prepare
+from rhs_isac_ros.ros.startup import SecurityError, prepare
 from rhs_isac_ros.tools import param, topic
 
 EVERY = ('bs', 'lab/user_1', 'operator', 'lab/operator', 'replay', 'other')
@@ -52,18 +51,6 @@ def test_a_given_enclave_takes_precedence(monkeypatch):
     assert prepare(args) == args
     monkeypatch.setenv('ROS_SECURITY_ENCLAVE_OVERRIDE', '/other')
     assert prepare(['unknown'])[0] == 'unknown'
-
-
-def test_security_has_the_lease_of_fast_dds(monkeypatch):
-    leases, rests = [], []
-    for value in ('true', 'false'):
-        monkeypatch.setenv('ROS_SECURITY_ENABLE', value)
-        text = discovery_profile_file().read_text(encoding='utf-8')
-        lease = re.search(r'<leaseDuration>.*?</leaseDuration>', text, re.S)[0]
-        leases.append(tuple(map(int, re.findall(r'\d+', lease))))
-        rests.append(re.sub('<!--.*?-->', '', text.replace(lease, ''), flags=re.S))
-    assert leases == [(20, 0), (1, 600_000_000)]
-    assert rests[0] == rests[1]
 
 
 @pytest.mark.parametrize('value', [None, '', 'false'])

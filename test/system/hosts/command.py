@@ -90,7 +90,7 @@ def _run(
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         observer = NetworkObserver(scenario)
         try:
-            trial = Trial(hosts, processes, observer, plan.lease_s(profile))
+            trial = Trial(hosts, processes, observer)
             trial.wait_until_served()
             outages = []
             for host in options.pull or plan.HOSTS:

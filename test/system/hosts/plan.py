@@ -5,9 +5,9 @@ another namespace, so that the machine's own network is not touched.
 """
 
 import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterable
-from pathlib import Path
+
+from rhs_isac_ros.protocol.presences import SILENCE_S
 
 HOSTS: dict[str, tuple[str, ...]] = {
     'base_station': ('bs', 'optimizer'),
@@ -27,8 +27,11 @@ WAITING: dict[str, tuple[str, ...]] = {
     'positioner': ('bs',),
     'users': (),
 }
-# Default of Fast DDS [s].
-_DEFAULT_LEASE_S = 20.0
+# Time without announcements of a node; for users, which receive none, the time after which Fast
+# DDS removes an unreachable node from the graph [s].
+_MISSED_AFTER_S = {'bs': SILENCE_S, 'user': 20.0}
+# Maximum time from then to the report [s].
+_REPORT_DELAY_S = 3.0
 
 _PREFIX = 'rhs_isac'
 _NAME = re.compile(rf'{_PREFIX}-(\d+)-\w+')
@@ -119,18 +122,7 @@ def command_prefix(pid: int, node: str) -> list[str]:
     return ['ip', 'netns', 'exec', namespace(pid, host_of(node))]
 
 
-def lease_s(profile: Path | None) -> float:
-    """Return the time after which Fast DDS considers an unreachable participant lost [s].
-
-    Parameters
-    ----------
-    profile
-        XML file with profiles; None for the defaults of Fast DDS.
-    """
-    if profile is None:
-        return _DEFAULT_LEASE_S
-    for element in ElementTree.parse(profile).iter():
-        if element.tag.rpartition('}')[2] == 'leaseDuration':
-            parts = {child.tag.rpartition('}')[2]: float(child.text) for child in element}
-            return parts.get('sec', 0.0) + 1e-9 * parts.get('nanosec', 0.0)
-    return _DEFAULT_LEASE_S
+def waiting(host: str, seconds: float) -> tuple[str, ...]:
+    """Return the nodes that report during an outage of a host [s] that they wait for its nodes."""
+    return tuple(node for node in WAITING[host]
+                 if seconds >= _MISSED_AFTER_S[node] + _REPORT_DELAY_S)

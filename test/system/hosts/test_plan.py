@@ -4,7 +4,6 @@ import ipaddress
 
 import pytest
 
-from rhs_isac_ros.ros.startup import discovery_profile_file
 from system.hosts import plan
 
 
@@ -47,9 +46,7 @@ def test_namespaces_of_terminated_processes_are_stale():
     assert plan.stale(names, lambda pid: pid == 1) == [terminated]
 
 
-def test_the_lease_is_read_from_the_profile(tmp_path):
-    assert plan.lease_s(discovery_profile_file()) == 1.6
-    assert plan.lease_s(None) == 20.0
-    other = tmp_path / 'other.xml'
-    other.write_text('<dds><leaseAnnouncement><sec>1</sec></leaseAnnouncement></dds>')
-    assert plan.lease_s(other) == 20.0
+@pytest.mark.parametrize(('seconds', 'nodes'), [
+    (4.0, ()), (6.0, ('bs',)), (22.0, ('bs',)), (25.0, ('bs', 'user'))])
+def test_users_miss_an_unreachable_node_later_than_the_base_station(seconds, nodes):
+    assert plan.waiting('channel', seconds) == nodes

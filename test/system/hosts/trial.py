@@ -14,8 +14,6 @@ _START_TIMEOUT_S = 60.0
 # Maximum duration of the observation before and after an outage [s].
 _BEFORE_S = 5.0
 _AFTER_S = 20.0
-# Nodes report a missing node at most this long after the lease has expired [s].
-_REPORT_DELAY_S = 3.0
 
 
 class NetworkBroken(RuntimeError):
@@ -23,19 +21,11 @@ class NetworkBroken(RuntimeError):
 
 
 class Trial:
-    """A network on several hosts, observed while links are taken down.
-
-    Parameters
-    ----------
-    lease_s
-        Time after which an unreachable participant is considered lost [s].
-    """
+    """A network on several hosts, observed while links are taken down."""
 
     def __init__(
-            self, hosts: Hosts, processes: Processes, observer: NetworkObserver, lease_s: float
-    ) -> None:
+            self, hosts: Hosts, processes: Processes, observer: NetworkObserver) -> None:
         self._hosts, self._processes, self._observer = hosts, processes, observer
-        self._lease_s = lease_s
 
     def wait_until_served(self) -> None:
         """Wait until cycles are served.
@@ -79,7 +69,7 @@ class Trial:
         self._hosts.reconnect(host)
         self._spin(_AFTER_S, 3)
         marks_s.append(time.monotonic())
-        waiting = plan.WAITING[host] if seconds >= self._lease_s + _REPORT_DELAY_S else ()
+        waiting = plan.waiting(host, seconds)
         return evaluate(
             host, marks_s, self._observer.log.complete, logs, warnings,
             [node for node in log_lengths if node.partition('_')[0] in waiting])
