@@ -72,7 +72,7 @@ class Combination(NamedTuple):
         return whitened[:, self.sources] * self.scale[band, :, None]
 
     def backward(self, band: int, weighted: np.ndarray, n_rows: int) -> np.ndarray:
-        """Convert derivatives by rows, [n, G, R], to derivatives by source rows, [n, S, R]."""
+        """Convert gradients in the rows, [n, G, R], to gradients in the source rows, [n, S, R]."""
         gathered = np.zeros((len(weighted), n_rows, weighted.shape[2]), complex)
         for row, (source, scale) in enumerate(zip(self.sources, self.scale[band], strict=True)):
             gathered[:, source] += np.conj(scale) * weighted[:, row]

@@ -85,7 +85,7 @@ def global_bound(
 
 
 class _Lattice:
-    """The points of a lattice in (r, u, v) inside the region of interest; one of them is given.
+    """The points of a lattice in (r, u, v) inside the region of interest; it contains `point`.
 
     Along a ray, the mean signals of a band are a carrier times a smooth function of the range,
     which is interpolated between Chebyshev nodes. All ranges of a ray then cost one product of

@@ -44,7 +44,7 @@ class Misspecified(NamedTuple):
     """Errors of the maximum-likelihood estimator of an assumed model under a true one."""
 
     bias: np.ndarray  #: Pseudo-true position minus true position, float64 [N, 3] [m].
-    covariance: np.ndarray  #: Of errors about the pseudo-true position, [N, 3, 3] [m^2].
+    covariance: np.ndarray  #: Of the errors about the pseudo-true position, [N, 3, 3] [m^2].
     #: Whether the result describes the estimator, bool [N]: ambiguities of the range are
     #: improbable, the mean is linear over the errors, the border of the region is far away, and
     #: estimators accept the residual of the signals.

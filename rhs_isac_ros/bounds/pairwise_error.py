@@ -100,7 +100,7 @@ class PairwiseErrorCost(Average):
         return sample
 
     def _confusion(self, block: slice, forms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the cost times Q(sqrt(q / 2)) [n], and minus its derivative by 2 q, [n, 1, 1]."""
+        """Return the cost times Q(sqrt(q / 2)) [n], and minus its slope over 2 q, [n, 1, 1]."""
         from scipy.special import ndtr
 
         squares, slopes = self._squares(forms)

@@ -192,7 +192,7 @@ def rows_within(
 
 def _rank_of_some(scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
                   tolerance: float, band: int) -> int:
-    """Return the rank, within a tolerance, of more than `_MAX_RANK` of the rows and columns."""
+    """Return the rank, within a tolerance, of a sample of the rows and columns."""
     size, width = 2 * _MAX_RANK, scenario.n_subbands * scenario.n_elements
     if n_items * n_rows <= size or width <= 3 * size:
         return 0

@@ -108,7 +108,7 @@ class Alignment:
         return signals * np.exp(-np.tensordot(values, self.patterns, axes=1))
 
     def slopes(self, aligned: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Return the derivatives of aligned signals by the values, [N, Q, N_B, N_SB F].
+        """Return derivatives of aligned signals with respect to values, [N, Q, N_B, N_SB F].
 
         Offsets of carrier and timing are visible because they move the multipath out of the nulls
         of its covariance. Their derivatives therefore contain the signals instead of the mean.
@@ -116,7 +116,7 @@ class Alignment:
         return self.patterns * np.where(self._moves_multipath, aligned[:, None], mean[:, None])
 
     def start(self, white: np.ndarray, white_mean: np.ndarray, values: np.ndarray) -> None:
-        """Set the values that only rotate whole bands, one by one, to the most likely ones."""
+        """Set the values that only rotate whole bands, one by one, to the likeliest values."""
         outputs = np.sum(np.conj(white_mean) * white, axis=2)
         for q in np.flatnonzero(self._phases.any(axis=0)):
             turns = self._phases[:, q]

@@ -245,7 +245,7 @@ def _start(name: str | None, scenario: Scenario, seed: int) -> Codebook | None:
 
 
 def _save_partial(result: OptimizeResult, partial: Path) -> None:
-    """Save an unfinished result; a failure is only a warning, as the final write may succeed."""
+    """Save an unfinished result; a failure causes only a warning, as a later write may succeed."""
     try:
         result.codebook.save(partial)
     except OSError as error:
@@ -253,7 +253,7 @@ def _save_partial(result: OptimizeResult, partial: Path) -> None:
 
 
 def _save(codebook: Codebook, output: Path) -> None:
-    """Save the result, which may have taken hours; if this fails, in a temporary directory."""
+    """Save the result, in a temporary directory if need be, because it may have taken hours."""
     try:
         codebook.save(output)
     except OSError as error:

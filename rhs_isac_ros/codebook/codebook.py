@@ -185,7 +185,7 @@ def _number(parameters: dict[str, Any], name: str) -> float:
 
 
 def _array(parameters: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a list parameter as a float64 array of a shape, or raise CodebookError."""
+    """Return a list parameter as a float64 array of this shape, or raise CodebookError."""
     values = parameters.get(f'codebook.{name}', ())
     if isinstance(values, str):
         # ``ros2 param load`` sends a list as text if it contains a number such as 1e-05.
@@ -299,7 +299,7 @@ def to_parameter(text: str) -> str:
 def from_parameter(text: str) -> str:
     """Return the text behind a string from `to_parameter`.
 
-    The mappings that versions up to 0.1.0 wrote become the text of `encode`.
+    Mappings written by versions up to 0.1.0 are converted to the text of `encode`.
     """
     legacy = _parse_yaml(text) if text.startswith('{') else None
     if isinstance(legacy, dict):

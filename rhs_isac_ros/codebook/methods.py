@@ -248,7 +248,7 @@ def minimize_interior_point(
     """Minimise over the free variables: barrier, trust region, conjugate gradients, BFGS Hessian.
 
     SciPy's `trust-constr` is the algorithm of Byrd, Hribar and Nocedal that the paper cites.
-    `start`, float64 [n], has all variables, and `free`, bool [n], marks those to change. Returns
+    `start`, float64 [n], contains all variables; `free`, bool [n], marks those to change. Returns
     the best point evaluated, including `start`, float64 [n].
     """
     # A slow import, which loading a codebook does not need.

@@ -42,8 +42,8 @@ def nuisance(
         tick: Tick = no_tick) -> Average:
     """Objective [m^2]: average bound with unknown phases of the bands and the region as prior.
 
-    Even a phase that is contained in the signals is unknown in effect, because it recurs in every
-    wavelength of range. The region as prior keeps positions that the signals do not determine
+    Even a known phase would determine the range only up to whole wavelengths, so phases are
+    treated as unknown. The region as prior keeps positions that the signals do not determine
     from dominating the average. The scenario may declare further nuisance parameters. `rng` is
     unused.
     """
@@ -122,7 +122,7 @@ _MAX_DRAWS = 200
 def draw_confusable(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
         scales: tuple[float, float] = NEAR) -> np.ndarray:
-    """Draw for each position, float64 [N, 3] [m], another one in the region with similar signals.
+    """For each position, float64 [N, 3] [m], draw another one in the region with similar signals.
 
     Two positions are hard to distinguish if their ranges differ by about a whole number of
     wavelengths in every band. Range lags are therefore drawn with a density proportional to

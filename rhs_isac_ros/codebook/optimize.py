@@ -37,8 +37,8 @@ INTERRUPTED = 'interrupted'
 class Method(NamedTuple):
     """An optimisation method with its default limit on update steps.
 
-    `minimize` takes a `Search` and returns the reason for stopping. It is None if the result is
-    the start.
+    `minimize` takes a `Search` and returns the reason for stopping. A method whose result is its
+    start has None instead.
     """
 
     minimize: Callable[[Search], str] | None

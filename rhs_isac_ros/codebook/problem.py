@@ -16,9 +16,9 @@ from rhs_isac_ros.model.surface import on_levels
 class Problem:
     """Implements Eq. (16). Problem P1: average bound, fixed power, configurations in [0, 1].
 
-    Solvers see one real vector: the configurations, then the real and the imaginary parts of
-    unscaled combining vectors. Scaling these to P_max eliminates the power constraint; the bounds
-    of the configurations are left to the solver.
+    Solvers operate on one real vector: the configurations, then the real and the imaginary parts
+    of unscaled combining vectors. Scaling these to P_max eliminates the power constraint; solvers
+    observe the bounds of the configurations.
     """
 
     def __init__(self, scenario: Scenario, objective: Average) -> None:

@@ -88,7 +88,7 @@ def run_locally(
     """Run jobs in single-threaded processes on this machine; yield each result when it is ready.
 
     There are `n_jobs` processes: -1 means one per core; 1 runs all jobs in this process. Closing
-    the generator ends them. Before joblib 1.4, a result also waits for all earlier ones.
+    the generator ends them. Before joblib 1.4, a result waits for all earlier ones.
     """
     with optional_import('running jobs', extra='experiments'):
         import joblib
@@ -242,7 +242,7 @@ def run_command(experiment: Callable[[], None]) -> int:
     except KeyboardInterrupt:
         print('interrupted: finished jobs are kept; repeat the command to resume',
               file=sys.stderr)
-        # As shells report it.
+        # The exit code by which shells report Ctrl-C.
         return 130
     except (JobError, MissingLibraryError, OSError) as error:
         print_error(f'{error}; finished jobs are kept; repeat the command to resume')

@@ -52,7 +52,7 @@ def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -
     `results` are float64 [members, cases], NaN where a member has no result for a case. Of M
     members, M - 1 are drawn with replacement, which makes the variance of the replicates unbiased
     (Rao and Wu, Resampling inference with complex survey data, 1988). A single member contributes
-    no variance. The seed should differ for other members. Results with the same number of cases
+    no variance. Other members should have another seed. Results with the same number of cases
     share the resampled cases. Quantiles are from 0 to 1; by default, the mean is computed.
     """
     if results.ndim != 2 or not np.isfinite(results).any():

@@ -63,7 +63,7 @@ _FIRST_SOBOL = threading.Lock()
 
 
 def families(quantities: Iterable[str]) -> list[str]:
-    """Return the families whose jobs compute all of the given quantities."""
+    """Return the families of quantities whose jobs together compute the given quantities."""
     wanted = set(quantities)
     found = [family for family, names in _QUANTITIES.items() if wanted.intersection(names)]
     return [family for family in found if family not in _INCLUSIVE] + [
@@ -148,19 +148,19 @@ def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, An
 
 @functools.lru_cache(maxsize=1)
 def _estimator(name: str, scenario: str, codebook: str) -> Estimator:
-    """Return an estimator for JSON of scenario and codebook; successive jobs share it."""
+    """Return an estimator for a scenario and codebook in JSON; successive jobs share it."""
     _initialise_sobol()
     return make_estimator(name, Scenario(**json.loads(scenario)),
                           Codebook.from_parameters(json.loads(codebook)))
 
 
 def _initialise_sobol() -> None:
-    """Create a Sobol sequence, because SciPy reads its table without a lock the first time."""
+    """Create a Sobol sequence, because SciPy reads its table at first use without a lock."""
     with _FIRST_SOBOL:
         qmc.Sobol(1)
 
 
-# Fields on which it depends whether a codebook fits a scenario.
+# Fields that decide whether a codebook fits a scenario.
 _STRUCTURE = ('center_frequencies_hz', 'n_subbands', 'n_frames', 'elements_per_side', 'n_feeds',
               'feed_positions_m', 'amplitude_levels')
 
@@ -237,7 +237,7 @@ class Sweep:
         return dataclasses.replace(self.base, **taken)
 
     def designs(self, setting: Setting) -> list[Job]:
-        """Return the jobs that make the codebooks of a setting; none for a file."""
+        """Return the jobs that make the codebooks of a setting; none if the codebook is a file."""
         if setting.codebook not in KINDS:
             return []
         arguments: dict[str, Any] = {

@@ -156,9 +156,9 @@ class Axis(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """One combination of values, `varied` by name, and the scenario with these values.
+    """One combination of values, and the scenario with these values.
 
-    `codebook` is a kind or a file.
+    `varied` contains the values by name; `codebook` is a kind or a file.
     """
 
     varied: Mapping[str, Any]

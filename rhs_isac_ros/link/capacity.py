@@ -92,7 +92,7 @@ def posterior_points(
     moved out to the closer of the two. Otherwise, a tail of the Gaussian at or behind the surface
     would contribute impossible capacities.
 
-    Of the covariance, only the symmetric part is used; negative variances count as 0. Returns
+    Only the symmetric part of the covariance is used; negative variances count as 0. Returns
     positions, float64 [n, 3] [m], and weights with the sum 1, float64 [n]. Raises ValueError if
     `mean` or `covariance` has a wrong shape or is not finite.
     """
@@ -110,7 +110,7 @@ def posterior_points(
 
 @functools.lru_cache(maxsize=8)
 def _standard_rule(varies: tuple[bool, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes [n, 3] and weights [n] for a Gaussian with unit variance in varying axes."""
+    """Return nodes [n, 3] and weights [n] for a Gaussian of unit variance along some axes."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(_N_NODES)
     weights = weights / weights.sum()
     rule = list(zip(nodes, weights, strict=True))

@@ -70,7 +70,7 @@ class _Point(NamedTuple):
     rate: np.ndarray  # Capacities [nat/symbol], float64 [N_B, n].
     vertex: np.ndarray  # Vertex in the direction of the gradient, float64 [N_B, n, N_E].
     snr: np.ndarray  # Signal-to-noise ratios, float64 [N_B, n, N_SB].
-    slope: np.ndarray  # Derivative of the ratios by each element, float64 [N_B, n, N_SB, N_E].
+    slope: np.ndarray  # Derivatives of the ratios, float64 [N_B, n, N_SB, N_E].
     curvature: np.ndarray  # Coefficient of the square of an element's change, of the same shape.
 
     @classmethod
@@ -183,7 +183,7 @@ def steer_bands(
 
 @one_blas_thread
 def prepare_steering(scenario: Scenario, surface: SurfaceEstimate | None = None) -> None:
-    """Compute the tables of a scenario and a surface; otherwise, the first beam is delayed."""
+    """Compute the tables of a scenario and a surface before the first beam needs them."""
     choose_beam(scenario, np.array(scenario.roi_center_m), surface=surface)
 
 

@@ -83,7 +83,7 @@ def to_polar(positions: np.ndarray) -> np.ndarray:
 
 
 def jacobian(points: np.ndarray) -> np.ndarray:
-    """Compute the derivative of the position by r [m], u and v at points [N, 3].
+    """Compute the derivative of the position with respect to r [m], u and v at points [N, 3].
 
     Returns float64 [N, 3, 3], in which rows are coordinates of the position.
     """

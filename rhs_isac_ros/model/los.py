@@ -91,7 +91,7 @@ def los_and_derivative(
 
 def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *,
               slopes: bool = True) -> Iterator[Waves]:
-    """Yield, band by band, the gains h^LoS times the frequency and factors of their derivative.
+    """Yield h^LoS times the frequency, and factors of its derivative, for one band at a time.
 
     The derivative with respect to the user's position p is dh/dp = a (p - p_m) + b e_x. The
     boresight term b exists only with a gain pattern, which adds (dh/dtheta) (dtheta/dp) for the
@@ -167,7 +167,7 @@ def _offsets(scenario: Scenario, positions: np.ndarray) -> np.ndarray:
 
 def _amplitude(
         scenario: Scenario, offsets: np.ndarray, *, slope: bool = False) -> float | np.ndarray:
-    """Return gain times distance times frequency, a number or [N, N_E], or its slope by angle."""
+    """Return gain times distance times frequency, a number or [N, N_E], or its slope in theta."""
     gains = scenario.element_gain, scenario.user_gain
     angles = np.zeros(())
     if has_pattern(scenario):

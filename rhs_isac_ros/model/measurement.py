@@ -238,7 +238,7 @@ class MeasurementModel:
 
     def _of_bands(self, positions: np.ndarray,
                   of_band: Callable[[np.ndarray, slice, int], np.ndarray]) -> np.ndarray:
-        """Call a function of positions, block and band for all blocks of positions and bands."""
+        """Call a function for every block of positions and every band, and join the results."""
         positions = checked_positions(positions)
         result = np.empty((len(positions), *self.shape), complex)
 

@@ -3,7 +3,7 @@
 An alternative has prior odds and an evidence: the likelihood averaged over its own unknowns. Its
 probability follows from a comparison with the evidence for the region. Above the limit of the
 alternative, there is no fix. The limit of a user outside is high, because the prior odds are even
-although most users are inside, and none of these should lose a fix.
+although most users are inside, and none of them should lose a fix.
 """
 
 import math
@@ -192,7 +192,7 @@ class Outside:
                 + prior.log_evidence_of_aligned(aligned))
 
     def log_evidence(self, whitened: np.ndarray, scales: Iterable[float] = (1.0,)) -> np.ndarray:
-        """Return logarithms of ``exp(-|y - t|^2)`` averaged over the prior, for scales of y."""
+        """Average ``exp(-|s y - t|^2)`` over the prior for each scale s; return the logarithms."""
         filtered, energy = self._filter(whitened), float(np.sum(np.abs(whitened)**2))
         # At any range, the log-likelihood is at most that of outputs in phase.
         bound = (np.sum(filtered, axis=0)**2 / self._node_energy).max(axis=0)

@@ -222,7 +222,7 @@ class Diagnosis:
         self._estimates.append(estimate)
 
     def clear(self) -> None:
-        """Forget all cycles."""
+        """Remove all cycles."""
         self._estimates.clear()
 
     def status(self, deviates: bool) -> dict[str, str]:

@@ -115,7 +115,7 @@ class DrawnPosterior:
             float(rays.highest[weights > 0].max()), float(weights @ rays.average))
 
     def _probabilities(self, query: Query, phase: int) -> np.ndarray:
-        """Return approximate shares of the cells in the posterior, as if phases were random."""
+        """Approximate the share of each cell in the posterior, as if phases were random."""
         # The average of exp(2 A cos(phase)) is nearly exp(2 A) / sqrt(1 + 4 pi A).
         n_bands, bound = len(self._wavenumbers), query.bound[phase]
         amplitude = (bound + self._table.energy) / (2 * n_bands)

@@ -172,7 +172,8 @@ class Site(NamedTuple):
     # parameters, complex128 [4 + Q, N_B, N_SB F]; and their changes if an element fails.
     columns: np.ndarray
     changes: np.ndarray  # Complex128 [N_E, 4 + Q, N_B, N_SB F].
-    # Derivatives by the scaled amplitude of a failed element, complex128 [N_E, N_B, N_SB F].
+    # Derivatives with respect to the scaled amplitude of a failed element, complex128
+    # [N_E, N_B, N_SB F].
     amplitudes: np.ndarray
 
     def columns_of(self, failed: Failed) -> np.ndarray:
@@ -350,8 +351,8 @@ class FailureSearch:
     """Adds failed elements to sets, one at a time, at several sites, for the signals of a phase.
 
     Extended sets are ordered by a likelihood that admits a few more failures; see
-    `FailureModel.weigh_extensions`. Otherwise, the best first element of two would often be one
-    that imitates the sum of both.
+    `FailureModel.weigh_extensions`. Otherwise, if two elements have failed, the first one added
+    would often be a third element that imitates the sum of both.
 
     Growth ends when new sets are less probable than the best by a margin, in log-probability, but
     continues while no hypothesis has a deviance below the usual residual.

@@ -397,7 +397,7 @@ class TemplateTable:
 
     def _loss_outside(self, phases: np.ndarray, points: np.ndarray, cells: np.ndarray,
                       value: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Return the loss of log-likelihood from points to the region, [P]; inf if unlikely."""
+        """Return the likelihood lost by moves into the region, [P]; inf if a point is unlikely."""
         inside = is_inside(to_positions(points), self._bounds)
         result = np.where(inside, 0.0, np.inf)
         best = np.full(phases.max(initial=0) + 1, -np.inf)

@@ -58,7 +58,7 @@ class Field:
         return f'{words}, {self.range}' if self.range else words
 
     def problem(self, value: Any) -> str:
-        """Return a text with an invalid value and the expected ones, or '' for a valid value."""
+        """Describe an invalid value and what was expected; return '' for a valid value."""
         if not self._has_type(value):
             return f'{value!r}, expected {self.expected}'
         if self.choices:

@@ -48,7 +48,7 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
 
 
 def check_writable(path: Path) -> None:
-    """Raise OSError unless `write_whole` can write a file and would replace no device."""
+    """Raise OSError if `write_whole` cannot write a file, or would replace a device."""
     if path.is_dir():
         raise IsADirectoryError(f'{path}: a directory, expected a file')
     if path.exists() and not path.is_file():

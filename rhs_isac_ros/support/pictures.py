@@ -84,7 +84,8 @@ def to_paler(colour: str, share: float = 0.6) -> tuple[float, float, float]:
 def paper_style(purpose: str = 'drawing') -> Iterator[None]:
     """Draw in the style of the paper inside the block, whatever the user's settings are.
 
-    It is also a decorator. The MissingLibraryError without Matplotlib begins with `purpose`.
+    Can also be used as a decorator. Without Matplotlib, a MissingLibraryError is raised, whose
+    message begins with `purpose`.
     """
     with optional_import(purpose, extra='plot'):
         import matplotlib
@@ -163,7 +164,7 @@ def write_picture(path: str | Path, figure: Any) -> None:
 
 
 def _fix_layout(figure: Any) -> None:
-    """Lay a figure out, and round positions, whose last digits would differ between runs."""
+    """Lay out a figure, and round positions, because their last digits differ between runs."""
     from matplotlib import rc_context
     from matplotlib.transforms import Bbox
 
