@@ -1,7 +1,7 @@
 """Averages of losses that depend on a codebook through quadratic forms, with gradients.
 
-The average Cramer-Rao bound is one of them. `by_radiation` is d/dRe(T_i) + i d/dIm(T_i) of an
-objective, complex128 [N_B, N_SB F, N_E].
+The average Cramer-Rao bound is one example. `by_radiation` is the gradient
+d/dRe(T_i) + i d/dIm(T_i) of an objective, complex128 [N_B, N_SB F, N_E].
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -43,8 +43,8 @@ from rhs_isac_ros.model.multipath import (
 from rhs_isac_ros.model.surface import AppliedBeams, Beamforming, feed_weights, onboard_matrix
 from rhs_isac_ros.support.threads import one_blas_thread
 
-# Callable that takes a block of n items and their forms, float64 [n, G, G], and returns the losses
-# [n] and their negative derivatives with respect to the forms, float64 [n, G, G].
+# Function of a block of n items and their forms, float64 [n, G, G]. It returns the losses [n] and
+# their negative derivatives with respect to the forms, float64 [n, G, G].
 Loss = Callable[[slice, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -61,18 +61,18 @@ class Gradient(NamedTuple):
 
 
 class Combination(NamedTuple):
-    """Rows of a quadratic form, each a multiple of one of the rows of the source."""
+    """Rows of a quadratic form, each of which is a multiple of a row of the source."""
 
-    # Index of the source's row [G], and factor of the row in each band, complex128 [N_B, G].
+    # Index of the source row [G], and factor of the row in each band, complex128 [N_B, G].
     sources: np.ndarray
     scale: np.ndarray
 
     def forward(self, band: int, whitened: np.ndarray) -> np.ndarray:
-        """Return the rows, complex128 [n, G, R], from the source's rows, [n, S, R]."""
+        """Compute the rows, complex128 [n, G, R], from the source rows, [n, S, R]."""
         return whitened[:, self.sources] * self.scale[band, :, None]
 
     def backward(self, band: int, weighted: np.ndarray, n_rows: int) -> np.ndarray:
-        """Return derivatives with respect to the source's rows, [n, S, R], from [n, G, R]."""
+        """Convert gradients in the rows, [n, G, R], to gradients in the source rows, [n, S, R]."""
         gathered = np.zeros((len(weighted), n_rows, weighted.shape[2]), complex)
         for row, (source, scale) in enumerate(zip(self.sources, self.scale[band], strict=True)):
             gathered[:, source] += np.conj(scale) * weighted[:, row]
@@ -84,24 +84,24 @@ class Average:
 
     The form of an item is 2 Re sum_i D_i^H Lambda_i^-1 D_i, where the G = `n_rows` columns of D_i
     are the means of the item's rows. If the rows are derivatives, the form is the Fisher
-    information; if they are differences, it is twice the squared distance between mean signals.
+    information. If they are differences, it is twice the squared distance between mean signals.
 
     Parameters
     ----------
     tolerance
-        Relative error of the rows, see `CompressedRows`; 0 selects exact ones. A tolerance that
-        is too small raises ValueError.
+        Relative error of the rows (see `CompressedRows`); 0 selects exact rows. Raises ValueError
+        if a positive tolerance is too small.
     patterns
-        Factors of the rows' means.
+        Factors of the means of the rows.
     combination
-        The form's rows, if they differ from the source's.
+        Rows of the form, if they differ from the rows of the source.
     tick
         Called repeatedly while the rows are computed; an exception ends the computation.
 
     Attributes
     ----------
     surface
-        An estimate of the surface that is taken as exact; None for the scenario's elements.
+        An estimate of the surface that is treated as exact; None for the scenario's elements.
     """
 
     @one_blas_thread
@@ -143,7 +143,6 @@ class Average:
         return Gradient(total / self.rows.n_items, *gradients)
 
     def _losses(self, codebook: Beamforming) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Results of the loss for each block."""
         evaluation = Evaluation(self.rows, self._model(codebook))
         for block in blocks(self.rows.n_items, self._n_rows, self.rows.width):
             yield self._loss(block, _sum_of_forms(self._whitened(evaluation, block)))
@@ -153,7 +152,7 @@ class Average:
         return MeasurementModel(self.scenario, codebook, exact)
 
     def _whitened(self, evaluation: Evaluation, block: slice) -> list[np.ndarray]:
-        """Whitened means of the form's rows, [n, G, N_SB F] of each band."""
+        """Return the whitened means of the form's rows, [n, G, N_SB F], for each band."""
         whitened = [evaluation.whitened(block, i) for i in range(self.scenario.n_bands)]
         if self._combination is None:
             return whitened
@@ -164,13 +163,9 @@ def average_crlb(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> Gradient:
     """Compute the average bound, Eq. (17), with its gradients by Propositions 2 and 3.
 
-    Takes at least one position of the user, float64 [N, 3] [m]. The value is in m^2, as is the
-    derivative with respect to C; that with respect to S is in m^2/sqrt(W).
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array, or holds no position.
+    `positions` are at least one position of the user, float64 [N, 3] [m]. The value and its
+    derivative with respect to C are in m^2, the derivative with respect to S in m^2/sqrt(W).
+    Raises ValueError if `positions` is not a finite [N, 3] array, or contains no position.
     """
     return AverageCrlb(scenario, positions)(codebook)
 
@@ -178,8 +173,8 @@ def average_crlb(
 class AverageCrlb(Average):
     """Average bound at fixed positions, float64 [N, 3] [m], for evaluation with many codebooks.
 
-    Nuisance parameters, errors of the elements and `region_prior` enter as in `crlb`, and
-    `tolerance` and `tick` as in `Average`.
+    Nuisance parameters, errors of the elements and `region_prior` are treated as in `crlb`;
+    `tolerance` and `tick` are passed to `Average`.
     """
 
     def __init__(self, scenario: Scenario, positions: np.ndarray, tolerance: float = 0.0, *,
@@ -203,25 +198,21 @@ class AverageCrlb(Average):
         information, regression = without_nuisance(joint)
         inverse = inverse_information(information + self._prior)
         values = np.trace(inverse, axis1=1, axis2=2)
-        # Where the signals do not determine the position, the value is infinite and the slope
-        # zero.
+        # If the signals do not determine the position, the value is infinite and the slope zero.
         finite = np.where(np.isfinite(values)[:, None, None], inverse, 0.0)
         slopes = np.matmul(finite, finite)
         if not regression.shape[1]:
             return values, slopes
-        # The Schur complement is W^T J W with W = [I; regression] held fixed, because W minimises
-        # it.
+        # W = [I; regression] minimises the Schur complement W^T J W, and is therefore held fixed.
         identity = np.broadcast_to(np.eye(3), (len(joint), 3, 3))
         whole = np.concatenate([identity, regression], axis=1)
         return values, whole @ slopes @ np.swapaxes(whole, 1, 2)
 
 
 def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
-    """Return how the rows of all parameters follow from those of the gain and its derivative.
-
-    A parameter whose pattern is constant in each band shares the row of the gain, scaled; each
-    other parameter has a separate row. Without nuisance parameters, the derivative is sufficient.
-    """
+    """Derive the rows of all parameters from the rows of the gain and its derivative."""
+    # A parameter whose pattern is constant in each band is a multiple of the gain; each other
+    # parameter has its own row. Without nuisance parameters, the derivative suffices.
     scaled = nuisance_of(scenario).scaled_patterns
     if not len(scaled):
         return [], None
@@ -238,12 +229,12 @@ def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
 
 
 def _sum_of_forms(whitened: list[np.ndarray]) -> np.ndarray:
-    """Sum of the bands' quadratic forms [n, G, G]."""
+    """Return the sum of the quadratic forms of the bands, [n, G, G]."""
     return np.sum([quadratic_form(means) for means in whitened], axis=0, dtype=float)
 
 
 def _weighted(weights: np.ndarray, whitened: np.ndarray) -> np.ndarray:
-    """Weights [n, G, G] times rows [n, G, R], in the precision of the rows."""
+    """Multiply weights [n, G, G] by rows [n, G, R], in the precision of the rows."""
     parts = whitened.view(whitened.real.dtype)
     weights = weights.astype(parts.dtype, copy=False)
     # Products of single rows take many times as long as one product of arrays.
@@ -258,7 +249,7 @@ def quadratic_gradients(
     """Compute the gradients of an average, as in `Gradient`, from the sums over n items.
 
     The sums are `GradientSums` of all bands, complex128 [N_B, N_SB F, N_E] and
-    [N_B, N_SB F, N_SB F]. An estimate of the surface is taken as exact.
+    [N_B, N_SB F, N_SB F]. An estimate of the surface is treated as exact.
     """
     scenario = model.scenario
     correlation = np.conj(measurement_correlation(scenario))
@@ -290,7 +281,7 @@ def quadratic_gradients(
 
 def _by_error(scenario: Scenario, radiation: np.ndarray, covariance_terms: np.ndarray,
               n_items: int) -> np.ndarray:
-    """Derivative with respect to a term of `error_radiation` [N_B, N_SB F, N_E]."""
+    """Return the derivative with respect to a term of `error_radiation`, [N_B, N_SB F, N_E]."""
     return np.stack([
         4 / n_items * np.einsum(
             'rsm,sm->rm', np.conj(element_correlation(scenario, band)) * terms[..., None], columns)
@@ -300,7 +291,7 @@ def _by_error(scenario: Scenario, radiation: np.ndarray, covariance_terms: np.nd
 def _through_term(
         scenario: Scenario, codebook: Beamforming, constant: np.ndarray | float,
         slope: np.ndarray | float, by_radiation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gradients through a radiation matrix (constant + slope C) * (S B), numbers or [N_E]."""
+    """Return the gradients through a matrix (constant + slope C) * (S B), numbers or [N_E]."""
     beams = AppliedBeams(np.conj(constant + slope * codebook.analog), codebook.digital)
     return (gradient_analog(scenario, codebook, np.conj(slope) * by_radiation),
             gradient_digital(scenario, beams, by_radiation))
@@ -310,8 +301,8 @@ def gradient_analog(
         scenario: Scenario, codebook: Beamforming, by_radiation: np.ndarray) -> np.ndarray:
     """Implements Proposition 2. Derivative with respect to C_i, float64 [N_B, F, N_E].
 
-    The paper writes the chain rule for every pair of coordinates. Here, the pairs have already
-    been summed in the derivative with respect to T_i.
+    The paper writes the chain rule for every pair of coordinates. Here, the derivative with
+    respect to T_i already contains the sum over these pairs.
     """
     weights = feed_weights(scenario, codebook)
     by_radiation = by_radiation.reshape(weights.shape)

@@ -11,7 +11,7 @@ from rhs_isac_ros.model.measurement import position_blocks
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
-# A normalised matrix with a smaller pivot is singular up to rounding.
+# If a pivot of a normalised matrix is smaller, the matrix is singular up to rounding.
 _MIN_PIVOT = 1e-14
 
 
@@ -20,21 +20,11 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
          region_prior: bool = False) -> np.ndarray:
     """Implements Eq. (11). Cramer-Rao lower bound on the mean squared positioning error.
 
-    Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2]; infinite where
-    the signals do not determine the position. Nuisance parameters that the scenario declares are
-    unknown, with their distributions as priors: the result is then the hybrid bound. Errors of
-    the elements enter with their covariance, averaged over the region.
-
-    Parameters
-    ----------
-    region_prior
-        Whether to add the information of the region of interest, as a Gaussian of covariance
-        size^2 / 12.
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array.
+    Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2]; infinite if the
+    signals do not determine the position. Declared nuisance parameters are unknown, with their
+    distributions as priors: the result is then the hybrid bound. Errors of the elements add their
+    covariance, averaged over the region. `region_prior` adds the region of interest as a Gaussian
+    prior of covariance size^2 / 12. Raises ValueError if `positions` is not a finite [N, 3] array.
     """
     return crlb_of(MeasurementModel(scenario, codebook), positions, region_prior=region_prior)
 
@@ -42,7 +32,7 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
 @one_blas_thread
 def crlb_of(model: MeasurementModel, positions: np.ndarray, *,
             region_prior: bool = False) -> np.ndarray:
-    """Compute `crlb` for a model, whose whitener is shared by all calls."""
+    """Compute `crlb` for a model; all calls share its whitener."""
     information, _ = without_nuisance(joint_information_of(model, positions))
     if region_prior:
         information = information + region_information(model.scenario)
@@ -52,7 +42,7 @@ def crlb_of(model: MeasurementModel, positions: np.ndarray, *,
 def without_nuisance(joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute the information about the position if the nuisance parameters are unknown.
 
-    Takes the result of `joint_information_of`, float64 [N, 3 + Q, 3 + Q]. Returns float64
+    `joint` is the result of `joint_information_of`, float64 [N, 3 + Q, 3 + Q]. Returns float64
     [N, 3, 3] [1/m^2], and how the parameters change with the position, [N, Q, 3].
     """
     if joint.shape[1] == 3:
@@ -65,7 +55,7 @@ def without_nuisance(joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def inverse_information(information: np.ndarray) -> np.ndarray:
     """Invert Fisher information matrices, float64 [N, 3, 3] [1/m^2].
 
-    The result [m^2] is infinite on the diagonal where a matrix is singular.
+    If a matrix is singular, the diagonal of the result [m^2] is infinite.
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
@@ -104,8 +94,8 @@ def fisher_information(model: MeasurementModel, positions: np.ndarray) -> np.nda
 def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
     """Compute the information about position and nuisance parameters, without any prior.
 
-    Returns float64 [N, 3 + Q, 3 + Q]; the nuisance parameters are scaled to a standard normal
-    prior.
+    Returns float64 [N, 3 + Q, 3 + Q]. The prior of the scaled nuisance parameters is standard
+    normal.
     """
     positions = checked_positions(positions)
     patterns = nuisance_of(model.scenario).scaled_patterns

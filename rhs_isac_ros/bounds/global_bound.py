@@ -1,18 +1,18 @@
 """A bound on the mean squared error that includes ambiguities: the error of an informed estimator.
 
-The position is uniform in the region of interest and q = (r, u, v) are its range and direction
-cosines. No estimator has a smaller mean squared error than the posterior mean, and the posterior
-mean of an estimator that is also given q modulo a lattice has a smaller one still. Given q modulo
-the lattice, the position is one of M known points. With the whitened differences
-d_k = L^-1 (mu(p_k) - mu(p)), Lambda = L L^H, and white noise n of unit covariance, the
-log-likelihood of the point k relative to the true one is -d_k^H d_k + 2 Re(d_k^H n), so that the
-error of the informed estimator is an M-ary average over n, which is drawn at random. This extends
-the pairs of hypotheses of the Ziv-Zakai bound (Bell, Steinberg, Ephraim and Van Trees, Extended
-Ziv-Zakai lower bound for vector parameter estimation, IEEE Trans. Inf. Theory 43 (2), 1997) to all
-hypotheses at once; of two points, the wrong one is chosen with probability Q(sqrt(d^H d / 2)).
+The position is uniform in the region of interest; q = (r, u, v) are its range and direction
+cosines. No estimator has a smaller mean squared error than the posterior mean. The error is
+smaller still if the estimator is also told q modulo a lattice, because the position is then one of
+M known points. With the whitened differences d_k = L^-1 (mu(p_k) - mu(p)), Lambda = L L^H, and
+white noise n of unit covariance, the log-likelihood of point k relative to the true one is -d_k^H
+d_k + 2 Re(d_k^H n). The error of the informed estimator is therefore an M-ary average over n,
+which is drawn at random. This extends the Ziv-Zakai bound (Bell, Steinberg, Ephraim and Van Trees,
+Extended Ziv-Zakai lower bound for vector parameter estimation, IEEE Trans. Inf. Theory 43 (2),
+1997) from pairs of hypotheses to all hypotheses at once. Of two points, the wrong one is chosen
+with probability Q(sqrt(d^H d / 2)).
 
 The finer the lattice, the tighter the bound. Steps of one to two local standard deviations lose
-little, because the variance of a Gaussian that is sampled so coarsely is almost exact.
+little, because even such coarse samples of a Gaussian have almost its exact variance.
 """
 
 from collections.abc import Iterator
@@ -29,43 +29,32 @@ from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Lattice steps of (r, u, v), in standard deviations of one coordinate with the others known, and
-# the smallest number of steps across the region. With Table I, steps half as large across the
-# line of sight change the bound by (1 +- 2) %.
+# the smallest number of steps across the region. With Table I, the bound changes by (1 +- 2) % if
+# the steps across the line of sight are half as large.
 _STEPS = np.array([2.4, 1.2, 1.2])
 _MIN_STEPS = 24
-# Largest number of lattice points in the box around the region; steps grow beyond it.
+# Largest number of lattice points in the box around the region; beyond it, steps grow.
 _MAX_POINTS = 2_000_000
-# Phases evaluated with one offset of the lattice, and at a time.
+# Number of phases that share an offset of the lattice, and number evaluated at a time.
 _PER_OFFSET = 512
 _BLOCK = 16
-# Points this much less likely than the true one have no effect.
+# Points further below the true one in log-likelihood have no effect.
 _MARGIN = 20.0
 # Nodes of the interpolation over the range, in addition to those for the phase of the sub-bands,
-# and ranges at which the likelihood of a ray is bounded.
+# and number of ranges at which the likelihood of a ray is bounded.
 _N_NODES = 10
 _N_CHECKS = 64
 
 
 class GlobalBound(NamedTuple):
-    """Bound on the mean squared error of any estimator, for a uniform prior on the region.
+    """Bound on the mean squared error of any estimator, for a uniform prior on the region."""
 
-    Attributes
-    ----------
-    value, standard_error
-        The bound and the standard error of its Monte-Carlo average [m^2].
-    positions
-        Positions of the phases that were drawn, float64 [n, 3] [m].
-    squared_errors
-        Squared error of the informed estimator in each, float64 [n] [m^2].
-    coarseness
-        Factor by which a limit on the number of lattice points has enlarged the steps; 1 if the
-        lattice resolves the posterior. The bound is loose if this is above about 3.
-    """
-
-    value: float
-    standard_error: float
-    positions: np.ndarray
-    squared_errors: np.ndarray
+    value: float  #: The bound [m^2].
+    standard_error: float  #: Standard error of its Monte-Carlo average [m^2].
+    positions: np.ndarray  #: Positions of the simulated phases, float64 [n, 3] [m].
+    squared_errors: np.ndarray  #: Squared errors of the informed estimator, float64 [n] [m^2].
+    #: Factor by which the limit on the number of lattice points has enlarged the steps; 1 if the
+    #: lattice resolves the posterior. Above about 3, the bound is loose.
     coarseness: float
 
 
@@ -75,8 +64,8 @@ def global_bound(
         n_phases: int = 2048) -> GlobalBound:
     """Compute the bound from the posterior of `n_phases` random positioning phases.
 
-    Nuisance parameters of the scenario are not included: the bound holds for a user who is
-    synchronised. Raises ValueError if `n_phases` is less than 2.
+    The bound holds for a synchronised user: nuisance parameters of the scenario are not included.
+    Raises ValueError if `n_phases` is less than 2.
     """
     if n_phases < 2:
         raise ValueError(f'n_phases: {n_phases}, expected at least 2')
@@ -84,7 +73,7 @@ def global_bound(
     steps, coarseness = _steps(model, rng)
     parts = []
     for first in range(0, n_phases, _PER_OFFSET):
-        # The offset of a random position, so that positions of all phases are uniform.
+        # A random position as the offset makes the positions of all phases uniform.
         lattice = _Lattice(model, steps, scenario.sample_positions(1, rng)[0])
         parts.append(np.stack(list(lattice.phases(min(_PER_OFFSET, n_phases - first), rng))))
     moments = np.concatenate(parts)
@@ -96,11 +85,11 @@ def global_bound(
 
 
 class _Lattice:
-    """The points of a lattice in (r, u, v) inside the region of interest; one is given.
+    """The points of a lattice in (r, u, v) inside the region of interest; it contains `point`.
 
     Along a ray, the mean signals of a band are a carrier times a smooth function of the range,
     which is interpolated between Chebyshev nodes. All ranges of a ray then cost one product of
-    small matrices, and rays on which no phase of the carriers yields a likely point cost none.
+    small matrices. Rays without a likely point, whatever the phases of the carriers, cost nothing.
     """
 
     def __init__(self, model: MeasurementModel, steps: np.ndarray, point: np.ndarray) -> None:
@@ -130,7 +119,7 @@ class _Lattice:
         self._interpolate(sight, ranges, box[:, 0])
 
     def _interpolate(self, sight: np.ndarray, ranges: np.ndarray, limits: np.ndarray) -> None:
-        """Compute signals at the nodes and the weights that continue them to all ranges."""
+        """Compute signals at the nodes, and weights that interpolate them to all ranges."""
         model, scenario = self._model, self._model.scenario
         span_hz = scenario.n_subbands * scenario.subband_width_hz
         turns = span_hz * np.ptp(limits) / SPEED_OF_LIGHT_MPS
@@ -158,10 +147,7 @@ class _Lattice:
         self._best_prior = np.max(self._prior, axis=1)
 
     def phases(self, n: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
-        """Draw true points and signals.
-
-        Yields for each the position [3], the variance of the posterior and the squared error.
-        """
+        """Draw true points and signals; yield position [3], posterior variance, squared error."""
         model = self._model
         # Systematic sampling spreads the points evenly over the region.
         shares = np.cumsum(np.exp(self._prior - self._prior.max()))
@@ -177,7 +163,7 @@ class _Lattice:
                 yield self._moments(products, ray, index)
 
     def _products(self, signals: np.ndarray) -> np.ndarray:
-        """Products of signals and templates at the nodes, complex64 [n, rays, bands, nodes]."""
+        """Return products of signals and templates at the nodes, [n, rays, bands, nodes]."""
         products = np.stack([
             np.matmul(np.conj(signals[:, band]), smooth).reshape(
                 len(signals), len(self._offset), -1)
@@ -206,10 +192,7 @@ class _Lattice:
 
 
 def _weights(nodes: np.ndarray, angles: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Weights of interpolation from Chebyshev nodes of the first kind to points, [nodes, points].
-
-    This is the barycentric formula.
-    """
+    """Return barycentric weights from Chebyshev nodes of the first kind, [nodes, points]."""
     gaps = points - nodes[:, None]
     gaps[gaps == 0] = np.finfo(float).tiny
     terms = ((-1.0)**np.arange(len(nodes)) * np.sin(angles))[:, None] / gaps
@@ -217,7 +200,7 @@ def _weights(nodes: np.ndarray, angles: np.ndarray, points: np.ndarray) -> np.nd
 
 
 def _steps(model: MeasurementModel, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-    """Steps of the lattice in (r [m], u, v), from local deviations, and their coarseness."""
+    """Return the lattice steps in (r [m], u, v), from local deviations, and their coarseness."""
     positions = model.scenario.sample_positions(256, rng)
     slopes = jacobian(to_polar(positions))
     information = fisher_information(model, positions)

@@ -1,13 +1,13 @@
 """Bias and covariance of an estimator that assumes another model than the true one.
 
-The maximum-likelihood estimator of a model with the mean mu(p) and the covariance L tends to the
-pseudo-true position p*, which minimises (m - mu(p))^H L^-1 (m - mu(p)) for the true mean m. Its
-errors about p* have the sandwich covariance A^-1 B A^-1, where A is the expected curvature of the
-assumed log-likelihood at p*, and B the covariance of its gradient, under the true covariance
-(Fortunati, Gini, Greco and Richmond, Performance bounds for parameter estimation under
-misspecified models, IEEE Signal Processing Magazine 34 (6), 2017; for reconfigurable surfaces:
-Zheng, Chen, Ballal, Valkama, Wymeersch and Al-Naffouri, arXiv 2204.12783). If both models are the
-same, this is the Cramer-Rao bound.
+Suppose that the assumed model has the mean mu(p) and the covariance L, and that the true mean is
+m. The maximum-likelihood estimator then tends to the pseudo-true position p*, which minimises (m -
+mu(p))^H L^-1 (m - mu(p)). Its errors about p* have the sandwich covariance A^-1 B A^-1, where A is
+the expected curvature of the assumed log-likelihood at p*, and B the covariance of its gradient
+under the true covariance (Fortunati, Gini, Greco and Richmond, Performance bounds for parameter
+estimation under misspecified models, IEEE Signal Processing Magazine 34 (6), 2017; for
+reconfigurable surfaces: Zheng, Chen, Ballal, Valkama, Wymeersch and Al-Naffouri, arXiv
+2204.12783). If both models are the same, this is the Cramer-Rao bound.
 """
 
 from typing import NamedTuple
@@ -24,38 +24,30 @@ from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.support.threads import one_blas_thread
 
 _MAX_STEPS, _HALVINGS = 60, 12
-# Steps of finite differences, and of a search that has converged [m].
+# Step of finite differences, and step at which the search has converged [m].
 _DIFFERENCE_M, _TOLERANCE_M = 1e-4, 1e-7
-# Points along the range per shortest wavelength at which ambiguities are looked for.
+# Number of ranges per shortest wavelength in the search for ambiguities.
 _PER_WAVELENGTH = 8
-# Scale of the distance of an ambiguity's maximum from the ray [m].
+# Scale of the distance between the maximum of an ambiguity and the ray [m].
 _MAX_OFFSET_M = 0.5
-# Probability with which estimators refuse a residual of a model that holds.
+# Probability with which estimators reject a residual although the model holds.
 _FALSE_ALARM = 1e-9
-# Quantile of the residual's energy that they should accept, 99 %, in standard deviations.
+# Quantile, in standard deviations, of the residual energy that they should accept: 99 %.
 _QUANTILE = 2.33
-# Largest share of ambiguities in the squared error, distance from the border of the region in
-# standard deviations, and relative error of the linearised mean, at which the result is valid.
+# Conditions for a valid result: largest share of ambiguities in the squared error, smallest
+# distance from the border of the region in standard deviations, and largest relative error of the
+# linearised mean.
 _MAX_AMBIGUITY, _MIN_BORDER, _MAX_NONLINEARITY = 0.01, 3.0, 0.25
 
 
 class Misspecified(NamedTuple):
-    """Errors of the maximum-likelihood estimator of an assumed model under a true one.
+    """Errors of the maximum-likelihood estimator of an assumed model under a true one."""
 
-    Attributes
-    ----------
-    bias
-        Pseudo-true less true position, float64 [N, 3] [m].
-    covariance
-        Covariance of the errors about the pseudo-true position, float64 [N, 3, 3] [m^2].
-    valid
-        Whether the result describes the estimator, bool [N]: ambiguities of the range are
-        improbable, the mean is linear over the errors, the border of the region is far away, and
-        estimators accept the residual of the signals.
-    """
-
-    bias: np.ndarray
-    covariance: np.ndarray
+    bias: np.ndarray  #: Pseudo-true position minus true position, float64 [N, 3] [m].
+    covariance: np.ndarray  #: Of the errors about the pseudo-true position, [N, 3, 3] [m^2].
+    #: Whether the result describes the estimator, bool [N]: ambiguities of the range are
+    #: improbable, the mean is linear over the errors, the border of the region is far away, and
+    #: estimators accept the residual of the signals.
     valid: np.ndarray
 
     @property
@@ -68,10 +60,10 @@ class Misspecified(NamedTuple):
 @one_blas_thread
 def misspecified(
         assumed: MeasurementModel, true: MeasurementModel, positions: np.ndarray) -> Misspecified:
-    """Compute the errors of an estimator that assumes one model while another one is true.
+    """Compute the errors of an estimator whose assumed model differs from the true one.
 
-    Takes positions of the user, float64 [N, 3] [m], and models of equal sizes without nuisance
-    parameters, such as phases; raises ValueError for others.
+    Takes positions of the user, float64 [N, 3] [m]. Raises ValueError unless both models have the
+    same sizes and no nuisance parameters, such as phases.
     """
     positions = checked_positions(positions)
     if assumed.shape != true.shape:
@@ -103,12 +95,12 @@ def _curvature(slopes: np.ndarray) -> np.ndarray:
 
 
 def _projections(slopes: np.ndarray, signals: np.ndarray) -> np.ndarray:
-    """Real inner products of derivatives and signals, float64 [N, 3]."""
+    """Return the real inner products of derivatives and signals, float64 [N, 3]."""
     return np.einsum('nair,nir->na', slopes.conj(), signals).real
 
 
 def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Minimise the distance of the whitened mean from a target by damped Gauss-Newton steps."""
+    """Minimise the distance between whitened mean and target by damped Gauss-Newton steps."""
     def cost(places: np.ndarray) -> np.ndarray:
         distances = np.abs(target - model.whiten(model.mean(places)))**2
         return np.sum(distances, axis=(1, 2))
@@ -121,7 +113,7 @@ def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndar
         ridge = 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         step = np.linalg.solve(information + ridge, gradient[..., None])[..., 0]
         for _ in range(_HALVINGS):
-            # The mean is defined in front of the surface only.
+            # The mean is defined only in front of the surface.
             trial = places + step
             trial[:, 0] = np.maximum(trial[:, 0], places[:, 0] / 2)
             other = cost(trial)
@@ -136,7 +128,7 @@ def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndar
 
 
 def _bending(model: MeasurementModel, places: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Part of the curvature from the second derivative of the mean, float64 [N, 3, 3]."""
+    """Return the curvature due to the second derivative of the mean, float64 [N, 3, 3]."""
     bending = np.empty((len(places), 3, 3))
     for axis in range(3):
         step = _DIFFERENCE_M * np.eye(3)[axis]
@@ -179,11 +171,8 @@ def _is_valid(model: MeasurementModel, places: np.ndarray, bias: np.ndarray,
 
 def _ambiguities(model: MeasurementModel, place: np.ndarray, mean: np.ndarray,
                  residual: np.ndarray, white: np.ndarray, covariance: np.ndarray) -> float:
-    """Bound the squared error from other ranges of the same direction [m^2].
-
-    The bound is the sum over maxima of the probability that a range is more likely than the true
-    one, times the squared distance.
-    """
+    """Bound the squared error from other ranges in the same direction [m^2]."""
+    # A sum over maxima: squared distance times the probability of being likelier than the truth.
     from scipy.special import ndtr
 
     scenario = model.scenario

@@ -1,9 +1,9 @@
 """Error from confusing distant positions, which the local Cramer-Rao bound does not include.
 
-The phases of the bands may be unknown: theta = A z, with standard normal z. The distance of two
-signals is then the minimum over z of ``sum_i 2 |a_i exp(i theta_i) - b_i|^2 + |z|^2``. For small
-deviations it agrees with the marginal Fisher information; for large ones it vanishes if the
-signals differ in the phases of their bands alone.
+The phases of the bands may be unknown: theta = A z, with standard normal z. The distance between
+two signals is then the minimum over z of ``sum_i 2 |a_i exp(i theta_i) - b_i|^2 + |z|^2``. For
+small deviations, it agrees with the marginal Fisher information. For large ones, it vanishes if
+the signals differ only in the phases of their bands.
 """
 
 import copy
@@ -17,10 +17,10 @@ from rhs_isac_ros.model.los import checked_positions, los_gain
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming
 
-# Share of a sample that is drawn uniformly. It bounds the weight of a pair whose cost grows while
+# Share of a sample that is drawn uniformly. It limits the weight of a pair whose cost grows while
 # the codebook changes.
 _UNIFORM_SHARE = 0.05
-# Steps of the minimisation over the phases, each of which lowers the distance.
+# Steps of the minimisation over the phases; each lowers the distance.
 _STEPS = 40
 
 
@@ -29,25 +29,12 @@ class PairwiseErrorCost(Average):
 
     A maximum-likelihood decision between two positions is wrong with probability Q(sqrt(q / 2)),
     where q = sum_i dmu_i^H Lambda_i^-1 dmu_i and dmu is the difference of the mean signals. The
-    cost is the average of ``|p - p'|^2 Q(sqrt(q / 2))``, in m^2 like the bound. The quadratic
-    form has the difference h(p) - h(p') in place of the derivative in Eq. (12). If the scenario
-    declares phases as unknown, the form is the smallest over the phases; other nuisance parameters
-    are not included.
-
-    Parameters
-    ----------
-    first_positions, second_positions
-        The two positions of each pair, float64 [N, 3] [m].
-    weights
-        Weights of the pairs, float64 [N]; 1 by default.
-    tolerance, tick
-        As in `Average`, for the differences.
-
-    Raises
-    ------
-    ValueError
-        If an argument has a wrong shape or a value that is not finite, there are no pairs, or a
-        weight is negative.
+    cost is the average of ``|p - p'|^2 Q(sqrt(q / 2))``, in m^2 like the bound. In its quadratic
+    form, the difference h(p) - h(p') replaces the derivative of Eq. (12). If the scenario declares
+    unknown phases, the form is minimised over them; other nuisance parameters are not included.
+    Pairs have positions, float64 [N, 3] [m], and weights, float64 [N]. `tolerance` and `tick` are
+    passed to `Average`. Raises ValueError if an argument has a wrong shape or is not finite, there
+    are no pairs, or a weight is negative.
     """
 
     def __init__(
@@ -86,10 +73,10 @@ class PairwiseErrorCost(Average):
     ) -> 'PairwiseErrorCost':
         """Draw n of the pairs, with a probability that grows with their cost.
 
-        The cost of the sample is an unbiased estimate for this codebook, and close to the whole
-        cost for similar ones: a few pairs, which are the most similar, contribute most of it. An
-        evaluation is in single precision. Raises ValueError if n is not from 1 to the number of
-        pairs, or the differences are exact.
+        For this codebook, the cost of the sample is an unbiased estimate of the whole cost; for
+        similar codebooks, it is close, because the few most similar pairs contribute most of it.
+        Evaluations are in single precision. Raises ValueError if n is not from 1 to the number of
+        pairs, or if the differences are exact.
         """
         total = len(self._costs)
         if not 1 <= n <= total:
@@ -113,7 +100,7 @@ class PairwiseErrorCost(Average):
         return sample
 
     def _confusion(self, block: slice, forms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cost times Q(sqrt(q / 2)) [n], and minus its derivative d/d(2 q), [n, 1, 1]."""
+        """Return the cost times Q(sqrt(q / 2)) [n], and minus its slope over 2 q, [n, 1, 1]."""
         from scipy.special import ndtr
 
         squares, slopes = self._squares(forms)
@@ -124,14 +111,14 @@ class PairwiseErrorCost(Average):
         return costs * ndtr(-root / 2), (costs * slope)[:, None, None] * slopes
 
     def _squares(self, forms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values 2 q [n], and their derivatives with respect to the forms."""
+        """Return the values 2 q [n], and their derivatives with respect to the forms."""
         if not self._scales.size:
             return forms[:, 0, 0], np.ones((1, 1, 1))
         first = np.arange(0, forms.shape[1], 3)
         turned, second = first + 1, first + 2
         phases, penalties = best_phases(
             forms[:, first, second] + 1j * forms[:, turned, second], self._scales)
-        # The phases minimise the value, which therefore does not change with them.
+        # The phases minimise the value, so its derivative does not depend on them.
         slopes = np.zeros(forms.shape)
         slopes[:, first, first] = slopes[:, second, second] = 1.0
         slopes[:, first, second] = slopes[:, second, first] = -np.cos(phases)
@@ -141,18 +128,18 @@ class PairwiseErrorCost(Average):
 
 
 def best_phases(products: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the phases theta with which signals a are the closest to signals b, almost always.
+    """Find the phases theta that bring signals a closest to signals b, almost always.
 
-    Takes twice the inner products a_i^H b_i of the whitened signals, complex128 [n, N_B], and the
-    matrix A, float64 [N_B, Q] [rad]. Returns theta, float64 [n, N_B] [rad], and the cost
-    ``|z|^2`` of these phases, float64 [n].
+    `products` are 2 a_i^H b_i of the whitened signals, complex128 [n, N_B], and `scales` is the
+    matrix A, float64 [N_B, Q] [rad]. Returns theta, float64 [n, N_B] [rad], and the cost ``|z|^2``
+    of these phases, float64 [n].
     """
     magnitude, angle = np.abs(products), np.angle(products)
-    # The cosines have curvatures up to the magnitudes, so that steps with these do not overshoot.
+    # The magnitudes bound the curvatures of the cosines, so these steps do not overshoot.
     curvature = np.einsum('bq,nb,bp->nqp', scales, magnitude, scales) + np.eye(scales.shape[1])
     inverse = np.linalg.inv(curvature)
     candidates = []
-    # Small deviations keep the minimum near 0, large ones near the angles of the products.
+    # For small deviations, the minimum is near 0; for large ones, near the angles of the products.
     for z in (np.zeros((len(products), scales.shape[1])), angle @ np.linalg.pinv(scales).T):
         for _ in range(_STEPS):
             slope = (magnitude * np.sin(z @ scales.T - angle)) @ scales + z
@@ -167,22 +154,22 @@ def best_phases(products: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _rows_of_bands(n_bands: int) -> Combination:
-    """Rows a_i, i a_i and b_i of each band, from the rows of the two signals."""
+    """Return the rows a_i, i a_i and b_i of each band, from the rows of the two signals."""
     scale = np.zeros((n_bands, n_bands, 3), complex)
     scale[np.arange(n_bands), np.arange(n_bands)] = 1, 1j, 1
     return Combination(np.tile([0, 0, 1], n_bands), scale.reshape(n_bands, -1))
 
 
 def _repeated_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
-    """Line-of-sight gains [n, N_SB, N_E], computed once for equal positions that are adjacent."""
+    """Compute line-of-sight gains [n, N_SB, N_E], once for equal positions that are adjacent."""
     is_new = np.concatenate([[True], np.any(np.diff(positions, axis=0) != 0, axis=1)])
     return los_gain(scenario, positions[is_new], band)[np.cumsum(is_new) - 1]
 
 
 def _inclusion_probabilities(shares: np.ndarray, n: int) -> np.ndarray:
-    """Probabilities proportional to shares [N], up to 1, whose sum is n."""
+    """Return probabilities proportional to shares [N], but at most 1, whose sum is n."""
     descending = np.sort(shares)[::-1]
     rest = np.cumsum(descending[::-1])[::-1]
-    # The first number of certain items with which no other probability exceeds 1.
+    # The smallest number of certain items for which no other probability exceeds 1.
     n_certain = np.argmax((n - np.arange(len(shares))) * descending <= rest)
     return np.minimum(shares * ((n - n_certain) / rest[n_certain]), 1.0)

@@ -1,9 +1,9 @@
-"""Confusion of ranges whose signals have similar phases in all bands.
+"""Confusion of ranges at which the signals have similar phases in all bands.
 
-The phases of carriers f_i at ranges that differ by a lag r differ by 2 pi f_i r / v_0. The range
-ambiguity function is the mismatch sum_i w_i (1 - cos(2 pi f_i r / v_0)); its minima are the lags
-that are hard to distinguish from 0. It depends on the frequencies alone, and so compares many band
-plans in little time.
+If two ranges differ by a lag r, the phases of a carrier f_i differ by 2 pi f_i r / v_0. The range
+ambiguity function is the mismatch sum_i w_i (1 - cos(2 pi f_i r / v_0)). Its minima are the lags
+that are hard to distinguish from 0. The function depends only on the frequencies, so many band
+plans can be compared in little time.
 """
 
 import numpy as np
@@ -29,20 +29,14 @@ def range_confusion_error(
     """Estimate the squared error from confusing ranges for many band plans, float64 [P] [m^2].
 
     Each minimum r of the mismatch has the weight w = (1 - r / r_max) Q(sqrt(q / 2)), with
-    q = 2 E sum_i (1 - cos(2 pi f_i r / v_0)) / N_B and the share 1 - r / r_max of the positions
-    from which a lag stays inside the region. The estimate is sum w r^2 / (1/2 + sum w), averaged
-    over energies E: the mean of r^2 over the confused ranges and the true one.
+    q = 2 E sum_i (1 - cos(2 pi f_i r / v_0)) / N_B. The factor 1 - r / r_max is the share of the
+    positions for which the lag stays inside the region. The estimate is sum w r^2 / (1/2 + sum w),
+    averaged over energies E: the mean of r^2 over the confused ranges and the true one.
 
-    Parameters
-    ----------
-    frequencies_hz
-        Centre frequencies of each plan, float64 [P, N_B] [Hz].
-    energies
-        Energies of the whitened mean signals of all bands at some positions, float64 [N].
-    max_lag_m
-        Longest lag r_max [m].
+    Takes the centre frequencies of each plan, float64 [P, N_B] [Hz], the energies E of the
+    whitened mean signals of all bands at some positions, float64 [N], and r_max [m].
     """
-    # A slow import, which loading a codebook does not need.
+    # A slow import, not needed to load a codebook.
     from scipy.special import ndtr
 
     n_bands = frequencies_hz.shape[1]
@@ -58,7 +52,7 @@ def range_confusion_error(
         ratio = np.sqrt(_refined(mismatch, plan, lag) / n_bands)
         share = 1 - lags[lag] / max_lag_m
         for energy in energies:
-            # Twice the share, for both signs.
+            # Twice the share, because lags have both signs.
             weights = 2 * share * ndtr(-ratio * np.sqrt(energy))
             total, confused = (np.bincount(plan, values, minlength=len(mismatch))
                                for values in (weights, weights * lags[lag]**2))
@@ -71,10 +65,10 @@ def range_confusion_error_of(
     """Estimate the squared error from confusing ranges with a codebook [m^2].
 
     This is the error of the posterior mean if the user is at one of N positions, float64 [N, 3]
-    [m], or at one that can be confused with it: the lags are the minima of the mismatch along the
-    line of sight. A small displacement of the confused position, to first order, and phases that
-    the scenario declares as unknown make the signals as similar as possible. Noise is drawn
-    several times for each position.
+    [m], or at a position that can be confused with it. The lags are the minima of the mismatch
+    along the line of sight. Signals are made as similar as possible by a small displacement of the
+    confused position, to first order, and by declared unknown phases. Noise is drawn several times
+    for each position.
     """
     positions = checked_positions(positions)
     scenario = model.scenario
@@ -107,10 +101,7 @@ def range_confusion_error_of(
 def _differences(
         model: MeasurementModel, mean: np.ndarray, confused: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whitened differences from a mean that remain with the best displacement and phases.
-
-    Returns the differences, float64 [n, R], and the costs of the phases, float64 [n].
-    """
+    """Return the differences [n, R] at the best displacement and phases, and phase costs [n]."""
     means, jacobians = model.mean_and_jacobian(confused)
     means, jacobians, target = model.whiten(means), model.whiten(jacobians), model.whiten(mean)
     scales, penalties = nuisance_of(model.scenario).scaled_phases, np.zeros(len(confused))
@@ -120,39 +111,38 @@ def _differences(
         phases, penalties = best_phases(products, scales)
         turns = np.exp(1j * phases)[..., None]
         means, jacobians = turns * means, turns[:, None] * jacobians
-        # Displacements and phases compensate each other.
+        # Displacements and phases can compensate for each other.
         turned = 1j * means[:, None] * scales.T[None, :, :, None]
         slopes = np.concatenate([jacobians, turned], axis=1)
     difference, directions = _real(means - target), _real(slopes)
     by_position = np.einsum('nur,nr->nu', directions, difference)
     information = np.einsum('nur,nvr->nuv', directions, directions)
-    # The phases have a prior; the information of real parts is half the curvature.
+    # Phases have a prior; the information of real parts is half the curvature.
     information[:, 3:, 3:] += np.eye(scales.shape[1]) / 2
     _, displacement = eliminate(information, information[..., :0], by_position)
     return difference - np.einsum('nu,nur->nr', displacement, directions), penalties
 
 
 def _lags(highest_hz: float, max_lag_m: float) -> np.ndarray:
-    """Lags from 0 to the longest [m]."""
     shortest = SPEED_OF_LIGHT_MPS / highest_hz
     return np.linspace(0, max_lag_m, 3 + int(max_lag_m / shortest * _LAGS_PER_WAVELENGTH))
 
 
 def _is_minimum(mismatch: np.ndarray) -> np.ndarray:
-    """Local minima of rows, except at their ends, bool [P, L]."""
+    """Return the local minima of rows, except at their ends, bool [P, L]."""
     inside = mismatch[:, 1:-1]
     is_minimum = (inside <= mismatch[:, :-2]) & (inside < mismatch[:, 2:])
     return np.pad(is_minimum, ((0, 0), (1, 1)))
 
 
 def _refined(mismatch: np.ndarray, plan: np.ndarray, lag: np.ndarray) -> np.ndarray:
-    """Minima of the parabolas through minima and their neighbours, at least 0 [n]."""
+    """Return the minima of parabolas through minima and their neighbours, at least 0, [n]."""
     before, at, after = (mismatch[plan, lag + step] for step in (-1, 0, 1))
     lowest = at - (after - before)**2 / (8 * (before - 2 * at + after))
     return np.maximum(lowest, 0.0)
 
 
 def _real(signals: np.ndarray) -> np.ndarray:
-    """Complex signals [..., N_B, R] as real vectors [..., 2 N_B R]."""
+    """Return complex signals [..., N_B, R] as real vectors [..., 2 N_B R]."""
     flat = np.ascontiguousarray(signals).reshape(*signals.shape[:-2], -1)
     return flat.view(float)

@@ -1,8 +1,8 @@
 """Products of the radiation matrices with the rows of quadratic forms.
 
-A row is a linear function of one band's line-of-sight gains, such as their derivative with respect
-to one coordinate, or their difference between two positions. Its mean is the same function of the
-mean signals, as in Eq. (13). Whitened means take most of the time of an objective.
+A row is a linear function of the line-of-sight gains of one band, such as their derivative with
+respect to a coordinate, or their difference between two positions. Its mean is the same function
+of the mean signals, as in Eq. (13). Whitened means take most of the time of an objective.
 """
 
 import copy
@@ -14,30 +14,29 @@ import numpy as np
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.support import streams
 
-# Callable that takes (block of n items, band) and returns the items' rows, complex128
-# [n, G, N_SB, N_E].
+# Function of a block of n items and a band; it returns their rows, complex128 [n, G, N_SB, N_E].
 RowSource = Callable[[slice, int], np.ndarray]
-# Callable that a long computation calls repeatedly, and that may raise an exception to end it.
+# Function that long computations call repeatedly; it may raise an exception to end them.
 Tick = Callable[[], None]
-# Rows and the factor of their means in each band and measurement, complex128 [N_B, N_SB F]; None
-# for 1. Together, the slices cover all rows.
+# Rows, and the factor of their means in each band and measurement, complex128 [N_B, N_SB F], or
+# None for 1. Together, the slices cover all rows.
 Pattern = tuple[slice, np.ndarray | None]
 PLAIN: Sequence[Pattern] = ((slice(None), None),)
-# Items of three rows per block: the arrays of a block fit into the cache.
+# Number of items of three rows in a block, whose arrays fit into the cache.
 _BLOCK = 128
 # Largest number of complex numbers in a block of exact rows.
 _BLOCK_NUMBERS = 1 << 21
 # Memory for exact rows that are kept between evaluations.
 _CACHE_BYTES = 1 << 30
-# Products with a basis of more vectors take as long as those with the rows of a few positions.
+# Largest useful rank. With more vectors, products take as long as with rows of a few positions.
 _MAX_RANK = 192
 # Minimum number of columns of the first sketch. Each further sketch has twice as many.
 _MIN_SKETCH = 128
-# Number of rows from which the basis of many rows is found, and the share of the tolerance that
-# their error may reach.
+# Number of rows used to find a basis for many rows, and the share of the tolerance that their
+# error may reach.
 _SKETCHED_ROWS = 2048
 _SKETCH_MARGIN = 0.8
-# Smaller relative errors are lost in the rounding of Gram matrices.
+# Smaller relative errors would be lost in the rounding of Gram matrices.
 MIN_TOLERANCE = 1e-7
 
 
@@ -59,7 +58,7 @@ class GradientSums(NamedTuple):
 class MeasurementRows:
     """Rows of all items and bands, as coefficients of basis vectors.
 
-    The sub-bands of a band form J groups of S, whose bases are complex128 [J, S, N_E, R]; None
+    The sub-bands of a band form J groups of S. Their bases are complex128 [J, S, N_E, R], or None
     if the coefficients are the rows themselves, with S = 1 and R = N_E.
     """
 
@@ -97,8 +96,8 @@ class Evaluation:
 
     def __init__(self, rows: MeasurementRows, model: MeasurementModel) -> None:
         self._rows, self._whitener = rows, model.whitener
-        # The filters of a single group include patterns and whitening, which then cost no time
-        # per item. Several groups have these after their means are joined.
+        # With a single group, the filters include patterns and whitening, which then cost no time
+        # per item. With several groups, these follow after the means are joined.
         self._is_folded = rows.n_groups == 1
         self._patterns = rows.patterns if self._is_folded else PLAIN
         self._filters = [
@@ -107,7 +106,7 @@ class Evaluation:
             for band, radiation in enumerate(model.radiation)]
         self._weights = [[np.zeros_like(one) for one in filters] for filters in self._filters]
         self._last = [np.empty(0)] * len(self._whitener)
-        # Sums of weighted whitened means times whitened means.
+        # Sums over weighted whitened means times whitened means.
         self._products = np.zeros_like(self._whitener)
 
     def _filter(self, means: np.ndarray, band: int, pattern: np.ndarray | None) -> np.ndarray:
@@ -158,7 +157,7 @@ class Evaluation:
                 np.moveaxis(grouped[:, part], 2, 0).reshape(n_groups, chosen.shape[1], -1))
 
     def sums(self, band: int) -> GradientSums:
-        """Return the sums over the blocks that were accumulated."""
+        """Return the sums over all blocks passed to `accumulate`."""
         whitener, products = self._whitener[band], self._products[band]
         total = np.zeros(())
         for (_, pattern), filters, gathered in zip(
@@ -179,8 +178,8 @@ def rows_within(
         patterns: Sequence[Pattern] = PLAIN, tick: Tick = no_tick) -> MeasurementRows:
     """Return rows within a relative error, compressed as in `CompressedRows`.
 
-    For an error of 0, the rows are exact. If there are few rows but they need a large basis, they
-    are stored in single precision instead.
+    If the tolerance is 0, the rows are exact. A small number of rows that would need a large basis
+    is stored in single precision instead.
     """
     of = scenario, source, n_items, n_rows
     if tolerance == 0:
@@ -193,7 +192,7 @@ def rows_within(
 
 def _rank_of_some(scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
                   tolerance: float, band: int) -> int:
-    """Rank of some rows and columns, slightly more than `_MAX_RANK`, to a tolerance."""
+    """Return the rank, within a tolerance, of a sample of the rows and columns."""
     size, width = 2 * _MAX_RANK, scenario.n_subbands * scenario.n_elements
     if n_items * n_rows <= size or width <= 3 * size:
         return 0
@@ -209,7 +208,7 @@ def _rank_of_some(scenario: Scenario, source: RowSource, n_items: int, n_rows: i
 
 
 class ExactRows(MeasurementRows):
-    """Rows without approximation, kept between evaluations if they fit within the memory limit."""
+    """Rows without approximation, kept between evaluations if they fit into memory."""
 
     def __init__(
             self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
@@ -238,10 +237,10 @@ class ExactRows(MeasurementRows):
 class CompressedRows(MeasurementRows):
     """Rows as coefficients in a basis: less memory, and one large matrix product per band.
 
-    Over a region of interest, the rows of all positions and sub-bands span, to a given accuracy,
-    far fewer dimensions than there are elements and sub-bands. A randomised range finder with a
-    fixed seed finds a basis. `tolerance`, from `MIN_TOLERANCE` to 1, is the root mean square of
-    the rows' relative errors.
+    The rows of all positions and sub-bands in a region span, to a given accuracy, far fewer
+    dimensions than there are elements and sub-bands. A randomised range finder with a fixed seed
+    finds a basis. `tolerance`, from `MIN_TOLERANCE` to 1, is the root mean square of the relative
+    errors of the rows.
     """
 
     def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
@@ -252,8 +251,7 @@ class CompressedRows(MeasurementRows):
         self.coefficients: list[np.ndarray] = []
         for band in range(scenario.n_bands):
             def flat_rows(block: slice, band: int = band) -> np.ndarray:
-                # A single item can have another memory layout, of which a view as real numbers
-                # fails.
+                # The memory layout of a single item may not allow a view as real numbers.
                 tick()
                 rows = source(block, band)
                 return np.ascontiguousarray(rows.reshape(-1, rows.shape[2] * rows.shape[3]))
@@ -268,7 +266,7 @@ class CompressedRows(MeasurementRows):
     def chosen(self, items: np.ndarray) -> 'CompressedRows':
         """Return the rows of some items, int [n], with coefficients in single precision.
 
-        Products with them take half the time. Their rounding, 6e-8, is far below the relative
+        Single precision halves the time of products. Its rounding, 6e-8, is far below the relative
         error of the rows.
         """
         rows = copy.copy(self)
@@ -280,7 +278,7 @@ class CompressedRows(MeasurementRows):
 
     @property
     def ranks(self) -> tuple[int, ...]:
-        """Dimensions of the basis of each band."""
+        """Number of basis vectors in each band."""
         return tuple(coefficients.shape[1] for coefficients in self.coefficients)
 
     def in_block(self, block: slice, band: int) -> np.ndarray:
@@ -302,11 +300,11 @@ def blocks(n_items: int, n_rows: int = 3, width: int = 0) -> Iterator[slice]:
 
 def _compress(rows_of: Callable[[slice], np.ndarray], every: list[slice], n_rows: int,
               tolerance: float, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients [n_rows, R] and an orthonormal basis [N_SB N_E, R] of the rows of blocks."""
+    """Return coefficients [n_rows, R] and orthonormal basis [N_SB N_E, R] of rows of blocks."""
     if not MIN_TOLERANCE <= tolerance < 1:
         raise ValueError(
             f'tolerance: {tolerance:g}, expected {MIN_TOLERANCE:g} to 1, or 0 for exact rows')
-    # A basis is found from some of many rows, and accepted if its error for all rows is small.
+    # The basis is found from a part of many rows, and accepted if its error for all rows is small.
     used = every[::max(n_rows // _SKETCHED_ROWS, 1)]
     while True:
         wanted = tolerance if len(used) == len(every) else _SKETCH_MARGIN * tolerance
@@ -328,7 +326,7 @@ def _compress(rows_of: Callable[[slice], np.ndarray], every: list[slice], n_rows
 
 def _project(rows_of: Callable[[slice], np.ndarray], chosen: Sequence[slice],
              basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients [n, R] of the rows of some blocks, and of those not zero, at unit length."""
+    """Return coefficients [n, R] of the rows of blocks, and of nonzero rows scaled to length 1."""
     coefficients, norms = [], []
     for block in chosen:
         rows = rows_of(block)
@@ -339,7 +337,7 @@ def _project(rows_of: Callable[[slice], np.ndarray], chosen: Sequence[slice],
 
 
 def _leading(relative: np.ndarray, tolerance: float) -> tuple[np.ndarray, float]:
-    """Directions to keep [S, R], and the error with all of them, in the measure of `tolerance`."""
+    """Return the basis directions to keep [S, R], and the relative error if all were kept."""
     values, vectors = np.linalg.eigh(np.conj(relative.T) @ relative / max(len(relative), 1))
     missing = _missing(relative)
     tails = missing + np.concatenate([[0.0], np.cumsum(np.maximum(values, 0.0))])
@@ -348,14 +346,14 @@ def _leading(relative: np.ndarray, tolerance: float) -> tuple[np.ndarray, float]
 
 
 def _missing(relative: np.ndarray) -> float:
-    """Mean square of the part of the rows, of unit length, that lies outside of the basis."""
+    """Return the mean square of the part of unit-length rows that is outside of the basis."""
     lengths = np.linalg.norm(relative, axis=1)
     return max(1.0 - float(np.sum(lengths**2)) / max(len(lengths), 1), 0.0)
 
 
 def _sketch(
         rows_of: Callable[[slice], np.ndarray], chosen: Sequence[slice], size: int) -> np.ndarray:
-    """Orthonormal basis of random combinations of the rows, normalised to unit length."""
+    """Return an orthonormal basis of random combinations of the rows, scaled to unit length."""
     rng = streams.generator(0, streams.SKETCH, size)
     mixtures = np.zeros(())
     for block in chosen:

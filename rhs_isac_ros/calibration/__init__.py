@@ -1,4 +1,4 @@
-"""Calibration of a surface, and of a hall, from signals of users at known positions."""
+"""Calibration of a surface, and survey of a hall, from signals of users at known positions."""
 
 from rhs_isac_ros.calibration.calibration import (
     Calibration,

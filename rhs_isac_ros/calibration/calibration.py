@@ -1,4 +1,4 @@
-"""A calibration: the estimate of a surface, the scenario that it belongs to, and its file."""
+"""A calibration: the estimate of a surface, the scenario to which it applies, and its file."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from rhs_isac_ros.model.arrays import check_arrays, read_only
 from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
 
 _FORMAT = 1
-# Types of the arrays in a file, and of their standard deviations, which are there for readers.
+# Types of the arrays in a file, and names of their standard deviations, which inform readers.
 _ARRAYS = {'gains': complex, 'offsets': complex, 'band_gains': complex, 'factor': complex,
            'failed_probability': float}
 _DEVIATIONS = ('gains_std', 'offsets_std', 'band_gains_std')
@@ -31,25 +31,14 @@ class CalibrationError(ValueError):
 class Calibration:
     """An estimate of a surface.
 
-    Attributes
-    ----------
-    surface
-        The estimate, which estimators, bounds and beams take.
-    scenario_id
-        `Scenario.id` of the scenario for which it holds, without the files of a hall.
-    about
-        How it was made: ``pilots``, their number; ``codebooks``, their ids; ``prior`` of the
-        elements; ``scenario``, the fields that differ from Table I; ``rounds`` of the estimation,
-        and whether it ``converged``; ``version``.
-
-    Raises
-    ------
-    CalibrationError
-        If sizes disagree or a number is not finite.
+    Raises CalibrationError if sizes disagree or a number is not finite.
     """
 
-    surface: SurfaceEstimate
-    scenario_id: str
+    surface: SurfaceEstimate  #: The estimate, as used by estimators, bounds and beams.
+    scenario_id: str  #: `Scenario.id` of its scenario, without the files of a hall.
+    #: Record of the calibration: ``pilots``, their number; ``codebooks``, their ids; ``prior`` of
+    #: the elements; ``scenario``, the fields that differ from Table I; ``rounds`` of the
+    #: estimation, and whether it ``converged``; ``version``.
     about: dict[str, Any]
 
     def __post_init__(self) -> None:
@@ -74,7 +63,7 @@ class Calibration:
         return f'ca{self.surface.id}'
 
     def check(self, scenario: Scenario) -> None:
-        """Raise CalibrationError unless the calibration belongs to a scenario."""
+        """Raise CalibrationError unless the calibration applies to a scenario."""
         expected_id = _without_hall(scenario).id
         if self.scenario_id != expected_id:
             raise CalibrationError(
@@ -88,7 +77,7 @@ class Calibration:
     def save(self, path: str | Path) -> None:
         """Write the calibration to a file of NumPy's format ``.npz``, without pickled objects.
 
-        An existing file is replaced at the end, or kept if there is an `OSError`.
+        An existing file is replaced only when the new one is complete.
         """
         surface, std = self.surface, self.surface.std()
         n = len(surface.gains)
@@ -147,10 +136,7 @@ def load_surface(path: str, scenario: Scenario) -> SurfaceEstimate | None:
 
 
 def report(calibration: Calibration, scenario: Scenario) -> str:
-    """Describe failed elements, the largest errors, and gains and phases of the bands.
-
-    Uncertainties are standard deviations.
-    """
+    """Describe failed elements, the largest errors, and the bands, with standard deviations."""
     surface, about = calibration.surface, calibration.about
     n = scenario.n_elements
     std = surface.std()

@@ -1,10 +1,10 @@
 """Estimation of the surface from pilots of a reference user at known positions.
 
-The mean signals are linear in gains and offsets of the elements, and in a band's gain. Multipath
-and noise are the noise of this linear model; their covariance contains the multipath that leaks
-through the errors of the elements. With better estimates less of it leaks, and the nulls
-of the beams, in which the errors are visible, gain weight: the estimation alternates between the
-posterior given a covariance, and the covariance given a posterior.
+The mean signals are linear in gains and offsets of the elements, and in the gain of a band.
+Multipath and thermal noise are the noise of this linear model. Their covariance also contains the
+multipath that leaks through the errors of the elements. As the estimates improve, less multipath
+leaks, and the nulls of the beams, where errors are visible, gain weight. The estimation therefore
+alternates between the posterior for a given covariance and the covariance for a given posterior.
 """
 
 import dataclasses
@@ -27,11 +27,11 @@ from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.measurement import signal_covariance
 from rhs_isac_ros.support.threads import one_blas_thread
 
-# Prior of scenarios that declare no errors or failures.
+# Prior for scenarios that declare no errors or failures.
 DEFAULT_ERROR_RMS = 0.05
 DEFAULT_FAILED_SHARE = 0.01
 _MAX_ROUNDS = 30
-# The estimation has converged when no parameter moves by more than this share of its deviation.
+# The estimation has converged if no parameter moves by more than this share of its deviation.
 TOLERANCE = 0.02
 # Share of the largest variance below which a direction of the covariance is dropped.
 _MIN_VARIANCE = 1e-12
@@ -43,8 +43,8 @@ _BLOCK = 64
 class Pilots:
     """Signals of a reference user at known positions, received with one codebook.
 
-    Positions are float64 [N, 3] [m]; received signals are complex128 [N, N_B, N_SB F],
-    sub-band-major. Raises ValueError if a shape is wrong or a number is not finite.
+    `positions` are float64 [N, 3] [m]; `received` are complex128 [N, N_B, N_SB F], sub-band-major.
+    Raises ValueError if a shape is wrong or a number is not finite.
     """
 
     beams: Beamforming
@@ -68,18 +68,11 @@ def prior_of(scenario: Scenario) -> SurfacePrior:
 def estimate_surface(
         scenario: Scenario, pilots: Sequence[Pilots], prior: SurfacePrior | None = None,
         progress: Callable[[int, float], None] | None = None) -> SurfaceEstimate:
-    """Estimate a surface from pilots.
+    """Estimate a surface from pilots of one or several codebooks.
 
-    Parameters
-    ----------
-    pilots
-        Pilots of one or several codebooks of the scenario's sizes; without any, the result is the
-        prior.
-    prior
-        By default the result of `prior_of`.
-    progress
-        Called after each round with its number and the largest change of a parameter, in
-        standard deviations.
+    The default prior is the result of `prior_of`; without pilots, it is also the estimate.
+    `progress` is called after each round with its number and the largest change of a parameter, in
+    standard deviations.
     """
     prior = prior or prior_of(scenario)
     statistics = PilotStatistics(scenario, pilots)
@@ -103,10 +96,7 @@ def estimate_surface(
 
 
 class Alignment:
-    """Scoring steps of nuisance parameters to the signals of pilots.
-
-    The values are scaled: they are standard normal a priori.
-    """
+    """Scoring steps that fit nuisance parameters, scaled to standard normal, to pilot signals."""
 
     def __init__(self, scenario: Scenario) -> None:
         nuisance = nuisance_of(scenario)
@@ -118,15 +108,15 @@ class Alignment:
         return signals * np.exp(-np.tensordot(values, self.patterns, axes=1))
 
     def slopes(self, aligned: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Return the derivatives of aligned signals by the values, [N, Q, N_B, N_SB F].
+        """Return derivatives of aligned signals with respect to values, [N, Q, N_B, N_SB F].
 
-        Offsets of carrier and timing move the multipath out of the nulls of its covariance, and
-        are visible there. Their derivatives therefore contain the signals, not the mean.
+        Offsets of carrier and timing are visible because they move the multipath out of the nulls
+        of its covariance. Their derivatives therefore contain the signals instead of the mean.
         """
         return self.patterns * np.where(self._moves_multipath, aligned[:, None], mean[:, None])
 
     def start(self, white: np.ndarray, white_mean: np.ndarray, values: np.ndarray) -> None:
-        """Set the values that only rotate whole bands to their most likely ones, one by one."""
+        """Set the values that only rotate whole bands, one by one, to the likeliest values."""
         outputs = np.sum(np.conj(white_mean) * white, axis=2)
         for q in np.flatnonzero(self._phases.any(axis=0)):
             turns = self._phases[:, q]
@@ -137,7 +127,7 @@ class Alignment:
 
     def step(self, whiten: Callable[[np.ndarray], np.ndarray], signals: np.ndarray,
              mean: np.ndarray, values: np.ndarray) -> None:
-        """Improve the values for signals and their mean, both [N, N_B, N_SB F]."""
+        """Improve the values by one scoring step, for signals and their mean [N, N_B, N_SB F]."""
         aligned = self.aligned(signals, values)
         slopes = whiten(self.slopes(aligned, mean))
         residual = whiten(aligned) - whiten(mean)
@@ -146,17 +136,15 @@ class Alignment:
         values += eliminate(curvature, curvature[..., :0], gradient)[1]
 
     def curvature(self, slopes: np.ndarray) -> np.ndarray:
-        """Return the curvature [N, Q, Q] of whitened slopes and prior."""
+        """Return the curvature [N, Q, Q] that results from whitened slopes and the prior."""
         n, n_values = slopes.shape[:2]
         return quadratic_form(slopes.reshape(n, n_values, -1)) + np.eye(n_values)
 
 
 def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
-    """Return the RMS of real and imaginary parts of the bands' relative errors [2, N_B].
-
-    Pilots cannot separate a random gain or phase of the user from those of the bands. The gains or
-    phases of as many bands are then fixed.
-    """
+    """Return the RMS of the real and imaginary parts of the bands' relative errors, [2, N_B]."""
+    # Pilots cannot distinguish a random gain or phase of the user from those of the bands. The
+    # gains or phases of as many bands are therefore fixed.
     rms = np.full((2, scenario.n_bands), prior.band_gain_rms / np.sqrt(2))
     nuisance = nuisance_of(scenario)
     phases = nuisance.phases
@@ -169,10 +157,7 @@ def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
 
 
 def _change(before: Posterior, after: Posterior, n_bands: int) -> float:
-    """Return the largest change of a parameter, in standard deviations.
-
-    The parameters of the bands are changes already.
-    """
+    """Return the largest change of a parameter; band parameters already are changes."""
     moved = np.abs(after.complex_mean() - before.complex_mean())
     moved[-n_bands:] = np.abs(after.complex_mean()[-n_bands:])
     std = np.sqrt(np.maximum(np.diagonal(after.complex_covariance()).real, 1e-300))
@@ -190,11 +175,11 @@ def _result(posterior: Posterior, band_gains: np.ndarray) -> SurfaceEstimate:
 
 
 class PilotStatistics:
-    """Information of pilots about the parameters, given the covariance of their noise.
+    """Information in pilots about the parameters, given the covariance of their noise.
 
     The P = 2 N_E + N_B parameters are gains and offsets of the elements, and relative errors of
-    the bands' gains. Nuisance parameters that the scenario declares have other values for
-    each pilot: each round improves the values by a scoring step and integrates over the rest.
+    the bands' gains. Declared nuisance parameters have different values for each pilot. Each round
+    improves these values by a scoring step and integrates over what remains unknown.
     """
 
     def __init__(self, scenario: Scenario, pilots: Sequence[Pilots]) -> None:
@@ -209,8 +194,8 @@ class PilotStatistics:
                  ) -> tuple[np.ndarray, np.ndarray]:
         """Compute information [2 P, 2 P] and shift [2 P] for real and then imaginary parts.
 
-        Takes the gains of the bands about which the model is linear, complex128 [N_B], and mean
-        and covariance of gains and offsets of the elements, [2 N_E] and [2 N_E, 2 N_E].
+        The model is linear about the band gains `gains`, complex128 [N_B]. `mean` and `covariance`
+        describe gains and offsets of the elements, [2 N_E] and [2 N_E, 2 N_E].
         """
         size = self._size
         normal, product = np.zeros((size, size), complex), np.zeros(size, complex)
@@ -242,22 +227,19 @@ class PilotStatistics:
 
     def _whiteners(self, radiation: np.ndarray, gains: np.ndarray, mean: np.ndarray,
                    covariance: np.ndarray) -> np.ndarray:
-        """Whiteners of the signals divided by the bands' gains [N_B, N_SB F, N_SB F]."""
+        """Return whiteners of the signals divided by the gains of the bands."""
         scenario, n = self._scenario, self._scenario.n_elements
         expected = radiation[..., :n] * mean[:n] + radiation[..., n:] * mean[n:]
         total = signal_covariance(scenario, expected)
         total += scattered_errors(scenario, radiation, covariance)
-        # Thermal noise is not subject to the gain.
+        # The gain does not act on thermal noise.
         excess = scenario.noise_power_w * (1 / np.abs(gains)**2 - 1)
         total += excess[:, None, None] * np.eye(total.shape[1])
         return np.linalg.inv(np.linalg.cholesky(total))
 
     def _linearised(self, part: '_Block', signals: np.ndarray, values: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray]:
-        """Improve the values; return the signals as in a model linear in them, and their slopes.
-
-        The parameters are the values themselves, not their changes, so that the prior applies.
-        """
+        """Improve the values; return signals linear in them, and their whitened slopes."""
         self._alignment.step(part.whiten, signals, part.mean, values)
         aligned = self._alignment.aligned(signals, values)
         slopes = self._alignment.slopes(aligned, part.mean)
@@ -265,7 +247,7 @@ class PilotStatistics:
 
     def _integrated(self, part: '_Block', signals: np.ndarray, slopes: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray]:
-        """Information [2 P, 2 P] and shift [2 P] that the unknown values take."""
+        """Return the information [2 P, 2 P] and shift [2 P] lost because values are unknown."""
         coupling = sum(np.einsum('nqr,nrp->nqp', np.conj(slopes[:, :, band]), columns)
                        for band, columns in enumerate(part.columns))
         coupling = 2 * np.concatenate([coupling.real, -coupling.imag], axis=2)

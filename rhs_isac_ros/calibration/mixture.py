@@ -1,9 +1,9 @@
 """The posterior of elements that work or have failed, from a Gaussian likelihood.
 
-A working element has a gain, a failed one an offset; the other number is zero. Given the states of
-all elements, the posterior is Gaussian. The search changes the state of one element at a time as
-long as that increases the evidence. The resulting posterior averages over both states of each
-element, given the states of the others; without data, it is the prior.
+A working element has a gain and no offset, a failed one an offset and no gain. Given the states of
+all elements, the posterior is Gaussian. The search changes the state of one element at a time, as
+long as this increases the evidence. The final posterior averages over both states of each element,
+given the states of the others. Without data, it is the prior.
 """
 
 import dataclasses
@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Smallest prior deviation of a coefficient, which keeps matrices regular.
+# Smallest prior deviation of a coefficient; it keeps matrices invertible.
 _MIN_RMS = 1e-6
-# Probability of the less likely state below which it is neglected.
+# If the less likely state has a smaller probability, it is neglected.
 _MIN_PROBABILITY = 1e-7
 
 
@@ -21,8 +21,8 @@ _MIN_PROBABILITY = 1e-7
 class SurfacePrior:
     """Knowledge of a surface before the calibration.
 
-    This is the RMS of the relative errors of the coefficients, the probability that an element has
-    failed, and the RMS of the relative errors of the bands' gains.
+    The fields are the RMS of the relative errors of the coefficients, the probability that an
+    element has failed, and the RMS of the relative errors of the bands' gains.
     """
 
     element_error_rms: float
@@ -41,7 +41,7 @@ class SurfacePrior:
 class Posterior(NamedTuple):
     """Gaussian approximation of a posterior, over real and then imaginary parts."""
 
-    # Of the P = 2 N_E + N_B gains, offsets and band gains, float64 [2 P] and [2 P, 2 P].
+    # For the P = 2 N_E + N_B gains, offsets and band gains: float64 [2 P] and [2 P, 2 P].
     mean: np.ndarray
     covariance: np.ndarray
     # The most likely states, bool [N_E], and probabilities, float64 [N_E].
@@ -61,12 +61,12 @@ class Posterior(NamedTuple):
 
 
 def without_data(prior: SurfacePrior, band_rms: np.ndarray, n_elements: int) -> Posterior:
-    """Return the prior, which `surface_posterior` also yields from no information."""
+    """Return the prior: the result of `surface_posterior` without information."""
     n, n_bands = n_elements, band_rms.shape[1]
     size = 2 * (2 + n_bands)
     one = surface_posterior(np.zeros((size, size)), np.zeros(size), prior, band_rms,
                             np.zeros(1, bool))
-    # Every element is like that one, and independent of the others.
+    # Each element equals this one and is independent of the others.
     like = np.repeat(np.arange(size), [n, n, *[1] * n_bands] * 2)
     owner = np.tile([*range(n), *range(n), *[n] * n_bands], 2)
     covariance = one.covariance[np.ix_(like, like)] * (owner[:, None] == owner)
@@ -76,11 +76,12 @@ def without_data(prior: SurfacePrior, band_rms: np.ndarray, n_elements: int) -> 
 
 def surface_posterior(information: np.ndarray, shift: np.ndarray, prior: SurfacePrior,
                       band_rms: np.ndarray, failed: np.ndarray) -> Posterior:
-    """Compute the posterior of a surface, with a search that starts from some `failed` [N_E].
+    """Compute the posterior of a surface; the search starts from the states `failed` [N_E].
 
-    The P parameters are gains and offsets of the elements, then errors of the bands' gains, whose
-    real and imaginary parts have the prior RMS `band_rms`, float64 [2, N_B]. The log-likelihood is
-    ``-x^T information x / 2 + shift^T x``, for real and then imaginary parts x.
+    The P parameters are gains and offsets of the elements, then errors of the bands' gains. The
+    real and imaginary parts of the latter have the prior RMS `band_rms`, float64 [2, N_B]. The
+    log-likelihood is ``-x^T information x / 2 + shift^T x``, where x lists the real and then the
+    imaginary parts.
     """
     search = _Search(information, shift, prior, band_rms)
     state, log_odds = search.climb(failed.copy())
@@ -96,7 +97,7 @@ def surface_posterior(information: np.ndarray, shift: np.ndarray, prior: Surface
         total_covariance += weight * (
             other_covariance - covariance + (1 - weight) * np.outer(difference, difference))
     if other.sum() > 1:
-        # The correction for each element assumes that the others do not change as well.
+        # The correction for each element assumes that the other elements do not change.
         values, vectors = np.linalg.eigh(total_covariance)
         total_covariance = vectors * np.maximum(values, 0.0) @ vectors.T
     return Posterior(total_mean, total_covariance, state, np.where(state, 1 - other, other))
@@ -124,7 +125,7 @@ class _Search:
         self._log_prior_odds = float(np.log(share) - np.log1p(-share))
 
     def _indices(self, failed: np.ndarray) -> np.ndarray:
-        """Indices of the parameters that are not zero, [2 N_E + 2 N_B]."""
+        """Return the indices of the parameters that are not zero, [2 N_E + 2 N_B]."""
         n = self._n_elements
         chosen = np.concatenate(
             [np.arange(n) + n * failed, np.arange(2 * n, 2 * n + self._n_bands)])
@@ -146,7 +147,7 @@ class _Search:
         return mean, covariance
 
     def climb(self, failed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Flip states while that raises the evidence; also return the log odds of each flip."""
+        """Flip states as long as the evidence grows; also return the log odds of each flip."""
         log_odds = self._log_odds(failed)
         for _ in range(4 * self._n_elements):
             best = int(np.argmax(log_odds))
@@ -157,13 +158,13 @@ class _Search:
         return failed, log_odds
 
     def _log_odds(self, failed: np.ndarray) -> np.ndarray:
-        """Log odds of the other state of each element, given the states of the others [N_E]."""
+        """Return the log odds of each element's other state, given the others' states, [N_E]."""
         active, inactive = self._indices(failed), self._indices(~failed)
         mean, covariance = self._solve(active)
         # Real and imaginary part of each element [N_E, 2].
         own = np.arange(self._n_elements)[:, None] + [0, len(active) // 2]
         pairs = own[:, :, None], own[:, None]
-        # Information about each element with all others eliminated, as it is ...
+        # Information about each element in its state, with all other elements eliminated ...
         curvature = np.linalg.inv(covariance[pairs])
         gradient = np.einsum('mxy,my->mx', curvature, mean[own])
         # ... and in its other state. Conditional on the element itself, it is smaller by the part
@@ -185,7 +186,7 @@ class _Search:
 
     def _log_evidence(
             self, indices: np.ndarray, curvature: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Log evidence of two parameters of each element, relative to their absence [N_E]."""
+        """Return the log evidence for two parameters of each element against their absence."""
         precision, mean = self._precision[indices], self._mean[indices]
         best = np.linalg.solve(curvature, gradient[..., None])[..., 0]
         exponents = np.log(precision) + gradient * best - precision * mean**2

@@ -5,14 +5,14 @@ nu, whose mean L_0 is the covariance that three fields declare, the posterior me
 
     L = t (nu L_0 + N S) / (nu + N).
 
-Fields and nu maximise the evidence, so that L is close to the declared covariance for few
-positions, and to the sample covariance for many. Multipath that consists of a few strong paths is
-not Gaussian: positioning errors then exceed the bound for t = 1. Each position is therefore left
-out in turn, and t is chosen so that 95 % of these positions lie in the 95 % region of the local
-bound, and 99 % pass the test of the residual.
+Fields and nu maximise the evidence. L is therefore close to the declared covariance for few
+positions, and to the sample covariance for many. If the multipath consists of a few strong paths,
+it is not Gaussian, and with t = 1 positioning errors would exceed the bound. Each position is
+therefore left out in turn, and t is chosen so that 95 % of these positions lie in the 95 % region
+of the local bound, and 99 % pass the test of the residual.
 
-Positions are excluded if their signals are more probable without a direct path, as multipath of an
-unknown level.
+Positions are excluded if their signals are more probable as multipath of an unknown level, without
+a direct path.
 """
 
 import dataclasses
@@ -33,33 +33,32 @@ from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.support.threads import one_blas_thread
 
-# Share of positions in the region of the local bound, and of residuals that pass their test, with
-# the false alarms of that test.
+# Share of positions that should lie in the region of the local bound, and of residuals that should
+# pass their test, which has this rate of false alarms.
 COVERAGE = 0.95
 _PASSING = 0.99
 _FALSE_ALARM = 1e-9
-# Inflation that a survey without positions would have, and its weight in positions: a margin for
-# small surveys, in which the quantiles above are uncertain.
+# Inflation of a survey without positions, and its weight in positions. It is a margin for small
+# surveys, for which the quantiles above are uncertain.
 _INFLATION, _INFLATION_WEIGHT = 1.8, 40
-# The same of the level of users in sight [dB].
+# Likewise for the standard deviation of the level of users in sight [dB].
 _LEVEL_STD_DB = 1.2
-# Smaller surveys, and those that span less of a side of the region, cause a warning.
+# Surveys with fewer positions, or a smaller span along a side of the region, cause a warning.
 MIN_POSITIONS = 20
 _MIN_SPAN = 0.5
-# Range of delay spreads in units of the inverse bandwidth, of angular spreads [deg], of levels
-# [dB] and of prior weights.
+# Limits of delay spreads in units of the inverse bandwidth, angular spreads [deg], levels [dB] and
+# prior weights.
 _DELAYS, _ANGLES, _LEVELS, _WEIGHTS = (1e-3, 10.0), (0.5, 300.0), (-80.0, 60.0), (0.5, 1e4)
-# Steps of the search: level [dB] and the logarithms of the others.
+# Initial steps of the search: level [dB], and logarithms of the other parameters.
 _STEPS = (3.0, 1.0, 0.7, 1.0)
-# Prior probability of a position without direct path if the scenario has none, and the largest.
+# Prior probability of a blocked position if the scenario declares none, and its largest value.
 _BLOCKED_PROBABILITY, _MAX_BLOCKED = 0.1, 0.9
-# Rounds of alignment of impairments, estimation and search for positions without direct path; and
-# steps of each alignment.
+# Rounds of alignment, estimation and search for blocked positions, and steps of each alignment.
 _ROUNDS, _ALIGNMENT_STEPS = 4, 6
 
 
 class SurveyWarning(UserWarning):
-    """A survey is too small, or covers a part of the region only."""
+    """A survey is too small, or covers only a part of the region."""
 
 
 @one_blas_thread
@@ -67,35 +66,14 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
            received: np.ndarray, surface: Surface | None = None) -> MultipathEstimate:
     """Estimate the covariance of the multipath from signals at known positions.
 
-    Parameters
-    ----------
-    scenario
-        The scenario of the signals. Fields of the multipath are starting points only; impairments
-        that the scenario declares are estimated for each position.
-    positions
-        Float64 [N, 3] [m], spread over the region of interest; at least one.
-    received
-        Complex128 [N, N_B, N_SB F], sub-band-major.
-    surface
-        Knowledge of the surface, as in `MeasurementModel`.
+    `positions`, float64 [N, 3] [m], should be spread over the region of interest; `received` are
+    complex128 [N, N_B, N_SB F], sub-band-major. Multipath fields of the scenario are only starting
+    points; declared impairments are estimated for each position. The result is a value of the
+    field `Scenario.multipath`, and its `about` contains the expected coverage.
 
-    Returns
-    -------
-    MultipathEstimate
-        The value of the field `multipath` of a scenario:
-        ``dataclasses.replace(scenario, multipath=estimate)``. The expected coverage and other
-        properties are in `MultipathEstimate.about`.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a number is not finite, or there is no position.
-
-    Warns
-    -----
-    SurveyWarning
-        If there are fewer than `MIN_POSITIONS` positions, or they span less than half of a side of
-        the region of interest.
+    Raises ValueError if a shape is wrong, a number is not finite, or there is no position. Warns
+    with SurveyWarning if there are fewer than `MIN_POSITIONS` positions, or if they span less than
+    half of a side of the region.
     """
     pilots = Pilots(codebook, np.asarray(positions, float), np.asarray(received, complex))
     n = len(pilots.positions)
@@ -107,7 +85,7 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
                          fit.total, fit.weight + n_sight - 1)
     n_measurements = int(np.prod(model.shape))
     level_std_db = _level_std_db(left_out, n_measurements)
-    # Estimators scale the covariance of a position by the level that the residual reveals.
+    # Estimators scale the covariance of a position by the level that the residual indicates.
     relative = left_out.energies / n_measurements
     left_out = left_out._replace(distances=left_out.distances / relative**share_of_level(
         n_measurements, level_std_db))
@@ -149,20 +127,20 @@ def survey_report(estimate: MultipathEstimate) -> str:
 
 
 class _Fit(NamedTuple):
-    """The most likely fields of a scenario, and residuals with these."""
+    """The most likely fields of the scenario, and the residuals for these fields."""
 
     # Scenario with the fields, and weight of the prior in positions.
     fields: Scenario
     weight: float
-    # Of all positions, complex128 [N, N_B, R], and which of them have a direct path [N].
+    # Residuals of all positions, complex128 [N, N_B, R]; and whether there is a direct path [N].
     residuals: np.ndarray
     in_sight: np.ndarray
-    # Sum over positions with a direct path, and of the prior, complex128 [N_B, R, R].
+    # Sum over the prior and the positions in sight, complex128 [N_B, R, R].
     total: np.ndarray
 
 
 def _fitted(fields: Scenario, pilots: Pilots, surface: Surface | None) -> _Fit:
-    """Fit fields, impairments and positions without direct path in turn."""
+    """Fit fields, impairments and blocked positions in turn."""
     has_nuisance, in_sight = len(nuisance_of(fields)) > 0, np.ones(len(pilots.positions), bool)
     for _ in range(_ROUNDS):
         model = MeasurementModel(fields, pilots.beams, surface)
@@ -179,7 +157,7 @@ def _fitted(fields: Scenario, pilots: Pilots, surface: Surface | None) -> _Fit:
 
 
 def _residuals(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
-    """Signals without the most likely factors of impairments, less their mean [N, N_B, R]."""
+    """Return signals without the likeliest impairments and without their mean, [N, N_B, R]."""
     alignment, mean = Alignment(model.scenario), model.mean(pilots.positions)
     values = np.zeros((len(mean), len(alignment.patterns)))
     alignment.start(model.whiten(pilots.received), model.whiten(mean), values)
@@ -190,7 +168,7 @@ def _residuals(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
 
 def _most_likely(scenario: Scenario, model: MeasurementModel, sample: np.ndarray, n: int
                  ) -> tuple[Scenario, float]:
-    """Return the scenario with the fields, and the prior weight, of the highest evidence."""
+    """Return the scenario fields and the prior weight with the highest evidence."""
     from scipy.optimize import minimize
 
     bandwidth_hz = scenario.n_subbands * scenario.subband_width_hz
@@ -224,10 +202,10 @@ def _most_likely(scenario: Scenario, model: MeasurementModel, sample: np.ndarray
 
 
 def _log_evidence(declared: np.ndarray, sample: np.ndarray, n: int, weight: float) -> float:
-    """Logarithm of the evidence of N residuals, up to a constant.
+    """Return the log evidence of n residuals, up to a constant.
 
-    The covariances of the bands are inverse Wishart variables of the mean `declared`, complex128
-    [N_B, R, R], and with ``weight + R`` degrees of freedom.
+    The covariances of the bands are inverse Wishart variables with the mean `declared`, complex128
+    [N_B, R, R], and ``weight + R`` degrees of freedom.
     """
     from scipy.special import gammaln
 
@@ -248,7 +226,7 @@ class _LeftOut(NamedTuple):
 
 def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndarray,
               total: np.ndarray, n_others: float) -> _LeftOut:
-    """Evaluate every position under the covariance ``(total - e e^H) / n_others`` of the others.
+    """Evaluate each position under the covariance ``(total - e e^H) / n_others`` of the others.
 
     `total` is complex128 [N_B, R, R]; the residuals e are complex128 [N, N_B, R]. An error is a
     scoring step from the true position, with unknown nuisance parameters.
@@ -259,7 +237,7 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     slopes = np.concatenate([by_position, nuisance * mean[:, None]], axis=1)
     white = np.einsum('irs,nis->nir', whitener, residuals)
     columns = np.einsum('irs,nais->nair', whitener, slopes)
-    # The inverse of total - e e^H is a change of rank one; the share of e in total is below 1.
+    # total - e e^H is a change of rank one, so its inverse is known; the share of e is below 1.
     own = 1 / (1 - np.sum(np.abs(white)**2, axis=2))
     products = np.einsum('nair,nir->nai', columns.conj(), white)
     information = np.einsum('nair,nbir->nab', columns.conj(), columns) + np.einsum(
@@ -277,13 +255,13 @@ def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
               in_sight: np.ndarray, total: np.ndarray, weight: float) -> np.ndarray:
     """Return which positions probably have a direct path, given the others, bool [N].
 
-    Without it, signals are multipath of an unknown level. `total` is the sum over the positions
-    that are `in_sight` and of the prior, of this weight, complex128 [N_B, R, R].
+    Otherwise, signals are multipath of an unknown level. `total`, complex128 [N_B, R, R], is the
+    sum over the positions that are `in_sight` and the prior, which has this weight.
     """
     whitener = np.linalg.inv(np.linalg.cholesky(total))
     with_path = np.einsum('irs,nis->nir', whitener, residuals)
     without = with_path + np.einsum('irs,nis->nir', whitener, model.mean(positions))
-    # A position does not explain itself: its term in the total is a change of rank one.
+    # A position must not explain itself: its term in the total is a change of rank one.
     share, counts = np.sum(np.abs(with_path)**2, axis=2), in_sight[:, None]
     cross = np.abs(np.sum(with_path.conj() * without, axis=2))**2
     others = weight - in_sight
@@ -298,7 +276,7 @@ def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
 
 
 def _inflation(left_out: _LeftOut, n_measurements: int) -> float:
-    """Return t, with the margin for small surveys."""
+    """Return t, including the margin for small surveys."""
     from scipy.special import gammainccinv
 
     n = len(left_out.energies)
@@ -313,7 +291,7 @@ def _inflation(left_out: _LeftOut, n_measurements: int) -> float:
 def _level_std_db(left_out: _LeftOut, n_measurements: int) -> float:
     """Return the standard deviation of the power of the residuals among users [dB]."""
     n = len(left_out.energies)
-    # The energies of Gaussian residuals of equal power scatter as well.
+    # Even energies of Gaussian residuals with equal power vary.
     excess = max(float(np.var(np.log(left_out.energies))) - 1 / n_measurements, 0.0)
     usual = (np.log(10) / 10 * _LEVEL_STD_DB)**2
     variance = (n * excess + _INFLATION_WEIGHT * usual) / (n + _INFLATION_WEIGHT)
@@ -321,14 +299,14 @@ def _level_std_db(left_out: _LeftOut, n_measurements: int) -> float:
 
 
 def _radius() -> float:
-    """Squared Mahalanobis radius of the region of probability `COVERAGE`."""
+    """Return the squared Mahalanobis radius of the region of probability `COVERAGE`."""
     from scipy.special import chdtri
 
     return float(chdtri(3, 1 - COVERAGE))
 
 
 def _interval(successes: int, n: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share."""
+    """Return Wilson's 95 % interval of a share."""
     square = 1.959964**2 / n
     share = successes / n
     centre, reach = share + square / 2, np.sqrt(share * (1 - share) * square + square**2 / 4)
@@ -336,7 +314,7 @@ def _interval(successes: int, n: int) -> tuple[float, float]:
 
 
 def _warnings(scenario: Scenario, positions: np.ndarray) -> list[str]:
-    """Return why the estimate may not hold in the whole region."""
+    """Return reasons why the estimate may not hold in the whole region."""
     texts = []
     if len(positions) < MIN_POSITIONS:
         texts.append(f'positions: {len(positions)}, expected at least {MIN_POSITIONS} for a '

@@ -54,9 +54,9 @@ from rhs_isac_ros.support.progress import progress_bar
 
 # Positions for the average bound of the result, drawn independently of the samples.
 HELD_OUT_POSITIONS = 2000
-# Beyond this, the samples would fill the memory.
+# With more positions, the samples would fill the memory.
 _MAX_POSITIONS = 10**5
-# Errors that the user can correct; their messages state the expected values.
+# Errors that the user can correct. Their messages state the expected values.
 ERRORS = (MissingLibraryError, ValueError, OSError, MemoryError)
 
 
@@ -146,8 +146,8 @@ def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
 def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     """Optimise according to the options of `add_options`, write the file and print a summary.
 
-    Ctrl-C ends the search; the best codebook found so far is then written. Returns the codebook
-    in the file and why the search stopped. Raises one of `ERRORS` if an option or a file is
+    Ctrl-C ends the search; the best codebook so far is then written. Returns the codebook in the
+    file and the reason why the search stopped. Raises one of `ERRORS` if an option or a file is
     invalid, or a library is missing; an existing output file is kept.
     """
     output, partial = options.output, _partial(options.output)
@@ -196,7 +196,7 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
 def _choose_bands(
         options: argparse.Namespace, scenario: Scenario,
         search: Callable[[Scenario], OptimizeResult]) -> BandPlan:
-    """Choose the bands and the codebook, write the scenario with them, and return both."""
+    """Choose the bands and the codebook, and write the scenario with these bands."""
     def report(candidate: Candidate) -> None:
         if not options.quiet:
             print(f'{_in_ghz(candidate.frequencies_hz)}: {candidate.error_m2:.4f} m^2 expected',
@@ -228,7 +228,7 @@ def _in_ghz(frequencies_hz: Sequence[float]) -> str:
 
 
 def _partial(output: Path) -> Path:
-    """Return the file in which an unfinished search is kept."""
+    """Return the file that holds an unfinished search."""
     return output.with_name(output.name + '.part')
 
 
@@ -245,7 +245,7 @@ def _start(name: str | None, scenario: Scenario, seed: int) -> Codebook | None:
 
 
 def _save_partial(result: OptimizeResult, partial: Path) -> None:
-    """Save an unfinished result; on failure only warn, as the final write may still succeed."""
+    """Save an unfinished result; a failure causes only a warning, as a later write may succeed."""
     try:
         result.codebook.save(partial)
     except OSError as error:
@@ -253,7 +253,7 @@ def _save_partial(result: OptimizeResult, partial: Path) -> None:
 
 
 def _save(codebook: Codebook, output: Path) -> None:
-    """Save the result, which may have taken hours; on failure, in a temporary directory."""
+    """Save the result, in a temporary directory if need be, because it may have taken hours."""
     try:
         codebook.save(output)
     except OSError as error:

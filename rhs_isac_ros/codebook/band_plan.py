@@ -1,9 +1,9 @@
 """Choice of the centre frequencies together with the codebook.
 
-Frequencies move on a raster. Three stages of growing cost compare band plans: the range ambiguity
-function, in closed form, of all plans or along a coordinate search; short codebook optimisations
-of a few plans that differ; and full optimisations for the best of these. The expected squared
-error with a codebook compares the plans of the last two stages.
+Frequencies lie on a raster. Band plans are compared in three stages of growing cost: by the range
+ambiguity function, in closed form, for all plans or along a coordinate search; by short codebook
+optimisations for a few different plans; and by full optimisations for the best of these. The last
+two stages compare the expected squared error with the codebook.
 """
 
 import dataclasses
@@ -22,9 +22,9 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.support import streams
 
-# Plans that are all compared; of more, a coordinate search compares some.
+# Largest number of plans that are all compared; beyond it, a coordinate search selects some.
 MAX_EXHAUSTIVE = 20_000
-# Starts of the coordinate search.
+# Number of starts of the coordinate search.
 _STARTS = 8
 
 
@@ -48,9 +48,9 @@ def screen(
         max_exhaustive: int = MAX_EXHAUSTIVE) -> tuple[np.ndarray, np.ndarray]:
     """Return plans with low errors, ascending float64 [P, N_B] [Hz], and the errors [P].
 
-    If there are at most `max_exhaustive` plans, the function returns all of them. Otherwise, it
-    returns the results of coordinate searches from several starts. Such a search moves one
-    frequency at a time to its best place on the raster.
+    If there are at most `max_exhaustive` plans, all are returned. Otherwise, coordinate searches
+    from several starts move one frequency at a time to its best place on the raster, and their
+    results are returned.
     """
     if math.comb(len(frequencies_hz), n_bands) > max_exhaustive:
         return _coordinate_search(frequencies_hz, n_bands, gap_hz, errors, rng)
@@ -63,7 +63,7 @@ def _coordinate_search(
         frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
         errors: Callable[[np.ndarray], np.ndarray], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Search from random starts that have the gap, and from the lowest frequencies."""
+    """Search from random plans that respect the gap, and from the lowest frequencies."""
     drawn = np.sort([rng.choice(frequencies_hz, n_bands, replace=False)
                      for _ in range(_STARTS)], axis=1)
     first = first_fit(frequencies_hz, n_bands, gap_hz)
@@ -91,7 +91,7 @@ def has_gap(plans: np.ndarray, gap_hz: float) -> np.ndarray:
 
 
 def first_fit(frequencies_hz: np.ndarray, n_bands: int, gap_hz: float) -> np.ndarray | None:
-    """Return the plan of the lowest frequencies that have the gap, or None."""
+    """Return the plan with the lowest frequencies that have the gap, or None."""
     plan: list[float] = []
     for frequency in frequencies_hz:
         if not plan or frequency - plan[-1] >= gap_hz * (1 - 1e-9):
@@ -102,49 +102,41 @@ def first_fit(frequencies_hz: np.ndarray, n_bands: int, gap_hz: float) -> np.nda
 
 
 DEFAULT_RASTER_HZ = 10e6
-# Energies of a codebook relative to a random one, for each of which the screening proposes plans:
-# with more energy, wider plans are better. From 8, proposed plans confuse directions more often,
-# which the screening does not take into account.
+# Energies of a codebook relative to a random one. The screening proposes plans for each: with more
+# energy, wider plans are better. From 8, proposed plans would confuse directions more often, which
+# the screening does not consider.
 _ENERGY_LEVELS = (2.0, 3.0, 4.0)
-# Plans with a codebook, and the positions and steps of their optimisations.
+# Number of plans with a codebook, and positions and steps of their optimisations.
 _CANDIDATES = 6
 _SHORT_POSITIONS, _SHORT_STEPS = 64, 200
-# Candidates with a full optimisation, and the largest ratio of their errors to the lowest one.
+# Number of candidates with a full optimisation, and largest ratio of their errors to the lowest.
 _FINALISTS, _MAX_RATIO = 3, 1.25
-# A later candidate replaces the best one if its error is lower by this factor: two standard errors
+# A later candidate replaces the best one if its error is lower by this factor, two standard errors
 # of the global bound.
 _BETTER = 0.95
 # Phases of the global bound after a short optimisation, and after a full one.
 _SHORT_PHASES, _PHASES = 1024, 4096
-# Positions at which energies and errors are averaged, and quantiles that represent the energies.
+# Positions at which energies and errors are averaged, and number of quantiles of the energies.
 _POSITIONS, _QUANTILES = 256, 16
-# Candidates differ from each other by this many steps of the raster in some frequency.
+# Candidates differ by at least this many steps of the raster in some frequency.
 _MIN_DIFFERENCE = 4
 
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
-    """A band plan that was compared with others, by its ascending centre frequencies.
-
-    Attributes
-    ----------
-    screening_m2
-        Squared error from confusing ranges, according to the range ambiguity function.
-    error_m2
-        Expected squared error with an optimised codebook, see `expected_error`.
-    """
+    """A band plan that was compared with others, with its ascending centre frequencies."""
 
     frequencies_hz: tuple[float, ...]
-    screening_m2: float
-    error_m2: float
+    screening_m2: float  #: Squared error from confusing ranges, by the range ambiguity function.
+    error_m2: float  #: Expected squared error with an optimised codebook; see `expected_error`.
 
 
 @dataclasses.dataclass(frozen=True)
 class BandPlan:
-    """Result of `best_of`: the scenario with its bands, and its codebook.
+    """The result of `best_of`: the scenario with its bands, and its codebook.
 
-    `candidates` are the plans that `choose_bands` compared, the best one first, and `error_m2` is
-    the expected squared error, NaN if the optimisation of the codebook was interrupted.
+    `candidates` are the plans compared by `choose_bands`, the best one first. `error_m2` is the
+    expected squared error, or NaN if the optimisation of the codebook was interrupted.
     """
 
     scenario: Scenario
@@ -159,10 +151,10 @@ def best_of(
         report: Callable[[Candidate], None] | None = None) -> BandPlan:
     """Optimise codebooks for the first candidates, and return the plan with the lowest error.
 
-    The candidates are in ascending order of their errors. The first one is the result unless the
-    error of another one is clearly lower; candidates with much larger errors are skipped. If a
-    `search` for a codebook is interrupted, the best plan so far is the result. `report` is called
-    with each plan that has a codebook, and its error.
+    The candidates are in ascending order of their errors. The first one is chosen unless the error
+    of another is clearly lower; candidates with much larger errors are skipped. If a `search` for
+    a codebook is interrupted, the best plan so far is returned. `report` is called with each plan
+    that has a codebook, and its error.
     """
     best: BandPlan | None = None
     for candidate in candidates[:_FINALISTS]:
@@ -186,30 +178,13 @@ def choose_bands(
         scenario: Scenario, spectrum_hz: Sequence[tuple[float, float]], n_bands: int, *,
         raster_hz: float = DEFAULT_RASTER_HZ, min_gap_hz: float | None = None, seed: int = 0,
         report: Callable[[Candidate], None] | None = None) -> tuple[Candidate, ...]:
-    """Choose centre frequencies with which users are located accurately.
+    """Choose centre frequencies with which users can be located accurately.
 
-    Parameters
-    ----------
-    spectrum_hz
-        Intervals of centre frequencies [Hz], ends included.
-    raster_hz
-        Spacing of possible centre frequencies, from the low end of each interval [Hz].
-    min_gap_hz
-        Smallest distance of two centre frequencies [Hz]; by default, the width of a band.
-    seed
-        Seed of the samples and of the optimisations.
-    report
-        Called with each plan for which a codebook is optimised.
-
-    Returns
-    -------
-    tuple of Candidate
-        The plans for which codebooks were compared, the best one first.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of range, or no plan has the gap.
+    `spectrum_hz` are intervals of centre frequencies, including their ends, `raster_hz` is the
+    spacing of frequencies from the low end of each interval, and `min_gap_hz` the smallest
+    distance of two frequencies, by default the width of a band. Returns the plans for which
+    codebooks were compared, the best one first; `report` is called with each. Raises ValueError if
+    an argument is out of range, or no plan has the gap.
     """
     if n_bands < 1 or scenario.n_bands * scenario.n_frames % n_bands:
         raise ValueError(
@@ -247,7 +222,7 @@ def _proposals(
         scenario: Scenario, frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
         difference_hz: float, rng: np.random.Generator
 ) -> list[tuple[tuple[float, ...], float]]:
-    """Return different plans, from the energy levels in turn, with screening values."""
+    """Return plans, taken alternately from the energy levels, with their screening errors."""
     spread = np.linspace(frequencies_hz[0], frequencies_hz[-1], n_bands)
     energies = _energies(with_bands(scenario, spread.tolist()))
     low, high = scenario.roi_bounds_m
@@ -274,9 +249,9 @@ def expected_error(
         scenario: Scenario, codebook: Codebook, seed: int = 0, n_phases: int = 2048) -> float:
     """Estimate the mean squared error with a codebook [m^2].
 
-    The estimate is the global bound, a few percent below the error. This bound ignores nuisance
-    parameters: if the scenario declares any, the estimate is the average local bound with the
-    region as prior, plus the squared error from confusing ranges.
+    The estimate is the global bound, a few percent below the error. If the scenario declares
+    nuisance parameters, which this bound ignores, the estimate is instead the average local bound
+    with the region as prior, plus the squared error from confusing ranges.
     """
     rng = streams.generator(seed, streams.PLANS, 1)
     if not len(nuisance_of(scenario)):
@@ -293,6 +268,6 @@ def _energies(scenario: Scenario) -> np.ndarray:
     model = MeasurementModel(scenario, random_codebook(scenario, rng))
     whitened = model.whiten(model.mean(scenario.sample_positions(_POSITIONS, rng)))
     energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
-    # A phase of each band that is unknown leaves less of the energy to compare phases with.
+    # If the phase of each band is unknown, less energy is left for the comparison of phases.
     energies /= 1 + 2 * scenario.band_phase_std_rad**2 * energies / scenario.n_bands
     return np.quantile(energies, (np.arange(_QUANTILES) + 0.5) / _QUANTILES)

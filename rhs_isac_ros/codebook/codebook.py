@@ -1,6 +1,6 @@
-"""The codebook: the beamforming of the surface and the base station while positioning.
+"""The codebook: the beamforming of surface and base station while positioning.
 
-`Codebook` has the arrays and their ROS parameters and files, `Provenance` its origin.
+`Codebook` holds the arrays, their ROS parameters and their files; `Provenance` is their origin.
 """
 
 import dataclasses
@@ -18,15 +18,16 @@ import yaml
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.scenario import check_shape
 from rhs_isac_ros.model.surface import on_levels
 from rhs_isac_ros.support.files import read_yaml, write_whole
 
-# The node with the parameters of a codebook file, in any namespace.
+# Node with the parameters in a codebook file, in any namespace.
 PARAMETER_NODE = '/**/optimizer'
 # Relative tolerance of the power constraint.
 _POWER_TOLERANCE = 1e-6
-# Tolerance of amplitudes, which must be levels of the elements.
+# Tolerance of amplitudes if elements have levels.
 _LEVEL_TOLERANCE = 1e-9
 
 
@@ -38,28 +39,14 @@ class CodebookError(ValueError):
 class Codebook:
     """Analog and digital beamforming of a positioning phase.
 
-    Attributes
-    ----------
-    analog
-        Configurations C, float64 [N_B, F, N_E], each entry in [0, 1].
-    digital
-        Combining vectors S, complex128 [N_B, N_SB, F, K] [sqrt(W)].
-    average_crlb_m2
-        Measured average bound [m^2]; NaN if unknown.
-    provenance
-        How the codebook was made; see `Provenance`.
-
-    Raises
-    ------
-    CodebookError
-        If an array has the wrong number of dimensions or entries that are not finite, the sizes
-        disagree, or a configuration is outside [0, 1].
+    Raises CodebookError if an array has the wrong number of dimensions or entries that are not
+    finite, the sizes disagree, or a configuration is outside [0, 1].
     """
 
-    analog: np.ndarray
-    digital: np.ndarray
-    average_crlb_m2: float = math.nan
-    provenance: str = ''
+    analog: np.ndarray  #: Configurations C, float64 [N_B, F, N_E], each entry in [0, 1].
+    digital: np.ndarray  #: Combining vectors S, complex128 [N_B, N_SB, F, K] [sqrt(W)].
+    average_crlb_m2: float = math.nan  #: Measured average bound; NaN if unknown.
+    provenance: str = ''  #: Origin of the codebook; see `Provenance`.
 
     def __post_init__(self) -> None:
         """Copy the arrays, check them, and make them read-only."""
@@ -73,8 +60,7 @@ class Codebook:
                 raise CodebookError(f'{name}: shape {array.shape}, expected [{dims}]')
             if not np.isfinite(array).all():
                 raise CodebookError(f'{name}: not finite, expected finite numbers')
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, read_only(array))
         if self.analog.min() < 0 or self.analog.max() > 1:
             raise CodebookError(
                 f'analog: {self.analog.min():g} to {self.analog.max():g}, expected 0 to 1')
@@ -100,8 +86,8 @@ class Codebook:
     def check(self, scenario: Scenario) -> None:
         """Raise CodebookError if the codebook does not fit a scenario.
 
-        Sizes and the power of each frame must be those of the scenario, and configurations must
-        be among its amplitude levels.
+        Sizes and the power of each frame must be as in the scenario, and configurations must
+        consist of its amplitude levels.
         """
         try:
             check_shape('analog', self.analog, 'N_B F N_E', scenario)
@@ -134,7 +120,7 @@ class Codebook:
 
     @classmethod
     def from_parameters(cls, parameters: dict[str, Any]) -> 'Codebook':
-        """Create a codebook from parameters as `to_parameters` returns them.
+        """Create a codebook from the parameters of `to_parameters`.
 
         ``codebook.id`` may be empty or missing. Raise CodebookError if a parameter is missing or
         malformed, or the id does not match the content.
@@ -162,10 +148,7 @@ class Codebook:
         return codebook
 
     def save(self, path: str | Path) -> None:
-        """Write the codebook as a ROS 2 parameter file, replacing an existing one atomically.
-
-        Raise OSError if the file cannot be written; an existing file is then kept.
-        """
+        """Write a ROS 2 parameter file atomically; raise OSError if it cannot be written."""
         values = {name.partition('.')[2]: value for name, value in self.to_parameters().items()}
         content = {PARAMETER_NODE: {'ros__parameters': {'codebook': values}}}
         text = yaml.safe_dump(content, sort_keys=False, width=95, default_flow_style=None)
@@ -190,7 +173,7 @@ class Codebook:
 
 
 def _number(parameters: dict[str, Any], name: str) -> float:
-    """Return a parameter's number, NaN if it is missing, or raise CodebookError."""
+    """Return a numeric parameter, NaN if it is missing, or raise CodebookError."""
     value = parameters.get(f'codebook.{name}', math.nan)
     try:
         if not isinstance(value, bool):
@@ -202,7 +185,7 @@ def _number(parameters: dict[str, Any], name: str) -> float:
 
 
 def _array(parameters: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a parameter's list as a float64 array of a shape, or raise CodebookError."""
+    """Return a list parameter as a float64 array of this shape, or raise CodebookError."""
     values = parameters.get(f'codebook.{name}', ())
     if isinstance(values, str):
         # ``ros2 param load`` sends a list as text if it contains a number such as 1e-05.
@@ -219,10 +202,7 @@ def _array(parameters: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.
 
 
 def default_codebook_file() -> Path:
-    """Return the path of the default codebook, ``config/codebook.yaml``.
-
-    Raise CodebookError if the package was installed without its data files.
-    """
+    """Return the path of ``config/codebook.yaml``; raise CodebookError if it is not installed."""
     # Every installation scheme puts share/ into a folder above the modules: the prefix of pip and
     # colcon, or the folder of pip's --target. A clone has config/ beside the package.
     package = Path(__file__).resolve().parents[1]
@@ -237,41 +217,23 @@ def default_codebook_file() -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class Provenance:
-    """The arguments of an optimisation and the progress it made.
-
-    Attributes
-    ----------
-    positions
-        Number of positions.
-    scenario
-        Fields of the scenario that differ from Table I.
-    version
-        Version of this package.
-    calibration
-        Id of the calibration; empty without one.
-    steps, evaluations
-        Totals, including the runs that it resumed.
-    value_m2
-        The objective [m^2].
-    reason
-        Why the search stopped.
-    """
+    """The arguments of an optimisation and its progress."""
 
     method: str
     objective: str
     seed: int
     sampling: str
-    positions: int
-    scenario: dict[str, Any]
+    positions: int  #: Number of positions.
+    scenario: dict[str, Any]  #: Fields that differ from Table I.
     version: str = __version__
-    calibration: str = ''
-    steps: int = 0
+    calibration: str = ''  #: Id of the calibration, if any.
+    steps: int = 0  #: Total, including the runs that were resumed; as for `evaluations`.
     evaluations: int = 0
-    value_m2: float = math.nan
+    value_m2: float = math.nan  #: The objective.
     reason: str = ''
 
     def to_text(self) -> str:
-        """Return one line that describes a result, for `Codebook.provenance`."""
+        """Return a description of a result in one line, for `Codebook.provenance`."""
         fields = dataclasses.asdict(self)
         if not self.calibration:
             del fields['calibration']
@@ -280,7 +242,7 @@ class Provenance:
     def resumed(self, text: str) -> 'Provenance':
         """Return the provenance of an earlier result, to resume it.
 
-        Raise ValueError unless it is the result of an optimisation with the same arguments.
+        Raise ValueError unless it comes from an optimisation with the same arguments.
         """
         earlier = Provenance.parse(text)
         if earlier is None:
@@ -302,9 +264,10 @@ class Provenance:
             return None
 
 
-# ``ros2 param load`` parses each value of a file as YAML a second time, so that a string such as
-# ``{seed: 0}`` becomes a mapping, which it cannot send. A plain string in YAML is preserved. It
-# needs no quotes. Its only separators are single spaces, so that ``, `` separates the fields.
+# ``ros2 param load`` parses each value of a file as YAML a second time. A string such as ``{seed:
+# 0}`` then becomes a mapping, which it cannot send, but a string that is plain in YAML is
+# preserved. Such a string needs no quotes, and its only separators are single spaces, so ``, ``
+# can separate the fields.
 _WORDS = re.compile(r'[A-Za-z][\w.+-]*( [\w.+-]+)*', re.ASCII)
 # Values of JSON that look like words.
 _CONSTANTS = {'null', 'true', 'false', 'NaN', 'Infinity'}
@@ -312,14 +275,14 @@ _NOTE = 'note='
 
 
 def encode(fields: Mapping[str, Any]) -> str:
-    """Return fields as ``name=value, name=value``; a value is plain words or JSON."""
+    """Return fields as ``name=value, name=value``, where a value is plain words or JSON."""
     return ', '.join(
         f'{name}={value if _is_bare(value) else _to_json(value)}'
         for name, value in fields.items())
 
 
 def decode(text: str) -> dict[str, Any]:
-    """Return the fields of a text that `encode` returned, or raise ValueError."""
+    """Return the fields of a text from `encode`, or raise ValueError."""
     pairs = [part.partition('=') for part in text.split(', ')]
     if not all(name and separator for name, separator, _ in pairs):
         raise ValueError(f'{text!r}, expected name=value, name=value')
@@ -327,16 +290,16 @@ def decode(text: str) -> dict[str, Any]:
 
 
 def to_parameter(text: str) -> str:
-    """Return any text as a string that YAML parses as the same string."""
+    """Return a text in a form that YAML parses as the same string."""
     if not text or _parse_yaml(text) == text and not text.startswith(_NOTE):
         return text
     return _NOTE + _to_json(text)
 
 
 def from_parameter(text: str) -> str:
-    """Return the text for which `to_parameter` returned a string.
+    """Return the text behind a string from `to_parameter`.
 
-    The mapping in YAML that versions up to 0.1.0 wrote becomes the text of `encode`.
+    Mappings written by versions up to 0.1.0 are converted to the text of `encode`.
     """
     legacy = _parse_yaml(text) if text.startswith('{') else None
     if isinstance(legacy, dict):

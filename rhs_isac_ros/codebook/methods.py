@@ -1,8 +1,8 @@
 """Optimisation methods: each minimises a `Search` and returns the reason for stopping.
 
-The default is L-BFGS-B, on samples of the pairs if there are many, and followed by exchanges if
-the elements have a few amplitudes. The paper and its references describe the alternating, direct
-and genetic methods.
+The default is L-BFGS-B. It uses samples of the pairs if there are many, and ends with exchanges of
+amplitudes if the elements have a few levels. The alternating, direct and genetic methods are
+described in the paper and its references.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import OptimizeResult
 
-# Number of corrections that approximate the Hessian. Evaluations are expensive, so more
-# corrections than SciPy's default of 10 pay off.
+# Number of corrections that approximate the Hessian: more than SciPy's default of 10, because
+# evaluations are expensive.
 _MEMORY = 30
 
 
@@ -40,18 +40,18 @@ def run_lbfgs(
         on_step: Callable[[], None], memory: int = _MEMORY) -> OptimizeResult:
     """Minimise a function that returns its value and gradient, with SciPy's L-BFGS-B.
 
-    The result does not depend on the unit of the function, whose value is positive. L-BFGS-B calls
-    `on_step` after each step.
+    The result does not depend on the unit of the positive values. `on_step` is called after each
+    step.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import minimize
 
-    # SciPy multiplies the corrections with a BLAS of its own.
+    # SciPy multiplies the corrections with a BLAS library of its own.
     one_blas_thread.find_libraries()
     unit = 0.0
 
     def relative(variables: np.ndarray) -> tuple[float, np.ndarray]:
-        """Divide by the value at the start: SciPy's tolerances are for values of about 1."""
+        """Divide by the first value, because SciPy's tolerances assume values of about 1."""
         nonlocal unit
         value, gradient = objective(variables)
         unit = unit or value or 1.0
@@ -66,12 +66,12 @@ def run_lbfgs(
     return result
 
 
-# Objectives with fewer pairs are evaluated with all of them.
+# Objectives with fewer pairs are evaluated with all pairs.
 FEWEST_PAIRS = 4096
-# Pairs and steps of each round; the last one is repeated. The first steps change the codebook, and
-# with it the pairs that matter, more than later ones, which need a more accurate objective.
+# Pairs and steps of each round; the last round is repeated. The first steps change the codebook,
+# and with it the important pairs, the most. Later steps need a more accurate objective.
 _ROUNDS = (2048, 200), (4096, 600)
-# Corrections that approximate the Hessian: an evaluation takes little longer than their products.
+# Number of corrections: an evaluation takes little longer than the products with them.
 _SAMPLED_MEMORY = 100
 # Scale of the combining vectors, to which the objective is more sensitive than to configurations.
 _DIGITAL_SCALE = 0.3
@@ -80,9 +80,9 @@ _DIGITAL_SCALE = 0.3
 def minimize_sampled(search: Search) -> str:
     """Minimise with L-BFGS-B on samples of the pairs; return the reason for stopping.
 
-    Each round draws a sample for the codebook of the previous round, see
-    `PairwiseErrorCost.sample`, and evaluates its result with all pairs. The search ends with its
-    steps, or with a round that does not lower the objective.
+    Each round draws a sample for the codebook of the previous round (`PairwiseErrorCost.sample`)
+    and evaluates the result with all pairs. The search ends when no steps are left, or when a
+    round does not lower the objective.
     """
     variables, left = search.start, search.max_steps
     value = search.value_m2
@@ -99,7 +99,7 @@ def minimize_sampled(search: Search) -> str:
 
 
 def _round(search: Search, start: np.ndarray, n_pairs: int, steps: int) -> tuple[int, np.ndarray]:
-    """Minimise on one sample; return the number of steps and the point."""
+    """Minimise the objective on one sample; return the number of steps and the best point."""
     scale = np.ones(len(start))
     scale[search.n_analog:] = _DIGITAL_SCALE
     sample = search.sample(start, n_pairs)
@@ -114,7 +114,7 @@ def _round(search: Search, start: np.ndarray, n_pairs: int, steps: int) -> tuple
 
     def on_step() -> None:
         nonlocal done
-        # The last step of the round is recorded with the value of all pairs.
+        # The last step of the round is recorded with the value for all pairs.
         if done:
             search.on_step()
         done += 1
@@ -122,7 +122,7 @@ def _round(search: Search, start: np.ndarray, n_pairs: int, steps: int) -> tuple
     try:
         run_lbfgs(objective, start / scale, search.bounds, steps, on_step, _SAMPLED_MEMORY)
     finally:
-        # Also after Ctrl-C, and when the sample has used the evaluations but one.
+        # Also after Ctrl-C, and if the sample has used all evaluations but one.
         if done:
             search.value(point)
             search.on_step()
@@ -131,11 +131,11 @@ def _round(search: Search, start: np.ndarray, n_pairs: int, steps: int) -> tuple
 
 # Weights of the penalty in its rounds, relative to the objective.
 _WEIGHTS = (0.1, 0.3, 1.0, 3.0, 10.0)
-# Shares of the steps for the relaxation and for the penalty; the exchange takes the rest.
+# Shares of the steps for the relaxation and for the penalty; the rest is for the exchange.
 _RELAXED, _PENALISED = 0.4, 0.3
 # Steps on the combining vectors after each sweep.
 _DIGITAL_STEPS = 20
-# A sweep ends after as many exchanges in a row that do not lower the objective.
+# Number of successive exchanges without a lower objective after which a sweep ends.
 _MAX_FAILURES = 64
 
 
@@ -143,15 +143,15 @@ def minimize_levels(search: Search) -> str:
     """Minimise over levels of the amplitudes, and return the reason for stopping.
 
     The first of three phases treats amplitudes as continuous. The second adds the penalty
-    sin^2(pi (L - 1) c), which is zero at the L levels, with growing weight: the amplitudes reach
-    the levels while the others and the combining vectors adapt. The third exchanges single
-    amplitudes for neighbouring levels, in the order of the gradient, as long as that lowers the
-    objective. L-BFGS-B minimises over continuous variables.
+    sin^2(pi (L - 1) c), which is zero at the L levels, with growing weight: amplitudes move to the
+    levels while all other variables adapt. The third exchanges single amplitudes for neighbouring
+    levels, in the order of the gradient, as long as this lowers the objective. L-BFGS-B minimises
+    over continuous variables.
     """
     share = _PENALISED / len(_WEIGHTS)
     variables, left = search.start, search.max_steps
     for weight, part in ((0.0, _RELAXED), *((weight, share) for weight in _WEIGHTS)):
-        # At least one step in each round, unless none is left.
+        # Each round has at least one step if any are left.
         steps = min(max(int(part * search.max_steps), 1), left)
         if steps:
             variables = _penalised(search, variables, weight, steps)
@@ -160,7 +160,7 @@ def minimize_levels(search: Search) -> str:
 
 
 def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int) -> np.ndarray:
-    """Minimise the relaxed objective plus a penalty, and evaluate the rounded result."""
+    """Minimise over continuous amplitudes with a penalty, and evaluate the rounded result."""
     scale = weight * search.relaxed_value_and_gradient(start)[0] / search.n_analog
     frequency = np.pi * _top_level(search)
 
@@ -176,7 +176,7 @@ def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int)
 
 
 def _exchange(search: Search, variables: np.ndarray, max_steps: int) -> str:
-    """Exchange single amplitudes until none lowers the objective; return why it stopped."""
+    """Exchange single amplitudes until none lowers the objective; return why this stopped."""
     levels = _top_level(search)
     variables = np.array(variables)
     variables[:search.n_analog] = np.rint(variables[:search.n_analog] * levels) / levels
@@ -197,14 +197,14 @@ def _sweep(search: Search, variables: np.ndarray, max_exchanges: int
            ) -> tuple[np.ndarray, int, int, int]:
     """Exchange amplitudes in the order of the expected decrease.
 
-    Returns the variables, and the numbers of exchanges, of failures since the last one, and of
-    amplitudes with a level in the direction of descent.
+    Returns the variables, and the numbers of exchanges, of failures since the last exchange, and
+    of amplitudes with a level in the direction of descent.
     """
     levels = _top_level(search)
     value, gradient = search.value_and_gradient(variables)
     by_analog = gradient[:search.n_analog]
     target = variables[:search.n_analog] - np.sign(by_analog) / levels
-    # A level outside of [0, 1] does not exist.
+        # There is no level outside of [0, 1].
     allowed = np.flatnonzero((target > -0.5 / levels) & (target < 1 + 0.5 / levels))
     exchanged = failures = 0
     for entry in allowed[np.argsort(-np.abs(by_analog[allowed]))]:
@@ -248,13 +248,13 @@ def minimize_interior_point(
     """Minimise over the free variables: barrier, trust region, conjugate gradients, BFGS Hessian.
 
     SciPy's `trust-constr` is the algorithm of Byrd, Hribar and Nocedal that the paper cites.
-    Takes all variables, float64 [n], and the mask of those to change, bool [n]. Returns the best
-    point evaluated, `start` included, float64 [n].
+    `start`, float64 [n], contains all variables; `free`, bool [n], marks those to change. Returns
+    the best point evaluated, including `start`, float64 [n].
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import BFGS, Bounds, minimize
 
-    # SciPy multiplies the Hessian matrix with a BLAS of its own.
+    # SciPy multiplies the Hessian matrix with a BLAS library of its own.
     one_blas_thread.find_libraries()
     best = search.value_and_gradient(start)[0], np.array(start)
     scale = best[0]
@@ -271,7 +271,7 @@ def minimize_interior_point(
     steps = evaluations = 0
 
     def on_iteration(_: np.ndarray, state: OptimizeResult) -> bool:
-        """Count the iterations that moved; SciPy also reports the start and each new barrier."""
+        """Count iterations that moved; SciPy also reports the start and each new barrier."""
         nonlocal steps, evaluations
         if steps < max_steps and state.nfev > max(evaluations, 1):
             steps, evaluations = steps + 1, state.nfev
@@ -282,7 +282,7 @@ def minimize_interior_point(
     bounded = not np.isnan(low).all()
     bounds = Bounds(np.nan_to_num(low, nan=-np.inf), np.nan_to_num(high, nan=np.inf))
     with warnings.catch_warnings():
-        # SciPy warns whenever a step leaves the gradient, and so the Hessian, unchanged.
+        # SciPy warns whenever a step does not change the gradient, and hence the Hessian.
         warnings.filterwarnings('ignore', 'delta_grad == 0.0', UserWarning)
         minimize(
             objective, start[free], jac=True, hess=BFGS(), method='trust-constr',
@@ -326,14 +326,14 @@ def minimize_direct(search: Search) -> str:
     return f'{search.max_steps} steps at most'
 
 
-# The default of the implementation that the paper uses, for more than five variables.
+# Default of the implementation in the paper, for more than five variables.
 _POPULATION = 200
 
 
 def minimize_genetic(search: Search) -> str:
     """Minimise with pymoo's genetic algorithm, one step a generation.
 
-    Only the direction of a combining vector matters, so its unscaled parts are searched in
+    Only the direction of a combining vector matters, so its unscaled parts are searched within
     [-1, 1]. The first generation contains the start. Raise MissingLibraryError without pymoo.
     """
     with optional_import("method 'genetic'", extra='genetic'):

@@ -1,9 +1,9 @@
 """Objectives of the codebook optimisation, and the samples of the region that they average over.
 
-An objective takes a scenario, sampled positions, float64 [N_sam, 3] [m], and a generator, and
-raises ValueError if the positions are not a finite [N, 3] array with at least one row. It calls
-`tick` repeatedly while it computes the parts that do not depend on the codebook; an exception of
-`tick` ends the computation.
+The arguments of an objective are a scenario, sampled positions, float64 [N_sam, 3] [m], a
+generator and `tick`. It raises ValueError unless the positions are a finite [N, 3] array with at
+least one row. It calls `tick` repeatedly during computations that do not depend on the codebook;
+an exception of `tick` ends them.
 """
 
 import dataclasses
@@ -19,13 +19,13 @@ from rhs_isac_ros.model.geometry import element_interval_m
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 
-# Relative error of an objective's rows. The error of its value is then below 0.1 %, far less than
-# the sampling error, and the gradient is exact for that value.
+# Relative error of the rows of an objective. The error of its value is then below 0.1 %, far less
+# than the sampling error, and the gradient is exact for this value.
 ROW_TOLERANCE = 3e-5
-# Confusable positions for each sampled position: many, because a few close pairs dominate the
-# mean.
+# Number of confusable positions for each sampled position: large, because a few close pairs
+# dominate the mean.
 _PAIRS_PER_POSITION = 128
-# Power of the volumes as weights of pairs. With 1, few pairs that are unlikely to be drawn would
+# Exponent of the volumes in the weights of pairs. With 1, a few pairs that are rarely drawn would
 # have most of the weight.
 _VOLUME_POWER = 0.6
 
@@ -42,10 +42,10 @@ def nuisance(
         tick: Tick = no_tick) -> Average:
     """Objective [m^2]: average bound with unknown phases of the bands and the region as prior.
 
-    A phase is unknown in effect even where the signals carry it, because the same phase occurs in
-    each wavelength of range. Without the information of the region, positions that the signals do
-    not determine otherwise would dominate the average. The scenario may declare further nuisance
-    parameters. `rng` is unused.
+    Even a known phase would determine the range only up to whole wavelengths, so phases are
+    treated as unknown. The region as prior keeps positions that the signals do not determine
+    from dominating the average. The scenario may declare further nuisance parameters. `rng` is
+    unused.
     """
     uniform = dataclasses.replace(
         scenario, band_phase_std_rad=max(scenario.band_phase_std_rad, 2 * np.pi))
@@ -68,8 +68,8 @@ def error(
     """Objective [m^2]: the cost of `ambiguity`, with weights close to those of the squared error.
 
     Pairs extend farther across the line of sight, up to the far side lobes. Their weights grow
-    with the volume that each represents, see `confusable_volumes`: with the volumes themselves,
-    the cost would be proportional to the union bound on the mean squared error.
+    with the volumes that they represent (`confusable_volumes`). With the volumes themselves as
+    weights, the cost would be proportional to the union bound on the mean squared error.
     """
     first_positions = np.repeat(checked_positions(positions), _PAIRS_PER_POSITION, axis=0)
     second_positions = draw_confusable(scenario, first_positions, rng, WIDE)
@@ -93,7 +93,7 @@ def monte_carlo(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndar
 def sobol(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
     """Draw scrambled Sobol points, which are more evenly spread, float64 [n, 3] [m].
 
-    A power of two for `n` gives the most even spread.
+    They are most even if `n` is a power of two.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.stats import qmc
@@ -108,12 +108,12 @@ SAMPLINGS: Mapping[str, Callable[[Scenario, int, np.random.Generator], np.ndarra
 
 # Grid points of the range lag per shortest carrier wavelength.
 _LAGS_PER_WAVELENGTH = 64
-# Ranges of the scale of transverse displacements, in widths of the narrowest beam: up to the first
+# Limits of the scale of transverse displacements, in widths of the narrowest beam: up to the first
 # side lobes, and beyond.
 NEAR, WIDE = (0.03, 0.3), (0.03, 0.6)
-# Fraction of the pairs that differ in direction only.
+# Share of pairs that differ only in direction.
 _ZERO_LAG_FRACTION = 0.3
-# Lags in radians, and squared displacements in beam widths, that are zero but for rounding.
+# Limit of rounding errors of lags in radians, and of squared displacements in beam widths.
 _ROUNDING = 1e-7
 # Number of attempts to draw a position inside the region.
 _MAX_DRAWS = 200
@@ -122,14 +122,14 @@ _MAX_DRAWS = 200
 def draw_confusable(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
         scales: tuple[float, float] = NEAR) -> np.ndarray:
-    """Draw for each position another one in the region of interest that has similar signals.
+    """For each position, float64 [N, 3] [m], draw another one in the region with similar signals.
 
     Two positions are hard to distinguish if their ranges differ by about a whole number of
-    wavelengths in every band, so range lags are drawn with a density proportional to
-    exp(-sum_i (1 - cos 2 pi f_i lag / v_0)). For a fraction of the positions the lag is 0: these
-    pairs differ in direction only. Across the line of sight, the displacement ranges from well
-    below the beam width up to the side lobes. Positions are float64 [N, 3] [m]; `scales` are the
-    limits of the log-uniform scale of this displacement, in widths of the narrowest beam.
+    wavelengths in every band. Range lags are therefore drawn with a density proportional to
+    exp(-sum_i (1 - cos 2 pi f_i lag / v_0)). For a part of the positions, the lag is 0: these
+    pairs differ only in direction. Across the line of sight, displacements range from well below
+    the beam width up to the side lobes. `scales` are the limits of the log-uniform scale of this
+    displacement, in widths of the narrowest beam.
     """
     low, high = scenario.roi_bounds_m
     lags, density = _lag_density(scenario)
@@ -141,7 +141,7 @@ def draw_confusable(
     for _ in range(_MAX_DRAWS):
         lag = np.interp(rng.uniform(size=len(pending)), cumulative, lags) * lagging[pending]
         moved = _displaced(scenario, positions[pending], lag, rng, scales)
-        # Clipping covers regions so thin, compared with a beam, that no draw is inside.
+        # Clipping is for regions so thin, compared with a beam, that no draw is inside.
         others[pending] = np.clip(moved, low, high)
         pending = pending[~((moved >= low) & (moved <= high)).all(axis=1)]
     return others
@@ -152,12 +152,12 @@ def confusable_volumes(
         scales: tuple[float, float]) -> np.ndarray:
     """Compute the volumes that positions from `draw_confusable` represent, float64 [N].
 
-    They are the reciprocal densities of the draws, so that weighted sums over the draws are
-    integrals over the region. The unit is proportional to the volume that the posterior of the
-    true position occupies: with signals whose amplitude is inversely proportional to the range
-    r, it grows as r^5.
+    The volumes are reciprocal densities of the draws, so that weighted sums over the draws are
+    integrals over the region. Their unit is proportional to the volume of the posterior of the
+    true position: if the amplitude of the signals is inversely proportional to the range r, this
+    volume grows as r^5.
     """
-    # Lags of zero stand for those below the phase of a radian.
+    # Lags of zero represent all lags below a phase of one radian.
     shortest = SPEED_OF_LIGHT_MPS / (2 * np.pi * max(scenario.center_frequencies_hz))
     ranges, other_ranges = (
         np.maximum(np.linalg.norm(points, axis=1), shortest) for points in (positions, others))
@@ -188,7 +188,7 @@ def _displaced(scenario: Scenario, positions: np.ndarray, lags: np.ndarray,
     transverse -= sight * np.sum(transverse * sight, axis=1, keepdims=True)
     lags = lags * rng.choice([-1, 1], size=n)
     moved = positions + free * transverse
-    # Coordinates without extent stay as they are, and the others determine the range.
+    # Coordinates without extent remain unchanged, and the others determine the range.
     wanted = ranges[:, 0] + lags
     within = np.sqrt(np.maximum(wanted**2 - np.sum(moved[:, ~free]**2, axis=1), 0))
     within = np.copysign(within, wanted) / np.linalg.norm(moved[:, free], axis=1)

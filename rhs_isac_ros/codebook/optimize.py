@@ -28,7 +28,7 @@ from rhs_isac_ros.model.surface import on_levels
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.threads import one_blas_thread
 
-# Sobol points; as good as 1200 independent positions.
+# Number of Sobol points; they are as good as 1200 independent positions.
 DEFAULT_POSITIONS = 256
 # Reason for stopping after Ctrl-C.
 INTERRUPTED = 'interrupted'
@@ -37,8 +37,8 @@ INTERRUPTED = 'interrupted'
 class Method(NamedTuple):
     """An optimisation method with its default limit on update steps.
 
-    `minimize` takes a `Search` and returns the reason for stopping. It is None for a method whose
-    result is its start.
+    `minimize` takes a `Search` and returns the reason for stopping. A method whose result is its
+    start has None instead.
     """
 
     minimize: Callable[[Search], str] | None
@@ -57,21 +57,11 @@ METHODS: Mapping[str, Method] = {
 
 @dataclasses.dataclass(frozen=True)
 class OptimizeResult:
-    """Result of an optimisation.
+    """Result of an optimisation."""
 
-    Attributes
-    ----------
-    codebook
-        The best codebook evaluated; its `average_crlb_m2` is over the sampled positions.
-    history
-        Progress after each step; step 0 is the start.
-    reason
-        Why the search stopped.
-    """
-
-    codebook: Codebook
-    history: tuple[Progress, ...]
-    reason: str
+    codebook: Codebook  #: The best evaluated; `average_crlb_m2` is for the sampled positions.
+    history: tuple[Progress, ...]  #: Progress after each step; step 0 is the start.
+    reason: str  #: The reason for stopping.
 
 
 @one_blas_thread
@@ -84,26 +74,28 @@ def optimize(
         keep: Callable[[OptimizeResult], None] | None = None) -> OptimizeResult:
     """Find a codebook that minimises an objective.
 
-    If the scenario has ``amplitude_levels``, configurations are optimised over these levels: by
-    `minimize_levels` for the method ``lbfgs``, and by ``genetic``.
-
-    On KeyboardInterrupt, the search ends and the best codebook so far is returned.
+    If the scenario has ``amplitude_levels``, configurations are optimised over these levels, by
+    `minimize_levels` for the method ``lbfgs`` and by ``genetic``. After a KeyboardInterrupt, the
+    best codebook so far is returned. Raises ValueError if a name is unknown, a number or the
+    positions are out of range, `resume` was made with other arguments, the calibration belongs to
+    another scenario, or the signals do not determine the positions; MissingLibraryError if the
+    method needs a library that is not installed; and CodebookError if `start` does not fit the
+    scenario.
 
     Parameters
     ----------
     positions
-        Samples of the user's position, float64 [N_sam, 3] [m]; by default drawn by `sampling`.
+        Samples of the user's position, float64 [N_sam, 3] [m]; by default `n_positions` drawn by
+        `sampling`.
     method
         One of `METHODS`.
     objective
-        One of `OBJECTIVES`: ``crlb``, the average bound; ``ambiguity``, which penalises
-        confusion between distant positions, which a local bound ignores; ``error``, the same with
-        weights close to those of the mean squared error; or ``nuisance``, the bound with unknown
-        phases of the bands and the region as prior.
+        One of `OBJECTIVES`: ``crlb``, the average bound; ``ambiguity``, the confusion of distant
+        positions, which a local bound ignores; ``error``, the same with weights close to those of
+        the mean squared error; or ``nuisance``, the bound with unknown phases of the bands and the
+        region as prior.
     sampling
         One of `SAMPLINGS`: ``sobol``, or ``monte_carlo`` as in the paper.
-    n_positions
-        Number of samples if `positions` is not given.
     seed
         Seed of the samples, the start and the method.
     start
@@ -112,28 +104,17 @@ def optimize(
         Result of an earlier call with the same arguments, to continue from; its steps and
         evaluations count towards the limits.
     calibration
-        Calibration of the surface, taken as exact; by default the surface is that of the
-        scenario.
+        Calibration of the surface, treated as exact; by default the scenario's surface.
     max_steps
-        Maximum number of update steps; by default that of the method.
+        Maximum number of update steps; the default depends on the method.
     max_evaluations
         Maximum number of evaluations of the objective; by default unlimited.
     progress
-        Called after each step, and once a second while the objective is set up, with an infinite
-        value. An exception ends the optimisation; on KeyboardInterrupt, the start is returned.
+        Called after each step, and once a second while the objective is set up, then with an
+        infinite value. An exception ends the optimisation; KeyboardInterrupt during the set-up
+        returns the start.
     keep
         Called at most every ten seconds with the result so far.
-
-    Raises
-    ------
-    ValueError
-        If a name is unknown, a number or the positions are out of range, `resume` was made with
-        other arguments, the calibration belongs to another scenario, or the signals do not
-        determine the positions.
-    MissingLibraryError
-        If the method needs a library that is not installed.
-    CodebookError
-        If `start` does not fit the scenario.
     """
     for name, value, known in (('method', method, METHODS), ('objective', objective, OBJECTIVES),
                                ('sampling', sampling, SAMPLINGS)):
@@ -206,14 +187,13 @@ def optimize(
 def check_start(codebook: Codebook, scenario: Scenario) -> None:
     """Raise CodebookError if a search for a scenario cannot start from a codebook.
 
-    Its amplitudes may be continuous even if the amplitudes of the scenario are not: a search over
-    levels begins with continuous ones.
+    Amplitudes may be continuous, because a search over levels also begins with such amplitudes.
     """
     codebook.check(dataclasses.replace(scenario, amplitude_levels=0))
 
 
 def _minimizer(problem: Problem, method: str) -> Callable[[Search], str]:
-    """Return the function of a method, or raise ValueError if it needs continuous amplitudes."""
+    """Return the function of a method; raise ValueError if it needs continuous amplitudes."""
     levels = problem.scenario.amplitude_levels
     if levels and method == 'lbfgs':
         return minimize_levels
@@ -228,7 +208,7 @@ def _minimizer(problem: Problem, method: str) -> Callable[[Search], str]:
 
 
 def _determined(value_m2: float) -> float:
-    """Return the objective at the start, or raise ValueError if it is not finite."""
+    """Return the objective at the start; raise ValueError if it is not finite."""
     if not np.isfinite(value_m2):
         raise ValueError(
             f'positions: objective {value_m2} at the start, expected a finite one: the signals '
@@ -250,7 +230,7 @@ def _run(search: Search, minimize: Callable[[Search], str]) -> str:
 
 
 class _Report:
-    """Progress callback that is also called during the set-up, and calls `keep` periodically."""
+    """Progress callback that also works during the set-up, and calls `keep` periodically."""
 
     _TICK_S, _KEEP_S = 1.0, 10.0
 
@@ -268,7 +248,7 @@ class _Report:
             self.keep()
 
     def tick(self) -> None:
-        """Report the time since the beginning, at most once a second."""
+        """Report the elapsed time, at most once a second."""
         elapsed_s = time.perf_counter() - self._begin
         if not (self._is_searching or elapsed_s < self._before.elapsed_s + self._TICK_S):
             self._before = dataclasses.replace(self._before, elapsed_s=elapsed_s)

@@ -21,10 +21,10 @@ from rhs_isac_ros.support.pictures import (
     paper_style,
 )
 
-# Points of the map of the bound along each axis, and of a beam over azimuth.
+# Number of points along each axis of the map of the bound, and of azimuths of a beam.
 _N_MAP_POINTS = 60
 _N_AZIMUTHS = 361
-# Panels of beams side by side.
+# Number of panels of beams side by side.
 _N_COLUMNS = 3
 
 
@@ -33,7 +33,7 @@ def plot_optimization(
         scenario: Scenario, codebook: Codebook, history: Sequence[Progress]) -> Any:
     """Plot convergence, the bound over the region of interest, and the beam patterns.
 
-    Returns a `matplotlib.figure.Figure`; errors are those of `paper_style`.
+    Returns a `matplotlib.figure.Figure`; raises the errors of `paper_style`.
     """
     rows = -(-scenario.n_bands // _N_COLUMNS)
     figure = new_figure(PAGE_IN, 2.7 + 2.3 * rows)
@@ -59,7 +59,7 @@ def beam_powers(
     """Return azimuths, float64 [n] [rad], and the received powers, float64 [F, n] [W].
 
     The user is at the height and distance of the centre of the region of interest, and receives
-    the middle sub-band of a band.
+    the middle sub-band of the band.
     """
     azimuths = np.linspace(-np.pi / 2, np.pi / 2, _N_AZIMUTHS)
     x, y, z = scenario.roi_center_m

@@ -16,9 +16,9 @@ from rhs_isac_ros.model.surface import on_levels
 class Problem:
     """Implements Eq. (16). Problem P1: average bound, fixed power, configurations in [0, 1].
 
-    Solvers work on one real vector: the configurations, followed by the real and the imaginary
-    parts of unscaled combining vectors. Scaling these to P_max eliminates the power constraint;
-    the solver enforces the bounds of the configurations.
+    Solvers operate on one real vector: the configurations, then the real and the imaginary parts
+    of unscaled combining vectors. Scaling these to P_max eliminates the power constraint; solvers
+    observe the bounds of the configurations.
     """
 
     def __init__(self, scenario: Scenario, objective: Average) -> None:
@@ -42,9 +42,9 @@ class Problem:
             [codebook.analog.ravel(), digital.real.ravel(), digital.imag.ravel()])
 
     def unpack(self, variables: np.ndarray, *, relaxed: bool = False) -> Codebook:
-        """Return the codebook of variables from `pack`; it satisfies all constraints.
+        """Return the codebook for variables from `pack`; it satisfies all constraints.
 
-        Unless relaxed, configurations are rounded to the amplitudes that the elements can take.
+        Unless `relaxed`, configurations are rounded to the amplitudes that elements can take.
         """
         analog, raw, norm = self._split(variables)
         if not relaxed:
@@ -53,18 +53,18 @@ class Problem:
 
     @property
     def n_pairs(self) -> int:
-        """Number of pairs of the objective that samples are drawn from; 0 if it has no pairs."""
+        """Number of pairs in the objective; 0 if it does not consist of pairs."""
         cost = self.objective
         return cost.rows.n_items if isinstance(cost, PairwiseErrorCost) else 0
 
     def sample(self, variables: np.ndarray, n_pairs: int, rng: np.random.Generator) -> 'Problem':
-        """Return the problem with a sample of the `n_pairs`, see `PairwiseErrorCost.sample`."""
+        """Return the problem with a sample of the pairs; see `PairwiseErrorCost.sample`."""
         cost = self.objective
         assert isinstance(cost, PairwiseErrorCost)
         return Problem(self.scenario, cost.sample(self.unpack(variables), n_pairs, rng))
 
     def value(self, variables: np.ndarray) -> float:
-        """Return the objective [m^2] for variables as `pack` returns them."""
+        """Return the objective [m^2] for variables from `pack`."""
         return self.objective.value(self.unpack(variables))
 
     def value_and_gradient(
@@ -72,7 +72,7 @@ class Problem:
         """Return the objective [m^2] of `unpack` and its gradient, shaped like `variables`."""
         _, raw, norm = self._split(variables)
         value, by_analog, by_digital = self.objective(self.unpack(variables, relaxed=relaxed))
-        # d(raw / norm) has no component along raw.
+        # The norm removes the component along raw.
         radial = np.sum((np.conj(raw) * by_digital).real, axis=(1, 3), keepdims=True)
         by_raw = np.sqrt(self.scenario.max_power_w) / norm * (by_digital - raw * radial / norm**2)
         return value, np.concatenate(
@@ -98,27 +98,16 @@ class Progress:
 
 
 class BudgetSpent(Exception):
-    """No evaluation is left; methods let this exception propagate."""
+    """No evaluation is left; methods must not catch this exception."""
 
 
 class Search:
-    """Objective that a method minimises; counts evaluations and keeps the best point.
+    """The objective that a method minimises; counts evaluations and keeps the best point.
 
-    Each method defines what an update step is. `done` are the steps and evaluations of the search
-    that this one resumes, which count towards the limits.
-
-    Attributes
-    ----------
-    start
-        First point, float64 [n].
-    max_steps
-        Update steps that remain.
-    value_m2
-        Lowest objective evaluated [m^2].
-    best
-        Point with that objective, float64 [n].
-    history
-        Progress after each step, beginning with the start.
+    Each method defines its own update steps. `done` are the steps and evaluations of the search
+    that is resumed, which count towards the limits. `start`, float64 [n], is the first point;
+    `max_steps` is the number of steps that remain; `best` is the point with the lowest objective,
+    `value_m2`; and `history` is the progress after each step, beginning with the start.
     """
 
     def __init__(
@@ -138,7 +127,7 @@ class Search:
     def begin(self) -> float:
         """Evaluate the start [m^2] and record it as the first entry of the history.
 
-        An evaluation of the same point by an earlier search is not counted again.
+        If an earlier search has evaluated the same point, it does not count again.
         """
         if self._evaluations:
             self._evaluations -= 1
@@ -160,7 +149,7 @@ class Search:
 
     def value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
         """Evaluate the objective [m^2] and its gradient, float64 [n], or raise BudgetSpent."""
-        # A method begins by evaluating the point at which the previous one ended.
+        # A method begins at the point at which the previous one ended.
         if self._last is None or not np.array_equal(self._last[0], variables):
             self._count()
             value, gradient = self.problem.value_and_gradient(variables)
@@ -169,7 +158,7 @@ class Search:
         return self._last[1:]
 
     def relaxed_value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
-        """Evaluate as if amplitudes were continuous; the point does not become the best one."""
+        """Evaluate with continuous amplitudes; the point does not become the best one."""
         self._count()
         return self.problem.value_and_gradient(variables, relaxed=True)
 
@@ -178,8 +167,8 @@ class Search:
     ) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
         """Return an estimate of `value_and_gradient` from a sample of the pairs at a point.
 
-        It also raises BudgetSpent if no evaluation would be left for its result. Its points do
-        not become the best one.
+        The points evaluated do not become the best one. The estimate also raises BudgetSpent if no
+        evaluation would be left for the final point.
         """
         problem = self.problem.sample(variables, n_pairs, self.rng)
 

@@ -1,9 +1,9 @@
 """Codebooks without optimisation: random ones, and focused beams that scan the region of interest.
 
-Both are benchmarks of the paper and starts of its optimisation. The paper leaves open where the
-beams are focused. `SCANS` contains three readings, functions that return focal points, float64
-[F, N_B, 3] [m]. Frames of the first two alternate between points below and above mid-height:
-beams that were all symmetric in height could not distinguish up from down.
+Both are benchmarks of the paper and starts of its optimisation. The paper does not specify the
+focal points. `SCANS` contains three interpretations, functions that return focal points, float64
+[F, N_B, 3] [m]. The frames of the first two alternate between points below and above mid-height,
+because beams that are all symmetric in height could not distinguish up from down.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,9 +35,9 @@ def directional_codebook(
     """Focus each of the N_B F frames on a point of a scan: the paper's `Directional`.
 
     The configuration follows the holographic principle. The weights of each sub-band are the
-    matched filter of the resulting feed signals, with equal power in all sub-bands. The codebook
-    is deterministic; `rng` is unused. `scan` is one of `SCANS`. Raise ValueError if it is unknown,
-    or a gain pattern of the scenario is zero at a focal point.
+    matched filter of the resulting feed signals, with equal power in all sub-bands. `rng` is
+    unused, as the codebook is deterministic. `scan` is one of `SCANS`. Raise ValueError if it is
+    unknown, or a gain pattern of the scenario is zero at a focal point.
     """
     if scan not in SCANS:
         raise ValueError(f'scan: {scan!r}, expected one of {sorted(SCANS)}')
@@ -76,8 +76,8 @@ def width_points_per_band(scenario: Scenario) -> np.ndarray:
 def grid_points(scenario: Scenario) -> np.ndarray:
     """Return a grid of F points across width and height, the same in each band.
 
-    The number of rows is the largest divisor of F up to its root: four frames make a grid of
-    2 x 2 points.
+    The number of rows is the largest divisor of F up to its square root: four frames make a grid
+    of 2 x 2 points.
     """
     n_frames = scenario.n_frames
     rows = max(n for n in range(1, n_frames + 1) if n_frames % n == 0 and n * n <= n_frames)
@@ -91,7 +91,7 @@ SCANS: Mapping[str, Callable[[Scenario], np.ndarray]] = {
 
 
 def _points(scenario: Scenario, across: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Place points at fractions of width and height that broadcast to [F, N_B], at mid-depth."""
+    """Place points at fractions of width and height, which broadcast to [F, N_B], at mid-depth."""
     low, high = scenario.roi_bounds_m
     points = np.tile((low + high) / 2, (scenario.n_frames, scenario.n_bands, 1))
     points[..., 1] = low[1] + (high[1] - low[1]) * across

@@ -1,8 +1,8 @@
-"""Measure accuracy, bounds and capacity over every combination of values of scenario fields.
+"""Measure accuracy, bounds and capacity over all combinations of values of scenario fields.
 
-The results are a CSV file with a row for each setting and measure, a picture, and a table on the
+The results are a CSV file with one row per setting and measure, a picture, and a table on the
 terminal. An interrupted sweep resumes when the command is repeated. Positions, signals and
-codebooks depend on the seed alone, and all settings with the same region use the same positions.
+codebooks depend only on the seed, and all settings with the same region use the same positions.
 """
 
 import argparse
@@ -45,7 +45,7 @@ from rhs_isac_ros.support.arguments import (
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.pictures import write_picture
 
-# The bootstrap holds 2000 weights of each position.
+# The bootstrap keeps 2000 weights of each position in memory.
 _MAX_POSITIONS = 10**5
 _MAX_SETTINGS = 10**4
 _Parsed = TypeVar('_Parsed')
@@ -132,7 +132,7 @@ def _check(parser: ArgumentParser, options: argparse.Namespace) -> None:
 
 def _check_names(settings: Sequence[Setting]) -> None:
     """Raise ValueError if an estimator is unknown, or a codebook is neither a kind nor a file."""
-    # A network would have to be trained for each codebook.
+    # `neural` is excluded, because its network would have to be trained for each codebook.
     estimators = {*REGION_ESTIMATORS, *plugins.names(plugins.ESTIMATORS)}
     for name, known in ((ESTIMATOR, estimators), (CODEBOOK, {*KINDS})):
         for value in sorted({getattr(setting, name) for setting in settings} - known):
@@ -157,7 +157,7 @@ def _run(sweep: Sweep, options: argparse.Namespace) -> None:
 
 
 def _report(axes: Sequence[Axis], points: Sequence[Point]) -> str:
-    """Return the points as a table: a row for each setting, a column for each measure."""
+    """Return the points as a table with a row per setting and a column per measure."""
     names = [axis.fields[0] for axis in axes]
     measures = list(dict.fromkeys(point.measure for point in points))
     rows: dict[tuple[str, ...], list[str]] = {}
@@ -174,7 +174,7 @@ class _Along(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
                  values: Any, option_string: str | None = None) -> None:
-        """Add the field."""
+        """Add the field of ``--with`` to the axis of the last ``--vary``."""
         if not getattr(namespace, 'vary', None):
             parser.error(f'argument {option_string}: expected after --vary')
         try:
@@ -184,7 +184,7 @@ class _Along(argparse.Action):
 
 
 def _type(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:
-    """Return a type for argparse from a function whose ValueErrors are for the user."""
+    """Convert a function that raises ValueError for invalid text to a type for argparse."""
     def parse_argument(text: str) -> _Parsed:
         try:
             return parse(text)

@@ -21,19 +21,16 @@ from rhs_isac_ros.support.arguments import integer, output_folder
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
-# Exit code that shells report after Ctrl-C.
-_INTERRUPTED = 130
-
 
 class JobError(Exception):
-    """A job failed; the message begins with its name."""
+    """A job failed; the message begins with the name of the job."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """A call of the function of an experiment with arguments that JSON can represent.
+    """A call of an experiment's function with arguments that JSON can represent.
 
-    `name` is the name of the result file without suffix, unique in its folder.
+    `name` is the name of the result file without its suffix, unique in its folder.
     """
 
     name: str
@@ -41,10 +38,7 @@ class Job:
 
 
 class JobResult(NamedTuple):
-    """Result of a job as JSON in `text`, or its error in `error`; the other is empty.
-
-    `version` is the version of this package in the process that ran the job.
-    """
+    """The result of a job as JSON in `text`, or its error; and the version that ran the job."""
 
     job: Job
     text: str = ''
@@ -53,10 +47,7 @@ class JobResult(NamedTuple):
 
 
 def attempt(function: Callable[..., Mapping[str, Any]], job: Job) -> JobResult:
-    """Run a job in the current process.
-
-    The result contains an exception as text, because not all exceptions can be pickled.
-    """
+    """Run a job in this process; an exception becomes text, because some cannot be pickled."""
     try:
         return JobResult(job, text=json.dumps(function(**job.arguments)))
     except MissingLibraryError as error:
@@ -66,11 +57,7 @@ def attempt(function: Callable[..., Mapping[str, Any]], job: Job) -> JobResult:
 
 
 def _stored(folder: Path, job: Job) -> dict[str, Any] | None:
-    """Return the result of a job from its file.
-
-    The result is None if there is no file, the file is damaged, or it was written for other
-    arguments or by another version of this package.
-    """
+    """Return the stored result of a job; None if it is missing, damaged or out of date."""
     try:
         record = json.loads(_file(folder, job).read_bytes())
     except (FileNotFoundError, ValueError):
@@ -100,20 +87,22 @@ def run_locally(
 ) -> Generator[JobResult, None, None]:
     """Run jobs in single-threaded processes on this machine; yield each result when it is ready.
 
-    There are `n_jobs` processes: -1 selects one per core; 1 runs all jobs in this process.
-    Closing the generator ends them. Before joblib 1.4, a result also waits for all earlier ones.
+    There are `n_jobs` processes: -1 means one per core; 1 runs all jobs in this process. Closing
+    the generator ends them. Before joblib 1.4, a result waits for all earlier ones.
     """
     with optional_import('running jobs', extra='experiments'):
         import joblib
 
+    release = tuple(int(part) for part in joblib.__version__.split('.')[:2])
     results, threads_before = None, set(threading.enumerate())
     try:
         with _interrupts_ignored(), joblib.parallel_config(
                 backend='loky', inner_max_num_threads=1):
             results = joblib.Parallel(
-                n_jobs=n_jobs, batch_size=1, return_as=_return_as(joblib.__version__))(
+                n_jobs=n_jobs, batch_size=1,
+                return_as='generator_unordered' if release >= (1, 4) else 'generator')(
                     joblib.delayed(attempt)(function, job) for job in jobs)
-        # `yield from` would close the generator outside the filter for warnings below.
+        # `yield from` would close the generator outside of the filter for warnings below.
         while result := next(results, None):
             yield result
     except BrokenExecutor as error:
@@ -121,11 +110,11 @@ def run_locally(
     finally:
         if results:
             with warnings.catch_warnings():
-                # Joblib warns about lost jobs; here they are abandoned deliberately.
+                # Joblib warns about lost jobs, which are abandoned deliberately here.
                 warnings.simplefilter('ignore', UserWarning)
                 results.close()
-            # A thread of the pool that the end of the interpreter stops may be releasing a
-            # semaphore, which the resource tracker of joblib then reports as leaked.
+            # If the end of the interpreter stopped a thread of the pool that is releasing a
+            # semaphore, the resource tracker of joblib would report a leak.
             for thread in set(threading.enumerate()) - threads_before:
                 thread.join(_THREAD_TIMEOUT_S)
 
@@ -135,9 +124,9 @@ def run_on_cluster(
 ) -> Generator[JobResult, None, None]:
     """Run jobs on the Dask cluster of a scheduler; yield each result when it is ready.
 
-    Closing the generator cancels pending jobs. This uses `distributed` directly: through joblib,
-    jobs for a cluster with a single thread run in this process instead, and the run never ends if
-    a worker dies.
+    Closing the generator cancels pending jobs. `distributed` is used directly: through joblib,
+    jobs for a cluster with a single thread run in this process, and the run never ends if a worker
+    dies.
     """
     with optional_import('running jobs on a Dask cluster', extra='experiments'):
         from distributed import Client, as_completed
@@ -155,22 +144,16 @@ def run_on_cluster(
                 list(jobs_by_future), loop=client.loop):
             try:
                 yield future.result()
-            except Exception as error:  # the job killed its worker or could not be sent to one
+            except Exception as error:  # The job killed its worker or could not be sent to one.
                 yield JobResult(jobs_by_future[future], error=f'{type(error).__name__}: {error}')
-
-
-def _return_as(version: str) -> str:
-    """Return the option of a version of joblib that yields results as early as possible."""
-    release = tuple(int(part) for part in version.split('.')[:2])
-    return 'generator_unordered' if release >= (1, 4) else 'generator'
 
 
 @contextlib.contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Ignore SIGINT inside the block, so that processes started there inherit this.
+    """Ignore SIGINT inside the block, and in processes that are started there.
 
-    A terminal sends SIGINT to the whole process group, but only this process may end the
-    workers. Blocking it would not lose a signal in the meantime, but joblib unblocks it.
+    A terminal sends SIGINT to the whole process group, but only this process may end the workers.
+    Blocking the signal instead would not lose it, but joblib unblocks it.
     """
     # Only the main thread can set handlers, and only there SIGINT raises KeyboardInterrupt.
     if threading.current_thread() is not threading.main_thread():
@@ -188,30 +171,15 @@ def run_jobs(
         n_jobs: int = -1, dask: str | None = None, label: str = '') -> list[dict[str, Any]]:
     """Run the jobs that have no stored result; return all results in order, decoded from JSON.
 
-    Each result is stored as soon as it is available. After an interruption or an error, the same
-    call resumes the experiment. A terminal shows a progress bar with a label.
+    `function` takes the arguments of a job and returns a dict that JSON can represent. Each result
+    is stored as soon as it is available, in a file in `folder`. After an interruption or an error,
+    the same call resumes the experiment. `n_jobs` jobs run in parallel on this machine, by default
+    one per core; `dask` is the address of the scheduler of a Dask cluster to use instead. A
+    terminal shows a progress bar with a label.
 
-    Parameters
-    ----------
-    function
-        Callable that takes the arguments of a job and returns a dict that JSON can serialise.
-    folder
-        Folder with one JSON file for each result.
-    n_jobs
-        Number of parallel jobs on this machine; -1 for one per core.
-    dask
-        Address of the scheduler of a Dask cluster to use instead.
-
-    Raises
-    ------
-    JobError
-        If a job fails, or its worker has another version of this package.
-    ConnectionError
-        If the cluster does not respond.
-    OSError
-        If a result cannot be read or stored.
-    MissingLibraryError
-        If a library is not installed.
+    Raises JobError if a job fails or its worker has another version of this package,
+    ConnectionError if the cluster does not respond, OSError if a result cannot be read or stored,
+    and MissingLibraryError if a library is not installed.
     """
     if len({job.name for job in jobs}) < len(jobs):
         raise ValueError('jobs: two have the same name, expected unique names')
@@ -221,7 +189,7 @@ def run_jobs(
     folder.mkdir(parents=True, exist_ok=True)
     known = {job.name: result for job in jobs if (result := _stored(folder, job)) is not None}
     pending = [job for job in jobs if job.name not in known]
-    # None disables the bar if stderr is not a terminal.
+    # None disables the bar unless stderr is a terminal.
     with tqdm(total=len(jobs), initial=len(known), unit='job', disable=None,
               desc=label or None) as bar:
         if pending:
@@ -238,7 +206,7 @@ def run_jobs(
 
 
 def _decoded(job_result: JobResult) -> dict[str, Any]:
-    """Return the result of a job, or raise JobError if it failed or ran in another version."""
+    """Return the result of a job; raise JobError if it failed or ran with another version."""
     name = job_result.job.name
     if job_result.error:
         raise JobError(f'job {name} failed: {job_result.error.strip()}')
@@ -274,7 +242,8 @@ def run_command(experiment: Callable[[], None]) -> int:
     except KeyboardInterrupt:
         print('interrupted: finished jobs are kept; repeat the command to resume',
               file=sys.stderr)
-        return _INTERRUPTED
+        # The exit code by which shells report Ctrl-C.
+        return 130
     except (JobError, MissingLibraryError, OSError) as error:
         print_error(f'{error}; finished jobs are kept; repeat the command to resume')
         return 1
@@ -282,7 +251,7 @@ def run_command(experiment: Callable[[], None]) -> int:
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Format a Markdown table with aligned columns, the first to the left, others to the right."""
+    """Format a Markdown table, the first column left-aligned and the others right-aligned."""
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     rule = ['-' * widths[0], *('-' * (width - 1) + ':' for width in widths[1:])]
     lines = [

@@ -12,21 +12,15 @@ _INTERVAL = (2.5, 97.5)
 
 
 class Replicates(NamedTuple):
-    """A statistic of results of several members, with replicates of the bootstrap.
+    """A statistic over several members and cases, with its replicates from the bootstrap.
 
-    A member is what is repeated besides the cases: a training, or a draw of a codebook.
-
-    Attributes
-    ----------
-    values
-        The statistic, then its replicates, which resample cases and members, float64
-        [1 + replicates]; NaN where a replicate has no result.
-    by_member
-        The same with all cases once: replicates that resample the members only.
+    A member is a repetition, such as another training or another random codebook.
     """
 
+    #: The statistic, then its replicates, which resample cases and members, float64
+    #: [1 + replicates]; NaN where a replicate has no result.
     values: np.ndarray
-    by_member: np.ndarray
+    by_member: np.ndarray  #: Likewise, but the replicates resample only the members.
     n_members: int
 
     def minus(self, other: 'Replicates') -> 'Replicates':
@@ -53,21 +47,13 @@ class Replicates(NamedTuple):
 
 
 def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -> list[Replicates]:
-    """Return the mean of results, or quantiles, with replicates of cases and members.
+    """Return the mean of results, or quantiles, with replicates over cases and members.
 
-    Of M members, M - 1 are drawn with replacement, which makes the variance of the replicates
-    unbiased (Rao and Wu, Resampling inference with complex survey data, 1988). The variance
-    between members is not included if there is only one. Results with the same number of cases
-    share the resampled cases.
-
-    Parameters
-    ----------
-    results
-        Float64 [members, cases]; NaN where a member has no result for a case.
-    seed
-        Seed of the resampled members; different for results with other members.
-    quantiles
-        Quantiles to compute instead of the mean, from 0 to 1.
+    `results` are float64 [members, cases], NaN where a member has no result for a case. Of M
+    members, M - 1 are drawn with replacement, which makes the variance of the replicates unbiased
+    (Rao and Wu, Resampling inference with complex survey data, 1988). A single member contributes
+    no variance. Other members should have another seed. Results with the same number of cases
+    share the resampled cases. Quantiles are from 0 to 1; by default, the mean is computed.
     """
     if results.ndim != 2 or not np.isfinite(results).any():
         raise ValueError(f'results: shape {results.shape}, expected [members, cases] with a '
@@ -88,7 +74,7 @@ def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -
 
 
 def share_percent(count: int, total: int) -> tuple[float, float, float]:
-    """Return a share of a positive total with its 95 % interval by Wilson: value and ends [%]."""
+    """Return a share of a positive total and Wilson's 95 % interval: value and ends [%]."""
     if total < 1:
         raise ValueError(f'total: {total}, expected at least 1')
     z2 = float(ndtri(0.975))**2
@@ -121,12 +107,12 @@ def _quantiles(results: np.ndarray, members: np.ndarray, cases: np.ndarray,
 
 def _interval(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
               ) -> tuple[float, float, float]:
-    """Return the first value and the 95 % interval of the replicates that follow it.
+    """Return the first value, and the 95 % interval of the other values, its replicates.
 
-    Percentiles of few members are too close to each other. They are moved apart by the ratio of
-    the quantiles of Student's t and of the normal distribution, with the degrees of freedom of
-    Satterthwaite: each part has the replicates due to the members of one sample, and their number.
-    This takes place on a logarithmic scale if all replicates are positive.
+    With few members, the percentiles are too close together. They are moved apart by the ratio of
+    the quantiles of Student's t and of the normal distribution, with Satterthwaite's degrees of
+    freedom. Each part has the replicates due to the members of one sample, and their number. The
+    scale is logarithmic if all replicates are positive.
     """
     with np.errstate(invalid='ignore'):
         if all(np.nanmin(array) > 0 for array in (values, *(part for part, _ in parts))):
@@ -138,7 +124,7 @@ def _interval(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
 
 def _spread(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
             ) -> tuple[float, float, float]:
-    # A ratio to zero is infinite; percentiles must not interpolate it.
+    # Division by zero gives infinite ratios, between which percentiles must not interpolate.
     low, high = np.nanpercentile(values[1:], _INTERVAL, method='inverted_cdf')
     total = np.nanvar(values[1:])**2
     uncertain = sum(np.nanvar(part[1:])**2 / (n - 1) for part, n in parts if n > 1)
@@ -151,7 +137,7 @@ def _spread(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
 
 @functools.lru_cache(maxsize=2)
 def _case_weights(n: int) -> np.ndarray:
-    """Return how often each case is drawn, float32 [1 + replicates, n]; once in the first row."""
+    """Return the multiplicities of the cases, float32 [1 + replicates, n]; row 0 has ones."""
     rng = np.random.default_rng(0)
     weights = np.ones((1 + _RESAMPLES, n), np.float32)
     for row in weights[1:]:

@@ -1,4 +1,4 @@
-"""Sweeps: measures over a product of settings, with one result for each setting and measure."""
+"""Sweeps: measures over a product of settings, one result for each setting and measure."""
 
 import csv
 import dataclasses
@@ -43,17 +43,17 @@ from rhs_isac_ros.support import streams
 # Kinds of codebooks that are made for a scenario.
 OPTIMIZE, DIRECTIONAL, RANDOM = 'optimize', 'directional', 'random'
 KINDS = (OPTIMIZE, DIRECTIONAL, RANDOM)
-# Positions of a job. A different size changes the positions of the global bound.
+# Positions of a job. Another size would change the positions of the global bound.
 BLOCK = 250
 # Samples of an optimisation.
 _SAMPLES = 64
 # Squared Mahalanobis radius of the 95 % region.
 _RADIUS = float(chdtri(3, 0.05))
-# A global bound from a coarser lattice is too loose.
+# Above this coarseness of its lattice, a global bound is too loose.
 _MAX_COARSENESS = 3.0
-# Relative deviation of the power that needs no scaling, below that of `Codebook.check`.
+# Relative deviation of the power without scaling, smaller than the one in `Codebook.check`.
 _POWER_TOLERANCE = 1e-9
-# Families of quantities that one job computes. Each of the last three includes those before it.
+# Families of quantities that a job computes. Each of the last three includes those before it.
 CRLB, BOUND, ERROR, CAPACITY, LOSS = 'crlb', 'bound', 'error', 'capacity', 'loss'
 _QUANTITIES = {
     CRLB: ('crlb_m2',), BOUND: ('bound_m2',), ERROR: ('squared_error_m2', 'inside', 'fix'),
@@ -63,7 +63,7 @@ _FIRST_SOBOL = threading.Lock()
 
 
 def families(quantities: Iterable[str]) -> list[str]:
-    """Return the families whose jobs compute all of some quantities."""
+    """Return the families of quantities whose jobs together compute the given quantities."""
     wanted = set(quantities)
     found = [family for family, names in _QUANTITIES.items() if wanted.intersection(names)]
     return [family for family in found if family not in _INCLUSIVE] + [
@@ -76,9 +76,9 @@ def plain_codebook(codebook: Codebook) -> dict[str, Any]:
 
 
 def with_power(codebook: Codebook, power_w: float) -> Codebook:
-    """Scale the combining vectors of a codebook so that each frame has a power.
+    """Scale the combining vectors so that each frame has a given power.
 
-    A codebook that has this power remains the same, with its id.
+    A codebook that already has this power is returned unchanged, with its id.
     """
     power = np.sum(np.abs(codebook.digital)**2, axis=(1, 3), keepdims=True)
     if np.allclose(power, power_w, rtol=_POWER_TOLERANCE, atol=0):
@@ -88,10 +88,10 @@ def with_power(codebook: Codebook, power_w: float) -> Codebook:
 
 def design(scenario: Mapping[str, Any], kind: str, seed: int, objective: str = '',
            steps: int = 0) -> dict[str, Any]:
-    """Make a codebook of one of `KINDS` and return its parameters, as a job.
+    """Make a codebook of one of `KINDS`, as a job, and return its parameters.
 
-    `scenario` has the fields that differ from Table I. Only an optimisation has an objective and
-    steps.
+    `scenario` has the fields that differ from Table I. `objective` and `steps` apply to an
+    optimisation only.
     """
     world = Scenario(**scenario)
     if kind == DIRECTIONAL:
@@ -108,10 +108,10 @@ def design(scenario: Mapping[str, Any], kind: str, seed: int, objective: str = '
 
 def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, Any], seed: int,
              first: int, n: int, estimator: str = '') -> dict[str, list[float]]:
-    """Compute the quantities of a family at positions `first` to ``first + n``, as a job.
+    """Compute a family of quantities at positions `first` to ``first + n``, as a job.
 
     The seed determines the sequence of positions, which is the same for all scenarios with the
-    same region. Lists of the result have a value for each position.
+    same region. Each list of the result has one value per position.
     """
     world, book = Scenario(**scenario), Codebook.from_parameters(dict(codebook))
     if family == BOUND:
@@ -148,19 +148,19 @@ def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, An
 
 @functools.lru_cache(maxsize=1)
 def _estimator(name: str, scenario: str, codebook: str) -> Estimator:
-    """Return an estimator for JSON of scenario and codebook, the same for successive jobs."""
+    """Return an estimator for a scenario and codebook in JSON; successive jobs share it."""
     _initialise_sobol()
     return make_estimator(name, Scenario(**json.loads(scenario)),
                           Codebook.from_parameters(json.loads(codebook)))
 
 
 def _initialise_sobol() -> None:
-    """Create a Sobol sequence: for the first of a process, SciPy reads a table without a lock."""
+    """Create a Sobol sequence, because SciPy reads its table at first use without a lock."""
     with _FIRST_SOBOL:
         qmc.Sobol(1)
 
 
-# A codebook fits only scenarios with the same values of these fields.
+# Fields that decide whether a codebook fits a scenario.
 _STRUCTURE = ('center_frequencies_hz', 'n_subbands', 'n_frames', 'elements_per_side', 'n_feeds',
               'feed_positions_m', 'amplitude_levels')
 
@@ -174,7 +174,7 @@ class Results(NamedTuple):
 
 
 class Point(NamedTuple):
-    """The value of a measure in a setting, and the ids of the codebooks."""
+    """The value of a measure in a setting, with the ids of the codebooks."""
 
     setting: Setting
     measure: str
@@ -184,45 +184,25 @@ class Point(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Sweep:
-    """What to measure, and where.
+    """The measures of a sweep, its settings, and the options of its codebooks.
 
-    Attributes
-    ----------
-    base
-        Scenario of the values that are not varied.
-    settings
-        The settings, see `settings_of`.
-    measures
-        Keys of `MEASURES`.
-    n_positions
-        Positions of each setting; they are the same in all settings with the same region.
-    seed
-        Seed of positions, signals and codebooks.
-    objective, steps
-        Objective and maximum number of steps of an optimisation.
-    optimize_for
-        Fields whose values the optimisation of a codebook takes from the setting, while other
-        fields have their base values; None for all. Fields that determine which codebooks fit are
-        always included.
-    repeats
-        Codebooks of each setting, with successive seeds, if they are optimised or random.
-
-    Raises
-    ------
-    ValueError
-        If a measure is unknown, a number is out of range, a file has no codebook that fits its
-        settings, or base values contradict those that an optimisation takes from a setting.
+    Raises ValueError if a measure is unknown, a number is out of range, a file has no codebook
+    that fits its settings, or base values contradict those that an optimisation takes from a
+    setting.
     """
 
-    base: Scenario
-    settings: Sequence[Setting]
-    measures: Sequence[str]
-    n_positions: int = 2000
-    seed: int = 0
-    objective: str = 'ambiguity'
-    steps: int = 300
+    base: Scenario  #: Scenario with the values that are not varied.
+    settings: Sequence[Setting]  #: Result of `settings_of`.
+    measures: Sequence[str]  #: Keys of `MEASURES`.
+    n_positions: int = 2000  #: In each setting; the same for all settings with the same region.
+    seed: int = 0  #: Seed of positions, signals and codebooks.
+    objective: str = 'ambiguity'  #: Objective of an optimisation.
+    steps: int = 300  #: Maximum number of steps of an optimisation.
+    #: Fields whose values the optimisation of a codebook takes from the setting; None for all.
+    #: Other fields have their base values, except those on which it depends whether a codebook
+    #: fits.
     optimize_for: Sequence[str] | None = None
-    repeats: int = 1
+    repeats: int = 1  #: Codebooks in each setting, with successive seeds, if optimised or random.
 
     def __post_init__(self) -> None:
         """Check names, numbers and codebooks."""
@@ -249,7 +229,7 @@ class Sweep:
         return {name: Codebook.load(name) for name in sorted(names)}
 
     def scenario_of_codebook(self, setting: Setting) -> Scenario:
-        """Return the scenario that the codebook of a setting is made for."""
+        """Return the scenario for which the codebook of a setting is made."""
         if self.optimize_for is None or setting.codebook != OPTIMIZE:
             return setting.scenario
         taken = {name: getattr(setting.scenario, name)
@@ -257,7 +237,7 @@ class Sweep:
         return dataclasses.replace(self.base, **taken)
 
     def designs(self, setting: Setting) -> list[Job]:
-        """Return the jobs that make the codebooks of a setting, none for a file."""
+        """Return the jobs that make the codebooks of a setting; none if the codebook is a file."""
         if setting.codebook not in KINDS:
             return []
         arguments: dict[str, Any] = {
@@ -279,7 +259,7 @@ class Sweep:
             for first in range(0, self.n_positions, BLOCK)] for family in families(quantities)}
 
     def codebooks(self, setting: Setting, made: Mapping[str, Mapping[str, Any]]) -> list[Codebook]:
-        """Return the codebooks of a setting, from the results of their jobs by name."""
+        """Return the codebooks of a setting from the results of their jobs, by name."""
         books = [Codebook.from_parameters(dict(made[job.name])) for job in self.designs(setting)]
         return [_fitted(book, setting)
                 for book in books or [self._files[setting.codebook]]]
@@ -314,7 +294,7 @@ def run_blocks(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = 
 
 
 def table(sweep: Sweep, points: Sequence[Point]) -> str:
-    """Return the points as CSV: a row for each, with all settings."""
+    """Return the points as CSV, one row for each, with all fields of the setting."""
     stream = io.StringIO()
     rows = csv.writer(stream, lineterminator='\n')
     rows.writerow(['measure', 'value', 'low', 'high', 'unit', 'estimator', 'codebook',
@@ -336,7 +316,7 @@ def table(sweep: Sweep, points: Sequence[Point]) -> str:
 
 
 def _fitted(codebook: Codebook, setting: Setting) -> Codebook:
-    """Return a codebook with the power of a setting, or raise CodebookError if it does not fit."""
+    """Return a codebook with the power of a setting; raise CodebookError if it does not fit."""
     fitted = with_power(codebook, setting.scenario.max_power_w)
     fitted.check(setting.scenario)
     return fitted
@@ -344,7 +324,7 @@ def _fitted(codebook: Codebook, setting: Setting) -> Codebook:
 
 def _stacked(blocks: Sequence[Mapping[str, Sequence[Job]]],
              found: Mapping[str, Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """Return the quantities by name, float64 [codebooks, positions], from results of blocks."""
+    """Return quantities by name, [codebooks, positions], from the results of blocks."""
     return {quantity: np.array([
         np.concatenate([found[job.name][quantity] for job in of_codebook[family]])
         for of_codebook in blocks])

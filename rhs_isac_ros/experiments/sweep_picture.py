@@ -1,4 +1,4 @@
-"""The picture of a sweep: a panel for each measure, with intervals on every point."""
+"""The picture of a sweep: a panel for each measure, and intervals at all points."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,22 +19,22 @@ from rhs_isac_ros.support.pictures import (
     paper_style,
 )
 
-# Heights of a row of panels, of the legend, and of a further line of labels.
+# Heights of a row of panels, of the legend, and of an additional line of labels.
 _PANEL_IN, _LEGEND_IN, _LINE_IN = 2.2, 0.4, 0.13
-# Positive values that span more are drawn on a logarithmic scale, unless they are capacities or
-# shares.
+# Largest ratio of positive values on a linear scale, and units to which it applies; values in
+# other units always have a linear scale.
 _WIDE = 8.0
 _LOGARITHMIC = ('m', 'm²')
-# Up to this ratio, a logarithmic axis has more labels than those of the decades.
+# Up to this ratio, a logarithmic axis has labels within decades.
 _FEW_DECADES = 200
-# Horizontal distance of lines relative to the axis, so that intervals do not cover each other.
+# Horizontal distance of lines relative to the axis, which keeps intervals from overlapping.
 _SHIFT = 0.01
-# With more values, the ticks are not at the values.
+# With more values than this, the ticks are not placed at the values.
 _MAX_TICKS = 8
 
 
 class _Line(NamedTuple):
-    """A line of a panel: its points, and how to draw it."""
+    """A line of a panel: its points and its style."""
 
     points: Sequence[Point]
     label: str
@@ -48,8 +48,8 @@ def draw(axes: Sequence[Axis], points: Sequence[Point],
          panels: Sequence[Sequence[str]]) -> Any:
     """Draw points, and return the `matplotlib.figure.Figure`.
 
-    The first axis is that of the panels, the second one has a line for each value, and each
-    combination of the others has a row of panels. The columns are `panels`, which list measures.
+    The first axis is the x axis of the panels, the second has one line per value, and each
+    combination of the others has a row of panels. `panels` lists the measures of each column.
     """
     first, *others = [axis.ordered() for axis in axes]
     lines, rows = others[:1], others[1:]
@@ -100,7 +100,7 @@ def draw_panel(panel: Any, first: Axis, others: Sequence[Axis], points: Sequence
     if logarithmic and max(finite) < _FEW_DECADES * min(finite):
         label_decades(panel.yaxis)
     if not numeric or len(values) <= _MAX_TICKS:
-        # Lists of numbers would not fit beside each other.
+        # Lists of numbers would not fit side by side.
         panel.set_xticks(places, [_text(first, value).replace(', ', '\n') for value in values])
         panel.set_xticks([], minor=True)
     label = MEASURES[names[0]].label if len(names) == 1 else 'error or bound'
@@ -110,9 +110,9 @@ def draw_panel(panel: Any, first: Axis, others: Sequence[Axis], points: Sequence
 
 def add_legend(place: Any, panels: Sequence[Any], lines: Sequence[Axis],
                joined: Sequence[Sequence[str]] = ()) -> None:
-    """Draw the legend of all panels, which share their lines, in other axes.
+    """Draw one legend for all panels, which have the same lines, in other axes.
 
-    `joined` are the measures of the panels that have several.
+    `joined` are the measures of the panels with several measures.
     """
     found: dict[str, Any] = {}
     for panel in panels:
@@ -153,7 +153,7 @@ def is_geometric(values: Sequence[float]) -> bool:
 
 
 def _set_scale(panel: Any, values: Sequence[float]) -> None:
-    """Set the scale of the x axis: logarithmic for geometric values, also if zero precedes."""
+    """Set the scale of the x axis: logarithmic for geometric values, even after a zero."""
     if is_geometric(values):
         panel.set_xscale('log')
     elif values[0] == 0 and is_geometric(values[1:]):
@@ -161,7 +161,7 @@ def _set_scale(panel: Any, values: Sequence[float]) -> None:
 
 
 def _scale(unit: str, values: Sequence[float]) -> tuple[float, str]:
-    """Return a factor for the values of a panel, and the unit that they then have."""
+    """Return a factor for the values of a panel, and the unit of the scaled values."""
     largest = max(map(abs, values), default=0)
     for size, prefix in ((1e6, 'M'), (1e3, 'k')):
         if unit == 'bit/s' and largest >= size:
@@ -172,8 +172,8 @@ def _scale(unit: str, values: Sequence[float]) -> tuple[float, str]:
 def _lines(others: Sequence[Axis], points: Sequence[Point], names: Sequence[str]) -> list[_Line]:
     """Return the lines of a panel.
 
-    Values of the other axes differ in colour and marker, measures in line style and fill. The
-    line style distinguishes the values, too, if there is one measure.
+    Values of the other axes differ in colour and marker, measures in line style and fill. With a
+    single measure, the values also differ in line style.
     """
     keys = list(dict.fromkeys(_key(point, others) for point in points))
     lines = []
@@ -206,7 +206,7 @@ def _draw_line(panel: Any, x: np.ndarray, intervals: np.ndarray, line: _Line) ->
         markerfacecolor=line.fill, label=line.label)
     for bar in bars.lines[2]:
         bar.set_linewidth(0.8)
-    # An interval without upper end has an arrow to the edge of the panel.
+    # An interval without an upper end becomes an arrow to the edge of the panel.
     for place in np.flatnonzero(np.isposinf(high)):
         panel.annotate('', (x[place], 1), (x[place], value[place]),
                        xycoords=panel.get_xaxis_transform(), textcoords='data',
@@ -215,7 +215,7 @@ def _draw_line(panel: Any, x: np.ndarray, intervals: np.ndarray, line: _Line) ->
 
 
 def _styles(names: Sequence[str]) -> dict[str, Any]:
-    """Return marks for the measures of a panel by their labels."""
+    """Return legend marks for the measures of a panel, by label."""
     from matplotlib.lines import Line2D
     handles = {}
     for number, name in enumerate(names):
@@ -231,7 +231,7 @@ def _key(point: Point, axes: Sequence[Axis]) -> tuple[Any, ...]:
 
 
 def _label(axis: Axis) -> str:
-    """Return name and symbol of the first field of an axis, and its unit unless values have it."""
+    """Return the name and symbol of an axis, with its unit unless the values contain it."""
     name = axis.fields[0]
     if name not in FIELDS:
         return name

@@ -16,31 +16,19 @@ from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.scenario import checked
 from rhs_isac_ros.support.threads import one_blas_thread
 
-# Larger than every finite result; its square root and its half remain finite.
+# Larger than every finite result; its square root and its half are finite.
 _INFINITE = 1e300
 
 
 class Measure(NamedTuple):
-    """A statistic of one quantity over the positions.
-
-    Attributes
-    ----------
-    label
-        Label of an axis without the unit.
-    quantile
-        The quantile, from 0 to 1; None for the mean.
-    root
-        Whether the measure is the square root of the statistic.
-    share
-        Whether the quantity is 0 or 1 and the measure its share in per cent.
-    """
+    """A statistic of one quantity over the positions."""
 
     quantity: str
-    label: str
+    label: str  #: Axis label without the unit.
     unit: str
-    quantile: float | None = None
-    root: bool = False
-    share: bool = False
+    quantile: float | None = None  #: From 0 to 1; None for the mean.
+    root: bool = False  #: Whether to take the square root of the statistic.
+    share: bool = False  #: Whether the quantity is 0 or 1, and the measure its share in per cent.
 
 
 MEASURES: Mapping[str, Measure] = {
@@ -77,13 +65,13 @@ def measured(measure: Measure, results: np.ndarray) -> Interval:
     """Return a measure of results, float64 [codebooks, positions], with its interval.
 
     The interval is a bootstrap over codebooks and positions. A share has Wilson's interval if
-    there is one codebook or if all results are equal, because their bootstrap has no width. The
-    value is NaN if a result is NaN, and the interval of an infinite mean is NaN.
+    there is one codebook, or if all results are equal and the bootstrap would have no width. If a
+    result is NaN, the value is NaN; if a mean is infinite, the interval is NaN.
     """
     if np.isnan(results).any():
         return Interval(np.nan, np.nan, np.nan)
     if measure.share and (len(results) == 1 or np.ptp(results) == 0):
-        # Codebooks share their positions, so that they do not count as further samples.
+        # Codebooks share their positions and therefore do not count as additional samples.
         return Interval(*share_percent(int(results[0].sum()), len(results[0])))
     if measure.quantile is None and np.isinf(results).any():
         return Interval(np.inf, np.nan, np.nan)
@@ -91,7 +79,7 @@ def measured(measure: Measure, results: np.ndarray) -> Interval:
     (replicates,) = replicate(finite, 0, () if measure.quantile is None else [measure.quantile])
     ends = np.array(replicates.interval())
     if measure.quantile is None:
-        # The replicates have single precision, fewer digits than the table of a sweep.
+        # The replicates have single precision, which is less than the digits of the table.
         ends[0] = results.mean()
     ends = np.where(ends > _INFINITE / 2, np.inf, ends)
     if measure.root:
@@ -104,7 +92,7 @@ def measured(measure: Measure, results: np.ndarray) -> Interval:
 def parse_measures(text: str) -> list[list[str]]:
     """Parse ``NAME,...``, where ``+`` joins measures of one unit that share a panel.
 
-    Raise ValueError if a measure is unknown or occurs twice, or units in a panel differ.
+    Raise ValueError if a measure is unknown or repeated, or units in a panel differ.
     """
     panels = [panel.split('+') for panel in text.split(',')]
     names = names_of(panels)
@@ -127,14 +115,14 @@ def names_of(panels: Iterable[Iterable[str]]) -> list[str]:
     return [name for panel in panels for name in panel]
 
 
-# Two names that can be varied like the fields of the scenario.
+# Two further names that can be varied like fields of the scenario.
 CODEBOOK, ESTIMATOR = 'codebook', 'estimator'
 FIELDS = {field.name: field for field in dataclasses.fields(Scenario)}
 NAMES = (*FIELDS, CODEBOOK, ESTIMATOR)
 
 
 class Axis(NamedTuple):
-    """Values of a field, or of several fields that vary together: a tuple for each step.
+    """Values of a field, or of several fields that vary together, as one tuple per step.
 
     Pictures show the first field.
     """
@@ -143,7 +131,7 @@ class Axis(NamedTuple):
     values: tuple[tuple[Any, ...], ...]
 
     def along(self, other: 'Axis') -> 'Axis':
-        """Return an axis on which the fields of another axis of the same length vary, too."""
+        """Return an axis that also varies the fields of another axis of the same length."""
         if len(other.values) != len(self.values):
             raise ValueError(
                 f'{other.fields[0]}: {len(other.values)} values, expected {len(self.values)} as '
@@ -161,16 +149,16 @@ class Axis(NamedTuple):
         return self
 
     def ordered(self) -> 'Axis':
-        """Return the axis in ascending order of the first field if its values are numbers."""
+        """Return the axis in ascending order of its first field if these values are numbers."""
         if all(isinstance(first, int | float) for first, *_ in self.values):
             return Axis(self.fields, tuple(sorted(self.values, key=lambda values: values[0])))
         return self
 
 
 class Setting(NamedTuple):
-    """One combination of values, `varied` by name, and the scenario with these values.
+    """One combination of values, and the scenario with these values.
 
-    `codebook` is a kind or a file.
+    `varied` contains the values by name; `codebook` is a kind or a file.
     """
 
     varied: Mapping[str, Any]
@@ -217,7 +205,7 @@ def settings_of(
 
 
 def plain(value: Any) -> str:
-    """Return a value of a field as text, as in scenario files."""
+    """Return the value of a field as text in the syntax of scenario files."""
     if isinstance(value, GainPattern | str):
         return str(value)
     return json.dumps(value)

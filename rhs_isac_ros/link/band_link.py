@@ -1,4 +1,4 @@
-"""The links between the surface and one position, and the division of the power over them."""
+"""The links between the surface and one position, and the division of power among channels."""
 
 import dataclasses
 import functools
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.geometry import element_positions, feed_positions
 from rhs_isac_ros.model.los import los_gain
@@ -14,7 +15,7 @@ from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import onboard_matrix
 
-# Gains above this have finite reciprocals.
+# The reciprocals of larger gains are finite.
 _MIN_GAIN = 1e-300
 
 
@@ -22,8 +23,8 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
     """Divide power [W] among channels so that the sum of log(1 + gain * share) is highest.
 
     The gains are relative to noise, float64 [..., N] [1/W]; each row is a separate problem. The
-    shares, float64 [..., N] [W], are not negative, and those of a row have the sum `power_w`. If
-    no gain of a row is positive, its shares are equal.
+    shares, float64 [..., N] [W], are not negative and add up to `power_w` in each row. If no gain
+    of a row is positive, its shares are equal.
     """
     n = gains.shape[-1]
     if n == 1:
@@ -34,7 +35,7 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
         if (level > floors).all():
             # Every channel is above its floor, as usual.
             return level - floors
-    # Without any gain, all levels and floors are infinite.
+    # If no gain is positive, all levels and floors are infinite.
     with np.errstate(divide='ignore', over='ignore', invalid='ignore'):
         floors = 1 / np.maximum(gains, 0)
         ranked = np.sort(floors, axis=-1)
@@ -54,39 +55,26 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BandLink:
-    """The link between the surface and a user in one band, or the links in some bands.
+    """The link between the surface and a user in one band, or the links in several bands.
 
-    With several bands, all arrays but `fixed` have a leading axis for the band, and configurations
-    are float64 [N_B, n, N_E]. In one band, configurations have any number of leading axes.
-
-    Attributes
-    ----------
-    onboard
-        B_j, complex128 [N_SB, K, N_E].
-    los
-        Line-of-sight gains, complex128 [N_SB, N_E].
-    spatial
-        V_i.
-    noise_power_w, power_w
-        Noise power of a sub-band, and power of the digital part over all sub-bands [W].
-    fixed
-        Elements whose configuration is always 1, bool [N_E].
+    With several bands, all arrays except `fixed` have a leading axis for the band, and
+    configurations are float64 [N_B, n, N_E]. In one band, they have any number of leading axes.
     """
 
-    onboard: np.ndarray
-    los: np.ndarray
-    spatial: SpatialCovariance
-    noise_power_w: float
-    power_w: float
-    fixed: np.ndarray
+    onboard: np.ndarray  #: B_j, complex128 [N_SB, K, N_E].
+    los: np.ndarray  #: Line-of-sight gains, complex128 [N_SB, N_E].
+    spatial: SpatialCovariance  #: V_i.
+    noise_power_w: float  #: Noise power of a sub-band.
+    power_w: float  #: Power of the digital part, summed over sub-bands.
+    fixed: np.ndarray  #: Elements whose configuration is always 1, bool [N_E].
 
     @classmethod
     def to(cls, scenario: Scenario, position: np.ndarray, bands: int | Sequence[int],
            surface: SurfaceEstimate | None = None) -> 'BandLink':
         """Return the links to a position, float64 [3] [m], in bands, counted from 0.
 
-        The coefficients of an estimated surface become part of the propagation on the board.
-        Raise ValueError if the position is not a finite [3] array.
+        Coefficients of an estimated surface are included in the propagation on the board. Raise
+        ValueError if the position is not a finite [3] array.
         """
         onboard, fixed = arrays(scenario, surface)
         listed, place = np.atleast_1d(bands).tolist(), np.asarray(position)[None]
@@ -107,8 +95,8 @@ class BandLink:
     def best_digital(self, analog: np.ndarray) -> np.ndarray:
         """Return the best digital part for configurations, complex128 [..., N_SB, K] [sqrt(W)].
 
-        It consists of the principal eigenvectors of the correlation matrices of the channels at
-        the feeds. Water-filling divides the power among them.
+        It consists of principal eigenvectors of the channels' correlation matrices at the feeds,
+        with the power divided by water-filling.
         """
         gains, directions = np.linalg.eigh(self.correlations(*self.feeds(analog)))
         power = water_filling(gains[..., -1] / self.noise_power_w, self.power_w)
@@ -136,13 +124,13 @@ class BandLink:
     @staticmethod
     def correlations(
             configured: np.ndarray, scattered: np.ndarray, direct: np.ndarray) -> np.ndarray:
-        """Correlation matrices of the channels of `feeds`, complex128 [..., N_SB, K, K]."""
+        """Return the correlation matrices of the channels of `feeds`, [..., N_SB, K, K]."""
         return (direct * np.conj(np.swapaxes(direct, -1, -2))
                 + np.matmul(scattered, np.conj(np.swapaxes(configured, -1, -2))))
 
 
 def band_index(bands: int | Sequence[int]) -> int | slice | list[int]:
-    """Return the index of bands in an array, a slice if possible, which needs no copy."""
+    """Return an index of bands for arrays: a slice if possible, because it avoids a copy."""
     if isinstance(bands, int):
         return bands
     first, n = bands[0], len(bands)
@@ -158,9 +146,7 @@ def arrays(scenario: Scenario, surface: SurfaceEstimate | None
         fixed = surface.failed
         coefficients = np.where(fixed, surface.offsets, surface.gains)
         onboard = surface.band_gains[:, None, None, None] * coefficients * onboard
-    for array in (onboard, fixed):
-        array.flags.writeable = False
-    return onboard, fixed
+    return read_only(onboard), read_only(fixed)
 
 
 @functools.lru_cache(maxsize=16)
@@ -168,8 +154,8 @@ def representative_subbands(
         scenario: Scenario, max_drift_rad: float, max_count: int) -> np.ndarray:
     """Return indices of evenly spread sub-bands, at most `max_count`.
 
-    Between neighbours, the phases of the elements drift apart by at most `max_drift_rad`, unless
-    that takes more sub-bands.
+    If this number suffices, the phases of the elements drift apart by at most `max_drift_rad` from
+    one of these sub-bands to the next.
     """
     elements, feeds = element_positions(scenario), feed_positions(scenario)
     on_board = np.linalg.norm(elements - feeds[:, None], axis=-1)

@@ -9,6 +9,7 @@ import numpy as np
 
 from rhs_isac_ros.link.band_link import band_index
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.los import direct_gain, los_sums
 from rhs_isac_ros.model.multipath import spatial_covariance
 from rhs_isac_ros.model.scenario import check_shape
@@ -17,39 +18,25 @@ from rhs_isac_ros.support.threads import one_blas_thread
 
 # Quadrature nodes along each principal axis of the covariance.
 _N_NODES = 3
-# Upper limit of a standard deviation [m]: it keeps squared distances finite.
+# Upper limit of a standard deviation [m], to keep squared distances finite.
 _MAX_SPREAD_M = 1e6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Beam:
-    """Beamforming of one band in the transmission phase.
+    """Beamforming of one band in the transmission phase."""
 
-    Attributes
-    ----------
-    analog
-        Configuration c-hat, float64 [N_E], each entry in [0, 1].
-    digital
-        Digital beamforming vectors s-hat, complex128 [N_SB, K] [sqrt(W)].
-    band
-        Index of the band, from 0.
-    """
-
-    analog: np.ndarray
-    digital: np.ndarray
-    band: int = 0
+    analog: np.ndarray  #: Configuration c-hat, float64 [N_E], each entry in [0, 1].
+    digital: np.ndarray  #: Digital beamforming vectors s-hat, complex128 [N_SB, K] [sqrt(W)].
+    band: int = 0  #: Index of the band, from 0.
 
 
 @one_blas_thread
 def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
     """Implements Eq. (10). Capacity R_i of a beam at `positions`, float64 [N, 3] [m].
 
-    The result is float64 [N] [bit/s].
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array, or the beam does not fit the scenario.
+    The result is float64 [N] [bit/s]. Raises ValueError if `positions` is not a finite [N, 3]
+    array, or the beam does not fit the scenario.
     """
     return capacities(scenario, [beam], positions)[0]
 
@@ -67,9 +54,9 @@ def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray)
 @one_blas_thread
 def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray,
                     blocked: np.ndarray | None = None) -> np.ndarray:
-    """Compute the capacity on the paths of a channel file, or `capacity` if there is no file.
+    """Compute the capacity on the paths of a channel file, or `capacity` without such a file.
 
-    With a channel file, `blocked`, bool [N], marks the users without line of sight.
+    With a channel file, `blocked`, bool [N], marks the users without a direct path.
     """
     if not scenario.channel:
         return capacity(scenario, beam, positions)
@@ -84,16 +71,12 @@ def expected_capacities(
 ) -> np.ndarray:
     """Average Eq. (10) of n beams over a Gaussian posterior of the position, float64 [n] [bit/s].
 
-    The posterior has a mean, float64 [3] [m], and a covariance, float64 [3, 3] [m^2].
-
-    Raises
-    ------
-    ValueError
-        If `mean` or `covariance` has a wrong shape or is not finite, or a beam does not fit the
-        scenario.
+    The posterior has the mean, float64 [3] [m], and the covariance, float64 [3, 3] [m^2]. Raises
+    ValueError if `mean` or `covariance` has a wrong shape or is not finite, or a beam does not fit
+    the scenario.
     """
     points, weights = posterior_points(scenario, mean, covariance)
-    # One product for each beam, so that the others do not affect its rounding.
+    # Separate products, so that the number of beams does not affect the rounding.
     return np.array([weights @ rates for rates in capacities(scenario, beams, points)])
 
 
@@ -103,28 +86,15 @@ def posterior_points(
     """Compute the nodes and weights of a quadrature over a Gaussian posterior.
 
     The quadrature is a product of Gauss-Hermite rules along the principal axes of the covariance,
-    exact for polynomials up to the fifth degree in each axis. All weights are positive, so that
-    an average of capacities lies between the smallest and the largest of them. An axis without
-    variance has one node. Nodes closer to the surface than both the region of interest and the
-    mean are moved out to the closer of the two. Otherwise, a tail of the Gaussian at or behind
-    the surface would contribute capacities that cannot occur.
+    exact for polynomials up to the fifth degree in each axis. An axis without variance has one
+    node. All weights are positive, so an average of capacities lies between the smallest and the
+    largest of them. Nodes closer to the surface than both the region of interest and the mean are
+    moved out to the closer of the two. Otherwise, a tail of the Gaussian at or behind the surface
+    would contribute impossible capacities.
 
-    Parameters
-    ----------
-    mean
-        Float64 [3] [m].
-    covariance
-        Float64 [3, 3] [m^2]. Only its symmetric part is used; negative variances count as 0.
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        Positions, float64 [n, 3] [m], and weights with the sum 1, float64 [n].
-
-    Raises
-    ------
-    ValueError
-        If `mean` or `covariance` has a wrong shape or is not finite.
+    Only the symmetric part of the covariance is used; negative variances count as 0. Returns
+    positions, float64 [n, 3] [m], and weights with the sum 1, float64 [n]. Raises ValueError if
+    `mean` or `covariance` has a wrong shape or is not finite.
     """
     for name, value, shape in (('mean', mean, (3,)), ('covariance', covariance, (3, 3))):
         if np.shape(value) != shape or not np.isfinite(value).all():
@@ -140,7 +110,7 @@ def posterior_points(
 
 @functools.lru_cache(maxsize=8)
 def _standard_rule(varies: tuple[bool, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes [n, 3] and weights [n] for a Gaussian with unit variance in the axes that vary."""
+    """Return nodes [n, 3] and weights [n] for a Gaussian of unit variance along some axes."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(_N_NODES)
     weights = weights / weights.sum()
     rule = list(zip(nodes, weights, strict=True))
@@ -150,7 +120,7 @@ def _standard_rule(varies: tuple[bool, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _radiation(scenario: Scenario, beam: Beam) -> np.ndarray:
-    """Radiation t_j = c . (s_j B_j) of the elements, complex128 [N_SB, N_E]."""
+    """Return the radiation t_j = c . (s_j B_j) of the elements, complex128 [N_SB, N_E]."""
     check_shape('analog', beam.analog, 'N_E', scenario)
     check_shape('digital', beam.digital, 'N_SB K', scenario)
     if not 0 <= beam.band < scenario.n_bands:
@@ -160,37 +130,30 @@ def _radiation(scenario: Scenario, beam: Beam) -> np.ndarray:
 
 
 def _rate(scenario: Scenario, power_w: np.ndarray) -> np.ndarray:
-    """Sum of the rates [bit/s] of sub-bands, the last axis of the received power [W]."""
+    """Sum the rates [bit/s] over sub-bands, the last axis of the received power [W]."""
     snr = power_w / scenario.noise_power_w
     return scenario.subband_width_hz * np.log2(1 + snr).sum(axis=-1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BeamPattern:
-    """Power of a beam over the directions in front of the surface, at one distance.
+    """Power of a beam over the directions in front of the surface, at one distance."""
 
-    Attributes
-    ----------
-    directions
-        Unit vectors from the surface's centre, float64 [n_el, n_az, 3]; elevation grows along
-        the first axis, azimuth along the second, both from -90 to 90 degrees.
-    relative
-        Line-of-sight power relative to that of the peak, the strongest direction, float64
-        [n_el, n_az]; zeros if the beam is off.
-    """
-
+    #: Unit vectors from the centre of the surface, float64 [n_el, n_az, 3]; elevation grows along
+    #: the first axis, azimuth along the second, both from -90 to 90 degrees.
     directions: np.ndarray
+    #: Line-of-sight power relative to the strongest direction, [n_el, n_az]; 0 if the beam is off.
     relative: np.ndarray
     distance_m: float
 
     def azimuth_cut(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cut the pattern at the elevation of the peak: azimuths [rad] and power, both [n_az]."""
+        """Return azimuths [rad] and power at the elevation of the peak, both [n_az]."""
         row, _ = self.peak
         x, y, _ = self.directions[len(self.directions) // 2].T
         return np.arctan2(y, x), self.relative[row]
 
     def elevation_cut(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cut the pattern at the azimuth of the peak: elevations [rad] and power, both [n_el]."""
+        """Return elevations [rad] and power at the azimuth of the peak, both [n_el]."""
         _, column = self.peak
         return np.arcsin(self.directions[:, column, 2]), self.relative[:, column]
 
@@ -204,14 +167,10 @@ class BeamPattern:
 @one_blas_thread
 def beam_pattern(
         scenario: Scenario, beam: Beam, distance_m: float, step_deg: float = 5.0) -> BeamPattern:
-    """Compute the pattern of a beam at a distance from the surface's centre, in the near field.
+    """Compute the near-field pattern of a beam at a distance from the centre of the surface.
 
-    Neighbouring azimuths, and elevations, are at most `step_deg` apart.
-
-    Raises
-    ------
-    ValueError
-        If the distance or the step is not positive, or the beam does not fit the scenario.
+    Neighbouring azimuths, and elevations, are at most `step_deg` apart. Raises ValueError if the
+    distance or the step is not positive, or the beam does not fit the scenario.
     """
     for name, value in (('distance_m', distance_m), ('step_deg', step_deg)):
         if not value > 0:
@@ -226,12 +185,10 @@ def beam_pattern(
 
 @functools.lru_cache(maxsize=4)
 def _directions(step_deg: float) -> np.ndarray:
-    """Unit vectors over the half space x > 0, float64 [n_el, n_az, 3], read-only."""
+    """Return unit vectors over the half space x > 0, float64 [n_el, n_az, 3], read-only."""
     n_half = max(1, int(np.ceil(90 / step_deg)))
-    # An odd number of angles, so that the middle ones are on boresight.
+    # An odd number of angles places the middle ones on boresight.
     angles = np.linspace(-np.pi / 2, np.pi / 2, 2 * n_half + 1)
     elevation, azimuth = np.meshgrid(angles, angles, indexing='ij')
-    directions = np.stack([np.cos(elevation) * np.cos(azimuth),
-                           np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1)
-    directions.flags.writeable = False
-    return directions
+    return read_only(np.stack([np.cos(elevation) * np.cos(azimuth),
+                               np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1))

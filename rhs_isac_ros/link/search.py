@@ -1,4 +1,4 @@
-"""Search for the configurations from which an ascent starts, in all bands at once."""
+"""Search for configurations from which an ascent starts, in all bands at once."""
 
 import functools
 from typing import NamedTuple
@@ -11,65 +11,48 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
 
-# Largest share of the multipath power that the modes may omit, unless that takes more of them.
-# The ascent from the configurations that are found includes all of it.
+# Largest share of the multipath power that modes may omit, and largest number of modes. The later
+# ascent includes all of the power.
 _MAX_OMITTED, _MAX_MODES = 0.02, 256
-# Relative accuracy of the powers of modes.
+# Relative accuracy of the powers of the modes.
 _MODE_TOLERANCE = 1e-3
-# Sub-bands whose phases drift apart by more than this over the surface are searched separately,
-# up to a limited number.
+# If the phases of sub-bands drift apart by more than this over the surface, the sub-bands are
+# searched separately, up to a limited number.
 _MAX_DRIFT_RAD = 1.0
 _MAX_SUBBANDS = 16
-# Number of random starts, and of those that remain after the first step.
+# Number of random starts, and number that remains after the first step.
 _N_STARTS = 256
 _N_DIRECT = 64
-# Number of steps with the strongest modes of the multipath, of these modes, and of configurations
-# that all modes then improve. Fewer steps would lose the best starts if the multipath is as strong
-# as the line of sight.
+# Number of steps with the strongest modes of the multipath, number of these modes, and number of
+# configurations that are then improved with all modes. Fewer steps would lose the best starts if
+# the multipath is as strong as the line of sight.
 _N_STEPS = 4
 _N_STRONGEST = 4
 _N_KEPT = 12
-# Number of configurations for the multipath alone, and of steps from as many random starts.
+# Number of configurations for the multipath alone, and of steps that lead to them.
 _N_SCATTERED = 8
 _N_SCATTERED_STEPS = 8
-# Configurations of nearly equal capacity count as one.
+# Configurations whose capacities differ by a smaller share count as one.
 _MIN_DIFFERENCE = 1e-6
 # Limits of the amplitudes relative to the noise.
 _AMPLITUDES = (1e-3, 1e4)
-# Lower limit of a norm, which avoids a division by zero.
+# Lower limit of a norm, to avoid a division by zero.
 _MIN_NORM = 1e-30
 
 
 class Tables(NamedTuple):
-    """The arrays of the search that do not depend on the position, for all bands.
+    """The arrays of the search that do not depend on the position, for all bands."""
 
-    Attributes
-    ----------
-    subbands
-        Indices of the sub-bands that represent all, int [J].
-    onboard
-        Gains on the board, complex64 [N_B, N_E, J, K].
-    paths
-        Gains from each feed via each element to each wave in the air, complex64
-        [N_B, N_E, J, K, L]. The first wave, the line of sight, is left zero. The others are the
-        strongest modes of the multipath, the columns of G with G G^T close to V_i.
-    starts
-        Fixed waves on the board, with which the search starts, float32 [S, 2 J K].
-    peaks
-        Upper limits of the amplitude of a mode at a feed, float64 [N_B].
-    scattered
-        Configurations with a high capacity over the multipath alone, float32 [N_B, n, N_E].
-    fixed
-        Elements whose configuration is always 1, bool [N_E].
-    """
-
-    subbands: np.ndarray
-    onboard: np.ndarray
+    subbands: np.ndarray  # Indices of the representative sub-bands, int [J].
+    onboard: np.ndarray  # Gains on the board, complex64 [N_B, N_E, J, K].
+    # Gains from each feed via each element to each wave in the air, complex64 [N_B, N_E, J, K, L].
+    # The first wave, the line of sight, is zero here. The others are the strongest modes of the
+    # multipath, the columns of G with G G^T close to V_i.
     paths: np.ndarray
-    starts: np.ndarray
-    peaks: np.ndarray
-    scattered: np.ndarray
-    fixed: np.ndarray
+    starts: np.ndarray  # Waves on the board with which the search starts, float32 [S, 2 J K].
+    peaks: np.ndarray  # Upper limits of the amplitude of a mode at a feed, float64 [N_B].
+    scattered: np.ndarray  # Good configurations for the multipath alone, float32 [N_B, n, N_E].
+    fixed: np.ndarray  # Elements whose configuration is always 1, bool [N_E].
 
 
 def candidate_configurations(
@@ -77,30 +60,32 @@ def candidate_configurations(
     """Find configurations of high capacity, float64 [N_B, n, N_E], each entry 0 or 1.
 
     By the holographic principle, a configuration enables the elements at which a wave on the
-    board, s B, and a wave in the air, G w, are in phase. The waves in the air are the line of
-    sight and the modes of the multipath, the columns of G. Starting from fixed waves on the
-    board, spread over all directions, the search improves waves and configuration in turn: the
-    best pair of waves for a configuration belongs to the largest singular value of B diag(c) G.
-    The search begins with the line of sight alone, for which the best wave on the board is known.
-    It continues with the best configurations found, those for the multipath alone, and the matched
-    filter. The strongest modes improve all of them, and all modes then the best.
+    board, s B, is in phase with a wave in the air, G w. The waves in the air are the line of sight
+    and the modes of the multipath, the columns of G. The search improves waves and configuration
+    in turn: the best pair of waves for a configuration belongs to the largest singular value of
+    B diag(c) G. It begins with fixed waves on the board, spread over all directions, and with the
+    line of sight alone, for which the best wave on the board is known. The best of these
+    configurations, those for the multipath alone, and the matched filter are then improved with
+    the strongest modes, and the best of them with all modes.
 
     `index` selects the bands of the link from the tables. The configurations of a band are in no
     particular order, and some may be equal.
     """
     los = np.swapaxes(link.los[:, tables.subbands], 1, 2)[..., None]
     direct = tables.onboard[index] * los
-    # The power is divided evenly among the sub-bands. Limits of the amplitudes keep the search
-    # within the range of single precision and hardly change its result.
+    # The power is divided evenly among the sub-bands. The amplitudes are limited to the range of
+    # single precision, which hardly changes the result.
     peak = np.maximum(np.abs(direct).sum(axis=1).max(axis=(1, 2)), tables.peaks[index])
     over_noise = np.sqrt(link.power_w / link.los.shape[1] / link.noise_power_w)
     scale = (np.clip(over_noise * peak, *_AMPLITUDES) / peak)[:, None, None, None]
     direct = (scale * direct).astype(np.complex64, order='C')
     paths = tables.paths[index] * scale[..., None].astype(np.float32)
     paths[..., 0] = direct
+    interference = direct.real.sum(axis=(2, 3))[:, None]
+    loudest = np.abs(interference).max(axis=-1, keepdims=True) + np.float32(_MIN_NORM)
+    matched = np.where(tables.fixed, np.float32(1), (interference / loudest + 1) / 2)
     analog = np.concatenate([
-        _direct_configurations(tables, direct), tables.scattered[index],
-        _matched(tables, direct)], axis=1)
+        _direct_configurations(tables, direct), tables.scattered[index], matched], axis=1)
     gains = np.ascontiguousarray(paths[..., :1 + _N_STRONGEST])
     waves = _Waves.at(gains, analog)
     for _ in range(_N_STEPS):
@@ -132,10 +117,7 @@ def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
 
 
 def _modes(scenario: Scenario) -> np.ndarray:
-    """Return the strongest modes of the multipath in each band, [N_B, N_E, L].
-
-    Bands with fewer modes than others have columns of zeros.
-    """
+    """Return the strongest modes of the multipath, [N_B, N_E, L], padded with zeros."""
     spatial = spatial_covariance(scenario)
     powers, directions = (
         _strongest(spatial) if spatial.matrix is None else np.linalg.eigh(spatial.matrix))
@@ -147,7 +129,7 @@ def _modes(scenario: Scenario) -> np.ndarray:
 
 
 def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest eigenvalues and the eigenvectors, as `numpy.linalg.eigh` does."""
+    """Return the largest eigenvalues and their eigenvectors, as `numpy.linalg.eigh` does."""
     from scipy.sparse.linalg import LinearOperator, eigsh
 
     pairs = []
@@ -161,7 +143,7 @@ def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
         start = start.astype(float if spatial.is_real else complex)
         operator = LinearOperator((len(start), len(start)), times, dtype=start.dtype)
         powers, directions = eigsh(operator, _MAX_MODES, v0=start, tol=_MODE_TOLERANCE)
-        # Those of complex matrices are in no particular order.
+        # For complex matrices, they are in no particular order.
         order = np.argsort(powers)
         pairs.append((powers[order], directions[:, order]))
     return np.stack([one for one, _ in pairs]), np.stack([other for _, other in pairs])
@@ -169,7 +151,7 @@ def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
 
 def _scattered_configurations(
         paths: np.ndarray, fixed: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Search for configurations without a line of sight, from random waves in the air."""
+    """Search from random waves in the air for configurations that suit the multipath alone."""
     shape = (len(paths), _N_STARTS, *paths.shape[2:])
     on_board = _complex_normal((*shape[:-1], 1), rng)
     in_air = _complex_normal((*shape[:-2], 1, shape[-1]), rng)
@@ -184,10 +166,10 @@ def _complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndar
 
 
 def _direct_configurations(tables: Tables, direct: np.ndarray) -> np.ndarray:
-    """Return configurations, float32 [N_B, n, N_E], for gains complex64 [N_B, N_E, J, K]."""
+    """Search for configurations [N_B, n, N_E] for line-of-sight gains [N_B, N_E, J, K]."""
     n_bands, n_elements, n_subbands, n_feeds = direct.shape
-    # Real arithmetic suffices: configurations are real, and only the real part of the product of
-    # the waves matters.
+    # Real arithmetic suffices, because configurations are real and only the real part of the
+    # product of the waves matters.
     gains = direct.reshape(n_bands, n_elements, -1).view(np.float32)
     analog = _in_phase(tables.starts @ np.swapaxes(gains, 1, 2), tables.fixed)
     # The best wave on the board is the conjugate of the channels at the feeds.
@@ -200,30 +182,13 @@ def _direct_configurations(tables: Tables, direct: np.ndarray) -> np.ndarray:
     return _in_phase(waves @ np.swapaxes(gains, 1, 2), tables.fixed)
 
 
-def _matched(tables: Tables, direct: np.ndarray) -> np.ndarray:
-    """Return the matched filter for line-of-sight gains, float32 [N_B, 1, N_E]."""
-    interference = direct.real.sum(axis=(2, 3))[:, None]
-    peak = np.abs(interference).max(axis=-1, keepdims=True) + np.float32(_MIN_NORM)
-    return np.where(tables.fixed, np.float32(1), (interference / peak + 1) / 2)
-
-
 class _Waves(NamedTuple):
-    """Configurations, float32 [N_B, n, N_E], with their capacities and a pair of waves for each.
-
-    Attributes
-    ----------
-    rate
-        Capacities [nat/symbol], float32 [N_B, n].
-    on_board
-        Conjugates of unit waves on the board, complex64 [N_B, n, J, K, 1].
-    in_air
-        The best waves in the air for them, over 1 plus the signal-to-noise ratio, complex64
-        [N_B, n, J, 1, L].
-    """
+    """Configurations, float32 [N_B, n, N_E], each with its capacity and a pair of waves."""
 
     analog: np.ndarray
-    rate: np.ndarray
-    on_board: np.ndarray
+    rate: np.ndarray  # Capacities [nat/symbol], float32 [N_B, n].
+    on_board: np.ndarray  # Conjugates of unit waves on the board, complex64 [N_B, n, J, K, 1].
+    # Best waves in the air for them over 1 plus the signal-to-noise ratio, [N_B, n, J, 1, L].
     in_air: np.ndarray
 
     @classmethod
@@ -247,12 +212,12 @@ class _Waves(NamedTuple):
         return cls(analog, np.log1p(snr).sum(axis=-1), on_board, in_air)
 
     def improved(self, known: np.ndarray, paths: np.ndarray, fixed: np.ndarray) -> '_Waves':
-        """Return the configurations that suit these waves over known paths, and their waves."""
+        """Return the configurations that match these waves over `known` paths, and their waves."""
         analog = _enabled(self.on_board * self.in_air, known, fixed)
         return _Waves.at(paths, analog, self.on_board)
 
     def best(self, n: int) -> '_Waves':
-        """Return the `n` best of each band; repeated capacities come last."""
+        """Return the `n` best of each band; equal capacities count once if possible."""
         bands = np.arange(len(self.rate))[:, None]
         order = np.argsort(-self.rate, axis=1)
         ranked = self.rate[bands, order]

@@ -19,7 +19,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.support.threads import one_blas_thread
 
-# Maximum number of rounds; two or three are usual.
+# Maximum number of rounds; usually two or three suffice.
 _MAX_ROUNDS = 100
 # Smallest relative gain of the capacity that justifies another round.
 _MIN_GAIN = 1e-9
@@ -28,15 +28,15 @@ _MIN_GAIN = 1e-9
 def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Increase the capacity of configurations until no step increases it.
 
-    Each round finds the best digital part and then, with that part fixed, a better configuration.
-    The received power is convex in the configuration, so that it lies above its linear model at
-    any point. The vertex of the box [0, 1]^N_E to which the gradient points therefore receives
-    more power, unless the point is that vertex. The capacity usually increases with the power,
-    but not always, and is therefore compared. If the vertex does not increase it, the round moves
-    the one element to an end of its range that increases the capacity most. The capacity never
-    falls below the capacity of the start.
+    Each round finds the best digital part, and then a better configuration for it. The received
+    power is convex in the configuration, so it lies above its linear model at any point. The
+    vertex of the box [0, 1]^N_E in the direction of the gradient therefore receives more power,
+    unless the point is that vertex. The capacity usually, but not always, increases with the
+    power. If the vertex does not increase the capacity, the round moves a single element to an end
+    of its range, the one that increases the capacity most. The capacity never falls below its
+    value at the start.
 
-    Takes links of several bands and starts, float64 [N_B, n, N_E], each entry in [0, 1]. Returns
+    Takes links of several bands, and starts, float64 [N_B, n, N_E], each entry in [0, 1]. Returns
     configurations of the same shape and range, and their capacities [nat/symbol] summed over the
     sub-bands, float64 [N_B, n].
     """
@@ -44,7 +44,7 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     spread = np.abs(link.los)**2 + link.spatial.power[:, None]
     spread = spread[:, None]
     point = _Point.at(link, spread, analog)
-    # Whether the vertex remains to be tried.
+    # Whether the vertex has yet to be tried.
     is_new = np.ones(point.rate.shape, bool)
     for _ in range(_MAX_ROUNDS):
         to_vertex = is_new & (point.vertex != point.analog).any(axis=-1)
@@ -56,7 +56,7 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             done[..., None], point.analog,
             np.where(to_vertex[..., None], point.vertex, by_element)))
         is_new = other.rate - point.rate > _MIN_GAIN * point.rate
-        # An element that does not increase the capacity after all ends the ascent.
+        # If the element does not increase the capacity after all, the ascent ends.
         if not (is_new | to_vertex).any():
             break
         point = other if (is_new | done).all() else other.where(is_new, point)
@@ -64,33 +64,20 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _Point(NamedTuple):
-    """Configurations, float64 [N_B, n, N_E], and the capacity with their best digital parts.
-
-    Attributes
-    ----------
-    rate
-        Capacities [nat/symbol], float64 [N_B, n].
-    vertex
-        The vertex that the gradient points to, float64 [N_B, n, N_E].
-    snr
-        Signal-to-noise ratios, float64 [N_B, n, N_SB].
-    slope, curvature
-        Derivative of the ratios with respect to each element, and the coefficient of the square
-        of a change, float64 [N_B, n, N_SB, N_E].
-    """
+    """Configurations, float64 [N_B, n, N_E], and the capacity with their best digital parts."""
 
     analog: np.ndarray
-    rate: np.ndarray
-    vertex: np.ndarray
-    snr: np.ndarray
-    slope: np.ndarray
-    curvature: np.ndarray
+    rate: np.ndarray  # Capacities [nat/symbol], float64 [N_B, n].
+    vertex: np.ndarray  # Vertex in the direction of the gradient, float64 [N_B, n, N_E].
+    snr: np.ndarray  # Signal-to-noise ratios, float64 [N_B, n, N_SB].
+    slope: np.ndarray  # Derivatives of the ratios, float64 [N_B, n, N_SB, N_E].
+    curvature: np.ndarray  # Coefficient of the square of an element's change, of the same shape.
 
     @classmethod
     def at(cls, link: BandLink, spread: np.ndarray, analog: np.ndarray) -> '_Point':
         configured, scattered, direct = link.feeds(analog)
         gains, directions = np.linalg.eigh(link.correlations(configured, scattered, direct))
-        # The configuration may pass no signal; only rounding makes the gain negative.
+        # The configuration may block all signals; only rounding makes the gain negative.
         gain = np.maximum(gains[..., -1], 0) / link.noise_power_w
         power = water_filling(gain, link.power_w)
         snr = gain * power
@@ -107,11 +94,11 @@ class _Point(NamedTuple):
         return cls(analog, np.log1p(snr).sum(axis=-1), vertex, snr, slope, curvature)
 
     def element_step(self, link: BandLink) -> tuple[np.ndarray, np.ndarray]:
-        """Return the best change of one element to an end of its range, and its gain [nat]."""
+        """Return the configurations after the best change of one element, and its gain [nat]."""
         # Axes: end, band, start, sub-band, element.
         steps = np.stack([-self.analog, 1 - self.analog])[:, :, :, None] * ~link.fixed
-        # The power is quadratic in each element, so that this is exact; only rounding can make
-        # it negative.
+        # The power is quadratic in each element, so this is exact; only rounding can make it
+        # negative.
         snr = self.snr[..., None] + steps * (self.slope + steps * self.curvature)
         low, high = np.log1p(np.maximum(snr, 0)).sum(axis=-2)
         rates = np.maximum(low, high)
@@ -129,7 +116,8 @@ class _Point(NamedTuple):
 
 # Number of ascents in each band.
 _N_ASCENTS = 2
-# Between the sub-bands of an ascent, phases drift by at most this, up to a number of sub-bands.
+# Largest drift of phases between the sub-bands of an ascent, and largest number of these
+# sub-bands.
 _MAX_DRIFT_RAD = 0.05
 _MAX_SUBBANDS = 64
 
@@ -165,16 +153,11 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
           surface: SurfaceEstimate | None = None) -> Beam:
     """Find a beam that maximises Eq. (10) for a user at a position, float64 [3] [m].
 
-    A search from many starts and the matched filter proposes configurations. The best few of them
-    are then improved together with the digital part. Amplitudes of the beam are 0 or 1, which
-    are among any number of amplitude levels. The power over all sub-bands is P_max. The same
-    position always gives the same beam. Bands are counted from 0. A calibrated surface applies
-    its own coefficients to the configuration of the beam.
-
-    Raises
-    ------
-    ValueError
-        If the position is not a finite [3] array, or the band is out of range.
+    A search from many starts, including the matched filter, proposes configurations. The best few
+    are improved together with the digital part. Amplitudes are 0 or 1, which exist for any number
+    of amplitude levels. The power over all sub-bands is P_max. The beam is deterministic. Bands
+    are counted from 0. A calibrated surface applies its own coefficients to the configuration.
+    Raises ValueError if the position is not a finite [3] array, or the band is out of range.
     """
     return steer_bands(scenario, position, [band], surface)[0]
 
@@ -200,12 +183,12 @@ def steer_bands(
 
 @one_blas_thread
 def prepare_steering(scenario: Scenario, surface: SurfaceEstimate | None = None) -> None:
-    """Compute the tables of a scenario and a surface, which delay the first beam otherwise."""
+    """Compute the tables of a scenario and a surface before the first beam needs them."""
     choose_beam(scenario, np.array(scenario.roi_center_m), surface=surface)
 
 
 def applied_beam(beam: Beam, surface: SurfaceEstimate | None) -> Beam:
-    """Return a beam with the coefficients and the gain that a calibrated surface applies."""
+    """Return a beam with the coefficients and gains that a calibrated surface applies to it."""
     if surface is None:
         return beam
     return Beam(surface.applied(beam.analog), surface.band_gains[beam.band] * beam.digital,
@@ -216,28 +199,14 @@ def applied_beam(beam: Beam, surface: SurfaceEstimate | None) -> Beam:
 def choose_beam(
         scenario: Scenario, mean: np.ndarray, covariance: np.ndarray | None = None,
         bands: Sequence[int] | None = None, surface: SurfaceEstimate | None = None) -> Choice:
-    """Steer a beam of each band to the mean position and choose the one of highest mean capacity.
+    """Steer a beam of each band to the mean position, and choose the one of highest mean capacity.
 
-    The capacity at the mean alone would mislead: a band with a stronger but narrower beam may
-    lose more capacity to the positioning error than its strength adds. The first of equal bands
-    is chosen.
-
-    Parameters
-    ----------
-    mean
-        Float64 [3] [m].
-    covariance
-        Float64 [3, 3] [m^2]; None if the position is known exactly.
-    bands
-        Bands to choose from, counted from 0; None for all.
-    surface
-        A calibrated surface; by default that of the scenario.
-
-    Raises
-    ------
-    ValueError
-        If `mean` or `covariance` has a wrong shape or is not finite, there is no band, or a band
-        is out of range.
+    The posterior is Gaussian, with the mean, float64 [3] [m], and the covariance, float64 [3, 3]
+    [m^2]; without a covariance, the position is exact. The capacity at the mean position alone
+    would mislead: a stronger but narrower beam may lose more capacity to the positioning error
+    than it gains. `bands` are counted from 0, and all by default; the first of equal bands is
+    chosen. Raises ValueError if `mean` or `covariance` has a wrong shape or is not finite, there
+    is no band, or a band is out of range.
     """
     covariance = np.zeros((3, 3)) if covariance is None else covariance
     bands = range(scenario.n_bands) if bands is None else bands
@@ -255,21 +224,11 @@ def capacity_report(
         surface: SurfaceEstimate | None = None) -> CapacityReport:
     """Compare a beam with the beam that `choose_beam` finds for the true position.
 
-    Both transmit over the paths of a channel file, if the scenario has one. The search for a beam
-    ends slightly below the maximum, so that the loss with an accurate estimate may be negative,
-    typically by less than a tenth of a per cent.
-
-    Parameters
-    ----------
-    position
-        The true position, float64 [3] [m].
-    bands, surface
-        As in `choose_beam`.
-
-    Raises
-    ------
-    ValueError
-        If the position is not a finite [3] array, or the beam does not fit the scenario.
+    Both beams transmit over the paths of a channel file, if the scenario has one. The search for a
+    beam ends slightly below the maximum. With an accurate estimate, the loss may therefore be
+    negative, typically by less than a tenth of a per cent. `bands` and `surface` are passed to
+    `choose_beam`. Raises ValueError if the position is not a finite [3] array, or the beam does
+    not fit the scenario.
     """
     def actual_bps(beam: Beam) -> float:
         place = np.asarray(position, dtype=float)[None]

@@ -26,7 +26,7 @@ def blocks(n: int, size: int) -> list[slice]:
 
 @functools.cache
 def gauss_legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights of a quadrature from -1 to 1, which are slow to compute."""
+    """Return nodes and weights of Gauss-Legendre quadrature from -1 to 1."""
     nodes, weights = np.polynomial.legendre.leggauss(n)
     return read_only(nodes), read_only(weights)
 
@@ -38,7 +38,7 @@ def digest(*arrays: np.ndarray) -> str:
 
 def check_arrays(owner: Any, shapes: Mapping[str, tuple[int, ...]],
                  error: type[ValueError] = ValueError) -> None:
-    """Raise an error unless attributes have these shapes and are finite."""
+    """Raise `error` unless the attributes of `owner` are finite and have these shapes."""
     for name, shape in shapes.items():
         array = getattr(owner, name)
         if np.shape(array) != shape:

@@ -1,20 +1,20 @@
 """Coefficients of the elements of a surface: drawn, declared as unknown, or estimated.
 
-The coefficient of element m in frame q is (1 + e_m) x_{q,m}, with the relative error e_m, complex
-normal of variance s^2, and the amplitude x: the configuration c, or with the probability p of a
-failure a level that is uniform in [0, 1]. Over surfaces, its mean is (1 - p) c + p / 2, and its
-covariance between two frames is
+The coefficient of element m in frame q is (1 + e_m) x_{q,m}. The relative error e_m is complex
+normal with variance s^2. The amplitude x is the configuration c or, if the element has failed, a
+level that is uniform in [0, 1]; the probability of a failure is p. Over all surfaces, the
+coefficient has the mean (1 - p) c + p / 2 and, between two frames, the covariance
 
-    s^2 E[x_q] E[x_q'] + (1 + s^2) (p / 12 + p (1 - p) (1/2 - c_q) (1/2 - c_q')),
+    s^2 E[x_q] E[x_q'] + (1 + s^2) (p / 12 + p (1 - p) (1/2 - c_q) (1/2 - c_q')).
 
-a sum of at most three products of a factor for each frame. Elements are independent. Signals are
-treated as circular: failures also contribute a pseudo-covariance, a sum over elements whose terms
-differ in phase.
+This is a sum of at most three terms, each a product of one factor per frame. Elements are
+independent. Signals are treated as circular, although failures also cause a pseudo-covariance: a
+sum over elements whose terms differ in phase.
 
-An estimated coefficient is linear in two numbers, ``gain c + offset``: an element that works has
-the offset 0, and one that has failed the gain 0. A band multiplies all its signals by a gain of
-the receiving chain. Mean signals are therefore linear in the elements and in each band's gain, and
-their errors have a covariance in closed form.
+An estimated coefficient is ``gain c + offset``: the offset of a working element is 0, as is the
+gain of a failed one. All signals of a band are also multiplied by a gain of its receiving chain.
+The mean signals are therefore linear in the elements and in the gain of each band, and their
+errors have a covariance in closed form.
 """
 
 import dataclasses
@@ -34,42 +34,42 @@ from rhs_isac_ros.model.multipath import (
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import AppliedBeams, Beamforming, feed_weights
 
-# Nodes along each side of the region of interest. Products of the gains of two sub-bands have no
-# carrier and are smooth.
+# Nodes along each side of the region of interest. The product of the gains in two sub-bands is
+# smooth, because the carrier cancels.
 _ROI_NODES = 8
-# Quasi-random positions over which other covariances are averaged.
+# Base-2 logarithm of the number of quasi-random positions over which covariances are averaged.
 _LOG2_NODES = 7
 # Positions evaluated at a time.
 _BLOCK = 32
 
-# Callable that takes a band and positions, float64 [N, 3] [m], and returns errors of the direct
-# path's signals per unit of R white numbers, complex128 [N, N_SB F, R].
+# Function of a band and positions, float64 [N, 3] [m], that returns the errors of the signals on
+# the direct path per unit of R white numbers, complex128 [N, N_SB F, R].
 DirectErrors = Callable[[int, np.ndarray], np.ndarray]
 
 
 class SurfaceModel:
     """Knowledge of the elements of a surface: expected coefficients and their errors.
 
-    A subclass defines `applied_beams`, and if there are errors `is_exact` and `errors`.
+    A subclass defines `applied_beams` and, if there are errors, `is_exact` and `errors`.
     """
 
     @property
     def is_exact(self) -> bool:
-        """Whether there are no errors."""
+        """Whether the coefficients of the elements are known without errors."""
         return True
 
     def applied_beams(self, beams: Beamforming) -> AppliedBeams:
-        """Return the expected beamforming in effect."""
+        """Return the beamforming with the expected coefficients of the elements."""
         raise NotImplementedError
 
     def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
-        """Return the covariance from the multipath [N_B, N_SB F, N_SB F] and the direct errors."""
+        """Return the multipath covariance [N_B, N_SB F, N_SB F] and the errors of direct paths."""
         raise NotImplementedError
 
     def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
         """Compute the covariance due to errors, complex128 [N_B, N_SB F, N_SB F] [W].
 
-        It is the average over the region of interest, and includes the errors of the direct path
+        It is an average over the region of interest, and includes the errors of the direct path
         and of the multipath.
         """
         from scipy.stats import qmc
@@ -82,7 +82,7 @@ class SurfaceModel:
 
     def error_covariance_at(
             self, scenario: Scenario, beams: Beamforming, positions: np.ndarray) -> np.ndarray:
-        """Compute `error_covariance` at positions [N, 3] [m] instead, [N, N_B, N_SB F, N_SB F]."""
+        """Compute `error_covariance` at single positions [N, 3] [m], [N, N_B, N_SB F, N_SB F]."""
         scattered, direct = self.errors(scenario, beams)
         covariance = np.repeat(scattered[None], len(positions), axis=0)
         for band in range(scenario.n_bands):
@@ -94,18 +94,10 @@ class SurfaceModel:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ElementErrors(SurfaceModel):
-    """Errors of the elements of one surface, the same in all bands and frames.
+    """Errors of the elements of one surface, the same in all bands and frames."""
 
-    Attributes
-    ----------
-    gains
-        Factor of the coefficient of each element, complex128 [N_E]; 1 without an error.
-    stuck
-        Amplitude of each failed element, float64 [N_E]; NaN where an element works.
-    """
-
-    gains: np.ndarray
-    stuck: np.ndarray
+    gains: np.ndarray  #: Factors of the coefficients, complex128 [N_E]; 1 without an error.
+    stuck: np.ndarray  #: Amplitudes of failed elements, float64 [N_E]; NaN if an element works.
 
     @property
     def id(self) -> str:
@@ -123,7 +115,7 @@ class ElementErrors(SurfaceModel):
         return np.where(np.isnan(self.stuck), analog, self.stuck) * self.gains
 
     def applied_beams(self, beams: Beamforming) -> AppliedBeams:
-        """Return the beamforming in effect."""
+        """Return the beamforming with the actual coefficients of the elements."""
         return AppliedBeams(self.applied(beams.analog), beams.digital)
 
 
@@ -140,13 +132,13 @@ class DeclaredElements(SurfaceModel):
         return self._is_exact
 
     def applied_beams(self, beams: Beamforming) -> AppliedBeams:
-        """Return the beamforming in effect, averaged over surfaces."""
+        """Return the beamforming with the coefficients averaged over surfaces."""
         share = self._failed_share
         analog = (1 - share) * beams.analog + share / 2 if share else beams.analog
         return AppliedBeams(analog, beams.digital)
 
     def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
-        """Compute the covariance, as `SurfaceModel` describes, from cached correlations."""
+        """Compute `SurfaceModel.error_covariance` from cached correlations."""
         covariance = []
         for band, radiation in enumerate(np.swapaxes(error_radiation(scenario, beams), 0, 1)):
             products = np.einsum('trm,tsm->rsm', radiation, np.conj(radiation))
@@ -154,7 +146,7 @@ class DeclaredElements(SurfaceModel):
         return np.stack(covariance)
 
     def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
-        """Return the errors, as `SurfaceModel` describes."""
+        """Return the errors; see `SurfaceModel.errors`."""
         # [N_B, N_SB F, T, N_E]
         radiation = np.moveaxis(error_radiation(scenario, beams), 0, 2)
         n_bands, n_rows, n_terms, n_elements = radiation.shape
@@ -171,26 +163,15 @@ class DeclaredElements(SurfaceModel):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SurfaceEstimate(SurfaceModel):
-    """Mean and covariance of the coefficients of a surface.
+    """Mean and covariance of the coefficients of a surface, ``gain c + offset``."""
 
-    Attributes
-    ----------
-    gains, offsets
-        Expected coefficient of each element, ``gain c + offset``, complex128 [N_E].
-    band_gains
-        Expected gain of each band, complex128 [N_B].
-    factor
-        F with F F^H the covariance of gains, offsets and relative errors of the band gains,
-        complex128 [2 N_E + N_B, R].
-    failed_probability
-        Probability that each element has failed, float64 [N_E].
-    """
-
-    gains: np.ndarray
-    offsets: np.ndarray
-    band_gains: np.ndarray
+    gains: np.ndarray  #: Expected gains of the elements, complex128 [N_E].
+    offsets: np.ndarray  #: Expected offsets of the elements, complex128 [N_E].
+    band_gains: np.ndarray  #: Expected gain of each band, complex128 [N_B].
+    #: F such that F F^H is the covariance of gains, offsets and relative errors of the band gains,
+    #: complex128 [2 N_E + N_B, R].
     factor: np.ndarray
-    failed_probability: np.ndarray
+    failed_probability: np.ndarray  #: Probability that each element has failed, float64 [N_E].
 
     @property
     def is_exact(self) -> bool:
@@ -205,15 +186,15 @@ class SurfaceEstimate(SurfaceModel):
 
     @property
     def failed(self) -> np.ndarray:
-        """Which elements have probably failed, bool [N_E]."""
+        """Whether each element has probably failed, bool [N_E]."""
         return self.failed_probability > 0.5
 
     def std(self) -> np.ndarray:
-        """Return the standard deviations of the rows of `factor`, float64 [2 N_E + N_B]."""
+        """Return the standard deviation of each row of `factor`, float64 [2 N_E + N_B]."""
         return np.sqrt(np.sum(np.abs(self.factor)**2, axis=1))
 
     def without_errors(self) -> 'SurfaceEstimate':
-        """Return an estimate that takes the means as exact."""
+        """Return the estimate with its means taken as exact."""
         return dataclasses.replace(self, factor=self.factor[:, :0])
 
     def applied(self, analog: np.ndarray) -> np.ndarray:
@@ -221,12 +202,12 @@ class SurfaceEstimate(SurfaceModel):
         return self.gains * analog + self.offsets
 
     def applied_beams(self, beams: Beamforming) -> AppliedBeams:
-        """Return the expected beamforming in effect, with the gains of the bands."""
+        """Return the beamforming with expected coefficients, times the gains of the bands."""
         return AppliedBeams(
             self.applied(beams.analog), self.band_gains[:, None, None, None] * beams.digital)
 
     def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
-        """Return the errors, as `SurfaceModel` describes."""
+        """Return the errors; see `SurfaceModel.errors`."""
         radiation = element_radiation(scenario, beams)
         of_elements, of_bands = np.split(self.factor, [2 * scenario.n_elements])
         scattered = scattered_errors(scenario, radiation, of_elements @ np.conj(of_elements.T))
@@ -248,8 +229,8 @@ def has_errors(scenario: Scenario) -> bool:
 def draw_surface(scenario: Scenario, rng: np.random.Generator) -> ElementErrors:
     """Draw the errors of a surface.
 
-    Generators in the same state give the same errors up to their declared size, and a higher
-    share of failed elements adds failures.
+    Generators in the same state draw the same errors, scaled to the declared size. A higher share
+    of failed elements only adds failures.
     """
     n_elements = scenario.n_elements
     fate, levels = rng.uniform(size=(2, n_elements))
@@ -259,10 +240,10 @@ def draw_surface(scenario: Scenario, rng: np.random.Generator) -> ElementErrors:
 
 
 def error_terms(scenario: Scenario) -> list[tuple[float, float]]:
-    """Return the factors of the coefficients' covariance: constants, and slopes over C.
+    """Return the factors of the coefficients' covariance, as constants and slopes over c.
 
     The covariance of an element's coefficient between two frames is a sum over T terms: one for
-    errors, and two more if elements can fail. Each is the product of the factors of both frames.
+    errors, and two more if elements can fail. Each term is a product of one factor per frame.
     """
     rms, share = scenario.element_error_rms, scenario.failed_element_share
     spread = np.sqrt((1 + rms**2) * share)
@@ -326,7 +307,7 @@ def direct_design(scenario: Scenario, radiation: np.ndarray, band: int,
 
 def scattered_errors(
         scenario: Scenario, radiation: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Compute the covariance of the signals from the multipath at erroneous elements [W].
+    """Compute the covariance [W] of the multipath signals that errors of the elements cause.
 
     Takes the weights of `element_radiation` and the covariance of gains and offsets, complex128
     [2 N_E, 2 N_E]. Returns complex128 [N_B, N_SB F, N_SB F].

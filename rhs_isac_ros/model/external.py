@@ -1,4 +1,4 @@
-"""Values of a scenario that come from outside of it: arrays of a file, or a plug-in."""
+"""Values of a scenario from outside: arrays read from a file, or an object from a plug-in."""
 
 import abc
 import functools
@@ -10,7 +10,7 @@ import numpy as np
 
 
 class External(abc.ABC):
-    """A value that a scenario writes as its origin and a digest; equal if the digests are.
+    """A value that a scenario writes as an origin and a digest; equal digests mean equal values.
 
     Attributes
     ----------
@@ -19,17 +19,17 @@ class External(abc.ABC):
     """
 
     origin: str
-    # The kind of value, and what a scenario expects, for errors.
+    # For error messages: the kind of value, and the values that a scenario accepts.
     WORDS: ClassVar[tuple[str, str]]
 
     @classmethod
     @abc.abstractmethod
     def load(cls, origin: Any) -> 'External':
-        """Load the value; raise ValueError if there is no valid one."""
+        """Load the value from its origin; raise ValueError if there is no valid value."""
 
     @classmethod
     def named(cls, text: str) -> 'External':
-        """Load a value by its origin, optionally with ``@`` and the digest that it must have.
+        """Load a value by its origin, which may be followed by ``@`` and the expected digest.
 
         Raise ValueError if there is no valid value or the digest differs.
         """
@@ -62,12 +62,12 @@ class External(abc.ABC):
         return isinstance(other, type(self)) and self.digest == other.digest
 
     def __hash__(self) -> int:
-        """Hash the content."""
+        """Return a hash of the content."""
         return hash(self.digest)
 
 
 class ArrayFile(External):
-    """Arrays of a file."""
+    """A value that consists of arrays in a file."""
 
     WORDS = 'arrays', 'the path of a file, or null'
 
@@ -77,7 +77,7 @@ class ArrayFile(External):
 
     @abc.abstractmethod
     def misfit(self, scenario: Any) -> str:
-        """Return why the arrays do not fit a scenario, from the field on; empty if they do."""
+        """Return the reason why the arrays do not fit a scenario, or '' if they fit."""
 
     @functools.cached_property
     def digest(self) -> str:

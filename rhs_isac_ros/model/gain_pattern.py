@@ -1,8 +1,9 @@
 """Gain patterns: amplitude gain of an antenna as a function of the angle from its boresight.
 
 The boresight of the elements is the x axis, and the user's antenna points in the opposite
-direction. The line between them therefore has the same angle theta from both boresights:
-cos theta = x / d for a user at the distance x from the surface's plane and d from the element.
+direction. The line between an element and the user therefore makes the same angle theta with both
+boresights: cos theta = x / d, with the user's distances x from the plane of the surface and d from
+the element.
 """
 
 from collections.abc import Callable
@@ -13,13 +14,13 @@ from rhs_isac_ros.model.arrays import digest
 from rhs_isac_ros.model.external import External
 from rhs_isac_ros.support import plugins
 
-# Callable that takes angles [rad], float64 of any shape, and returns float64 of that shape.
+# Function of angles [rad], float64 of any shape; the result has the same shape.
 AngleFunction = Callable[[np.ndarray], np.ndarray]
 
 # Angles [rad] at which patterns are checked and compared.
 _ANGLES = np.linspace(0, np.pi, 4097)
 _MAX_GAIN = 1e6
-# Step of the numerical derivative [rad]: truncation and rounding errors are about equal.
+# Step of the numerical derivative [rad], at which truncation and rounding errors are about equal.
 _STEP_RAD = 1e-3
 
 
@@ -31,6 +32,8 @@ class GainPattern(External):
     """Amplitude gain that depends only on the angle from the boresight.
 
     Patterns whose gains agree to seven digits are equal, even if they use different functions.
+    Raises PatternError if a function fails, or returns a wrong shape, complex values or values out
+    of range.
 
     Parameters
     ----------
@@ -43,11 +46,6 @@ class GainPattern(External):
         degrees.
     origin
         Name of the plug-in; empty for other functions.
-
-    Raises
-    ------
-    PatternError
-        If a function fails, or returns another shape or values that are not real or out of range.
     """
 
     WORDS = 'a function', f'a number or the name of a plug-in of {plugins.GAIN_PATTERNS}'
@@ -64,7 +62,7 @@ class GainPattern(External):
         if not gains[_ANGLES < np.pi / 2].any():
             raise PatternError('gain 0 at all angles below pi/2, expected a positive gain')
         content = gains if slope is None else np.concatenate([gains, self.slope(_ANGLES)])
-        # Machines may round the last digit of a sine differently, hence single precision.
+        # Single precision, because machines may round the last digit of a sine differently.
         self.digest = digest(content.astype('<f4'))
 
     def amplitude(self, angles: np.ndarray) -> np.ndarray:

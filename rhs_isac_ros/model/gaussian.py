@@ -9,13 +9,12 @@ BLOCKED_STD_DB = 10.0
 
 
 class Marginal(NamedTuple):
-    """The Gaussian of the first n of n + Q unknowns, after the maximum over the others."""
+    """Gaussian of the first n of n + Q unknowns, with the others at their maximum."""
 
     # Schur complement of the information [N, n, n], and gradient of the log-likelihood [N, n].
     information: np.ndarray
     gradient: np.ndarray
-    # Change of the other unknowns with the first ones [N, Q, n], and their step to the maximum
-    # [N, Q].
+    # How the maximum over the others moves with the first n [N, Q, n], and the step to it [N, Q].
     regression: np.ndarray
     offset: np.ndarray
     # Logarithm of the integral over the others relative to the maximum [N], without the factors
@@ -27,12 +26,11 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
                           ) -> np.ndarray:
     """Average the likelihood of Gaussian numbers over their level, a log-normal power.
 
-    Takes the energies of n complex numbers, relative to their variance at 0 dB, float64 [N], and
-    the standard deviation and the median of the level. Returns the logarithm of the average,
-    relative to the density of zeros at 0 dB, float64 [N].
+    `energy`, float64 [N], is the energy of n complex numbers relative to their variance at 0 dB.
+    Returns the logarithm of the average, float64 [N], relative to the density of zeros at 0 dB.
     """
     std = np.log(10) / 10 * std_db
-    # The likelihood of n numbers determines the level up to n**-0.5.
+    # The likelihood of n numbers has a width of n**-0.5 in the level, which the grid resolves.
     normal = np.linspace(-4, 4, 2 * int(np.ceil(4 * std * np.sqrt(n))) + 61)
     level, prior = np.log(10) / 10 * median_db + std * normal, -normal**2 / 2
     exponents = -energy[:, None] * np.exp(-level) - n * level + prior
@@ -42,11 +40,10 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
 
 
 def share_of_level(n: int, std_db: float) -> float:
-    """Return the share of the level in the variance of the logarithm of an energy, from 0 to 1.
+    """Return the share, from 0 to 1, of the variance of a log energy that is due to its level.
 
-    The energy is that of n complex Gaussian numbers of unknown level, a log-normal power with the
-    given standard deviation. Of the deviation of an energy from its median, this share is expected
-    to be a deviation of the level.
+    The energy is that of n complex Gaussian numbers whose unknown level is a log-normal power. If
+    an energy deviates from its median, this share of the deviation is attributed to the level.
     """
     variance = float(np.log(10) / 10 * std_db)**2
     return variance / (variance + 1 / n)
@@ -72,9 +69,9 @@ def eliminate(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Maximise a quadratic log-likelihood over nuisance parameters.
 
-    Takes its curvature in these, float64 [N, Q, Q], their coupling with n other unknowns,
-    [N, Q, n], and its gradient, [N, Q]. Returns how the maximum moves with the other unknowns,
-    [N, Q, n], and the step to the maximum, [N, Q].
+    Takes the curvature in these parameters, float64 [N, Q, Q], their coupling with n other
+    unknowns, [N, Q, n], and the gradient, [N, Q]. Returns how the maximum moves with the other
+    unknowns, [N, Q, n], and the step to the maximum, [N, Q].
     """
     both = np.linalg.solve(
         curvature, np.concatenate([-coupling, gradient[..., None]], axis=-1))

@@ -1,7 +1,7 @@
 """Positions of the elements and feeds, frequencies of the sub-bands, and polar coordinates.
 
-The polar coordinates q = (r, u, v) of a position are its range and two direction cosines: it lies
-at r (w, u, v) with w = sqrt(1 - u^2 - v^2), in front of the surface.
+The polar coordinates (r, u, v) of a position are its range and two direction cosines. The position
+is r (w, u, v) with w = sqrt(1 - u^2 - v^2), in front of the surface.
 """
 
 import functools
@@ -11,7 +11,7 @@ import numpy as np
 from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
-# A region thinner than this, in wavelengths, determines the coordinate.
+# Lower limit of the region's extent [wavelengths], so that the prior of a flat region is finite.
 _NO_EXTENT = 1e-5
 
 
@@ -64,7 +64,7 @@ def subband_frequencies_hz(scenario: Scenario) -> np.ndarray:
 def to_positions(points: np.ndarray) -> np.ndarray:
     """Convert points (r [m], u, v), float64 [..., 3], to positions, float64 [..., 3] [m].
 
-    Directions outside the unit circle have x = 0.
+    Points outside the unit circle, u^2 + v^2 > 1, are given x = 0.
     """
     distance, u, v = points[..., 0], points[..., 1], points[..., 2]
     positions = np.empty_like(points, dtype=float)
@@ -83,9 +83,9 @@ def to_polar(positions: np.ndarray) -> np.ndarray:
 
 
 def jacobian(points: np.ndarray) -> np.ndarray:
-    """Compute dp/dq at points (r [m], u, v), float64 [N, 3].
+    """Compute the derivative of the position with respect to r [m], u and v at points [N, 3].
 
-    The result is float64 [N, 3, 3], with the coordinates of the position in rows.
+    Returns float64 [N, 3, 3], in which rows are coordinates of the position.
     """
     distance, u, v = points.T
     w = np.sqrt(np.maximum(1 - u**2 - v**2, 1e-9))
@@ -97,12 +97,12 @@ def jacobian(points: np.ndarray) -> np.ndarray:
 
 
 def polar_bounds(bounds: np.ndarray) -> np.ndarray:
-    """Compute lower and upper limits of (r [m], u, v) between bounds of positions, [2, 3]."""
+    """Compute the limits of (r [m], u, v), [2, 3], in a box with the corners `bounds`, [2, 3]."""
     nearest, farthest = np.clip(0.0, *bounds), np.abs(bounds).max(axis=0)
     limits = np.empty((2, 3))
     limits[:, 0] = np.linalg.norm(nearest), np.linalg.norm(farthest)
     for axis in (1, 2):
-        # A cosine is the largest where the other coordinates are the smallest, if it is positive.
+        # A positive cosine is largest where the other coordinates are smallest.
         for side, bound in enumerate(bounds[:, axis]):
             outward = bound > 0 if side else bound < 0
             others = np.delete(nearest if outward else farthest, axis)
@@ -113,7 +113,7 @@ def polar_bounds(bounds: np.ndarray) -> np.ndarray:
 def region_information(scenario: Scenario) -> np.ndarray:
     """Return the information of a Gaussian as wide as the region, float64 [3, 3] [1/m^2].
 
-    Its covariance is that of the uniform distribution, size^2 / 12.
+    Its variances, size^2 / 12, equal those of the uniform distribution.
     """
     shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
     return np.diag(12 / np.maximum(scenario.roi_size_m, _NO_EXTENT * shortest)**2)

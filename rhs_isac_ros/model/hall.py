@@ -1,21 +1,19 @@
-"""Data of one hall that take the place of declared multipath: a covariance, or paths.
+"""Data of one hall that replace declared multipath: a measured covariance, or traced paths.
 
-A survey measures the covariance. Gains g of the elements in all measurements of a band are
-Gaussian with the covariance C_0 that three fields of the scenario declare. A survey with the
-radiation matrix T replaces the covariance L_0 of its signals T g + noise with a measured one, L,
-and keeps the distribution of g given these signals. Among all covariances of g for which the
-signals have the covariance L, the result has the smallest Kullback-Leibler divergence from C_0,
-apart from the noise:
+Let g be the Gaussian gains of the elements in all measurements of a band. Three fields of the
+scenario declare their covariance C_0. A survey with the radiation matrix T replaces the covariance
+L_0 of its signals, T g + noise, by the measured covariance L, and keeps the distribution of g
+given the signals. Apart from the noise, the result has the smallest Kullback-Leibler divergence
+from C_0 among all covariances of g that give the signals the covariance L:
 
     C = C_0 + C_0 T^H M T C_0    with    M = L_0^-1 (L - L_0) L_0^-1.
 
-It yields the covariance for any other beams, and for single elements.
+C also gives the covariance of the signals for any other beams, and of single elements.
 
 Paths come from a ray tracer, for example. A path is a spherical wave from a virtual source, such
-as the mirror image of the user in a wall: a line of sight to that source, times a complex
-reflection coefficient, which is the amplitude of the path at the surface's centre relative to free
-space over the same distance. Gain patterns of elements and users apply to a path as they do to a
-line of sight to its source.
+as the mirror image of the user in a wall. Its gain is the line-of-sight gain to this source,
+including gain patterns of elements and users, times a complex reflection coefficient: the
+amplitude of the path at the centre of the surface, relative to free space over the same distance.
 """
 
 import dataclasses
@@ -41,15 +39,16 @@ SPEED_OF_LIGHT_MPS = 299_792_458.0
 _FORMAT = 1
 # Fields of the scenario that a measured covariance replaces.
 FIELDS = ('multipath_to_los_db', 'delay_spread_s', 'angular_spread_deg')
-# Fields on which it depends; they are written to the file.
+# Fields on which a measured covariance depends; its file contains their values.
 CONDITIONS = (
     'center_frequencies_hz', 'n_subbands', 'subband_width_hz', 'n_frames', 'elements_per_side',
     'element_interval_wavelengths', 'multipath_direction_deg', 'roi_center_m', 'roi_size_m')
 # Largest ratio of a centre frequency to the frequency of the paths, or the inverse.
 _MAX_FREQUENCY_RATIO = 1.5
-# Largest amplitude relative to free space, and distance of a direct path's source from its user.
+# Largest amplitude relative to free space, and largest distance between a user and the source of
+# the user's direct path.
 _MAX_COEFFICIENT, _MAX_OFFSET_M = 2.0, 0.01
-# Smallest share of the users that are in the region of interest.
+# Smallest share of the users who must be in the region of interest.
 _MIN_SHARE = 0.5
 # Types of the arrays of paths in memory; in a file, some have less precision.
 _TYPES = {'users': float, 'a': complex, 'src': float, 'n': int, 'f0': float, 'gains': complex}
@@ -60,10 +59,12 @@ _FILE_TYPES = {'a': np.complex64, 'gains': np.complex64, 'src': np.float32, 'n':
 class MultipathEstimate(ArrayFile):
     """A measured covariance of the multipath, as a value of the field `Scenario.multipath`.
 
+    Raises ArchiveError if sizes disagree or a number is not finite.
+
     Attributes
     ----------
     multipath_to_los_db, delay_spread_s, angular_spread_deg
-        The fields of C_0.
+        The fields that declare C_0.
     radiation
         T_i of the survey, complex128 [N_B, N_SB F, N_E].
     excess
@@ -71,15 +72,10 @@ class MultipathEstimate(ArrayFile):
     conditions
         Fields of the survey's scenario on which the covariance depends.
     about
-        How it was made: ``positions``, their number; ``prior_weight`` nu, ``inflation`` t and
-        ``level_std_db``, the standard deviation of the power among users [dB];
+        Record of the survey: ``positions``, the number of positions; ``prior_weight`` nu;
+        ``inflation`` t; ``level_std_db``, the standard deviation of the power among users [dB];
         ``coverage``, the expected share of positions in the 95 % region, with its interval;
         ``warnings``; ``codebook``, its id; ``version``.
-
-    Raises
-    ------
-    ArchiveError
-        If sizes disagree or a number is not finite.
     """
 
     multipath_to_los_db: float
@@ -104,8 +100,7 @@ class MultipathEstimate(ArrayFile):
     def level_db(self) -> tuple[float, float]:
         """Median and standard deviation of the level of a user's multipath [dB].
 
-        The median is below 0 dB, because the covariance is larger than the multipath by the
-        inflation of the survey.
+        The median is below 0 dB, because the survey inflates the covariance.
         """
         return (-10 * math.log10(self.about.get('inflation', 1.0)),
                 self.about.get('level_std_db', 0.0))
@@ -116,7 +111,7 @@ class MultipathEstimate(ArrayFile):
         return fields, self.radiation, self.excess
 
     def misfit(self, scenario: Any) -> str:
-        """Return why the covariance does not fit a scenario; empty if it does."""
+        """Return the reason why the covariance does not fit a scenario, or '' if it fits."""
         fields = scenario.fields()
         for name in CONDITIONS:
             if (own := self.conditions.get(name)) != fields[name]:
@@ -126,7 +121,7 @@ class MultipathEstimate(ArrayFile):
     def save(self, path: str | Path) -> None:
         """Write the estimate to a file of NumPy's format ``.npz``, without pickled objects.
 
-        An existing file is replaced at the end, or kept if there is an `OSError`.
+        An existing file is replaced only when the new one is complete.
         """
         write_archive(path, {'radiation': self.radiation, 'excess': self.excess}, {
             'format': _FORMAT, 'about': self.about, 'conditions': self.conditions,
@@ -149,29 +144,26 @@ class MultipathEstimate(ArrayFile):
 class PathChannel(ArrayFile):
     """Propagation paths between users and the surface, as a value of `Scenario.channel`.
 
-    Users have at most P paths; the amplitude of missing ones is 0.
+    Users have at most P paths; the amplitude of missing ones is 0. Raises ArchiveError if sizes
+    disagree, or a number is not finite or physically impossible.
 
     Attributes
     ----------
     users
         Positions, float64 [N, 3] [m], in the frame of the scenario.
     a
-        Amplitudes at the surface's centre and the frequency `f0` for antennas without gain,
-        without the phase of the distance, complex128 [N, P]; c / (4 pi f0 d) in free space.
+        Amplitudes at the centre of the surface and at the frequency `f0`, for antennas without
+        gain and without the phase of the distance, complex128 [N, P]; c / (4 pi f0 d) in free
+        space.
     src
         Virtual sources, float64 [N, P, 3] [m]; the user itself for the direct path.
     n
         Number of reflections, int [N, P]; 0 for the direct path, and -1 for a missing path.
     f0
-        Frequency of the amplitudes [Hz], which are inversely proportional to the frequency.
+        Frequency of the amplitudes [Hz]. Amplitudes are inversely proportional to the frequency.
     gains
-        Factors of the paths at each element, complex128 [N, P, N_E], for objects that only a part
-        of the surface sees; None if all are 1.
-
-    Raises
-    ------
-    ArchiveError
-        If sizes disagree, or a number is not finite or not possible.
+        Factors of the paths at each element, complex128 [N, P, N_E], for objects that are visible
+        from only a part of the surface; None if all factors are 1.
     """
 
     users: np.ndarray
@@ -234,7 +226,7 @@ class PathChannel(ArrayFile):
 
     @classmethod
     def joined(cls, parts: Sequence['PathChannel']) -> 'PathChannel':
-        """Join the users of several channels of one frequency and without factors `gains`."""
+        """Join the users of several channels, which must have one frequency and no `gains`."""
         n_paths = max(part.a.shape[1] for part in parts)
 
         def padded(name: str, value: float) -> np.ndarray:
@@ -272,7 +264,7 @@ class PathChannel(ArrayFile):
         return self.users, self.a, self.src, self.n, np.array([self.f0]), *gains
 
     def misfit(self, scenario: Any) -> str:
-        """Return why the paths do not fit a scenario; empty if they do."""
+        """Return the reason why the paths do not fit a scenario, or '' if they fit."""
         for frequency in scenario.center_frequencies_hz:
             ratio = max(frequency, self.f0) / min(frequency, self.f0)
             if ratio > _MAX_FREQUENCY_RATIO:

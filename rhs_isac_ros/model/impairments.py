@@ -1,15 +1,14 @@
 """Impairments of the signals: unknown gains, phases, and offsets of timing and carrier.
 
-Given the position, the signals of a cycle are Gaussian if a few Gaussian numbers and the elements
-of the surface (see `elements`) are known. Each of the numbers, a nuisance parameter x, has an
-exponent P of the signals: they are multiplied by ``exp(x P)``. A real exponent is a gain in
-nepers, an imaginary one a phase. The factor applies to the direct path and to the multipath, but
-not to the thermal noise. The exponential wraps phases, so that a phase whose standard deviation is
-a turn is uniform.
+Given the position, the elements of the surface (see `elements`) and a few Gaussian numbers, the
+signals of a cycle are Gaussian. Each of the numbers is a nuisance parameter x with an exponent P:
+the signals are multiplied by ``exp(x P)``. A real exponent is a gain in nepers, an imaginary one a
+phase. The factor applies to the direct path and to the multipath, but not to the thermal noise.
+The exponential wraps phases, so a phase whose standard deviation is a whole turn is uniform.
 
-Simulation, estimators, bounds and calibration use the results of an `Impairment` only. Another
-one is a plug-in of the group ``rhs_isac_ros.impairments``, or a `Factor` in `BUILT_IN` and the
-field of the scenario that declares it.
+Simulation, estimators, bounds and calibration depend only on the interface `Impairment`. A new
+impairment is a plug-in of the group ``rhs_isac_ros.impairments``, or a `Factor` in `BUILT_IN` with
+a field of the scenario that declares it.
 """
 
 import dataclasses
@@ -33,28 +32,19 @@ _NEPERS_PER_DB = np.log(10) / 20
 
 
 class Scope(enum.Enum):
-    """How often the value of an impairment is drawn anew."""
+    """When the values of an impairment are drawn anew: for every user, or in every cycle."""
 
     USER = 'user'
     CYCLE = 'cycle'
 
 
 class Linear(NamedTuple):
-    """The exponents of an impairment and the prior of its values.
+    """The exponents of an impairment and the prior of its values."""
 
-    Attributes
-    ----------
-    patterns
-        Exponent of the signals per unit of each value, complex128 [q, N_B, N_SB F].
-    root
-        Factor L of the covariance L L^T of the values, float64 [q, q], regular.
-    needs_search
-        Whether the likelihood of a value has several maxima within its prior, so that estimators
-        compare values on a grid before they refine one.
-    """
-
-    patterns: np.ndarray
-    root: np.ndarray
+    patterns: np.ndarray  #: Exponents per unit of each value, complex128 [q, N_B, N_SB F].
+    root: np.ndarray  #: Invertible factor L of the values' covariance L L^T, float64 [q, q].
+    #: Whether the likelihood of a value has several maxima within its prior. Estimators then
+    #: compare values on a grid before they refine one.
     needs_search: bool = False
 
 
@@ -62,14 +52,14 @@ class Impairment:
     """An impairment of the signals.
 
     A subclass defines `size` and `linear`. Its values are Gaussian unless it overrides `values`;
-    estimators and bounds always assume the Gaussian prior of `linear`. They are drawn anew as
-    often as `scope` states.
+    estimators and bounds always assume the Gaussian prior of `linear`. `scope` states how often
+    values are drawn anew.
     """
 
     scope: Scope = Scope.CYCLE
 
     def size(self, scenario: Scenario) -> int:
-        """Return the number q of values."""
+        """Return the number q of values that an impairment has."""
         raise NotImplementedError
 
     def linear(self, scenario: Scenario) -> Linear:
@@ -84,21 +74,13 @@ class Impairment:
 class Nuisance:
     """The nuisance parameters of all impairments of a scenario.
 
-    The parameters are x = L z with standard normal z. Bounds and estimators use z, which needs no
-    units.
-
-    Attributes
-    ----------
-    patterns, scaled_patterns
-        Exponent of the signals per unit of x and of z, complex128 [Q, N_B, N_SB F].
-    needs_search
-        As in `Linear`, bool [Q].
-    moves_multipath
-        Which of z change measurements of one band relative to each other, bool [Q]. These move the
-        multipath out of the nulls of its covariance.
-    phases
-        Phase of each band per unit of those z that only turn whole bands, and 0 for all others,
-        float64 [N_B, Q].
+    The parameters are x = L z with standard normal z. Bounds and estimators use z, which is
+    dimensionless. `patterns` and `scaled_patterns`, complex128 [Q, N_B, N_SB F], are the exponents
+    per unit of x and of z. `needs_search`, bool [Q], repeats the flag of `Linear`.
+    `moves_multipath`, bool [Q], marks values z that change the measurements of one band relative
+    to each other, and so move the multipath out of the nulls of its covariance. `phases`, float64
+    [N_B, Q], is the phase of each band per unit of z, and 0 for every z that does more than rotate
+    the phases of whole bands.
     """
 
     def __init__(self, scenario: Scenario, parts: Sequence[Linear]) -> None:
@@ -160,12 +142,12 @@ def _shape(scenario: Scenario) -> tuple[int, int]:
 
 @dataclasses.dataclass(frozen=True)
 class Factor(Impairment):
-    """Independent values whose standard deviation is a field of the scenario."""
+    """An impairment with independent values, whose standard deviation is a scenario field."""
 
     field: str
     # Function that returns the exponents per unit of the values.
     patterns: Callable[[Scenario], np.ndarray]
-    # Unit of the field, in the unit of the values.
+    # One unit of the field, expressed in the unit of the values.
     unit: float = 1.0
     needs_search: bool = False
     scope: Scope = Scope.CYCLE
@@ -213,8 +195,8 @@ def draw_factors(
 ) -> np.ndarray | None:
     """Draw the factors of the signals of n users and cycles, complex128 [n, N_B, N_SB F].
 
-    Impairments of users and of cycles have a generator each. The values of a built-in impairment
-    do not depend on others. The result is None if the scenario declares no impairment.
+    Users and cycles each have a generator. The values of a built-in impairment do not depend on
+    which others are declared. The result is None if the scenario declares no impairment.
     """
     declared = impairments_of(scenario)
     if not declared:
@@ -238,9 +220,9 @@ def draw_impairments(
 ) -> tuple[ElementErrors | None, np.ndarray | None]:
     """Draw a surface, and the factors of the signals of n phases, complex128 [n, N_B, N_SB F].
 
-    Each phase has another user. Either result is None if the scenario does not declare it. The
-    numbers come from children of the generator, whose own numbers, of multipath and noise, do not
-    depend on what is declared.
+    Each phase has a new user. Either result is None if the scenario does not declare it. The
+    numbers come from children of the generator, so that the multipath and noise drawn from `rng`
+    itself do not depend on the declared impairments.
     """
     if not has_errors(scenario) and not impairments_of(scenario):
         return None, None

@@ -1,7 +1,7 @@
 """Line-of-sight gains of the elements and their derivatives with respect to the user's position.
 
-Positions are those of the user, float64 [N, 3] [m]; `band` is an index from 0. Functions that take
-positions raise ValueError if the shape is wrong or a value is not finite.
+`positions`, float64 [N, 3] [m], belong to users, and `band` is an index from 0. A function that
+takes positions raises ValueError if the shape is wrong or a value is not finite.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,8 +14,8 @@ from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
-# Minimum distance of the user from an element's boresight. On boresight, the direction in which
-# the angle grows is undefined.
+# Minimum distance of the user from an element's boresight. On the boresight itself, the direction
+# in which the angle grows is undefined.
 _MIN_BORESIGHT_OFFSET_M = 1e-9
 # Gain, radial factor [1/m^2], and boresight term [1/m] or None, all times the frequency [Hz],
 # complex128 [N_SB, N, N_E].
@@ -32,7 +32,7 @@ def los_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray
 
 
 def draw_blocked(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw whether n users lack the direct path, bool [n]."""
+    """Draw which of n users are blocked, that is, have no direct path, bool [n]."""
     if not scenario.blocked_probability:
         return np.zeros(n, bool)
     return rng.spawn(1)[0].random(n) < scenario.blocked_probability
@@ -42,8 +42,9 @@ def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
                 blocked: np.ndarray | None = None) -> np.ndarray:
     """Compute the gains without random multipath, complex128 [N, N_SB, N_E].
 
-    These are the gains of `los_gain`, or with a channel file the sums over the paths of the users
-    nearest to the positions. Users that are `blocked`, bool [N], have no direct path.
+    Without a channel file, these are the gains of `los_gain`. With one, they are sums over the
+    paths of its users nearest to the positions. `blocked`, bool [N], marks users that have no
+    direct path.
     """
     channel = scenario.channel
     blocked = np.zeros(len(positions), bool) if blocked is None else blocked
@@ -65,10 +66,7 @@ def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
 
 def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
              weights: np.ndarray) -> np.ndarray:
-    """Sum the gains of `los_gain` over the elements in n bands, complex128 [n, N, N_SB].
-
-    The weights are complex128 [n, N_SB, N_E].
-    """
+    """Sum `los_gain` with weights [n, N_SB, N_E] over the elements of n bands, [n, N, N_SB]."""
     waves = los_waves(scenario, checked_positions(positions), bands, slopes=False)
     scaled = weights / subband_frequencies_hz(scenario)[list(bands), :, None]
     return np.stack([(gain @ row[..., None])[..., 0].T
@@ -93,12 +91,12 @@ def los_and_derivative(
 
 def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *,
               slopes: bool = True) -> Iterator[Waves]:
-    """Yield the gains h^LoS of bands times the frequency, and the factors of their derivative.
+    """Yield h^LoS times the frequency, and factors of its derivative, for one band at a time.
 
     The derivative with respect to the user's position p is dh/dp = a (p - p_m) + b e_x. The
     boresight term b exists only with a gain pattern, which adds (dh/dtheta) (dtheta/dp) for the
     angle theta from the boresight: dtheta/dp = ((p - p_m) cos theta / d - e_x) / (d sin theta).
-    Without `slopes`, the gain takes the place of the radial factor a.
+    Without `slopes`, the gain is repeated in place of the radial factor a.
     """
     elements = element_positions(scenario)
     distances = np.sqrt(sum(
@@ -157,22 +155,19 @@ def has_pattern(scenario: Scenario) -> bool:
 
 
 def _positions_first(scenario: Scenario, band: int, waves: np.ndarray) -> np.ndarray:
-    """Convert one of `Waves` to [N, N_SB, N_E], without the frequency."""
+    """Divide an array of `Waves` by the frequency, and return it as [N, N_SB, N_E]."""
     return np.divide(np.moveaxis(waves, 0, 1), subband_frequencies_hz(scenario)[band][:, None],
                      order='C')
 
 
 def _offsets(scenario: Scenario, positions: np.ndarray) -> np.ndarray:
-    """Vectors from every element to the user, float64 [N, N_E, 3] [m]."""
+    """Return the vectors from every element to the user, float64 [N, N_E, 3] [m]."""
     return positions[:, None, :] - element_positions(scenario)
 
 
 def _amplitude(
         scenario: Scenario, offsets: np.ndarray, *, slope: bool = False) -> float | np.ndarray:
-    """Gain times distance and frequency [m Hz], or its derivative by the angle [m Hz/rad].
-
-    Returns a number, or float64 [N, N_E] if there is a gain pattern.
-    """
+    """Return gain times distance times frequency, a number or [N, N_E], or its slope in theta."""
     gains = scenario.element_gain, scenario.user_gain
     angles = np.zeros(())
     if has_pattern(scenario):
@@ -187,11 +182,9 @@ def _amplitude(
 
 
 def _phasors(phases: np.ndarray) -> np.ndarray:
-    """Compute exp(i phase), complex128, for phases [rad] of moderate size.
+    """Compute exp(i phase), in a third of the time of `np.exp`, by a table and a Taylor series.
 
-    The nearest phasor of a table is rotated by the rest of the phase with the Taylor series, which
-    takes a third of the time of an exponential. The error is below 1e-15, or below the rounding
-    of a large phase.
+    The error is below 1e-15, or below the rounding of a large phase.
     """
     turns = phases * (_N_PHASORS / (2 * np.pi))
     nearest = np.rint(turns)

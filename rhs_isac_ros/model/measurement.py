@@ -1,8 +1,8 @@
 """Distribution and simulation of the signals received in a positioning phase.
 
 The signals of band i are complex Gaussian with a mean that depends on the user's position and a
-covariance Lambda_i that does not. Bands are independent of each other. Element errors that the
-scenario declares add to the covariance; `impairments` describes unknown gains and phases.
+covariance Lambda_i that does not. Bands are independent of each other. Errors of the elements add
+to the covariance; unknown gains and phases are described in `impairments`.
 """
 
 import functools
@@ -39,11 +39,11 @@ from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
 # Knowledge of the elements of one surface: their errors, or an estimate of them.
 Surface = ElementErrors | SurfaceEstimate
-# Largest number of positions evaluated at a time, and of gains of all elements and sub-bands. The
-# random numbers of `simulate_received` depend on the former.
+# Largest number of positions in a block, and of gains over their elements and sub-bands. Random
+# numbers of `simulate_received` depend on the former.
 _BLOCK, _MAX_GAINS = 256, 1 << 21
-# Memory for an array of all elements and sub-bands. Larger arrays leave the cache, and each call
-# gets new pages for them from the system.
+# Size of an array over elements and sub-bands [bytes]. Larger arrays do not fit in the cache, and
+# every call obtains new memory pages for them.
 _ARRAY_BYTES = 3 << 18
 _MIN_BLOCK = 8
 
@@ -56,7 +56,7 @@ def received_signal(
     Parameters
     ----------
     los
-        Line-of-sight gains H^LoS, complex128 [..., N_SB, N_E]; one row serves all F frames.
+        Line-of-sight gains H^LoS, complex128 [..., N_SB, N_E], the same in all F frames.
     multipath
         Multipath gains H^MP, complex128 [..., N_SB F, N_E] (sub-band-major), or 0.
     radiation
@@ -68,7 +68,7 @@ def received_signal(
     """
     n_subbands = los.shape[-2]
     frames = radiation.reshape(n_subbands, -1, radiation.shape[-1])
-    # Only the diagonal of H T^T is needed: the F rows of T of each sub-band with its gains.
+    # Only the diagonal of H T^T is needed: for each sub-band, its gains times its F rows of T.
     direct = np.matmul(los[..., None, :], np.swapaxes(frames, -1, -2))
     combined = direct.reshape(*los.shape[:-2], -1)
     if np.ndim(multipath):
@@ -80,17 +80,13 @@ def received_signal(
 def simulate_received(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
         rng: np.random.Generator, surface: ElementErrors | None = None) -> np.ndarray:
-    """Simulate signals of independent positioning phases by Eq. (8), element by element.
+    """Simulate the signals of independent positioning phases by Eq. (8), element by element.
 
-    Takes the user's position in each phase, float64 [N, 3] [m], and returns complex128
-    [N, N_B, N_SB F], sub-band-major. Impairments that the scenario declares are drawn too: a new
-    user and a new cycle for each position, and one surface for all of them, unless `surface` is
-    given. With a channel file, the users are the file's nearest to the positions.
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array, or a size differs from the scenario's.
+    The user's position in each phase is a row of `positions`, float64 [N, 3] [m]. Returns
+    complex128 [N, N_B, N_SB F], sub-band-major. Declared impairments are drawn too: a new user and
+    a new cycle for each position, and one surface for all positions unless `surface` is given.
+    With a channel file, the nearest user of the file replaces each position. Raises ValueError if
+    `positions` is not a finite [N, 3] array, or a size differs from the scenario's.
     """
     positions = checked_positions(positions)
     drawn, factors = draw_impairments(scenario, len(positions), rng)
@@ -115,8 +111,8 @@ def receive_feeds(
         rng: np.random.Generator | None) -> np.ndarray:
     """Combine the feed signals of a phase by Eq. (7), complex128 [N_B, N_SB, F].
 
-    Takes the signals at the feeds, complex128 [N_B, F, N_SB, K], and the source of the thermal
-    noise; None if the signals already contain noise.
+    `feeds` are the signals at the feeds, complex128 [N_B, F, N_SB, K]. `rng` draws the thermal
+    noise; it is None if the signals already contain noise.
     """
     noise = 0.0 if rng is None else _thermal_noise(scenario, codebook.digital.shape[:3], rng)
     return combine(codebook.digital, np.swapaxes(feeds, 1, 2), noise)
@@ -138,7 +134,7 @@ def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
 
 
 def position_blocks(scenario: Scenario, n: int) -> list[slice]:
-    """Split n positions into blocks whose line-of-sight gains need little memory."""
+    """Split n positions into blocks, which limits the memory for their line-of-sight gains."""
     return blocks(
         n, max(min(_BLOCK, _MAX_GAINS // (scenario.n_subbands * scenario.n_elements)), 1))
 
@@ -150,15 +146,16 @@ class MeasurementModel:
     and the weights of `mean_and_jacobian` are computed at first use, or by `prepare`.
 
     Methods take positions of the user, float64 [N, 3] [m], and raise ValueError if the shape is
-    wrong or a value is not finite. Measurements are sub-band-major.
+    wrong or a value is not finite. Measurements are sub-band-major. Raises ValueError if the
+    beamforming or the surface does not have the sizes of the scenario.
 
     Parameters
     ----------
     surface
-        Known errors of the elements, or an estimate of them, whose own errors the covariance
-        then includes. By default they are unknown, with the distribution that the scenario
-        declares: the mean is then the average over surfaces, and the covariance includes the
-        errors.
+        Known errors of the elements, or an estimate of the elements; the covariance then includes
+        the errors of the estimate. By default, the errors of the elements are unknown and have the
+        declared distribution: the mean is an average over surfaces, and the covariance includes
+        the errors.
 
     Attributes
     ----------
@@ -166,11 +163,6 @@ class MeasurementModel:
         `surface`, or the distribution that the scenario declares.
     radiation
         T_i of Eq. (9) for the coefficients in effect, complex128 [N_B, N_SB F, N_E], read-only.
-
-    Raises
-    ------
-    ValueError
-        If the beamforming or the surface does not have the sizes of the scenario.
     """
 
     @one_blas_thread
@@ -201,7 +193,7 @@ class MeasurementModel:
     def covariance_at(self, positions: np.ndarray) -> np.ndarray:
         """Compute the covariance at positions, complex128 [N, N_B, N_SB F, N_SB F] [W].
 
-        It depends on the position through unknown errors of the elements only.
+        It depends on the position only if errors of the elements are unknown.
         """
         positions = checked_positions(positions)
         covariance = np.repeat(
@@ -223,7 +215,7 @@ class MeasurementModel:
 
     @one_blas_thread
     def prepare(self, jacobian: bool = False) -> 'MeasurementModel':
-        """Compute the whitener, and on request the weights of `mean_and_jacobian`, in advance."""
+        """Compute the whitener in advance, and on request the weights of `mean_and_jacobian`."""
         _ = self.whitener
         if jacobian:
             _ = self._weights
@@ -231,7 +223,7 @@ class MeasurementModel:
 
     def whiten(self, signals: np.ndarray) -> np.ndarray:
         """Transform signals [..., N_B, N_SB F] to unit covariance; the shape stays the same."""
-        # Unlike a matrix product, this rounds a signal the same in a batch of any size.
+        # Unlike a matrix product, this rounds a signal equally in batches of all sizes.
         return np.einsum('irs,...is->...ir', self.whitener, signals)
 
     def mean(self, positions: np.ndarray) -> np.ndarray:
@@ -246,7 +238,7 @@ class MeasurementModel:
 
     def _of_bands(self, positions: np.ndarray,
                   of_band: Callable[[np.ndarray, slice, int], np.ndarray]) -> np.ndarray:
-        """Evaluate a function of positions, block and band, complex128 [N, N_B, N_SB F]."""
+        """Call a function for every block of positions and every band, and join the results."""
         positions = checked_positions(positions)
         result = np.empty((len(positions), *self.shape), complex)
 
@@ -262,9 +254,10 @@ class MeasurementModel:
             whitened: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Compute the mean and its derivative, complex128 [N, 3, N_B, N_SB F] [1/m]: Eq. (13).
 
-        The mean is that of `mean`, computed faster and with different rounding. Both results may
-        be `whitened`. With derivatives of the positions with respect to Q other coordinates,
-        float64 [N, 3, Q], the derivatives of the mean are with respect to these.
+        The mean equals the result of `mean` up to rounding, and is computed faster. Both results
+        may be `whitened`. Given the derivatives of the positions with respect to Q other
+        coordinates, float64 [N, 3, Q], the derivatives of the mean are with respect to those
+        coordinates.
         """
         positions, weights = checked_positions(positions), self._weights
         n, (n_bands, n_rows) = len(positions), self.shape
@@ -288,7 +281,7 @@ class MeasurementModel:
         return mean, jacobian
 
     def fast_mean(self, positions: np.ndarray) -> np.ndarray:
-        """Compute the mean that `mean_and_jacobian` returns, in a third of its time."""
+        """Compute the mean of `mean_and_jacobian` without the Jacobian, in a third of the time."""
         positions, weights = checked_positions(positions), self._weights
         mean = np.empty((len(positions), *self.shape), complex)
         for block in blocks(len(positions), weights.block):
@@ -299,10 +292,9 @@ class MeasurementModel:
     def sample(self, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Draw signals of independent phases, one at each position, complex128 [N, N_B, N_SB F].
 
-        Multipath and noise are drawn together, with the covariance Lambda_i. `simulate_received`
-        draws the gain of every element instead; the distribution is the same, but the call takes
-        a hundred times as long. As there, impairments that the scenario declares are drawn too,
-        and the paths of a channel file replace direct path and random multipath.
+        The distribution is that of `simulate_received`, including declared impairments and channel
+        files. Multipath and noise are drawn together, with the covariance Lambda_i. This is a
+        hundred times as fast as drawing the gain of every element.
         """
         scenario = self.scenario
         surface, factors = draw_impairments(scenario, len(positions), rng)
@@ -336,9 +328,9 @@ class MeasurementModel:
 class ElementSums:
     """Implements Eq. (13). Sums over the elements for the mean signals and their derivative.
 
-    Each sum over elements of a T_i (p - p_m) is p times the sum of a T_i, minus the sum of
-    a T_i p_m: sums of N_E terms that need no array of N_E by 3. `block` is the number of positions
-    to evaluate at a time.
+    The sum of a_m T_m (p - p_m) over elements m, with factors a_m, is computed as p times the sum
+    of a_m T_m, minus the sum of a_m T_m p_m. This avoids an array of N_E by 3. `block` is the
+    number of positions to evaluate at a time.
     """
 
     def __init__(self, scenario: Scenario, radiation: np.ndarray) -> None:
@@ -346,12 +338,12 @@ class ElementSums:
         shape = scenario.n_bands, scenario.n_subbands, scenario.n_frames, scenario.n_elements
         self.block = max(_ARRAY_BYTES // (16 * shape[1] * shape[3]), _MIN_BLOCK)
         self._has_pattern = has_pattern(scenario)
-        # T_i over the frequency, complex128 [N_B, N_SB, N_E, F].
+        # T_i divided by the frequency, complex128 [N_B, N_SB, N_E, F].
         self._frames = np.ascontiguousarray(
             np.swapaxes(radiation.reshape(shape), 2, 3)
             / subband_frequencies_hz(scenario)[..., None, None])
         self._elements = element_positions(scenario)
-        # Coordinates in which the elements differ from the origin; a plane has two.
+        # Axes along which elements are not at 0; for elements in a plane, there are two.
         self._axes = np.flatnonzero(self._elements.any(axis=0))
         coordinates = np.hstack([np.ones((shape[3], 1)), self._elements[:, self._axes]])
         moments = coordinates[:, :, None] * self._frames[..., None, :]
@@ -361,7 +353,7 @@ class ElementSums:
     def terms(self, positions: np.ndarray, slopes: bool = True) -> np.ndarray:
         """Compute the mean and the terms of its derivative, complex128 [N_B, N, 1 + G, N_SB F].
 
-        The first row is the mean; `weights` multiply the others, which are absent on request.
+        Row 0 is the mean. The other rows, which `weights` multiply, are omitted without `slopes`.
         """
         n, (n_bands, n_subbands, _, n_frames) = len(positions), self._frames.shape
         n_terms = 2 + len(self._axes) + self._has_pattern if slopes else 1

@@ -27,7 +27,7 @@ class Mobility(Protocol):
 
 
 class Leg(NamedTuple):
-    """A part of a path at constant velocity [3] [m/s], from a position [3] [m], between times."""
+    """Part of a path between two times, with a first position [3] [m] and a velocity [3] [m/s]."""
 
     origin: np.ndarray
     velocity: np.ndarray
@@ -37,7 +37,7 @@ class Leg(NamedTuple):
 
 @runtime_checkable
 class StraightMobility(Mobility, Protocol):
-    """Path of straight legs; a subclass needs to define `leg` only."""
+    """Path of straight legs; a subclass only needs to define `leg`."""
 
     def leg(self, now_s: float) -> Leg:
         """Return the leg at a time; the times of all calls must not decrease."""
@@ -50,7 +50,7 @@ class StraightMobility(Mobility, Protocol):
 
 
 class Crowd:
-    """The paths of many users; one array operation evaluates all straight legs."""
+    """The paths of many users; all straight legs are evaluated in one array operation."""
 
     def __init__(self, mobilities: Sequence[Mobility]) -> None:
         self._mobilities = mobilities
@@ -148,7 +148,7 @@ class RandomWalk(StraightMobility):
         return self._scenario.sample_positions(1, self._rng)[0]
 
     def _begin_leg(self) -> None:
-        """Compute the velocity and the duration of a leg once: a node may have many users."""
+        """Compute velocity and duration once per leg, because a node may have many users."""
         leg = self._target - self._origin
         length = float(np.linalg.norm(leg))
         self._velocity = leg / length * self._speed_mps
@@ -156,10 +156,7 @@ class RandomWalk(StraightMobility):
 
 
 class Traced:
-    """The user of a channel file who is nearest to the position of another mobility.
-
-    The velocity is that of the other mobility.
-    """
+    """Path of another mobility, moved to the nearest user of a channel file."""
 
     def __init__(self, mobility: Mobility, channel: PathChannel) -> None:
         self._mobility, self._channel = mobility, channel
@@ -173,11 +170,11 @@ class Traced:
 def make_plugin(
         name: str, scenario: Scenario, speed_mps: float, rng: np.random.Generator,
         start: Sequence[float] | None = None) -> Mobility:
-    """Create the mobility of another package.
+    """Create a mobility from a plug-in, an entry point of the group `plugins.MOBILITIES`.
 
-    Calls the object of an entry point of the group `plugins.MOBILITIES` with the other arguments,
-    like `RandomWalk`. If `start` is None, the object chooses the first position. Raises
-    PluginError if there is no such entry point, or it does not return a mobility.
+    The plug-in is called with the other arguments, like `RandomWalk`. If `start` is None, it
+    chooses the first position. Raises PluginError if there is no such plug-in, or it does not
+    return a mobility.
     """
     mobility: Mobility = plugins.make(plugins.MOBILITIES, name, scenario, speed_mps, rng, start)
     if not callable(getattr(mobility, 'state', None)):

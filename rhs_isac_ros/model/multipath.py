@@ -1,7 +1,7 @@
 """Multipath: spatial covariance, correlation over sub-bands and frames, random gains.
 
-Indices of bands, sub-bands and frames start at 0. Bands are independent. Fields of a scenario
-declare the covariance of the gains; a measured covariance adds a term of low rank, see `hall`.
+Indices of bands, sub-bands and frames start at 0. Bands are independent. Fields of the scenario
+declare the covariance of the gains; a measured covariance adds a term of low rank (see `hall`).
 """
 
 import dataclasses
@@ -18,11 +18,11 @@ from rhs_isac_ros.model.geometry import element_interval_m, subband_frequencies_
 from rhs_isac_ros.model.hall import MultipathEstimate
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
-# Gauss-Legendre nodes on an interval of angles in which the profile is smooth, and the largest
-# phase over the elements that they resolve.
+# Gauss-Legendre nodes in each interval of angles, and the largest change of phase over the surface
+# that they resolve.
 _ANGLE_NODES = 160
 _PANEL_PHASE_RAD = 400.0
-# Number of elements above which products with V_i are convolutions.
+# Number of elements above which products with V_i are computed as convolutions.
 _MAX_MATRIX = 1024
 # Complex numbers processed at a time.
 _BLOCK_NUMBERS = 1 << 22
@@ -33,43 +33,32 @@ _ROI_NODES = 24
 def multipath_covariance(scenario: Scenario) -> np.ndarray:
     """Implements Eq. (2). Covariance of the multipath gains, as the fields declare it.
 
-    The power-angle profile is a product of two Laplacians of `angular_spread_deg` about
-    `multipath_direction_deg`, normalised over the half space in front of the surface, weighted by
-    a gain pattern of the elements, and scaled by the mean line-of-sight power in the region of
-    interest times ``multipath_to_los_db``. The paper leaves the scale open; equal powers by
-    default are the reading of this package. Returns V_i, complex128 [N_B, N_E, N_E];
-    `declared_covariance` needs less memory for many elements.
+    The power-angle profile is a product of two Laplacians with the spread `angular_spread_deg`,
+    centred on `multipath_direction_deg`. It is normalised over the half space in front of the
+    surface and weighted by a gain pattern of the elements. Its total is the mean line-of-sight
+    power in the region of interest times ``multipath_to_los_db``; the paper leaves this scale
+    open. Returns V_i, complex128 [N_B, N_E, N_E]; `declared_covariance` needs less memory for many
+    elements.
     """
     return _matrix(_lattice(scenario), scenario)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SpatialCovariance:
-    """V_i of Eq. (2) for products with it, in one band or in several with a leading axis.
+    """V_i of Eq. (2) in a form for fast products, for one band or for several on a leading axis.
 
-    The declared covariance of two elements depends only on their lattice offset, so that a product
-    is a convolution. For few elements, a matrix is as fast. A measured covariance adds a term of
-    low rank.
-
-    Attributes
-    ----------
-    shape
-        Numbers of rows and columns of the elements.
-    is_real
-        Whether V_i is real, as for an even profile that is not measured.
-    power
-        Power of the gain of each element, float64 [N_E] or [N_B, N_E].
-    matrix
-        V_i [..., N_E, N_E]; None for many elements.
+    The declared covariance of two elements depends only on their offset on the lattice, so a
+    product with V_i is a convolution. For few elements, a matrix is as fast. A measured covariance
+    adds a term of low rank.
     """
 
-    shape: tuple[int, int]
-    is_real: bool
-    power: np.ndarray
-    matrix: np.ndarray | None = None
+    shape: tuple[int, int]  #: Numbers of rows and columns of the elements.
+    is_real: bool  #: Whether V_i is real, as it is for an even profile that is not measured.
+    power: np.ndarray  #: Power of the gain of each element, float64 [N_E] or [N_B, N_E].
+    matrix: np.ndarray | None = None  #: V_i [..., N_E, N_E]; None for many elements.
     # Fourier transform over the offsets of the elements; None for few elements.
     spectrum: np.ndarray | None = None
-    # W F and F of the term of low rank, without a matrix.
+    # W F and F of the term of low rank (`plus`) if there is no matrix.
     excess: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
@@ -78,7 +67,7 @@ class SpatialCovariance:
         return math.prod(self.shape)
 
     def __getitem__(self, bands: int | slice | list[int]) -> 'SpatialCovariance':
-        """Return V_i of some bands."""
+        """Return V_i for some of the bands."""
         return SpatialCovariance(
             self.shape, self.is_real, self.power[bands],
             None if self.matrix is None else self.matrix[bands],
@@ -86,7 +75,7 @@ class SpatialCovariance:
             self.excess and (self.excess[0][bands], self.excess[1][bands]))
 
     def plus(self, weights: np.ndarray, factor: np.ndarray) -> 'SpatialCovariance':
-        """Return the sum with F^H W F, of W [N_B, R, R] and F [N_B, R, N_E]; W is Hermitian."""
+        """Return V_i + F^H W F, for Hermitian W [N_B, R, R] and F [N_B, R, N_E]."""
         through = np.matmul(weights, factor)
         power = self.power + np.sum(np.conj(factor) * through, axis=-2).real
         total = dataclasses.replace(self, is_real=False, power=power)
@@ -148,7 +137,7 @@ def declared_covariance(scenario: Scenario) -> SpatialCovariance:
         return SpatialCovariance(shape, is_real, power, matrix)
     from scipy import fft
 
-    # A circle long enough that nothing wraps around; the offset 0 comes first.
+    # Padding keeps the circular convolution from wrapping around; the offset 0 comes first.
     kernel = np.zeros((len(lattice), *(fft.next_fast_len(2 * n - 1) for n in shape)), complex)
     kernel[:, :2 * shape[0] - 1, :2 * shape[1] - 1] = np.conj(lattice)
     kernel = np.roll(kernel, (1 - shape[0], 1 - shape[1]), axis=(1, 2))
@@ -163,10 +152,7 @@ def _matrix(lattice: np.ndarray, scenario: Scenario) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def _lattice(scenario: Scenario) -> np.ndarray:
-    """Compute V_i by the offset of the elements, complex128 [N_B, 2 rows - 1, 2 columns - 1].
-
-    The offset 0 is in the middle.
-    """
+    """Compute V_i by lattice offset, 0 in the middle, [N_B, 2 rows - 1, 2 columns - 1]."""
     is_even = [not angle for angle in scenario.multipath_direction_deg]
     lattice = np.empty((scenario.n_bands, 2 * scenario.n_rows - 1, 2 * scenario.n_columns - 1),
                        complex)
@@ -175,7 +161,7 @@ def _lattice(scenario: Scenario) -> np.ndarray:
         for waves in _plane_waves(scenario, band, is_even):
             along_y = np.einsum('a,eay->ey', waves.azimuth_weights,
                                 waves.along_y * np.square(waves.gain)[..., None])
-            # Offsets of either sign along z, and not negative ones along y.
+            # Offsets of both signs along z, but only non-negative ones along y.
             along_z = [waves.along_z]
             if not is_even[1]:
                 along_z.append(np.conj(waves.along_z))
@@ -195,8 +181,8 @@ class _PlaneWaves(NamedTuple):
     elevation_weights: np.ndarray
     azimuth_weights: np.ndarray
     gain: float | np.ndarray
-    # Phasors at the rows [E, rows] and at the columns [E, A, columns]; their real parts alone if
-    # the profile is even.
+    # Phasors at the rows [E, rows] and at the columns [E, A, columns]; for an even profile, only
+    # their real parts.
     along_z: np.ndarray
     along_y: np.ndarray
 
@@ -204,11 +190,7 @@ class _PlaneWaves(NamedTuple):
 def _plane_waves(
         scenario: Scenario, band: int, is_even: Sequence[bool], n_draws: int = 1
 ) -> Iterator[_PlaneWaves]:
-    """Yield the waves of a quadrature over the profile, some elevations at a time.
-
-    If the profile is even in azimuth or elevation, only its positive angles are needed. The number
-    of elevations leaves memory for `n_draws` amplitudes of each wave.
-    """
+    """Yield plane waves in blocks of elevations, sized for `n_draws` amplitudes per wave."""
     wavenumber = 2 * np.pi * scenario.center_frequencies_hz[band] / SPEED_OF_LIGHT_MPS
     columns, rows = (np.arange(n) * element_interval_m(scenario)
                      for n in (scenario.n_columns, scenario.n_rows))
@@ -245,8 +227,8 @@ def _mean_power(scenario: Scenario, band: int) -> float:
 def mean_los_power(scenario: Scenario, band: int) -> float:
     """Compute the mean line-of-sight power gain in the region of interest, for g^E = 1.
 
-    This is the mean of (v_0 g^U / (4 pi f_c,i r))^2, with the distance r from the surface's
-    centre. A gain pattern g^U is evaluated at the angle from the boresight there.
+    This is the mean of (v_0 g^U / (4 pi f_c,i r))^2, where r is the distance from the centre of
+    the surface. A gain pattern g^U is evaluated at the angle seen from this centre.
     """
     nodes, weights = gauss_legendre(_ROI_NODES)
     low, high = scenario.roi_bounds_m
@@ -315,7 +297,7 @@ def coupling(scenario: Scenario, radiation: np.ndarray, other: np.ndarray) -> np
 
 
 def scattered_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
-    """Compute the multipath part of `signal_covariance`."""
+    """Compute the part of `signal_covariance` that is due to multipath."""
     covariance = coupling(scenario, radiation, radiation)
     if measured := scenario.multipath:
         to_survey = coupling(scenario, radiation, measured.radiation)
@@ -357,7 +339,7 @@ def draw_multipath(
 
 def _draw_plane_waves(
         scenario: Scenario, band: int, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw n vectors of gains from independent plane waves, which need no factor of V_i."""
+    """Draw n vectors of gains as sums of independent plane waves, without a factor of V_i."""
     drawn = np.zeros((1, 1, 1))
     for waves in _plane_waves(scenario, band, (False, False), n):
         amplitudes = complex_normal(
@@ -371,11 +353,10 @@ def _draw_plane_waves(
 
 @functools.lru_cache(maxsize=16)
 def _stretches(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Compute how a measured covariance changes gains with the declared one.
+    """Compute A and T V_0 of each band, which turn declared gains g into g + C_0 T^H A T g.
 
-    For each band, these are A and T V_0, so that gains g become g + C_0 T^H A T g. With the
-    covariance S of the signals T g, and R = S^(1/2), it follows from `hall` that
-    R A R = (1 + R M R)^(1/2) - 1.
+    With the covariance S of the signals T g and R = S^(1/2), the covariance described in `hall`
+    requires R A R = (1 + R M R)^(1/2) - 1.
     """
     assert scenario.multipath
     radiation, stretches = scenario.multipath.radiation, []
@@ -398,22 +379,18 @@ def complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarr
 
 
 def _fields(scenario: Scenario) -> Scenario | MultipathEstimate:
-    """Return the owner of the three fields that declare the covariance."""
+    """Return the scenario or its survey, whichever declares the fields of the covariance."""
     return scenario.multipath or scenario
 
 
 def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase: float
                         ) -> tuple[np.ndarray, np.ndarray]:
-    """Angles [n] and weights [n] of the Laplacian profile, normalised to a sum of one.
-
-    The number of angles depends on the phase [rad] over the elements. If the profile is even, only
-    its positive angles are included.
-    """
+    """Compute angles and normalised weights of a Laplacian [n]; if even, positive angles only."""
     nodes, weights = gauss_legendre(_ANGLE_NODES)
     mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)
     angles, density = [], []
     signs = (1,) if is_even else (-1, 1)
-    # An interval begins at the cusp, the mean, and ends earlier for a narrow profile.
+    # Each interval begins at the cusp, the mean, and is shorter for a narrow profile.
     reaches = [min(1 - sign * mean / (np.pi / 2), 30 * spread / (np.pi / 2)) for sign in signs]
     for sign, reach in zip(signs, reaches, strict=True):
         panels = math.ceil(phase * reach / _PANEL_PHASE_RAD) or 1
@@ -427,7 +404,7 @@ def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase
 
 
 def square_root(matrix: np.ndarray) -> np.ndarray:
-    """Return R with R R^H = matrix, without eigenvectors that are due to rounding alone."""
+    """Return R with R R^H = matrix, without eigenvalues at the level of rounding."""
     values, vectors = np.linalg.eigh(matrix)
     keep = values > values[-1] * len(values) * np.finfo(float).eps
     return read_only(vectors[:, keep] * np.sqrt(values[keep]))

@@ -22,7 +22,7 @@ from rhs_isac_ros.support.fields import Field
 from rhs_isac_ros.support.files import read_yaml
 from rhs_isac_ros.support.plugins import PluginError
 
-# Relative rounding of differences between frequencies.
+# Relative tolerance for differences between frequencies.
 _ROUNDING = 1e-9
 
 
@@ -35,9 +35,9 @@ def declare(
         label: str) -> Any:
     """Declare a scenario field.
 
-    `low` and `high` are inclusive; `text` describes the field, and `source` is the publication
-    from which its model is taken, if that is not the paper. `label` is the name on an axis, with
-    the symbol as mathtext and without the unit.
+    `low` and `high` are inclusive. `source` cites the publication that defines this part of the
+    model, unless it is the paper. `label` is the name on an axis, with the symbol as mathtext and
+    without the unit.
     """
     kind = int if isinstance(default, int) else float
     return dataclasses.field(default=default, metadata={
@@ -103,14 +103,14 @@ class Table1:
 
 @dataclasses.dataclass(frozen=True)
 class Extensions:
-    """Effects beyond the paper's model; by default there are none.
+    """Effects beyond the paper's model, all absent by default.
 
-    Standard deviations belong to Gaussians with zero mean. A phase is wrapped to the circle. With
-    a standard deviation of 2 pi or more, it is practically uniform: its mean resultant length,
-    exp(-std^2 / 2), is below 3e-9.
+    Standard deviations describe Gaussians with zero mean. Phases are wrapped to the circle: with a
+    standard deviation of 2 pi or more, a phase is practically uniform, because its mean resultant
+    length, exp(-std^2 / 2), is below 3e-9.
 
-    A user's gain and carrier offset are drawn once per user. Phases and the timing offset are
-    drawn once per cycle, and element errors and failures once per surface.
+    A user's gain and carrier offset are drawn once per user, phases and the timing offset once per
+    cycle, and element errors and failures once per surface.
     """
 
     multipath_to_los_db: float = declare(
@@ -197,7 +197,7 @@ class Extensions:
         '', label='channel')
 
 
-# Fields whose values come from outside, and those among them that are files.
+# Fields whose values come from plug-ins or files, and those among them that are files.
 _EXTERNAL: dict[str, type[External]] = {
     'element_gain': GainPattern, 'user_gain': GainPattern, 'multipath': MultipathEstimate,
     'channel': PathChannel}
@@ -208,20 +208,15 @@ _FILES = [name for name, kind in _EXTERNAL.items() if issubclass(kind, ArrayFile
 class Scenario(Extensions, Table1):
     """Geometry, bands and propagation of one system; the defaults are the paper's Table I.
 
-    The fields are those of `Table1`, followed by those of `Extensions`, all of which are off by
-    default.
+    A scenario has the fields of `Table1` and those of `Extensions`, which are all off by default.
 
     Lengths are in metres in the frame ``map``: the surface lies in the plane x = 0, centred on
     the origin, with x pointing outward and z up.
 
-    A gain is a number, a `GainPattern`, a function of the angle from the boresight, or the name
-    of an installed plug-in. Files can hold numbers and names only. `multipath` and
-    `channel` are objects, or the paths of their files.
-
-    Raises
-    ------
-    ScenarioError
-        If a value has the wrong type, is out of range, or contradicts another one.
+    A gain is a number, a `GainPattern`, a function of the angle from boresight, or the name of an
+    installed plug-in; in a file, it is a number or a name. `multipath` and `channel` are objects
+    or paths of files. Raises ScenarioError if a value has the wrong type, is out of range, or
+    contradicts another one.
     """
 
     def __post_init__(self) -> None:
@@ -263,7 +258,7 @@ class Scenario(Extensions, Table1):
     def from_yaml(cls, path: str | Path) -> 'Scenario':
         """Read a scenario from a YAML file that maps field names to values.
 
-        Fields that are not in the file have their defaults. Paths in the file are relative to its
+        Fields that the file omits keep their defaults. Paths in the file are relative to its
         folder. Raises ScenarioError if the file is invalid.
         """
         try:
@@ -303,7 +298,7 @@ class Scenario(Extensions, Table1):
         """Hash of the fields: ``sc`` and 16 hex digits, which YAML never parses as a number."""
         changes, fields = self.changes(), self.fields()
         for name in ('impairments', 'multipath_direction_deg', 'blocked_probability', *_FILES):
-            # Identifiers in existing files precede these fields.
+            # Existing files contain identifiers from before these fields were introduced.
             if name not in changes:
                 del fields[name]
             elif name in _FILES:
@@ -353,7 +348,7 @@ class Scenario(Extensions, Table1):
     def sample_positions(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw positions from the region of interest, float64 [n, 3] [m].
 
-        They are uniform, or with a channel file those of its users.
+        Positions are uniform. With a channel file, they are positions of its users.
         """
         if self.channel:
             return self.channel.users[rng.integers(len(self.channel.users), size=n)]
@@ -362,7 +357,7 @@ class Scenario(Extensions, Table1):
 
 
 def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) -> None:
-    """Raise ValueError unless the shape is that of `symbols`, keys of `Scenario.sizes`."""
+    """Raise ValueError unless the array has the shape `symbols`, keys of `Scenario.sizes`."""
     expected = tuple(scenario.sizes[symbol] for symbol in symbols.split())
     if np.shape(array) != expected:
         listed = ', '.join(symbols.split())
@@ -399,7 +394,7 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
 
 def _number(field: dataclasses.Field[Any], value: Any) -> Any:
     declared = field.metadata['declared']
-    # YAML reads 28e9 as a string, so that strings must be accepted for numbers.
+    # YAML reads 28e9 as a string, so strings are accepted as numbers.
     convert = operator.index if declared.kind is int else float
     if not isinstance(value, bool):
         with contextlib.suppress(TypeError, ValueError, OverflowError):
@@ -433,7 +428,7 @@ def _strengths(field: dataclasses.Field[Any], value: Any) -> tuple[tuple[str, fl
             plugins.load(plugins.IMPAIRMENTS, name)
         except PluginError as error:
             raise ScenarioError(f'{field.name}: {error}') from None
-    # No strength, no impairment.
+    # An impairment of strength 0 is the same as none.
     checked_pairs = ((name, _number(field, strength)) for name, strength in pairs)
     return tuple(pair for pair in checked_pairs if pair[1])
 
@@ -447,7 +442,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _entries(field: dataclasses.Field[Any], value: Any, expected: str) -> Any:
-    """Return a value that is a list with at least one entry."""
+    """Return the value if it is a list with at least one entry, or raise ScenarioError."""
     if not isinstance(value, list | tuple | np.ndarray) or len(value) == 0:
         raise ScenarioError(f'{field.name}: {value!r}, expected a list of {expected}')
     return value

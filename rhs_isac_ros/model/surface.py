@@ -1,4 +1,4 @@
-"""The surface: from signals at its elements to those at its feeds and at the base station."""
+"""The surface: from the signals at its elements to the feeds and to the base station."""
 
 import functools
 from typing import NamedTuple, Protocol
@@ -25,7 +25,7 @@ class Beamforming(Protocol):
 
 
 class AppliedBeams(NamedTuple):
-    """Beamforming whose coefficients need not be real, or levels of the surface."""
+    """Beamforming with arbitrary complex coefficients, such as those of faulty elements."""
 
     analog: np.ndarray
     digital: np.ndarray
@@ -45,8 +45,8 @@ def feed_signals(
     """Implements Eq. (5). Signals that the feeds receive from the elements, [..., N_SB, K].
 
     Takes the configuration c of each frame, float64 [..., N_E], and the element signals tau,
-    complex128 [..., N_SB, N_E]. The elements apply their radiation coefficients here; the paper
-    introduces them with Eq. (9).
+    complex128 [..., N_SB, N_E]. The configuration is applied here; the paper introduces it with
+    Eq. (9).
     """
     return np.einsum('...jm,jkm->...jk', analog[..., None, :] * elements,
                      onboard_matrix(scenario)[band])
@@ -86,7 +86,7 @@ def radiation_matrix(scenario: Scenario, beams: Beamforming) -> np.ndarray:
 
 
 def feed_weights(scenario: Scenario, beams: Beamforming) -> np.ndarray:
-    """Compute S B, the weights of elements with the coefficient 1 [N_B, N_SB, F, N_E]."""
+    """Compute S B, the weights of elements whose coefficient is 1, [N_B, N_SB, F, N_E]."""
     return np.matmul(beams.digital, onboard_matrix(scenario))
 
 
@@ -111,7 +111,7 @@ def matched_configuration(los: np.ndarray, onboard: np.ndarray) -> np.ndarray:
     """Compute a configuration by the holographic principle, float64 [N_E], entries in [0, 1].
 
     Takes line-of-sight gains, complex128 [N_SB, N_E], and B_j, complex128 [N_SB, K, N_E]. An
-    element radiates strongly where the wave on the board and the path to the user are in phase.
+    element radiates strongly if the wave on the board and the path to the user are in phase there.
     If all gains are 0, all entries are 0.5.
     """
     interference = np.einsum('jm,jkm->m', los, onboard).real

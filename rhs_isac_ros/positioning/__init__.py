@@ -1,21 +1,21 @@
 """Estimators of the user's position from the received signals.
 
 `make_estimator` creates an estimator for a scenario and a codebook: an object with the interface
-of `Estimator`, whose method ``estimate`` takes received signals and returns an `Estimate`. It is
-a class of `ESTIMATORS` below, or an entry point of the group `plugins.ESTIMATORS` in another
-package. `simulate_pairs` draws signals to try it, and a `Tracker` combines successive positioning
-phases of a user that moves.
+of `Estimator`, whose method ``estimate`` takes received signals and returns an `Estimate`. Its
+class is in `ESTIMATORS` below, or another package provides it as an entry point of
+`plugins.ESTIMATORS`. `simulate_pairs` draws signals for trials, and a `Tracker` combines
+successive positioning phases of a moving user.
 
-The modules, in the order in which they are best read:
+The modules, in reading order:
 
-* `estimate`, the interface, and `estimators`, the whole way of `bayes` and `ml`
-* `coordinates` and `lattice`, the coordinates and lengths in which signals differ
-* `likelihood`, of positions and nuisance parameters
-* `grid`, which finds starts; `search`, which ascends from them to the modes; and `failures`, which
-  finds the modes if elements have failed
-* `posterior`, from modes to samples, and `draws`, without modes; `alternatives` to a user in the
-  region; and `diagnosis`, whether the signals fit the model
-* `tracking`; `neural`, the paper's network; and `store`, which keeps tables in files
+* `estimate`: the interface; `estimators`: `bayes` and `ml`, from signals to positions
+* `coordinates` and `lattice`: the coordinates and lengths in which signals differ
+* `likelihood`: the likelihood of positions and nuisance parameters
+* `grid`: starts of the search; `search`: ascent from the starts to the modes; `failures`: modes if
+  elements have failed
+* `posterior`: from modes to samples; `draws`: samples without modes; `alternatives` to a user in
+  the region; `diagnosis`: tests of the fit between signals and model
+* `tracking`; `neural`: the paper's network; `store`: tables in files
 """
 
 from collections.abc import Callable, Mapping
@@ -55,21 +55,13 @@ def make_estimator(
         name: str, scenario: Scenario, codebook: Codebook, **options: Any) -> Estimator:
     """Create an estimator by its name.
 
-    The options of `REGION_ESTIMATORS` are ``table_folder``, a folder for tables,
-    ``reject_outside``, whether users outside of the region get no fix, ``surface``, what is known
-    of the surface, and ``progress``, called with the computed share of a table. `neural` requires
-    ``model_file``, a `Network` or its file. Plug-ins define their own options.
+    `REGION_ESTIMATORS` take the options of `SearchEstimator`. `neural` requires ``model_file``, a
+    `Network` or its file. Plug-ins define their own options.
 
-    Raises
-    ------
-    ValueError
-        If there is no estimator of that name.
-    PluginError
-        If a plug-in cannot be loaded, fails, or does not return an estimator.
-    ModelError
-        If a model cannot be read or was trained for another codebook or scenario.
-    CodebookError
-        If the codebook does not fit the scenario.
+    Raises ValueError if there is no estimator of that name, PluginError if a plug-in cannot be
+    loaded, fails, or does not return an estimator, ModelError if a model cannot be read or was
+    trained for another codebook or scenario, and CodebookError if the codebook does not fit the
+    scenario.
     """
     if name in ESTIMATORS:
         return ESTIMATORS[name](scenario, codebook, **options)

@@ -1,9 +1,9 @@
-"""What received signals may be instead of those of a user in the region with a direct path.
+"""Alternatives to a user in the region with a direct path: a user outside, or a blocked one.
 
-An alternative has prior odds and an evidence, the likelihood averaged over its own unknowns.
-Compared with the evidence for the region, it has a probability, and above the limit of the
-alternative there is no fix. The limit of a user outside is high: the prior is even, although most
-users are inside, and none of them should lose a fix.
+An alternative has prior odds and an evidence: the likelihood averaged over its own unknowns. Its
+probability follows from a comparison with the evidence for the region. Above the limit of the
+alternative, there is no fix. The limit of a user outside is high, because the prior odds are even
+although most users are inside, and none of them should lose a fix.
 """
 
 import math
@@ -23,16 +23,16 @@ from rhs_isac_ros.support.threads import map_blocks
 
 # Probabilities of a user outside, and of a blocked one, above which there is no fix.
 OUTSIDE_LIMIT = 0.99
-# A region of 95 % cannot contain the user with this probability if the user may be blocked.
+# If the user is blocked with a higher probability, no 95 % region can contain the user that often.
 BLOCKED_LIMIT = 0.05
-# Largest level of multipath without a direct path that explains signals, in standard deviations.
+# Largest plausible level of the multipath of a blocked user, in standard deviations.
 _LEVEL_REACH = 3.0
 _DB_PER_NEPER = 20 / math.log(10)
 _MIN_PROBABILITY = 1e-12
-# Smallest probability of an alternative that is worth a word.
+# Smallest probability of an alternative that is reported.
 _MIN_DOUBT = 0.01
-# Relative to the nearest range of the region: distance from it up to which a user may be located
-# at its border, and nearest range outside.
+# Relative to the nearest range of the region: distance outside of it up to which a user may be
+# located at its border, and nearest range on the grid.
 _BORDER = 0.1
 _NEAREST = 0.3
 # The nearest range is at least this multiple of the radius of the aperture.
@@ -40,9 +40,9 @@ _MIN_APERTURES = 4.0
 # Farthest range in units of the farthest range of the region, and ratio of successive ranges.
 _MAX_RANGE_FACTOR = 3.0
 _RANGE_RATIO = 1.15
-# Phase error of a template at the edge of the aperture from which another direction takes over,
-# and number of templates above which it is larger: large apertures distinguish more directions
-# than a comparison of two hypotheses needs.
+# Phase error of a template at the edge of the aperture at which the next direction takes over. It
+# is larger if there would be more than this number of templates: large apertures distinguish more
+# directions than a comparison of two hypotheses needs.
 _DIRECTION_RAD = 0.25
 _MAX_TEMPLATES = 40_000
 # Quadrature over the gain: spacing [nepers], and reach in standard deviations.
@@ -56,7 +56,7 @@ _GRID_ERROR = 0.25
 _BLOCK = 512
 # Largest sine of the angle from boresight on the grid.
 _MAX_SINE = 0.998
-# Directions in which the log-likelihood is lower by more at all ranges do not matter.
+# Directions whose log-likelihood is further below the best at all ranges are ignored.
 _MARGIN = 30.0
 
 
@@ -72,23 +72,24 @@ class Alternative(Protocol):
                         prior: NuisancePrior) -> float:
         """Compute the logarithm of the evidence with the nuisance parameters integrated out.
 
-        Takes whitened signals of one phase, complex128 [N_B, N_SB F], without the aligned
-        parameters, which the signals alone reveal, float64 [Q]; they are 0 for the others. The
-        residual is the whitened energy that the best position in the region leaves.
+        `whitened` are the signals of one phase, complex128 [N_B, N_SB F], without the factors of
+        the `aligned` parameters, float64 [Q]: those that follow from the signals alone, and 0 for
+        the others. `residual` is the energy that remains at the best position in the region.
         """
         ...
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
-        """Return whether the alternative explains the signals, up to this residual energy."""
+        """Return whether the alternative explains the signals up to this residual energy."""
         ...
 
 
 class Blocked:
     """A user without a direct path, whose signals are multipath of an unknown level.
 
-    A survey inflates the covariance of the multipath, and its level differs among users in sight.
-    Their evidence is that of the inflated covariance, in which weak residuals are improbable, so
-    the evidence of a blocked user is divided by the change that the actual levels would make.
+    A survey inflates the covariance of the multipath, and the level differs among users in sight.
+    The evidence for a user in sight is computed with the inflated covariance, under which weak
+    residuals are improbable. The evidence for a blocked user is therefore divided by the factor by
+    which actual levels would change the evidence for a user in sight.
     """
 
     name, reason, limit = 'blocked', 'blocked', BLOCKED_LIMIT
@@ -101,7 +102,7 @@ class Blocked:
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
                         prior: NuisancePrior) -> float:
-        """Compute the evidence, as `Alternative` describes, from the energies of the signals."""
+        """Compute the evidence from the energies of the signals; see `Alternative`."""
         energy = np.array([residual, np.sum(np.abs(whitened)**2)])
         # The gain of the user is a part of the level.
         std_db = math.hypot(BLOCKED_STD_DB, self._std_db, _DB_PER_NEPER * prior.gain_std)
@@ -111,7 +112,7 @@ class Blocked:
         return blocked - (in_sight + residual) + prior.log_evidence_of_aligned(aligned)
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
-        """Return whether a plausible level explains the signals, as `Alternative` describes."""
+        """Return whether a plausible level explains the signals; see `Alternative`."""
         energy = float(np.sum(np.abs(whitened)**2))
         return energy <= max_residual * 10**(_LEVEL_REACH * BLOCKED_STD_DB / 10)
 
@@ -120,10 +121,10 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
                      ) -> dict[str, np.ndarray]:
     """Compute the arrays of `Outside`: templates of the half space in front of the surface.
 
-    A template is a whitened mean times range and carrier, which depends on the direction and, via
+    A template is a whitened mean times range and carrier. It depends on the direction and, through
     the curvature of the wavefront and the delays of the sub-bands, slowly on the range. For T
     template ranges, R ranges and V directions, the arrays are ``outer_filters``, the conjugate
-    templates, complex64 [N_B, T V, N_SB F]; ``outer_energy`` of these [m^2], float32 [T, V];
+    templates, complex64 [N_B, T V, N_SB F]; ``outer_energy``, their energy [m^2], float32 [T, V];
     ``outer_index``, the template of each range, int64 [R]; and ``outer_weights``, the prior
     probability of ranges and directions, 0 inside the region, float64 [R, V].
     """
@@ -156,15 +157,15 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
 class Outside:
     """A user in front of the surface but outside of the region of interest.
 
-    Range ambiguities repeat every few wavelengths, so that signals from outside often fit some
-    position of the region. The prior is uniform in range and solid angle, up to a multiple of the
-    region's farthest range. The carrier phases of the bands turn within centimetres of range; the
-    average over them has a closed form, the product over the bands of ``I_0(2 |t_i^H y_i|)``. The
-    rest is smooth, so that a coarse grid suffices: the arrays of `tabulate_outside`.
+    Range ambiguities repeat every few wavelengths, so signals from outside often fit some position
+    in the region. The prior is uniform in range and solid angle, up to a multiple of the region's
+    farthest range. The carrier phases of the bands turn within centimetres of range. The average
+    over them has a closed form: the product over the bands of ``I_0(2 |t_i^H y_i|)``. The rest is
+    smooth, so a coarse grid suffices: the arrays of `tabulate_outside`.
     """
 
     name, reason, limit = 'outside', 'position outside of the region', OUTSIDE_LIMIT
-    # As many users are outside as inside.
+    # The prior odds are even: as many users are outside as inside.
     log_odds = 0.0
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
@@ -180,7 +181,7 @@ class Outside:
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
                         prior: NuisancePrior) -> float:
-        """Compute the evidence, as `Alternative` describes; phases have no effect."""
+        """Compute the evidence, which does not depend on phases; see `Alternative`."""
         gain = np.zeros(1)
         if prior.gain_std:
             n_points = 2 * int(np.ceil(_GAIN_REACH * prior.gain_std / _GAIN_STEP)) + 3
@@ -191,13 +192,13 @@ class Outside:
                 + prior.log_evidence_of_aligned(aligned))
 
     def log_evidence(self, whitened: np.ndarray, scales: Iterable[float] = (1.0,)) -> np.ndarray:
-        """Average the likelihood ``exp(-|y - t|^2)`` over the prior, for scales of the signals."""
+        """Average ``exp(-|s y - t|^2)`` over the prior for each scale s; return the logarithms."""
         filtered, energy = self._filter(whitened), float(np.sum(np.abs(whitened)**2))
-        # Whatever the range, the log-likelihood is at most that of outputs in phase.
+        # At any range, the log-likelihood is at most that of outputs in phase.
         bound = (np.sum(filtered, axis=0)**2 / self._node_energy).max(axis=0)
         values = []
         for scale in scales:
-            # Small factors make directions more alike.
+            # Small scales make directions more alike.
             chosen = np.flatnonzero(bound >= bound.max() - _MARGIN / scale**2)
             argument = filtered[:, :, chosen][:, self._index] * (np.float32(scale) * self._scale)
             log_likelihood = np.sum(_log_bessel(argument), axis=0) + self._offset[:, chosen]
@@ -205,14 +206,14 @@ class Outside:
         return np.array(values)
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
-        """Return whether some position explains the signals, as `Alternative` describes."""
+        """Return whether some position explains the signals; see `Alternative`."""
         amplitude = np.sum(self._filter(whitened), axis=0)[self._index] * self._scale
         residual = np.sum(np.abs(whitened)**2) - amplitude + self._energy
         tolerated = max_residual + _GRID_ERROR * self._energy
         return bool((self._possible & (residual <= tolerated)).any())
 
     def _filter(self, whitened: np.ndarray) -> np.ndarray:
-        """Magnitude of the filtered signals for templates and directions, [N_B, T, V] [m]."""
+        """Return filter output magnitudes by template and direction, [N_B, T, V] [m]."""
         signals = whitened.astype(np.complex64)[..., None]
         filtered = np.abs(np.matmul(self._filters, signals)[..., 0])
         return filtered.reshape(len(filtered), -1, self._energy.shape[1])
@@ -222,27 +223,27 @@ ALTERNATIVES: tuple[type[Outside] | type[Blocked], ...] = (Outside, Blocked)
 
 
 def probabilities_of(estimate: object) -> dict[str, float]:
-    """Return the known probabilities in an `Estimate` or a message, by names of alternatives."""
+    """Return the known probabilities in an `Estimate` or a message, by alternative."""
     values = {kind.name: float(getattr(estimate, f'{kind.name}_probability'))
               for kind in ALTERNATIVES}
     return {name: value for name, value in values.items() if not math.isnan(value)}
 
 
 def describe_doubts(estimate: object) -> str:
-    """Return the probabilities of at least 1 % as a text, such as ``blocked 12 %``; or nothing."""
+    """Return the probabilities of at least 1 % as a text such as ``blocked 12 %``, or ''."""
     return ', '.join(f'{name} {100 * value:.0f} %' for name, value in probabilities_of(
         estimate).items() if value >= _MIN_DOUBT)
 
 
 def shares(log_weights: np.ndarray) -> np.ndarray:
-    """Return the probabilities of hypotheses with these logarithms of weights, float64 [N, A]."""
+    """Return the probabilities of hypotheses from the logarithms of their weights, [N, A]."""
     weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
     weights /= weights.sum(axis=1, keepdims=True)
     return weights
 
 
 def rejection(alternative: Alternative, probability: float) -> str:
-    """Reject signals for the probability of an alternative alone, or return an empty text."""
+    """Return a reason if the probability of an alternative alone rules out a fix, or ''."""
     if probability <= alternative.limit:
         return ''
     return (f'{alternative.reason}: probability {probability:.6g}, expected at most '
@@ -257,7 +258,7 @@ def _log_bessel(argument: np.ndarray) -> np.ndarray:
 
 
 def _ranges(scenario: Scenario) -> np.ndarray:
-    """Ranges of the grid in geometric progression, float64 [R] [m]."""
+    """Return the ranges of the grid in geometric progression, float64 [R] [m]."""
     resolution = Resolution.of(scenario)
     aperture_m = np.linalg.norm(element_positions(scenario), axis=1).max()
     nearest_m = max(_NEAREST * resolution.nearest_m, _MIN_APERTURES * aperture_m)
@@ -267,7 +268,7 @@ def _ranges(scenario: Scenario) -> np.ndarray:
 
 
 def _directions(scenario: Scenario) -> np.ndarray:
-    """Direction cosines (u, v) over the half space, float64 [V, 2]."""
+    """Return direction cosines (u, v) over the half space, float64 [V, 2]."""
     direction = Resolution.of(scenario).direction
     n_ranges = len(_template_ranges(scenario, _ranges(scenario))[0])
     fewest = np.sqrt(np.pi / 4 * n_ranges / (np.prod(direction) * _MAX_TEMPLATES))
@@ -278,7 +279,7 @@ def _directions(scenario: Scenario) -> np.ndarray:
 
 
 def _points(ranges: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Every range in every direction, (r [m], u, v), float64 [R, V, 3]."""
+    """Return every range in every direction, (r [m], u, v), float64 [R, V, 3]."""
     points = np.empty((len(ranges), len(directions), 3))
     points[..., 0] = ranges[:, None]
     points[..., 1:] = directions
@@ -296,15 +297,15 @@ def _prior(scenario: Scenario, ranges: np.ndarray, directions: np.ndarray) -> np
 
 
 def _template_ranges(scenario: Scenario, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ranges of the templates [T] [m], and for each range of the grid its template, [R].
+    """Return the ranges of the templates [T] [m], and the template of each range of the grid, [R].
 
-    The phase of a template errs by the curvature of the wavefront, proportional to 1 / r, and by
-    the delay across the sub-bands, proportional to r.
+    The phase error of a template is due to the curvature of the wavefront, proportional to 1 / r,
+    and to the delay across the sub-bands, proportional to r.
     """
     resolution = Resolution.of(scenario)
 
     def node(first: int, end: int) -> float:
-        # Halfway in 1 / r, both ends have the same error from the curvature.
+        # Midway in 1 / r, the curvature causes the same error at both ends.
         return float(2 / (1 / ranges[first] + 1 / ranges[end - 1]))
 
     def fits(first: int, end: int) -> bool:

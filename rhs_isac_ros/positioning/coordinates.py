@@ -1,8 +1,7 @@
 """Positions as range and direction cosines, in which the likelihood is nearly Gaussian.
 
-A point q = (r, u, v) is the position r (w, u, v) with w = sqrt(1 - u^2 - v^2), in front of the
-surface. The signals determine the range to a fraction of a wavelength, but the direction only to
-a fraction of a beam. In Cartesian coordinates, the modes of the likelihood are therefore curved.
+The signals determine the range to a fraction of a wavelength, but the direction only to a fraction
+of a beam. In Cartesian coordinates, the modes of the likelihood are therefore curved.
 """
 
 from typing import Any, TypeVar
@@ -14,7 +13,7 @@ from rhs_isac_ros.model.geometry import jacobian as jacobian
 from rhs_isac_ros.model.geometry import to_polar as to_polar
 from rhs_isac_ros.model.geometry import to_positions as to_positions
 
-# Alternating projections onto the region and onto a sphere.
+# Number of alternating projections onto the region and onto a sphere.
 _N_PROJECTIONS = 4
 # A named tuple of arrays with equal first dimensions.
 _Rows = TypeVar('_Rows', bound=tuple[np.ndarray, ...])
@@ -41,10 +40,10 @@ def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,
                   tolerance_m: float) -> np.ndarray:
     """Compute the offsets from modes to the nearest points of the region of interest.
 
-    The offset follows the sphere of the mode's range, the coordinate that the signals determine
-    best. The range then changes with the direction so that the likelihood is highest. Takes modes
-    (r [m], u, v), float64 [M, 3], the curvature of the log-likelihood there, the bounds of the
-    region, float64 [2, 3], and the distance from the sphere that counts as zero.
+    The offset follows the sphere of the mode's range, because the signals determine the range
+    best. The range then changes with the direction to keep the likelihood as high as possible.
+    Takes modes (r [m], u, v), float64 [M, 3], the curvature of the log-likelihood there, the
+    bounds of the region, float64 [2, 3], and the distance from the sphere that counts as zero.
     """
     positions = to_positions(points)
     result = np.zeros_like(points)
@@ -57,8 +56,8 @@ def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,
         offset: np.ndarray = nearest - points
         nearest[:, 0] = points[:, 0]
         positions = to_positions(nearest)
-    # The projections leave a small remainder; a larger one means that the sphere does not
-    # intersect the region.
+    # The projections leave a small remainder. If it is large, the sphere does not intersect the
+    # region.
     excess = np.sign(offset[:, 0]) * np.maximum(np.abs(offset[:, 0]) - tolerance_m, 0.0)
     coupling = np.einsum('mq,mq->m', curvature[:, 0, 1:], offset[:, 1:]) / curvature[:, 0, 0]
     offset[:, 0] = excess - coupling
@@ -80,7 +79,7 @@ def log_sum(values: np.ndarray) -> float:
 
 
 def symmetric(covariances: np.ndarray) -> np.ndarray:
-    """Remove the rounding errors by which matrices [..., n, n] are not symmetric."""
+    """Return matrices [..., n, n] without the asymmetry that rounding causes."""
     return (covariances + np.swapaxes(covariances, -1, -2)) / 2
 
 

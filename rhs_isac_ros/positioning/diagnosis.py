@@ -1,19 +1,20 @@
-"""Whether the model explains received signals: those of one phase, and of the latest cycles.
+"""Tests whether the model explains received signals, in one phase and in the latest cycles.
 
 Whitened signals y from a position with the whitened mean t differ from t by noise of unit
-variance: ``2 |y - t|^2`` has a chi-square distribution with two degrees of freedom per
+variance, so ``2 |y - t|^2`` has a chi-square distribution with two degrees of freedom per
 measurement. Signals beyond its quantiles do not fit any position of the region (`FitTest`).
 Possible causes are a user elsewhere, another codebook, or a silent or defective receiver.
 
-Only gross errors of the model exceed this test. The mean energy of many residuals reveals small
-ones, such as a wrong delay spread, which leave the positions plausible but their covariances too
-small. Its variance reveals deviations that differ from phase to phase, such as unknown gains of
-the users, of which the best position absorbs the larger part (`InnovationTest`).
+This test detects only gross errors of the model. The mean energy of many residuals also reveals
+small errors, such as a wrong delay spread, which leave positions plausible but their covariances
+too small. The variance of the energy reveals deviations that differ from phase to phase, such as
+unknown gains of the users, although the best position absorbs the larger part of them
+(`InnovationTest`).
 
-The mean alone does not distinguish a wrong level of the multipath from a wrong spread: both change
-it in either direction. A level scales all residuals, so that their relative variance remains. A
-wrong spread concentrates the energy in a few directions of the signals, and levels that differ
-between users or places differ from cycle to cycle: the relative variance grows (`Diagnosis`).
+The mean alone does not distinguish a wrong level of the multipath from a wrong spread, because
+both can raise or lower it. A wrong level scales all residuals, and leaves their relative variance
+unchanged. The relative variance grows if a wrong spread concentrates the energy in a few
+directions of the signals, or if levels differ between users or places (`Diagnosis`).
 """
 
 import collections
@@ -26,28 +27,27 @@ from rhs_isac_ros.positioning.estimate import Estimate
 
 # Share of valid signals that each test of one phase may reject.
 FALSE_ALARM = 1e-9
-# Probability that the mean residual of a correct model causes a warning, and that their variance
-# does, for which the approximation is less accurate.
+# Probabilities that the mean and the variance of the residuals of a correct model cause a warning.
+# For the variance, the approximation is less accurate.
 FALSE_WARNING = 1e-6
 FALSE_SPREAD_WARNING = 1e-7
-# Probability of the latest residuals from which a warning ends: high, so that a small deviation
-# does not end and begin again and again.
+# Probability of the latest residuals at which a warning ends. It is high, so that a small
+# deviation does not cause one warning after another.
 RETURN = 0.9
 SPREAD_RETURN = 0.5
-# Number of residuals in the mean, of those that end a warning, and the smallest number that is
-# judged.
+# Numbers of residuals: in the window, to end a warning, and at least to begin one.
 WINDOW = 400
 MIN_RETURN = 100
 MIN_FIXES = 10
-# Tolerated error of an expectation, and relative excess of the variance, from modes that are not
-# Gaussian.
+# Tolerated error of an expectation, and relative excess of the variance, both due to modes that
+# are not Gaussian.
 _TOLERANCE = 0.5
 _SPREAD_TOLERANCE = 0.15
-# Larger deviations from the expectation count as this many standard deviations, and larger squares
-# as this one, so that no single signal causes a warning, and few do not dominate.
+# Deviations are limited to this many standard deviations, so that no single signal causes a
+# warning, and their squares to this value, so that a few signals do not dominate.
 _MAX_DEVIATIONS = 6.0
 _MAX_SQUARE = 9.0
-# Subjects of the reasons.
+# Subjects with which reasons begin.
 _ENERGY = 'energy of the whitened signals'
 _RESIDUAL = 'residual energy at the best position'
 # Causes of signals without a position.
@@ -61,7 +61,7 @@ _MAX_DISPERSION = 1.2
 class FitTest:
     """Tests of the energy of N_B N_SB F whitened signals; each returns a reason, or ''.
 
-    The multipath of users in sight has a median level relative to the whitened noise.
+    `level` is the median power of the multipath of users in sight, relative to the model.
     """
 
     def __init__(self, n_measurements: int, level: float = 1.0) -> None:
@@ -70,13 +70,13 @@ class FitTest:
 
         self.min_energy = float(gammaincinv(n_measurements, FALSE_ALARM))
         self._level = level
-        # With an unknown level of the multipath, the ratio of the likelihoods with and without a
-        # direct path is that of residual and energy to the power of n.
+        # If the level of the multipath is unknown, the ratio of the likelihoods with and without a
+        # direct path is (energy / residual)**n.
         self._weak_share = FALSE_ALARM**(1 / n_measurements)
         self.max_residual = float(gammainccinv(n_measurements, FALSE_ALARM))
 
     def min_energy_test(self, energy: float) -> str:
-        """Reject signals that are weaker than noise; the energy is relative to it."""
+        """Reject signals weaker than noise; `energy` is relative to the noise."""
         if energy >= self.min_energy:
             return ''
         return (f'{_ENERGY}: {energy:.3g}, expected at least {self.min_energy:.3g}, '
@@ -88,8 +88,8 @@ class FitTest:
         return _excess(_ENERGY, energy, (max_mean_energy**0.5 + self.max_residual**0.5)**2)
 
     def weak_test(self, energy: float, residual: float) -> str:
-        """Reject signals that are weaker than the multipath, unless they are a direct path."""
-        # Multipath may be weaker than in the model. The direct path at the best position then
+        """Reject signals weaker than the multipath, unless a direct path explains them."""
+        # Multipath may be weaker than in the model, but then the direct path at the best position
         # explains most of the energy.
         excess = _excess(_RESIDUAL, residual, self._weak_share * energy)
         if energy >= self._level * self.min_energy or not excess:
@@ -109,13 +109,14 @@ class InnovationTest:
     """Mean and variance of the energy of the last residuals, compared with the expectation.
 
     Twice an energy has approximately a chi-square distribution; `Estimate.expected_residual` is
-    half its mean. `ValueError` if the window is shorter than `MIN_RETURN`: no warning would end.
+    half its mean. Raises ValueError if the window is shorter than `MIN_RETURN`, because no warning
+    would end.
 
     Attributes
     ----------
     drifts
-        Whether the residuals deviate from the model. This begins when the mean or the variance
-        over the window is improbable, and ends when those of the latest `MIN_RETURN` are not.
+        Whether the residuals deviate from the model: True once their mean or variance over the
+        window is improbable, until both are probable for the latest `MIN_RETURN`.
     """
 
     def __init__(self, window: int = WINDOW) -> None:
@@ -189,10 +190,7 @@ class _Residual(NamedTuple):
 
 
 def _probability(total: _Residual, n: int) -> float:
-    """Probability of a sum at least as far from the expected sum of `n` energies, on either side.
-
-    Below it, the assumed multipath is too strong in some directions, and too weak in others.
-    """
+    """Return the two-sided p-value of a sum of `n` energies."""
     # Every node imports this package, and SciPy takes longer to load than ROS.
     from scipy.special import gammainc, gammaincc
 
@@ -203,7 +201,7 @@ def _probability(total: _Residual, n: int) -> float:
 
 
 def _spread_probability(total: _Residual, n: int) -> float:
-    """Probability of a sum of `n` squared deviations that is at least as large."""
+    """Return the one-sided p-value of a sum of `n` squared deviations."""
     from scipy.special import gammaincc
 
     # The sum is approximately a gamma variable. The square of a normalised gamma variable of
@@ -214,25 +212,25 @@ def _spread_probability(total: _Residual, n: int) -> float:
 
 
 class Diagnosis:
-    """Fixes, residuals and probabilities of the latest cycles."""
+    """The estimates of the latest cycles, and the diagnostics that follow from them."""
 
     def __init__(self) -> None:
         self._estimates: collections.deque[Estimate] = collections.deque(maxlen=WINDOW)
 
     def add(self, estimate: Estimate) -> None:
-        """Add the estimate of a cycle."""
+        """Add the estimate of a cycle to the history."""
         self._estimates.append(estimate)
 
     def clear(self) -> None:
-        """Forget all cycles."""
+        """Remove all cycles."""
         self._estimates.clear()
 
     def status(self, deviates: bool) -> dict[str, str]:
-        """Return the values for the diagnostics, as texts.
+        """Return texts for the diagnostics.
 
-        They are ``probability.<alternative>``, the share of such users; and if there are cycles
-        without a fix, ``no_fix.share`` and ``no_fix.cause``. If the residuals deviate from the
-        scenario, the probabilities are wrong.
+        ``probability.<alternative>`` is the share of such users. ``no_fix.share`` and
+        ``no_fix.cause`` exist if there are cycles without a fix. `deviates` states whether the
+        residuals deviate from the scenario, in which case the probabilities are wrong.
         """
         values = {}
         probabilities = [probabilities_of(one) for one in self._estimates]
@@ -240,7 +238,7 @@ class Diagnosis:
             found = [each[kind.name] for each in probabilities if kind.name in each]
             if found:
                 values[f'probability.{kind.name}'] = f'{np.mean(found):.3f}'
-        # What precedes the colon is the subject of a reason.
+        # The part of a reason before the colon is its subject.
         subjects = collections.Counter(
             str(one.reason).partition(':')[0] for one in self._estimates if one.reason)
         if subjects:

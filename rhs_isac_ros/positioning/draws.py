@@ -1,11 +1,12 @@
 """The posterior of weak signals: positions drawn all over the grid, instead of modes.
 
-Below the noise, thousands of beams and range steps explain the signals. To find all of these modes
-takes long, and they are not Gaussian. A draw is a direction within a cell of the grid; along the
-range, the likelihood is integrated. Cells are drawn with the probabilities that the bounds of
-their likelihood imply, and the weight of a draw is its integral over the expected number of draws
-of its cell: importance sampling. The weights show how many draws are effective. As long as these
-are too few, further draws follow the weights so far; peaks of strong signals are too narrow.
+Below the noise, thousands of beams and range steps explain the signals. Finding all of these modes
+takes long, and they are not Gaussian. Instead, directions are drawn within cells of the grid, and
+the likelihood is integrated along the range. This is importance sampling: cells are drawn with
+probabilities that follow from bounds of their likelihood, and the weight of a draw is its integral
+divided by the expected number of draws in its cell. The weights determine the number of effective
+draws. While it is too small, further draws follow the weights found so far. Peaks of strong
+signals are too narrow for this method.
 """
 
 from typing import NamedTuple
@@ -17,23 +18,23 @@ from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, concatenat
 from rhs_isac_ros.positioning.grid import Query, TemplateTable, Windows
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution
 
-# Draws at a time, largest number of times, and number of effective draws that suffices: the mean
-# squared error increases by its inverse.
+# Draws per round, largest number of rounds, and sufficient number of effective draws; its inverse
+# is the relative increase of the mean squared error.
 _N_DRAWS = 500
 _MAX_ROUNDS = 4
 _N_EFFECTIVE = 150.0
 # Share of further draws that follow the bounds instead of the weights.
 _SHARE_OF_BOUNDS = 0.1
-# Windows of range whose log-likelihood is lower than the best average by more have no effect.
+# Windows of range whose log-likelihood is further below the best average have no effect.
 _MARGIN = 12.0
-# Range steps per wavelength, at least; a Gaussian peak then has one for each two deviations.
+# Smallest number of range steps per wavelength. A Gaussian peak has one per two deviations.
 _MIN_STEPS = 8
 # Number of range steps to evaluate at a time.
 _BLOCK = 1 << 20
 # Multiples of these numbers modulo 1 cover the unit square evenly: powers of the inverse root of
 # x^3 = x + 1.
 _SEQUENCE = 1.324717957244746**-np.array([1.0, 2.0])
-# Components of directions below it count as positive, so that they have a finite inverse.
+# Smaller components of directions are replaced by this value, whose inverse is finite.
 _TINY = 1e-12
 
 
@@ -48,7 +49,7 @@ class Draws(NamedTuple):
 
 
 class _Rays(NamedTuple):
-    """Integrals of the likelihood over ranges in R directions, from one draw each."""
+    """Integrals of the likelihood over intervals of range, each in the direction of a draw."""
 
     draw: np.ndarray  # Number of the draw, int [R].
     direction: np.ndarray  # Unit vector, float64 [R, 3].
@@ -114,7 +115,7 @@ class DrawnPosterior:
             float(rays.highest[weights > 0].max()), float(weights @ rays.average))
 
     def _probabilities(self, query: Query, phase: int) -> np.ndarray:
-        """Share of each cell in the posterior if the bands had random phases, roughly, [C]."""
+        """Approximate the share of each cell in the posterior, as if phases were random."""
         # The average of exp(2 A cos(phase)) is nearly exp(2 A) / sqrt(1 + 4 pi A).
         n_bands, bound = len(self._wavenumbers), query.bound[phase]
         amplitude = (bound + self._table.energy) / (2 * n_bands)
@@ -123,7 +124,7 @@ class DrawnPosterior:
         return shares / shares.sum()
 
     def _rays(self, query: Query, phase: int, cells: np.ndarray, places: np.ndarray) -> _Rays:
-        """Integrate along directions at places in the unit square, [K, 2], of cells [K]."""
+        """Integrate along directions, given by places [K, 2] in the unit squares of cells [K]."""
         directions = np.empty((len(cells), 3))
         directions[:, 1:] = self._low[cells] + places * self._extent[cells]
         directions[:, 0] = _boresight(directions[:, 1:])
@@ -145,10 +146,7 @@ class DrawnPosterior:
 
     def _integrate(self, windows: Windows, low: np.ndarray, high: np.ndarray, n_steps: int
                    ) -> tuple[np.ndarray, ...]:
-        """Integrate over the ranges of windows; return the last fields of `_Rays`.
-
-        Takes the ends of the region in the direction of each draw [m].
-        """
+        """Integrate over windows from `low` to `high` [m]; return the last fields of `_Rays`."""
         step_m, range_m = self._table.window_m / n_steps, windows.range_m
         offsets_m = ((np.arange(n_steps) - (n_steps - 1) / 2) * step_m).astype(np.float32)
         phase = np.exp(1j * self._wavenumbers[:, None] * offsets_m)
@@ -173,12 +171,12 @@ class DrawnPosterior:
         return (log_mass, range_m + mean, np.maximum(square - mean**2, 0.0), average, highest)
 
     def _inside(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Range at which directions [K, 3] enter and leave the region, float64 [K] [m]."""
+        """Return the ranges at which directions [K, 3] enter and leave the region, [K] [m]."""
         directions = np.where(np.abs(directions) < _TINY, _TINY, directions)
         ends = np.sort(self._bounds[:, None] / directions, axis=0)
         return ends[0].max(axis=1), ends[1].min(axis=1)
 
 
 def _boresight(directions: np.ndarray) -> np.ndarray:
-    """Cosine of the angle from boresight for (u, v), float64 [K, 2]; at least 1e-6."""
+    """Return the cosine of the angle from boresight for (u, v) [K, 2]; at least 1e-6."""
     return np.sqrt(np.maximum(1 - np.sum(directions**2, axis=1), 1e-12))

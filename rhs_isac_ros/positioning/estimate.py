@@ -9,11 +9,11 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 
-# Far above any received amplitude [sqrt(W)]; after whitening, its square is still finite in single
-# precision.
+# Limit far above any received amplitude [sqrt(W)]. After whitening, its square is still finite in
+# single precision.
 _MAX_MAGNITUDE = 1e3
-# The fields of an `Estimate` of one phase: mean [3], covariance [3, 3] and reason, and optionally
-# those that follow.
+# The fields of an `Estimate` of one phase: mean [3], covariance [3, 3] and reason, optionally
+# followed by the four other fields.
 Located: TypeAlias = (
     tuple[np.ndarray, np.ndarray, str]
     | tuple[np.ndarray, np.ndarray, str, float, float, float, float])
@@ -25,12 +25,12 @@ class SignalError(ValueError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Estimate:
-    """A position and its uncertainty, or the reason why there is no position; or N of these.
+    """A position with its uncertainty, or the reason why there is none; or N of these.
 
     Attributes
     ----------
     mean
-        Position, float64 [3] or [N, 3] [m]; NaN if the signals determine none.
+        Position, float64 [3] or [N, 3] [m]; NaN if there is none.
     covariance
         Covariance of the position, float64 [3, 3] or [N, 3, 3] [m^2]; NaN without a position.
     reason
@@ -38,14 +38,14 @@ class Estimate:
     residual
         Energy of the whitened residual at the best position, float64 [] or [N]; or NaN.
     expected_residual
-        Its mean for signals that match the model, given the modes of the posterior, float64 [] or
-        [N]; NaN without a residual, and if the user may be outside of the region or blocked.
+        Expected `residual` of signals that match the model, given the modes of the posterior,
+        float64 [] or [N]; NaN without a residual, or if the user may be outside or blocked.
     outside_probability
-        Probability that the user is outside of the region, float64 [] or [N]; NaN from estimators
-        that assume a user inside. Mean and covariance are those of a user inside.
+        Probability that the user is outside of the region, float64 [] or [N]; NaN if the estimator
+        assumes a user inside. Mean and covariance always apply to a user inside.
     blocked_probability
-        Probability that there is no direct path, float64 [] or [N]; NaN from estimators that
-        assume one. Mean and covariance are those of a user in sight.
+        Probability that there is no direct path, float64 [] or [N]; NaN if the estimator assumes
+        a direct path. Mean and covariance always apply to a user in sight.
     """
 
     mean: np.ndarray
@@ -68,12 +68,12 @@ class Estimator(Protocol):
     name: str
 
     def estimate(self, received: np.ndarray) -> Estimate:
-        """Estimate positions from received signals; `SignalError` if they cannot be used.
+        """Estimate positions from received signals; raise `SignalError` if they are unusable.
 
         The signals are complex128 [N_B, N_SB F], or [N, N_B, N_SB F] for N positions,
-        sub-band-major; the estimate has a leading dimension N if the signals have one. It may
-        differ from those of single phases: one in a thousand by more than five hundredths of a
-        standard deviation.
+        sub-band-major; the estimate has a leading dimension N if the signals have one. Estimates
+        of a batch may differ from estimates of single phases; one in a thousand differs by more
+        than five hundredths of a standard deviation.
         """
         ...
 
@@ -83,15 +83,9 @@ def estimate_each(
         locate: Callable[[np.ndarray], Iterable[Located]]) -> Estimate:
     """Check received signals, locate every phase, and match the result to the signals' shape.
 
-    Takes signals, complex128 [N_B, N_SB F] or [N, N_B, N_SB F], and a function that yields the
-    values of `Located` for each phase of checked signals [N, N_B, N_SB F]: mean [3], covariance
-    [3, 3] and reason, and optionally the other fields of an `Estimate`. If the reason is not
-    empty, mean and covariance are ignored.
-
-    Raises
-    ------
-    SignalError
-        If the shape is wrong, a value is not finite, or a magnitude exceeds 1000.
+    `locate` yields the values of `Located` for each phase of checked signals [N, N_B, N_SB F]. If
+    the reason is not empty, mean and covariance are ignored. Raises SignalError if the shape is
+    wrong, a value is not finite, or a magnitude exceeds 1000.
     """
     batch = checked_received(codebook, received)
     mean, covariance = np.full((len(batch), 3), np.nan), np.full((len(batch), 3, 3), np.nan)

@@ -51,31 +51,31 @@ from rhs_isac_ros.positioning.search import Modes, ascend, find_modes
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
-# Coordinates fitted to the signals of each phase.
+# Number of coordinates fitted to the signals of each phase.
 _N_COORDINATES = 3
 # Number of phases that are located together.
 _BLOCK = 128
-# Samples of a mode if the phases of the bands carry information: their density has several peaks
-# within a mode, so that fewer samples have most of the weight.
+# Samples per mode if the phases of the bands carry information. The density then has several peaks
+# within a mode, and few of the samples have most of the weight.
 _N_INFORMATIVE = 512
-# Probability of all alternatives above which residuals are not compared with the scenario.
+# Total probability of the alternatives above which residuals are not compared with the scenario.
 _DOUBT_LIMIT = 0.05
 
 
 class _Fit(NamedTuple):
-    """What the signals of one phase reveal of a user inside the region."""
+    """Result for one phase on the assumption that the user is inside the region."""
 
     mean: np.ndarray  # Float64 [3] [m].
     covariance: np.ndarray  # Float64 [3, 3] [m^2].
     log_evidence: float  # Logarithm of the likelihood averaged over the region.
     residual: float  # Energy of the whitened residual at the best position.
-    expected: float  # Its mean for signals that match the model.
-    gain: complex  # Of the signals at the best position [nepers].
+    expected: float  # Expected residual of signals that match the model.
+    gain: complex  # Gain of the signals at the best position [nepers].
     modes: Modes | None = None  # None if positions were drawn instead.
 
 
 class SearchEstimator(abc.ABC):
-    """An estimator from the modes of the posterior, for a uniform prior on the region of interest.
+    """Estimator based on the modes of the posterior, with a uniform prior over the region.
 
     Signals that the model cannot explain at the best mode give no fix; see `diagnosis`. If the
     scenario has a `blocked_probability`, users may lack the direct path; see `alternatives`.
@@ -86,11 +86,11 @@ class SearchEstimator(abc.ABC):
     reject_outside
         Whether the user may also be outside of the region. If this is almost certain
         (`alternatives.OUTSIDE_LIMIT`), there is no fix. Otherwise the estimate contains its
-        probability, while position and covariance remain those of a user inside.
+        probability, and position and covariance apply to a user inside.
     surface
-        What is known of the surface, as in `MeasurementModel`; for example a calibration.
+        Knowledge of the surface, such as a calibration; see `MeasurementModel`.
     progress
-        Called with the share of the table that is computed, from any thread; not if it is loaded.
+        Called with the completed share while a table is computed, from any thread.
     """
 
     averages = True  # Whether positions are averages over the posterior.
@@ -112,7 +112,7 @@ class SearchEstimator(abc.ABC):
             self._alternatives.append(Blocked(scenario))
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
         # Median level of the multipath of users in sight, and the share of a residual's deviation
-        # that is a deviation of the level.
+        # that is due to the level.
         median_db, std_db = scenario.multipath.level_db if scenario.multipath else (0.0, 0.0)
         self._level = 10**(median_db / 10)
         self._level_share = share_of_level(n_measurements, std_db)
@@ -141,7 +141,7 @@ class SearchEstimator(abc.ABC):
 
     @one_blas_thread
     def estimate(self, received: np.ndarray) -> Estimate:
-        """Estimate positions from received signals, as `Estimator.estimate` describes."""
+        """Estimate positions from received signals; see `Estimator.estimate`."""
         return estimate_each(self.scenario, self._likelihood.codebook, received, self._locate)
 
     @one_blas_thread
@@ -166,10 +166,7 @@ class SearchEstimator(abc.ABC):
 
     def _locate_block(self, signals: Signals, draws: bool
                       ) -> list[tuple[Located, Modes | None]]:
-        """Locate phases together: position or reason, and modes if there is a position.
-
-        With `draws`, phases that have too many modes have positions without them.
-        """
+        """Locate phases together; with `draws`, draw positions if there are too many modes."""
         energies = np.sum(np.abs(signals.received)**2, axis=(1, 2)) / self.scenario.noise_power_w
         reasons = [self._test.min_energy_test(energy) for energy in energies.tolist()]
         results: list[tuple[Located, Modes | None]] = [
@@ -185,7 +182,7 @@ class SearchEstimator(abc.ABC):
         return results
 
     def _search(self, signals: Signals, aligned: np.ndarray, draws: bool) -> list[_Fit]:
-        """Find the posteriors of N phases, by draws where it has too many modes."""
+        """Find the posterior of each phase, by draws if it has too many modes."""
         likelihood, fits = self._likelihood, dict[int, _Fit]()
         extra = self._failures.search_margin if self._failures else 0.0
 
@@ -208,7 +205,7 @@ class SearchEstimator(abc.ABC):
         return [fits[phase] for phase in range(len(aligned))]
 
     def _fit(self, modes: Modes, signals: Signals, rows: list[int]) -> Iterator[_Fit]:
-        """Yield the posterior of each phase in `rows`, ascending, from its modes."""
+        """Yield the posterior of each phase in `rows`, in ascending order, from its modes."""
         likelihood = self._likelihood
         conditionals: dict[int, Sequence[Conditional]] = dict.fromkeys(
             rows, [self._dispersed or likelihood])
@@ -232,9 +229,8 @@ class SearchEstimator(abc.ABC):
         samples = WeightedSamples.of(drawn, modes)
         means, covariances = self._moments(modes, samples)
         log_evidence = samples.log_evidence(likelihood.resolution.volume_m3)
-        # Averaged over the posterior, the energy of a model that holds has the mean of a
-        # chi-square variable. At the best of several modes it is smaller, by the difference from
-        # the average.
+        # If the model holds, the residual energy averaged over the posterior has the mean of a
+        # chi-square variable. At the best of several modes, it is smaller than the average.
         expected = self._mean_residual - samples.average(modes.residual)
         value = modes.roi_log_likelihood
         ends = [*samples.starts[1:].tolist(), len(modes.phases)]
@@ -247,7 +243,7 @@ class SearchEstimator(abc.ABC):
 
     def _judge(self, fit: _Fit, whitened: np.ndarray, aligned: np.ndarray
                ) -> tuple[Located, Modes | None]:
-        """Return the position of one phase, or why there is none, and its modes."""
+        """Return the position of one phase or the reason for its absence, and the modes."""
         log_weights = np.array([fit.log_evidence, *(
             one.log_odds + one.log_evidence_of(
                 whitened, aligned, fit.residual, self._likelihood.nuisance)
@@ -255,8 +251,8 @@ class SearchEstimator(abc.ABC):
         probabilities = shares(log_weights[None])[0]
         reason = self._reason(whitened * np.exp(-fit.gain), fit.residual, log_weights)
         moments = _no_fix() if reason else (fit.mean, self._covariance(fit))
-        # Of signals without a fix, only a residual that nothing explains is evidence against
-        # the scenario.
+            # Without a fix, only a residual that nothing explains is evidence against the
+            # scenario.
         counts = (reason == self._test.residual_test(fit.residual) if reason
                   else probabilities[0] >= 1 - _DOUBT_LIMIT)
         by_name = {one.name: float(share) for one, share in zip(
@@ -266,16 +262,16 @@ class SearchEstimator(abc.ABC):
                  outside, blocked), None if reason else fit.modes)
 
     def _covariance(self, fit: _Fit) -> np.ndarray:
-        """Return the covariance for the level of the multipath that the residual reveals."""
+        """Return the covariance, scaled to the level of the multipath that the residual shows."""
         relative = max(fit.residual, 1e-9) / (self._level * max(fit.expected, 0.5))
-        # No position is less certain than anywhere in the region.
+        # The covariance of a position never exceeds the prior's.
         largest = max(self._prior_m2 / float(fit.covariance.trace()), 1.0)
         return min(relative**self._level_share, largest) * fit.covariance
 
     def _reason(self, whitened: np.ndarray, residual: float, log_weights: np.ndarray) -> str:
-        """Return why there is no fix, empty if there is one."""
-        # If no position of the region explains the signals, an alternative has to explain them to
-        # be the reason.
+        """Return the reason why there is no fix, or '' if there is one."""
+        # If no position in the region explains the signals, an alternative is the reason only if
+        # it explains them.
         unexplained = self._test.residual_test(residual) or self._test.weak_test(
             float(np.sum(np.abs(whitened)**2)), residual)
         for index in np.argsort(-log_weights[1:]).tolist():
@@ -294,8 +290,7 @@ class BayesEstimator(SearchEstimator):
 
     def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
         mean, covariance = samples.moments()
-        # The mean of few samples is itself uncertain; its covariance never exceeds that of the
-        # prior.
+        # The mean of few samples is itself uncertain; its covariance never exceeds the prior's.
         prior = np.diag((self._bounds[1] - self._bounds[0])**2 / 12)
         within = samples.average(np.matmul(samples.spread, np.swapaxes(samples.spread, 1, 2)))
         within = within @ np.linalg.solve(within + prior, np.broadcast_to(prior, within.shape))
@@ -332,9 +327,9 @@ class WeightedModes(NamedTuple):
 def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> WeightedModes | None:
     """Compute the modes for the signals of one phase, complex128 [N_B, N_SB F] or [N_B, N_SB, F].
 
-    Mean and covariance of the mixture are those of the estimate of `BayesEstimator`, up to the
-    uncertainty of the mean of its samples, unless that estimate is an average over draws. The
-    result is None if there is no position. Raises `SignalError` if the signals cannot be used.
+    The mixture has the mean and covariance of `BayesEstimator`, apart from the sampling error of
+    its mean, unless that estimate is an average over draws. The result is None if there is no
+    position. Raises `SignalError` if the signals cannot be used.
     """
     modes = estimator.posterior(received.reshape(len(received), -1)).modes
     if modes is None:
@@ -352,7 +347,7 @@ def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> Weighted
 
 
 def surface_of(estimator: Estimator) -> Surface | None:
-    """Return what an estimator assumes to be known of the surface; None for other estimators."""
+    """Return the surface that a `SearchEstimator` assumes; None for other estimators."""
     return estimator.surface if isinstance(estimator, SearchEstimator) else None
 
 

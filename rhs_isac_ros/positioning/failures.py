@@ -1,15 +1,15 @@
 """Modes of the posterior as a mixture over sets of failed elements.
 
-`DispersedLikelihood` replaces the mixture by one Gaussian for each number of failures, which
-discards what the signals reveal about the set: a single failure is far above the nulls of the
-multipath. Here, the sets with a substantial weight are found by adding elements to the most
-probable sets, one at a time.
+`DispersedLikelihood` replaces the mixture by one Gaussian for each number of failures. This
+ignores the information about the set: even a single failure is far above the nulls of the
+multipath. Here, sets with a substantial weight are found by adding elements to the most probable
+sets, one at a time.
 
-A failed element is stuck at an amplitude that is uniform in [0, 1]. With its amplitude treated as
-Gaussian, of mean 1/2 and variance 1/12, the signals are Gaussian. The amplitude is one more
-unknown of the direct path, in which the mean is linear; its variance adds to the covariance of the
-multipath. Errors of the elements have their average covariance in the search for sets, and the
-covariance at each point in the likelihood of a set.
+A failed element is stuck at an amplitude that is uniform in [0, 1]. If its amplitude is treated as
+Gaussian, with mean 1/2 and variance 1/12, the signals are Gaussian. In the direct path, the
+amplitude is one more unknown in which the mean is linear; in the multipath, its variance adds to
+the covariance. The search for sets uses the average covariance of the elements' errors, and the
+likelihood of a set uses their covariance at each point.
 """
 
 import dataclasses
@@ -40,27 +40,26 @@ from rhs_isac_ros.positioning.search import Modes, ascend, predict
 
 # Largest expected number of failures for which sets are searched.
 _MAX_EXPECTED = 2.0
-# Probability that an intact surface has a higher residual than the usual one, and the number of
-# modes from which sets are searched below that residual.
+# Probability that the residual of an intact surface exceeds the usual residual, and number of
+# modes from which sets are searched if it does not.
 _UNUSUAL = 0.01
 _N_USUAL = 2
-# Points of the table and their margin, besides the modes, and sites to search from otherwise.
+# Otherwise: number of points of the table besides the modes, their margin, and number of sites.
 _MAX_POINTS = 64
 _POINT_MARGIN = 30.0
 _N_SITES = 64
-# Share of further failures that orders the sets, and number of sets of the same size to extend.
+# Share of further failures assumed to order the sets, and number of sets of one size to extend.
 _REMAINDER = 0.3
 _N_EXTENDED = 16
-# Sets to try at all sites.
+# Number of sets to try at all sites.
 _N_SETS = 4
-# Hypotheses whose log-probability is lower than the best by more than this are dropped, before
-# and after the first exact step, and the number of those that remain.
+# Hypotheses further below the best in log-probability are dropped, before and after the first
+# exact step; and the largest number that remains.
 _MARGIN = 9.0
 _FIRST_MARGIN = 27.0
 _MAX_HYPOTHESES = 48
 _N_STEPS = 2
-# Hypotheses to extend, of each set and of each site; and of the extended sets, those to weigh
-# exactly.
+# Numbers of hypotheses to extend per set and per site, and of extended sets to weigh exactly.
 _MAX_PER_SET = 3
 _MAX_PER_SITE = 4
 _N_EXACT = 16
@@ -75,14 +74,14 @@ Key: TypeAlias = tuple[Failed, int]
 
 
 def can_enumerate(scenario: Scenario) -> bool:
-    """Return whether a scenario declares failures so rare that their sets can be searched."""
+    """Return whether declared failures are so rare that their sets can be searched."""
     return 0 < scenario.failed_element_share * scenario.n_elements <= _MAX_EXPECTED
 
 
 class FailedElements:
     """The posterior of positions if a few elements of the surface may have failed."""
 
-    # Extra margin of the search for modes, whose average over sets misjudges each set.
+    # Extra margin of the search for modes, which averages over sets and thus misjudges each set.
     search_margin = 10.0
 
     def __init__(self, likelihood: Likelihood, grid: TemplateTable) -> None:
@@ -94,21 +93,21 @@ class FailedElements:
         self._usual_residual = float(gammainccinv(np.prod(likelihood.model.shape), _UNUSUAL))
 
     def refine(self, modes: Modes, signals: Signals) -> tuple[Modes, list['FailedSet']]:
-        """Return a mode of one phase for every probable set, and the likelihoods of the sets.
+        """Return modes of one phase for all probable sets, and the likelihoods of the sets.
 
-        Takes the modes of the search, and the signals of the phase, N = 1.
+        Takes the modes found without sets, and the signals of the phase, N = 1.
         """
         return self._converge(self._search(modes, signals), signals)
 
     def _search(self, modes: Modes, signals: Signals) -> 'FailureSearch':
-        """Search for probable sets at the modes and elsewhere."""
+        """Search for probable sets of failed elements, at the modes and elsewhere."""
         order = np.argsort(-modes.roi_log_likelihood)
         search = FailureSearch(self._model, signals, _MARGIN, self._usual_residual)
         keys = search.add(modes.roi_points[order], modes.values[order])
         if search.explains(keys):
             search.grow(keys[:_N_USUAL])
         else:
-            # The parameters that a search on the grid must know.
+            # The search on the grid needs the parameters that move the multipath.
             aligned = modes.values[order[0]] * self._likelihood.nuisance.moves_multipath
             found = self._grid.starts(
                 self._likelihood.whitened(aligned, signals), self._likelihood.nuisance,
@@ -121,7 +120,7 @@ class FailedElements:
 
     def _converge(self, search: 'FailureSearch', signals: Signals
                   ) -> tuple[Modes, list['FailedSet']]:
-        """Take exact steps from the most probable hypotheses."""
+        """Take exact Gauss-Newton steps from the most probable sets and positions."""
         values, best = search.values, max(search.values.values())
         keys = sorted((key for key in values if values[key] >= best - _MARGIN),
                       key=lambda key: -values[key])[:_MAX_HYPOTHESES]
@@ -145,11 +144,11 @@ class Surface(NamedTuple):
     """A surface with failed elements."""
 
     scattered: np.ndarray  # T V, complex128 [N_B, N_SB F, N_E].
-    # Of the signals given the amplitudes of the direct path, complex128 [N_B, N_SB F, N_SB F].
+    # Covariance of the signals, given the amplitudes in the direct path, [N_B, N_SB F, N_SB F].
     covariance: np.ndarray
 
     def whitening(self, prior: NuisancePrior) -> 'Whitening':
-        """Factor the covariance."""
+        """Return the inverse Cholesky factor of the covariance."""
         roots = np.linalg.cholesky(self.covariance)
         whitener = np.linalg.inv(roots)
         return Whitening(whitener[:, None], log_determinant(roots).sum(keepdims=True),
@@ -157,11 +156,11 @@ class Surface(NamedTuple):
 
 
 class Whitening(NamedTuple):
-    """Factors of the covariances of H sets."""
+    """Factors of the covariance matrices of H sets of failed elements."""
 
     whitener: np.ndarray  # Inverse Cholesky factors, complex128 [N_B, H, N_SB F, N_SB F].
     log_volume: np.ndarray  # Logarithms of the determinants, float64 [H].
-    information: np.ndarray  # Of one covariance about the nuisance parameters, float64 [Q, Q].
+    information: np.ndarray  # One covariance's information about the parameters, float64 [Q, Q].
 
 
 class Site(NamedTuple):
@@ -173,7 +172,8 @@ class Site(NamedTuple):
     # parameters, complex128 [4 + Q, N_B, N_SB F]; and their changes if an element fails.
     columns: np.ndarray
     changes: np.ndarray  # Complex128 [N_E, 4 + Q, N_B, N_SB F].
-    # Derivatives by the scaled amplitude of a failed element, complex128 [N_E, N_B, N_SB F].
+    # Derivatives with respect to the scaled amplitude of a failed element, complex128
+    # [N_E, N_B, N_SB F].
     amplitudes: np.ndarray
 
     def columns_of(self, failed: Failed) -> np.ndarray:
@@ -203,7 +203,7 @@ class FailedSet:
         self._amplitudes = amplitudes[self._failed]
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate points, as `Conditional` describes."""
+        """Evaluate points; see `Conditional.local`."""
         prior, positions = self._likelihood.nuisance, to_positions(points)
         mean, slopes = self._means(points)
         gains = np.stack([
@@ -231,8 +231,8 @@ class FailureModel:
         self.likelihood, self.scenario = likelihood, scenario
         intact = dataclasses.replace(scenario, failed_element_share=0.0)
         self._model = MeasurementModel(intact, codebook).prepare(jacobian=True)
-        # Weights of the elements' direct paths, [N_E, N_B, N_SB F]: their changes by a failure,
-        # and per standard deviation of the amplitude of a failed element.
+        # Weights of the elements' direct paths, [N_E, N_B, N_SB F]: their change by a failure, and
+        # the weight per standard deviation of a failed element's amplitude.
         weights = np.matmul(codebook.digital, onboard_matrix(scenario))
         self._shift, self._amplitudes = (
             np.ascontiguousarray(np.moveaxis(one.reshape(self._model.radiation.shape), 2, 0))
@@ -257,7 +257,7 @@ class FailureModel:
             len(failed) * self._log_odds + self._log_intact, excess_at))
 
     def _excess_at(self, positions: np.ndarray) -> np.ndarray:
-        """Covariance of element errors at positions, less its average, [M, N_B, S, S]."""
+        """Return the covariance of element errors at positions, less its average."""
         return self._model.covariance_at(positions) - self._intact.covariance
 
     def _surface(self, failed: Failed) -> Surface:
@@ -289,8 +289,9 @@ class FailureModel:
     def weigh(self, failed: Failed, site: Site) -> tuple[float, float]:
         """Return the log-probability of a set at a site, and its deviance, after a step.
 
-        The former is relative to the prior of an intact surface. The deviance is the energy of
-        the residual plus the cost of the parameters: an unknown gain lowers any energy.
+        The log-probability is relative to the prior of an intact surface. The deviance is the
+        energy of the residual plus the cost of the parameters, because an unknown gain can lower
+        any energy.
         """
         whitening = self._whitening(failed)
         columns = np.concatenate([site.columns_of(failed), site.amplitudes[[*failed]]])[None]
@@ -300,9 +301,9 @@ class FailureModel:
     def weigh_extensions(self, failed: Failed, site: Site, remainder: float = 0.0) -> np.ndarray:
         """Compute the log-probability of `weigh` if one more element fails, float64 [N_E].
 
-        Besides, further elements may have failed, the declared share times `remainder` of them.
-        They add to the covariance, so that elements which explain a part of the signals have a
-        higher value than elements which imitate the sum.
+        The other elements are assumed to fail with the declared share times `remainder`, which
+        adds to the covariance. Elements that explain a part of the signals then have a higher
+        value than elements that imitate the sum.
         """
         extended, columns = self._extensions_of(failed, remainder), site.columns_of(failed)
         own = np.broadcast_to(site.amplitudes[[*failed]],
@@ -313,7 +314,7 @@ class FailureModel:
 
     def _predicted(self, site: Site, columns: np.ndarray, whitening: Whitening,
                    n_failed: int) -> np.ndarray:
-        """Marginal log-likelihood of columns [H, C, N_B, N_SB F] after a step, [H]."""
+        """Return the marginal log-likelihood of columns [H, C, N_B, N_SB F] after a step, [H]."""
         prior, n = self.likelihood.nuisance, len(columns)
         white = np.matmul(np.moveaxis(columns, 2, 0), np.swapaxes(whitening.whitener, 2, 3))
         white = np.moveaxis(white, 0, 2).reshape(n, columns.shape[1], -1)
@@ -328,7 +329,7 @@ class FailureModel:
             covariance = surface.covariance[:, None] + np.swapaxes(self._growth(surface), 0, 1)
             covariance += remainder * self._error[:, None]
             roots = np.linalg.cholesky(covariance)
-            # Those of the intact surface serve all phases; each takes a few megabytes.
+            # Only extensions of the intact surface serve all phases; each takes a few megabytes.
             self._extensions = {key: kept for key, kept in self._extensions.items() if not key[0]}
             self._extensions[failed, remainder] = Whitening(
                 np.linalg.inv(roots), log_determinant(roots).sum(axis=0),
@@ -336,11 +337,11 @@ class FailureModel:
         return self._extensions[failed, remainder]
 
     def _growth(self, surface: Surface, elements: slice = slice(None)) -> np.ndarray:
-        """Change of a surface's covariance if an element fails, [N_E, N_B, S, S]."""
+        """Return the change of a surface's covariance if an element fails, [N_E, N_B, S, S]."""
         shift, spread = self._shift[elements], self._amplitudes[elements]
         power = np.diagonal(self._spatial, axis1=1, axis2=2).real.T[elements, :, None]
         cross = np.moveaxis(surface.scattered[..., elements], 2, 0) + power / 2 * shift
-        # A product of two vectors plus its conjugate transpose, and one of the amplitudes.
+        # A product of two vectors plus its conjugate transpose, and a product of the amplitudes.
         left = np.stack([shift, cross, power * spread], axis=-1)
         right = np.stack([cross, shift, spread], axis=-1)
         return self._correlation * np.matmul(left, np.conj(np.swapaxes(right, 2, 3)))
@@ -349,11 +350,11 @@ class FailureModel:
 class FailureSearch:
     """Adds failed elements to sets, one at a time, at several sites, for the signals of a phase.
 
-    The order of the extended sets follows from a likelihood that admits a few more failures; see
-    `FailureModel.weigh_extensions`. Without them, the best first element of two would often be
-    one that imitates the sum of both.
+    Extended sets are ordered by a likelihood that admits a few more failures; see
+    `FailureModel.weigh_extensions`. Otherwise, if two elements have failed, the first one added
+    would often be a third element that imitates the sum of both.
 
-    Growth ends with sets that are less probable than the best by a margin, in log-probability, but
+    Growth ends when new sets are less probable than the best by a margin, in log-probability, but
     continues while no hypothesis has a deviance below the usual residual.
     """
 
@@ -372,7 +373,7 @@ class FailureSearch:
         return max(self.values, key=lambda key: self.values[key])
 
     def explains(self, keys: list[Key]) -> bool:
-        """Whether a hypothesis has no higher deviance than usual."""
+        """Return whether the deviance of a hypothesis is no higher than usual."""
         return any(self._deviances[key] <= self._usual_residual for key in keys)
 
     def add(self, points: np.ndarray, values: np.ndarray, failed: Failed = ()) -> list[Key]:
@@ -385,8 +386,7 @@ class FailureSearch:
     def grow(self, parents: list[Key], remainder: float = 0.0) -> None:
         """Add failures to hypotheses as long as the result is probable.
 
-        Takes the share of further failures that orders the sets, as in
-        `FailureModel.weigh_extensions`.
+        `remainder` is the argument of `FailureModel.weigh_extensions`.
         """
         # Earlier growth does not count: it may have ended with a set that is less probable.
         found = self._weigh(parents)
@@ -403,7 +403,7 @@ class FailureSearch:
             parents = _diverse(ranked)
 
     def try_neighbours(self, key: Key) -> None:
-        """Weigh the sets with one element more, less, or exchanged."""
+        """Weigh the sets in which one element is added, removed or exchanged."""
         failed, index = key
         smaller = [tuple(sorted(set(failed) - {element})) for element in failed]
         self._weigh((one, index) for one in smaller)
@@ -423,7 +423,7 @@ class FailureSearch:
     def _weigh_children(self, parents: list[Key], remainder: float = 0.0) -> list[Key]:
         """Return the sets with one more element, the most probable first."""
         children: dict[Key, float] = {}
-        # The covariances of a set are computed once.
+        # In this order, the covariances of a set are computed once.
         for failed, index in sorted(parents):
             values = self._model.weigh_extensions(failed, self.sites[index], remainder)
             for element, value in enumerate(values.tolist()):
@@ -433,7 +433,7 @@ class FailureSearch:
 
 
 def _diverse(ranked: list[Key]) -> list[Key]:
-    """Choose the first hypotheses to extend, few of each set and of each site."""
+    """Choose the best hypotheses to extend, but only a few per set and per site."""
     chosen: list[Key] = []
     for failed, index in ranked:
         if (sum(other == failed for other, _ in chosen) < _MAX_PER_SET

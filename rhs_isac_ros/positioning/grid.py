@@ -1,11 +1,11 @@
 """The search for modes of the likelihood on a grid of templates over the region of interest.
 
-A template is a mean signal times the range, without the carriers of its sub-bands:
-exp(i k_n r) r mu_n(p). It changes with the direction, as the aperture resolves it, and with the
-range only by the curvature of the wavefront, so that many ranges share one template. The search
-descends through three levels: the outputs of the matched filters at every template, for each
-sub-band; their sum at range cells, within which delays and amplitudes hardly change; and range
-steps that resolve the carriers, along which one output per band rotates.
+A template is a mean signal times the range, without the carriers of its sub-bands: exp(i k_n r) r
+mu_n(p). It changes with the direction at the resolution of the aperture, but with the range only
+through the curvature of the wavefront, so many ranges share one template. The search has three
+levels. Matched filters are evaluated for every template and sub-band. Their outputs are summed in
+range cells, within which delays and amplitudes hardly change. Along fine range steps, which
+resolve the carriers, one output per band then rotates.
 
 All lengths of the grid follow from the scenario; see `lattice`.
 """
@@ -43,29 +43,29 @@ _N_NORMAL = 128
 _BLOCK = 128
 # Fine range steps per shortest wavelength; at least four are needed to resolve the posterior.
 _STEPS_PER_WAVELENGTH = 8
-# Number of outputs to compute at a time, which limits the number of phases.
+# Number of outputs in a block, which limits the number of phases.
 _N_OUTPUTS = 1 << 18
-# Cells of a phase that are examined first. They show how likely others have to be.
+# Number of cells of a phase that are examined first, to find how likely others must be.
 _N_FIRST = 48
-# Number of further cells that may matter from which positions are drawn instead.
+# Number of further relevant cells above which positions are drawn instead.
 _MAX_CELLS = 100
-# Largest number of peaks of a phase that are examined further, which limits memory and time. Only
-# signals below the noise have more; the rest of them have little weight.
+# Largest number of peaks of a phase that are kept, to limit memory and time. Only signals below
+# the noise have more, and the remaining peaks have little weight.
 _MAX_PEAKS = 8192
 # Squared Mahalanobis distance below which points belong to the same mode.
 _SAME_MODE = 2.0
-# Largest distance of points to compare, in radii of the ellipsoid.
+# Largest distance at which points are compared, in radii of the ellipsoid.
 _MAX_REACH = 3.0
-# Errors within a range cell, as a share of the energy of the template.
+# Error within a range cell, as a share of the energy of the template.
 _TABLE_ERROR = 0.015
-# Error of the likelihood that a step with the slopes predicts, relative to the loss that it makes
-# up for.
+# Error of the log-likelihood after a step with the slopes, relative to the loss that the step
+# recovers.
 _STEP_ERROR = 0.5
 
 
 def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None = None
              ) -> dict[str, np.ndarray]:
-    """Compute the arrays of a `TemplateTable`, for G templates and C pairs with a range cell.
+    """Compute the arrays of a `TemplateTable`, for G templates and C pairs of template and cell.
 
     They are ``filters``, the conjugate templates, complex64 [N_B, N_SB, G, F]; ``slope_filters``,
     their derivatives with respect to (r [m], u, v), complex64 [N_B, N_SB, G, 3, F]; ``energy`` of
@@ -117,7 +117,7 @@ def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None =
 
 
 def standard_normal(n: int) -> np.ndarray:
-    """Return points that represent a standard Gaussian, float64 [n, 3], for a power of two."""
+    """Return points that represent a standard Gaussian, float64 [n, 3]; n is a power of two."""
     # The points are kept with the table because these imports take longer than loading a table.
     from scipy.special import ndtri
     from scipy.stats import qmc
@@ -128,7 +128,7 @@ def standard_normal(n: int) -> np.ndarray:
 class TemplateTable:
     """Fast evaluation of the log-likelihood over the whole region of interest.
 
-    Takes the arrays of `tabulate`, of which `normal`, `spread` and `energy` are attributes.
+    Its argument is the result of `tabulate`; `normal`, `spread` and `energy` are attributes.
     """
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
@@ -150,7 +150,7 @@ class TemplateTable:
         self._set_windows(scenario)
 
     def _set_windows(self, scenario: Scenario) -> None:
-        """Divide range cells into windows of one width, with the same fine steps."""
+        """Divide range cells into windows of equal width, with the same fine steps."""
         grid, wavelength_m = self.grid, self._resolution.wavelength_m
         counts = np.ceil(grid.widths_m / grid.widths_m.min() - 1e-9).astype(int)
         self._first_window, self._n_windows = np.cumsum(counts) - counts, counts
@@ -161,7 +161,7 @@ class TemplateTable:
         self._window_turns = self._turns(self._window_ranges_m).astype(np.complex64)
         n_fine = int(np.ceil(width_m.max() / wavelength_m * _STEPS_PER_WAVELENGTH))
         self.window_m = width_m.max()
-        # One step more at either end, so that a maximum is within some window.
+        # One more step at either end keeps every maximum inside some window.
         self._step_m = width_m.max() / n_fine
         self._offsets_m = (np.arange(n_fine + 2) - (n_fine + 1) / 2) * self._step_m
         phase = np.exp(1j * carrier_wavenumbers(scenario) * self._offsets_m[:, None])
@@ -169,17 +169,18 @@ class TemplateTable:
         self._fine = np.ascontiguousarray(phase.T.astype(np.complex64))
 
     def _turns(self, ranges_m: np.ndarray) -> np.ndarray:
-        """Factors of the templates' conjugates at ranges [R], complex128 [N_B, N_SB, R]."""
+        """Return the factors of conjugate templates at ranges [R], complex128 [N_B, N_SB, R]."""
         return np.exp(1j * self._wavenumbers[..., None] * ranges_m) / ranges_m
 
     def starts(self, whitened: np.ndarray, prior: NuisancePrior, margin: float,
                draw: Callable[['Query', int], bool] | None = None) -> 'Starts':
         """Find the most likely separate points, to the accuracy of one Gauss-Newton step.
 
-        Takes whitened signals of N phases, complex128 [N, N_B, N_SB F], without the offsets of
-        carrier and timing; and the negative logarithm of the share of the posterior that points
-        may leave out. The points of a phase do not depend on the other phases. A phase in which
-        very many cells matter has none if `draw`, called with its row in a query, returns True.
+        `whitened` are the signals of N phases, complex128 [N, N_B, N_SB F], without offsets of
+        carrier and timing. `margin` is the negative logarithm of the share of the posterior that
+        may be left out. The points of a phase do not depend on the other phases. If very many
+        cells of a phase are relevant, `draw` is called with the query and the phase's row in it;
+        the phase has no points if `draw` returns True.
         """
         n = max(1, _N_OUTPUTS // (len(self.energy) * len(self._wavenumbers)))
         parts = []
@@ -190,7 +191,7 @@ class TemplateTable:
         return concatenate(*parts)
 
     def query(self, whitened: np.ndarray, prior: NuisancePrior, margin: float) -> 'Query':
-        """Filter the whitened signals of a few phases, complex128 [N, N_B, N_SB F]."""
+        """Apply the matched filters to whitened signals, complex128 [N, N_B, N_SB F]."""
         weighted = np.swapaxes(np.matmul(np.swapaxes(whitened, 0, 1), self._whitener.conj()), 0, 1)
         n, n_bands = weighted.shape[:2]
         signals = weighted.reshape(n, n_bands, -1, self._filters.shape[3]).astype(np.complex64)
@@ -201,7 +202,6 @@ class TemplateTable:
         return query._replace(bound=self._bound(query))
 
     def _starts(self, query: 'Query', draw: Callable[['Query', int], bool] | None) -> 'Starts':
-        """Find the starts of a query."""
         prior, margin = query.prior, query.margin
         peaks = self._peaks(query, draw)
         points = self._points(peaks)
@@ -254,13 +254,13 @@ class TemplateTable:
         return peaks.select(separate(peaks.phases, self._points(peaks), radii))
 
     def _points(self, peaks: '_Peaks') -> np.ndarray:
-        """Points (r [m], u, v) of peaks, float64 [P, 3]."""
+        """Return the points (r [m], u, v) of peaks, float64 [P, 3]."""
         points: np.ndarray = self.grid.nodes[self.grid.node[peaks.cell]]
         points[:, 0] = peaks.range_m
         return points
 
     def _bound(self, query: 'Query') -> np.ndarray:
-        """Bound the log-likelihood in all cells: that of outputs in phase, float32 [N, C]."""
+        """Bound the log-likelihood in all cells by outputs added in phase, float32 [N, C]."""
         grid, outputs = self.grid, query.outputs
         amplitude = np.empty((len(outputs), len(grid.node)), np.float32)
         turns = np.swapaxes(self._cell_turns, 1, 2)
@@ -278,7 +278,7 @@ class TemplateTable:
         return np.stack(bounds) - self.energy
 
     def _peaks_of(self, phases: np.ndarray, cells: np.ndarray, query: 'Query') -> '_Peaks':
-        """Find all peaks along the range in pairs [K] of the grid, for a phase each, ascending."""
+        """Find all peaks along the range in pairs [K] of the grid; their phases [K] ascend."""
         grid, outputs, prior = self.grid, query.outputs, query.prior
         pair, window = self._windows_of(cells)
         phases, cells = phases[pair], cells[pair]
@@ -325,7 +325,7 @@ class TemplateTable:
             np.zeros(len(step)) if gain is None else gain[step, column], at_peak)
 
     def _windows_of(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Windows of range in pairs [K] of the grid: indices into the pairs and windows, [W]."""
+        """Return the windows of pairs [K] of the grid: indices of their pairs and windows, [W]."""
         ranges = self.grid.cell[cells]
         counts = self._n_windows[ranges]
         pair = np.repeat(np.arange(len(cells)), counts)
@@ -336,7 +336,8 @@ class TemplateTable:
                 ) -> 'Windows':
         """Evaluate windows of range at directions (u, v), [K, 2], in pairs [K] of the grid.
 
-        Means are linear in the distance from the template's direction, and energies quadratic.
+        Means change linearly with the offset from the template's direction, energies
+        quadratically.
         """
         grid, curvature = self.grid, self._curvature[cells][:, 1:, 1:]
         node, slope, cell_m = grid.node[cells], self._energy_slope[cells], self._cell_ranges(cells)
@@ -357,11 +358,11 @@ class TemplateTable:
 
     def _step(self, query: 'Query', peaks: '_Peaks', points: np.ndarray, values: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:
-        """Gauss-Newton steps from peaks, [P, 3], and the likelihood that they predict, [P]."""
+        """Compute Gauss-Newton steps from peaks, [P, 3], and predicted log-likelihoods, [P]."""
         grid, prior, node = self.grid, query.prior, self.grid.node[peaks.cell]
         pairs, index = np.unique(peaks.phases * len(grid.nodes) + node, return_inverse=True)
         phase, its_node = np.divmod(pairs, len(grid.nodes))
-        # By band, sub-band, pair and coordinate.
+        # Axes: peak, band, sub-band and coordinate.
         slopes = np.einsum('iskqf,kisf->kisq', self._slope_filters[:, :, its_node],
                            query.signals[phase])[index]
         node_m = grid.nodes[node, 0]
@@ -391,12 +392,12 @@ class TemplateTable:
         return np.clip(step, -limits, limits), peaks.value + changes + rise
 
     def _cell_ranges(self, cells: np.ndarray) -> np.ndarray:
-        """Ranges of the cells of pairs [K], float64 [K] [m]."""
+        """Return the ranges of the cells of pairs [K], float64 [K] [m]."""
         return self.grid.ranges_m[self.grid.cell[cells]]
 
     def _loss_outside(self, phases: np.ndarray, points: np.ndarray, cells: np.ndarray,
                       value: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Loss of log-likelihood from points to the region, [P]; infinite for unlikely points."""
+        """Return the likelihood lost by moves into the region, [P]; inf if a point is unlikely."""
         inside = is_inside(to_positions(points), self._bounds)
         result = np.where(inside, 0.0, np.inf)
         best = np.full(phases.max(initial=0) + 1, -np.inf)
@@ -411,7 +412,7 @@ class TemplateTable:
 
 
 class Starts(NamedTuple):
-    """Points from which a search ascends to the modes of N phases, the most likely first."""
+    """Points at which the ascent to the modes of N phases starts, the most likely first."""
 
     phases: np.ndarray  # Phase of each point, int [M], ascending.
     points: np.ndarray  # (r [m], u, v), float64 [M, 3].
@@ -419,29 +420,29 @@ class Starts(NamedTuple):
 
 
 class Query(NamedTuple):
-    """Signals of N phases, and the hypotheses with which the grid compares them."""
+    """Signals of N phases, prepared for comparison with the templates of the grid."""
 
-    first: int  # Number of its first phase.
+    first: int  # Index of the first phase.
     signals: np.ndarray  # Weighted with the inverse covariance, complex64 [N, N_B, N_SB, F].
-    outputs: np.ndarray  # Of the filters of all templates, complex64 [N, N_B, N_SB, G].
-    energies: np.ndarray  # Of the whitened signals, float64 [N].
-    bound: np.ndarray  # Of the log-likelihood in each cell, float32 [N, C].
+    outputs: np.ndarray  # Filter outputs for all templates, complex64 [N, N_B, N_SB, G].
+    energies: np.ndarray  # Energies of the whitened signals, float64 [N].
+    bound: np.ndarray  # Bound of the log-likelihood in each cell, float32 [N, C].
     prior: NuisancePrior
     margin: float
 
     def over_gain(self, amplitude: np.ndarray, energy: float) -> tuple[np.ndarray, np.ndarray]:
-        """Maximise over the gain, as `NuisancePrior.over_gain` describes."""
+        """Maximise over the gain; see `NuisancePrior.over_gain`."""
         return self.prior.over_gain(amplitude, energy, self.signals[0].size)
 
 
 class Windows(NamedTuple):
     """W windows of range, in which only the phases of the carriers change."""
 
-    pair: np.ndarray  # Index of the pair to which it belongs, int [W], ascending.
+    pair: np.ndarray  # Index of the window's pair, int [W], ascending.
     range_m: np.ndarray  # Centre, float64 [W] [m].
     width_m: np.ndarray  # Float64 [W] [m].
-    outputs: np.ndarray  # Of the bands' matched filters at the centre, complex64 [N_B, W].
-    energy: np.ndarray  # Of the whitened mean, float32 [W].
+    outputs: np.ndarray  # Matched-filter outputs of the bands at the centre, complex64 [N_B, W].
+    energy: np.ndarray  # Energy of the whitened mean, float32 [W].
 
     def select(self, chosen: np.ndarray | slice) -> 'Windows':
         """Return the windows with the given indices."""
@@ -457,7 +458,7 @@ class _Peaks(NamedTuple):
     range_m: np.ndarray  # Float64 [P] [m].
     value: np.ndarray  # Log-likelihood, float32 [P].
     gain: np.ndarray  # Most likely gain [nepers], float64 [P].
-    outputs: np.ndarray  # Outputs of the bands' matched filters, complex64 [P, N_B].
+    outputs: np.ndarray  # Matched-filter outputs of the bands, complex64 [P, N_B].
 
     def select(self, chosen: np.ndarray) -> '_Peaks':
         return _Peaks(*(field[chosen] for field in self))
@@ -471,27 +472,27 @@ def first_of_each(phases: np.ndarray) -> np.ndarray:
 
 
 def heaviest(phases: np.ndarray, value: np.ndarray, margin: float | np.ndarray) -> np.ndarray:
-    """Return which points contain almost all of the weight of their phase, bool [M].
+    """Mark the points that contain almost all of the weight of their phase, bool [M].
 
-    Takes the phase of each point, int [M], ascending; log-likelihoods, float64 [M], descending for
-    each phase; and the negative logarithm of the share that may be left out, a number or [M].
+    `phases`, int [M], ascend; log-likelihoods `value`, float64 [M], descend within each phase.
+    `margin` is the negative logarithm of the share that may be left out, a number or [M].
     """
     firsts = first_of_each(phases)
     counts = np.diff(firsts, append=len(phases))
     relative = value - np.repeat(value[firsts], counts)
     total = np.add.reduceat(np.exp(relative), firsts)
-    # No point after one is heavier.
+    # Within a phase, no later point is heavier.
     n_left = np.repeat(firsts + counts, counts) - np.arange(len(phases))
     return relative + np.log(n_left) > np.repeat(np.log(total), counts) - margin
 
 
 def separate(phases: np.ndarray, points: np.ndarray, radii: np.ndarray,
              curvature: np.ndarray | None = None) -> np.ndarray:
-    """Choose the points that are not in the mode of a better one: non-maximum suppression.
+    """Choose the points that do not belong to the mode of a better point.
 
-    Takes the phase of each point, int [M], ascending, of which the best comes first; and points
-    (r [m], u, v), float64 [M, 3]. The ellipsoid with the `radii` [3] around a mode contains no
-    other; with the curvature [M, 3, 3] of the log-likelihood, broad modes extend beyond it.
+    `phases`, int [M], ascend; the best of the points (r [m], u, v), float64 [M, 3], of a phase
+    comes first. An ellipsoid with the `radii` [3] around a mode contains no other mode. Given the
+    curvature [M, 3, 3] of the log-likelihood, broad modes extend further.
     """
     from scipy.spatial import cKDTree
 
@@ -501,7 +502,7 @@ def separate(phases: np.ndarray, points: np.ndarray, radii: np.ndarray,
     if curvature is not None:
         variance = np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2) / radii**2
         reach = float(np.clip(np.sqrt(_SAME_MODE * variance.max()), 1.0, _MAX_REACH))
-    # Different phases are far from each other.
+    # Move different phases far away from each other.
     scaled[:, 0] += phases * (2 * reach + np.ptp(scaled[:, 0]))
     better, worse = cKDTree(scaled).query_pairs(reach, output_type='ndarray').T
     if curvature is not None:
@@ -510,7 +511,8 @@ def separate(phases: np.ndarray, points: np.ndarray, radii: np.ndarray,
         close |= np.einsum('kp,kpq,kq->k', offset, curvature[worse], offset) < _SAME_MODE
         worse, better = worse[close], better[close]
     previous = ~chosen
-    # Each round settles at least one more point, because only better ones matter; a few suffice.
+    # Each round settles at least one more point, because only better points matter. A few rounds
+    # suffice.
     while (chosen != previous).any():
         previous = chosen
         chosen = np.ones(len(points), bool)

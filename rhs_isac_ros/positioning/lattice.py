@@ -1,8 +1,8 @@
-"""The lengths over which signals from the region differ, and what follows from them.
+"""The lengths over which signals from the region differ, and the grid that follows from them.
 
 The lengths follow from wavelength, aperture, bandwidth and region. The grid of the search has as
-many points as there are distinguishable positions, and points that are closer share one evaluation
-of the model.
+many points as there are distinguishable positions. Closer points share one evaluation of the
+model.
 """
 
 import functools
@@ -19,35 +19,36 @@ from rhs_isac_ros.model.geometry import (
 )
 from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
 
-# Largest sine of the angle from boresight on the grid: directions have no derivative at the rim.
+# Largest sine of the angle from boresight on the grid; at the rim, directions have no derivative.
 _MAX_SINE = 0.995
-# Distance in range below which a point is in the region, in wavelengths.
+# Distance in range up to which a point counts as inside the region, in wavelengths.
 _TOLERANCE_WAVELENGTHS = 0.2
-# The linear model of the mean does not hold beyond these steps, in wavelengths and in radians at
-# the edge of the aperture.
+# Longest steps for which the linear model of the mean holds, in wavelengths and in radians at the
+# edge of the aperture.
 _STEP_WAVELENGTHS = 0.2
 _STEP_RAD = 0.5
 # Phase error of a template at the edge of the aperture or of the band [rad], and error of its
-# amplitude, from which another template or range cell takes over. The slopes of the templates
-# correct the errors to first order.
+# amplitude, at which the next template or range cell takes over. The slopes of the templates
+# correct both errors to first order.
 PHASE_ERROR = 0.2
 _AMPLITUDE_ERROR = 0.05
-# Phase at the edge of the aperture over which points share an expansion [rad].
+# Phase at the edge of the aperture within which points share an expansion [rad].
 _SHARED_RAD = 0.05
-# Radii of an ellipsoid around a mode that contains no other, in wavelengths and radians.
+# Radii of an ellipsoid around a mode that contains no other mode, in wavelengths and radians.
 _SEPARATION_WAVELENGTHS = 0.37
 _SEPARATION_RAD = 0.57
-# Steps and radii in range cells if the phases of the bands carry no information about the range.
+# Steps and radii in range cells if the phases of the bands contain no information about the range.
 _COARSE_CELLS = 0.75
-# Direction cosines per radian of apertures below a few wavelengths: the gains of elements and of
-# the user also change with the direction.
+# Largest value of `Resolution.direction`. It applies to apertures below a few wavelengths, where
+# the gains of elements and of the user also change with the direction.
 _MAX_DIRECTION = 0.4
 # Smallest thickness of the region, in wavelengths.
 _MIN_THICKNESS = 0.2
-# Smallest range relative to the farthest one: directions lose their meaning at the surface.
+# Smallest range relative to the farthest one, because directions lose their meaning at the
+# surface.
 _MIN_RANGE = 1e-3
-# Information about the position that is added everywhere, relative to that of a uniform prior on
-# the region. It keeps matrices regular where the signals contain none.
+# Information about the position that is added everywhere, relative to a uniform prior over the
+# region. It keeps matrices invertible where the signals contain no information.
 _FLOOR = 0.01
 
 
@@ -92,26 +93,25 @@ class Resolution(NamedTuple):
         return float(np.prod(self.bounds_m[1] - self.bounds_m[0]))
 
     def cell_width_m(self, range_m: float) -> float:
-        """Change of a range over which delays and amplitudes hardly change."""
+        """Return the interval of ranges in which delays and amplitudes hardly change."""
         return min(2 * _AMPLITUDE_ERROR * range_m, 2 * PHASE_ERROR * self.delay_m)
 
     def step_limits(self, is_coarse: bool) -> np.ndarray:
-        """Longest steps in (r [m], u, v) for which the linear model of the mean holds, [3]."""
+        """Return the longest steps in (r [m], u, v) for which the linear mean holds, [3]."""
         return self._radii(is_coarse, _STEP_WAVELENGTHS, _STEP_RAD)
 
     def separation(self, is_coarse: bool) -> np.ndarray:
-        """Radii in (r [m], u, v) of an ellipsoid around a mode that contains no other, [3]."""
+        """Return radii in (r [m], u, v) of an ellipsoid around a mode without others, [3]."""
         return self._radii(is_coarse, _SEPARATION_WAVELENGTHS, _SEPARATION_RAD)
 
     def _radii(self, is_coarse: bool, wavelengths: float, radians: float) -> np.ndarray:
-        # Ranges are coarse if the phases of the bands carry no information about them.
         range_m = (_COARSE_CELLS * self.cell_width_m(self.nearest_m) if is_coarse
                    else wavelengths * self.wavelength_m)
         return np.array([range_m, *radians * self.direction])
 
     @property
     def curvature_floor(self) -> np.ndarray:
-        """Curvature of the log-likelihood in (r, u, v) to add everywhere, [3]."""
+        """Curvature in (r, u, v) that is added to every log-likelihood, [3]."""
         extent = np.array([self.farthest_m - self.nearest_m,
                            *(self.directions[:, 1] - self.directions[:, 0])])
         return 12 * _FLOOR / np.maximum(
@@ -119,7 +119,7 @@ class Resolution(NamedTuple):
 
     @property
     def tolerance_m(self) -> float:
-        """Distance in range below which a point is in the region."""
+        """Distance in range up to which a point counts as inside the region."""
         return _TOLERANCE_WAVELENGTHS * self.wavelength_m
 
 
@@ -135,9 +135,9 @@ class Grid(NamedTuple):
     ranges_m: np.ndarray  # Centres of the range cells, float64 [R].
     widths_m: np.ndarray
     node: np.ndarray  # Template of each pair that belongs to the grid, int [C].
-    cell: np.ndarray  # Its range cell.
-    # Successive templates, range cells and pairs of one range of templates: a segment's pairs are
-    # some of all pairs of its range cells and templates.
+    cell: np.ndarray  # Range cell of each pair, int [C].
+    # Slices of templates, range cells and pairs with the same range of templates. The pairs of a
+    # segment are a subset of all pairs of its range cells and templates.
     segments: list[tuple[slice, slice, slice]]
 
     @property
@@ -193,7 +193,7 @@ def lay_grid(scenario: Scenario) -> Grid:
 
 
 def groups(n: int, fits: Callable[[int, int], bool]) -> list[tuple[int, int]]:
-    """Divide n successive items into groups, from `first` to before `end`, as long as they fit."""
+    """Divide n successive items into the longest groups (first, end) for which `fits` is true."""
     result, first = [], 0
     for end in range(1, n + 1):
         if end == n or not fits(first, end + 1):
@@ -203,20 +203,20 @@ def groups(n: int, fits: Callable[[int, int], bool]) -> list[tuple[int, int]]:
 
 
 class Expansion(NamedTuple):
-    """Mean signals around n points, to first order apart from distance and carriers.
+    """First-order expansion of the mean signals around n points.
 
-    The factor exp(-i k_n r) / r of a sub-band's mean is exact. The rest changes with the
-    direction, as the aperture resolves it, and with the curvature of the wavefront, 1 / r.
+    The factor exp(-i k_n r) / r of a sub-band's mean is exact. The rest changes slowly with the
+    direction and with the curvature of the wavefront, 1 / r.
     """
 
     points: np.ndarray  # (r [m], u, v), float64 [n, 3].
-    wavenumbers: np.ndarray  # Of the carrier of each measurement, float64 [N_B, N_SB F] [1/m].
+    wavenumbers: np.ndarray  # Of each measurement's carrier, float64 [N_B, N_SB F] [1/m].
     mean: np.ndarray  # Mean signals over the factor, complex128 [n, N_B, N_SB F].
     slopes: np.ndarray  # Their derivatives, complex128 [n, 3, N_B, N_SB F].
 
     @classmethod
     def of(cls, model: MeasurementModel, points: np.ndarray) -> 'Expansion':
-        """Evaluate a model at points."""
+        """Expand the mean signals of a model around points."""
         wavenumbers = subband_wavenumbers(model.scenario)
         wavenumbers = np.repeat(wavenumbers, model.shape[1] // wavenumbers.shape[1], axis=1)
         mean, slopes = model.mean_and_jacobian(to_positions(points), jacobian(points))
@@ -227,7 +227,7 @@ class Expansion(NamedTuple):
         return cls(points, wavenumbers, mean, slopes)
 
     def at(self, index: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Evaluate points [M, 3], each near the point of the expansion with an index, int [M].
+        """Evaluate points [M, 3], each near the expansion point with the given index, int [M].
 
         Returns means, complex128 [M, N_B, N_SB F], and derivatives, [M, 3, N_B, N_SB F].
         """
@@ -256,7 +256,7 @@ def whiten(model: MeasurementModel, mean: np.ndarray, slopes: np.ndarray) -> np.
 class Means:
     """Mean signals and their derivatives; neighbouring points share one expansion.
 
-    Modes of the posterior stand in rows along the range, in nearly the same direction.
+    Modes of the posterior form rows along the range, in nearly the same direction.
     """
 
     def __init__(self, model: MeasurementModel) -> None:
@@ -265,7 +265,7 @@ class Means:
             [resolution.curvature_m, *1 / resolution.direction]) / _SHARED_RAD
 
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Evaluate points (r [m], u, v), [M, 3], as `Expansion.at` does."""
+        """Evaluate points (r [m], u, v), [M, 3]; see `Expansion.at`."""
         cells = points * self._per_cell
         cells[:, 0] = self._per_cell[0] / points[:, 0]
         keys = np.rint(cells).astype(np.int64) @ np.array([1 << 42, 1 << 21, 1])

@@ -1,10 +1,11 @@
 """The likelihood of positions and nuisance parameters: one Gaussian for each state of the surface.
 
-Signals y have nuisance parameters z, a factor exp(z P) of direct path and multipath; see
-`model.impairments`. Thermal noise is far weaker than the multipath, so that the divided signals
-y exp(-z P) have the distribution of the model without the factor, apart from the change of volume:
-with mean mu(p) and covariance Lambda at a position p, the log-likelihood is, up to a constant,
-``-|W (y exp(-z P) - mu(p))|^2 - 2 Re(sum z P) - log det Lambda`` with ``W^H W = Lambda^-1``.
+Nuisance parameters z multiply the direct path and the multipath in the signals y by exp(z P); see
+`model.impairments`. Thermal noise is far weaker than the multipath. The divided signals y exp(-z
+P) therefore have the distribution of the model without the factor, apart from the change of
+volume. With mean mu(p) and covariance Lambda at a position p, the log-likelihood is, up to a
+constant, ``-|W (y exp(-z P) - mu(p))|^2 - 2 Re(sum z P) - log det Lambda`` with ``W^H W =
+Lambda^-1``.
 
 A `Conditional` evaluates it for one state of the surface, with its derivatives. Search, posterior
 and tracks use only `Conditional`, whatever the impairments are.
@@ -23,10 +24,10 @@ from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.coordinates import to_positions
 from rhs_isac_ros.positioning.lattice import Means, Resolution, whiten
 
-# Standard deviation of a Gaussian whose density at its centre is that of a uniform phase.
+# Standard deviation of a Gaussian whose density at its centre equals that of a uniform phase.
 _UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
-# Standard deviation from which the search treats the phases of the bands as uniform. Their joint
-# density then has many peaks along the range, too narrow for Gaussians; the information is added
+# Standard deviation above which the search treats the phases of the bands as uniform. Their joint
+# density then has many peaks along the range, too narrow for Gaussians. Its information is added
 # to the samples of the posterior afterwards.
 COARSE_STD_RAD = 0.75
 # Grid on which parameters with several maxima are compared: reach in standard deviations, number
@@ -38,12 +39,12 @@ _N_REFINEMENTS = 4
 _N_GAIN = 161
 _N_AMPLITUDE = 256
 _GAIN_REACH = 4.5
-# Smaller gains have no effect [nepers].
+# Standard deviation of the gain below which the gain has no effect [nepers].
 _MIN_GAIN_STD = 1e-9
-# Numbers of failures whose probability is relevant.
+# Smallest probability of the numbers of failures to average over, and how many at most.
 _MIN_PROBABILITY = 1e-5
 _MAX_COUNTS = 12
-# Share of the errors of an estimate in the whitened signals from which their position matters.
+# Share of an estimate's errors in the whitened energy above which their position is considered.
 _MIN_ERROR_SHARE = 0.05
 
 
@@ -65,8 +66,8 @@ class Signals(NamedTuple):
 class Local(NamedTuple):
     """The log-likelihood of M points (r [m], u, v) with nuisance parameters, and its derivatives.
 
-    The information is the expected one. Observed curvatures of range and phase differ by noise,
-    and would spoil the marginal, in which the two nearly cancel.
+    `information` is the expected information. Observed curvatures of range and phase differ by
+    noise, which would spoil the marginal, where the two nearly cancel.
     """
 
     value: np.ndarray  # Logarithm of likelihood and prior of the parameters, float64 [M].
@@ -79,15 +80,15 @@ class Conditional(Protocol):
     """The likelihood given one state of the surface."""
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate points [M, 3] with parameters [M, Q] for the signals of each, N = M."""
+        """Evaluate points [M, 3] with parameters [M, Q], each for its own signals, N = M."""
         ...
 
 
 class NuisancePrior:
     """Prior and effect of the nuisance parameters, in units in which they are standard normal.
 
-    A uniform phase has no prior, and the unit `_UNIFORM_EQUIVALENT`. If the phases of the bands
-    are nearly independent, each band has a uniform phase instead of all parameters that turn whole
+    A uniform phase has no prior, and its unit is `_UNIFORM_EQUIVALENT`. If the phases of the bands
+    are nearly independent, a uniform phase of each band replaces all parameters that rotate whole
     bands; the range then follows from delays, amplitudes and wavefronts only.
     """
 
@@ -95,11 +96,11 @@ class NuisancePrior:
         nuisance = nuisance_of(model.scenario)
         n_bands, n_rows = model.shape
         patterns, phases = nuisance.scaled_patterns, nuisance.phases
-        # Covariance of the phases of the bands that the scenario declares, float64 [N_B, N_B].
+        # Declared covariance of the phases of the bands, float64 [N_B, N_B].
         self.phase_covariance = phases @ phases.T
         centre = np.eye(n_bands) - (1 / n_bands if n_bands > 1 else 0.0)
         relative = np.linalg.eigvalsh(centre @ self.phase_covariance @ centre)[-1]
-        # A phase that all bands share leaves rounding errors.
+        # If all bands share one phase, only rounding errors remain.
         is_shared = relative <= 1e-9 * np.trace(self.phase_covariance)
         self.relative_phase_std_rad = 0.0 if is_shared else float(np.sqrt(relative))
         # Whether every band has a uniform phase.
@@ -132,7 +133,7 @@ class NuisancePrior:
         self.moves_multipath = np.append(nuisance.moves_multipath[keeps], np.zeros(n_added, bool))
         self._operators = self._multiplying(model.root, model.whitener)
         self.information = self.information_of(model.root, model.whitener)
-        # Curvature of the log-likelihood in (r, u, v) that is added everywhere, float64 [3].
+        # Curvature in (r, u, v) that is added to every log-likelihood, float64 [3].
         self.floor = Resolution.of(model.scenario).curvature_floor
 
     def __len__(self) -> int:
@@ -158,13 +159,13 @@ class NuisancePrior:
                 slopes: np.ndarray, *linear: np.ndarray) -> np.ndarray:
         """Return the residual and its derivatives at M points, complex128 [M, C, N_B, N_SB F].
 
-        After the residual, the columns are the derivatives of the mean with respect to the point,
-        of the signals that contain the information about the parameters, of the mean with respect
-        to further `linear` parameters, and of the received signals with respect to the parameters.
+        The residual is followed by four groups of derivatives: of the mean by the point, of the
+        informative signals by the parameters, of the mean by further `linear` parameters, and of
+        the received signals by the parameters.
         """
         divided = self.divide(received, values)
-        # A parameter that moves the multipath is visible in the multipath that was received; the
-        # information about it varies from phase to phase.
+        # A parameter that moves the multipath acts on the received multipath, so the information
+        # about it varies from phase to phase.
         sources = np.where(self.moves_multipath[:, None, None], divided[:, None], mean[:, None])
         return np.concatenate([
             (divided - mean)[:, None], slopes, self.patterns * sources, *linear,
@@ -180,17 +181,17 @@ class NuisancePrior:
         return values @ self.phases.T
 
     def log_prior(self, values: np.ndarray) -> np.ndarray:
-        """Logarithm of prior and volume of parameters [M, Q], float64 [M]."""
+        """Return the logarithm of prior and change of volume, float64 [M]."""
         return -(values**2 @ self.precision / 2 + values @ self.volume)
 
     def log_evidence_of_aligned(self, aligned: np.ndarray) -> float:
-        """Integrate over the parameters that move the multipath, relative to the aligned [Q]."""
+        """Return the log integral over parameters that move the multipath, near `aligned`."""
         (moves,) = np.nonzero(self.moves_multipath)
         curvature = self.information[np.ix_(moves, moves)] + np.diag(self.precision[moves])
         return float(-self.precision @ aligned**2 - np.linalg.slogdet(curvature)[1]) / 2
 
     def amplitude(self, outputs: np.ndarray) -> np.ndarray:
-        """Sum the outputs of the bands' matched filters, [N_B, ...], in their likely phases."""
+        """Sum the matched-filter outputs of the bands, [N_B, ...], in their likely phases."""
         if not self.relative_phase_std_rad:
             return _in_phase(outputs.sum(axis=0), float(self.phase_std_rad[0]))
         parts = [_in_phase(output, float(std))
@@ -199,11 +200,11 @@ class NuisancePrior:
 
     def over_gain(self, amplitude: np.ndarray, energy: float, n_rows: int
                   ) -> tuple[np.ndarray, np.ndarray]:
-        """Maximise the log-likelihood over the gain, up to the template's energy.
+        """Maximise the log-likelihood, without the template's energy, over the gain.
 
-        Takes amplitudes A of any shape and the energy of the whitened signals: at a factor h of
-        the signals, the log-likelihood is ``-h^2 |y|^2 + 2 h A + 2 n log h``. Returns the maximum,
-        relative to signals without noise if the gain is known, and the gain [nepers].
+        If signals with the whitened energy ``|y|^2`` are multiplied by h, the log-likelihood at
+        the amplitude A, of any shape, is ``-h^2 |y|^2 + 2 h A + 2 n log h``. Returns its maximum
+        and the gain [nepers]. If the gain is known, the maximum does not include the energy.
         """
         if not self.gain_std:
             return 2 * amplitude, np.zeros(1)
@@ -217,7 +218,7 @@ class NuisancePrior:
                 np.interp(amplitude, knots, gain[table.argmax(axis=1)]))
 
     def start(self, outputs: np.ndarray, gain: np.ndarray) -> np.ndarray:
-        """Return parameters [M, Q] from filters' outputs [N_B, M] and gains [nepers] [M]."""
+        """Return initial parameters [M, Q] for filter outputs [N_B, M] and gains [M] [nepers]."""
         angles = np.angle(outputs)
         if not self.relative_phase_std_rad:
             angles = np.broadcast_to(np.angle(outputs.sum(axis=0)), angles.shape)
@@ -230,7 +231,7 @@ class NuisancePrior:
 
 
 class Likelihood:
-    """The likelihood with one covariance everywhere: the average over region and surfaces."""
+    """The likelihood with one covariance everywhere, averaged over the region and surfaces."""
 
     def __init__(self, scenario: Scenario, codebook: Codebook,
                  surface: Surface | None = None) -> None:
@@ -247,13 +248,13 @@ class Likelihood:
         return Signals(received, self.model.whiten(received))
 
     def whitened(self, values: np.ndarray, signals: Signals) -> np.ndarray:
-        """Whiten signals without the factors of parameters [M, Q], [M, N_B, N_SB F]."""
+        """Whiten signals after removing the factors of parameters [M, Q], [M, N_B, N_SB F]."""
         if not len(self.nuisance):
             return signals.whitened
         return self.model.whiten(self.nuisance.divide(signals.received, values))
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate points, as `Conditional` describes."""
+        """Evaluate points; see `Conditional.local`."""
         n, white = len(points), whiten(self.model, *self._means(points))
         mean, whitened = white[:, 0], self.whitened(values, signals)
         residual, derivative = (whitened - mean).reshape(n, -1), white[:, 1:].reshape(n, 3, -1)
@@ -263,7 +264,7 @@ class Likelihood:
             expected = np.where(moves, observed, self.nuisance.slopes(mean))
             return assemble(self.nuisance, values, np.concatenate(
                 [residual[:, None], derivative, expected, observed], axis=1))
-        # The same as `assemble`, without the copies that take time.
+        # The same as `assemble`, but without its copies.
         parts = residual.view(float)
         gradient = 2 * np.matmul(derivative.view(float), parts[..., None])[..., 0]
         energy = np.sum(parts**2, axis=1)
@@ -272,7 +273,7 @@ class Likelihood:
 
     def settle(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Replace uniform phases of all bands, in parameters [M, Q], by the most likely ones."""
-        # Steps of the range turn the phases many times.
+        # A step in range turns the phases many times.
         if not self.nuisance.is_coarse:
             return values
         outputs, change = self.outputs(points, values, signals), np.zeros_like(values)
@@ -287,18 +288,13 @@ class Likelihood:
 
 def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
              information_of_covariance: np.ndarray | None = None, n_linear: int = 0) -> Local:
-    """Combine whitened columns to the likelihood and its derivatives at parameters [M, Q].
+    """Combine whitened columns into the likelihood and its derivatives at parameters [M, Q].
 
-    Parameters
-    ----------
-    white
-        The columns of `NuisancePrior.columns`, complex128 [M, C, n]. The last Q may be absent:
-        with the derivatives of the mean, the gradient predicts no more than the whole energy.
-    information_of_covariance
-        Of the parameters, float64 [Q, Q]; by default from the average covariance.
-    n_linear
-        Number of further standard normal parameters in which the mean is linear. They are
-        integrated out.
+    `white`, complex128 [M, C, n], are the columns of `NuisancePrior.columns`. The last Q may be
+    absent; the gradient then uses derivatives of the mean, and predicts no more than the whole
+    energy. `information_of_covariance`, float64 [Q, Q], is the information of the covariance about
+    the parameters; by default, the average covariance is used. `n_linear` is the number of further
+    standard normal parameters in which the mean is linear; they are integrated out.
     """
     n, end = 3 + len(prior), 4 + len(prior) + n_linear
     expected, observed = white[:, 1:end], white[:, end:]
@@ -306,7 +302,7 @@ def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
     parts = np.ascontiguousarray(white[:, 0]).view(float)
     information = quadratic_form(expected)
     information += np.diag(np.concatenate([prior.floor, prior.precision, np.ones(n_linear)]))
-    # The derivatives of parameters that move the multipath include it.
+    # Derivatives of parameters that move the multipath already include this information.
     still = ~prior.moves_multipath
     information[:, 3:n, 3:n] += np.outer(still, still) * (
         prior.information if information_of_covariance is None else information_of_covariance)
@@ -325,15 +321,12 @@ def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
 
 
 def log_determinant(roots: np.ndarray) -> np.ndarray:
-    """Logarithm of the determinants from Cholesky factors [..., S, S], float64 [...]."""
+    """Return the logarithms of determinants from Cholesky factors [..., S, S], float64 [...]."""
     return 2 * np.log(np.diagonal(roots, axis1=-2, axis2=-1).real).sum(axis=-1)
 
 
 def whiten_each(roots: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Whiten the columns of M points, complex128 [M, C, N_B, N_SB F], with roots at each point.
-
-    Takes Cholesky factors, complex128 [M, N_B, N_SB F, N_SB F]; returns [M, C, N_B N_SB F].
-    """
+    """Whiten columns [M, C, N_B, N_SB F] by Cholesky factors of each point, [M, C, N_B N_SB F]."""
     white = np.linalg.solve(roots, np.moveaxis(columns, 1, 3))
     return np.moveaxis(white, 3, 1).reshape(*columns.shape[:2], -1)
 
@@ -341,9 +334,9 @@ def whiten_each(roots: np.ndarray, columns: np.ndarray) -> np.ndarray:
 class DispersedLikelihood:
     """The likelihood with the covariance of element errors at each position.
 
-    Errors of the direct path are stronger for near users, and a surface has a whole number of
-    failed elements: given k failures, their covariance is k / E[k] times the average one. The
-    likelihood is the average over k. Its value is relative to that of `Likelihood`.
+    Errors of the direct path are stronger for near users. A surface has a whole number k of failed
+    elements, and their covariance is k / E[k] times the average. The likelihood is averaged over
+    k, and its value is relative to `Likelihood`.
     """
 
     def __init__(self, likelihood: Likelihood) -> None:
@@ -366,7 +359,7 @@ class DispersedLikelihood:
 
     @classmethod
     def of(cls, likelihood: Likelihood) -> 'DispersedLikelihood | None':
-        """Return the likelihood of a model, or None if errors are absent or negligible."""
+        """Return the likelihood for a model, or None if errors are absent or negligible."""
         model = likelihood.model
         if model.elements.is_exact:
             return None
@@ -379,7 +372,7 @@ class DispersedLikelihood:
         return cls(likelihood)
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate points, as `Conditional` describes."""
+        """Evaluate points; see `Conditional.local`."""
         prior, states = self._base.nuisance, []
         columns = prior.columns(values, signals.received, *self._means(points))
         for roots, offset, information in zip(
@@ -391,7 +384,7 @@ class DispersedLikelihood:
         return _average_of(states)
 
     def _roots_at(self, points: np.ndarray) -> list[np.ndarray]:
-        """Cholesky factors at points for each number of failures, [M, N_B, N_SB F, N_SB F]."""
+        """Return Cholesky factors at points for each number of failures."""
         # Numerical integration evaluates many parameters at the same points. Another thread may
         # replace the attribute at any time.
         latest = self._latest
@@ -421,7 +414,7 @@ def _average_of(states: list[Local]) -> Local:
 
 
 def _failure_counts(n_elements: int, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of failures relative to their mean, and the logarithm of their probability."""
+    """Return numbers of failures relative to their mean, and logarithms of their probability."""
     if share == 0:
         return np.zeros(1), np.zeros(1)
     from scipy.stats import binom
@@ -436,7 +429,7 @@ def _failure_counts(n_elements: int, share: float) -> tuple[np.ndarray, np.ndarr
 
 
 def _in_phase(outputs: np.ndarray, std: float) -> np.ndarray:
-    """Real part of outputs after the most likely rotation, less half its prior cost."""
+    """Return the real part of outputs after the likeliest rotation, less half its prior cost."""
     if std == 0:
         return outputs.real
     magnitude: np.ndarray = np.abs(outputs)
@@ -450,9 +443,9 @@ def _in_phase(outputs: np.ndarray, std: float) -> np.ndarray:
 class Alignment:
     """Estimates of the parameters that move the multipath, from the signals alone.
 
-    Offsets of carrier and timing move the signals out of the nulls of the multipath, so that they
-    must be known before the search. Whatever the position, it contributes the covariance of the
-    mean signals over the region, the `spread` of `tabulate`.
+    Offsets of carrier and timing move the signals out of the nulls of the multipath, so they must
+    be known before the search. The unknown position is represented by the covariance of the mean
+    signals over the region, `spread` of `tabulate`.
     """
 
     def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:
@@ -460,13 +453,12 @@ class Alignment:
         self._whitener = np.linalg.inv(np.linalg.cholesky(spread + np.eye(spread.shape[1])))
 
     def values_of_each(self, received: np.ndarray) -> np.ndarray:
-        """Return parameters [N, Q] for signals [N, N_B, N_SB F]; those that move nothing are 0."""
+        """Return parameters [N, Q] for signals [N, N_B, N_SB F]; 0 if they move no multipath."""
         if not self._prior.moves_multipath.any():
             return np.zeros((len(received), len(self._prior)))
         return np.stack([self._values(one) for one in received])
 
     def _values(self, received: np.ndarray) -> np.ndarray:
-        """Return parameters [Q] for the signals of one phase."""
         prior, moves = self._prior, self._prior.moves_multipath
         values = np.zeros(len(prior))
         if prior.needs_search.any():
@@ -476,7 +468,7 @@ class Alignment:
             residual = self._whitened(divided[None]).reshape(-1)
             slopes = self._whitened(prior.patterns[moves] * divided)
             slopes = slopes.reshape(len(slopes), -1)
-            # An unknown gain normalises the energy.
+            # With an unknown gain, the energy is normalised.
             scale = residual.size / np.sum(np.abs(residual)**2) if prior.gain_std else 1.0
             curvature = 2 * scale * (slopes.conj() @ slopes.T).real
             curvature += np.diag(prior.precision[moves])
@@ -486,7 +478,7 @@ class Alignment:
         return values
 
     def _best_on_grid(self, received: np.ndarray) -> np.ndarray:
-        """Compare values of the parameters whose likelihood has several maxima."""
+        """Return the best grid values of parameters whose likelihood has several maxima."""
         prior = self._prior
         (searched,) = np.nonzero(prior.needs_search)
         n_grid = _N_GRID.get(len(searched), 5)

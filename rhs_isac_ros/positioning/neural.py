@@ -1,10 +1,10 @@
 """The paper's estimator: a network with one hidden layer, its file, its use and its training.
 
-The "256 nodes" that the paper mentions in its description of Fig. 4 are read as the units of the
+The paper mentions "256 nodes" in its description of Fig. 4; they are taken to be the units of the
 hidden layer. The paper does not specify the rest. This implementation uses the real and imaginary
-parts of the signals or their magnitudes as inputs, the ReLU activation, the squared position error
-as the loss, and Adam with a learning rate of 10^-3. The 10^5 simulated pairs are split
-7 : 1.5 : 1.5 for training, validation and test. When the validation error has not decreased for
+parts of the signals, or their magnitudes, as inputs, the ReLU activation, the squared position
+error as the loss, and Adam with a learning rate of 10^-3. The 10^5 simulated pairs are split
+7 : 1.5 : 1.5 for training, validation and test. If the validation error has not decreased for
 some epochs, the batch size grows, which reduces the noise of the steps. Training stops after the
 largest batches, and the weights of the best epoch are used.
 """
@@ -35,7 +35,7 @@ _BATCH_SIZES = (128, 1024, 8192)
 _LEARNING_RATE = 1e-3
 # Epochs without improvement before the batch size grows.
 _PATIENCE_EPOCHS = 4
-# Per cent of the pairs that precede the validation, and the test.
+# Percentage of the pairs before the validation set, and before the test set.
 _VALIDATION_PERCENT, _TEST_PERCENT = 70, 85
 _FORMAT = 1
 # Arrays of a network with D inputs and H hidden units.
@@ -74,13 +74,13 @@ class Network:
     variance. The position is p = center + w_out^T max(0, w_in^T x + b_in) + b_out, in metres.
     """
 
-    input_mean: np.ndarray  #: Of the inputs in training, float64 [D].
-    input_scale: np.ndarray  #: Their standard deviation.
+    input_mean: np.ndarray  #: Mean of the inputs in training, float64 [D].
+    input_scale: np.ndarray  #: Standard deviation of the inputs in training, float64 [D].
     w_in: np.ndarray  #: Weights of the hidden layer, float64 [D, H].
-    b_in: np.ndarray  #: [H].
+    b_in: np.ndarray  #: Biases of the hidden layer, float64 [H].
     w_out: np.ndarray  #: Weights of the output, float64 [H, 3] [m].
-    b_out: np.ndarray  #: [3] [m].
-    center: np.ndarray  #: Of the region of interest, float64 [3] [m].
+    b_out: np.ndarray  #: Biases of the output, float64 [3] [m].
+    center: np.ndarray  #: Centre of the region of interest, float64 [3] [m].
     covariance: np.ndarray  #: Second moments of the validation residuals, float64 [3, 3] [m^2].
     max_energy: float  #: Largest energy of the whitened mean signal at a training position.
     #: ``codebook``, the id of the codebook; ``scenario``, the fields that differ from Table I;
@@ -108,7 +108,7 @@ class Network:
         return hidden @ self.w_out + self.b_out + self.center
 
     def save(self, path: str | Path) -> None:
-        """Write an ``.npz`` file; an existing one is kept if there is an `OSError`."""
+        """Write an ``.npz`` file; if this raises `OSError`, an existing file is kept."""
         write_archive(path, {key: getattr(self, name) for name, key in _KEYS.items()},
                       {'format': _FORMAT, 'inputs': self.inputs, **self.about})
 
@@ -129,17 +129,12 @@ class Network:
 
 
 class NeuralEstimator:
-    """Positions by a trained network, all with the covariance of the validation residuals.
+    """Positions from a trained network, all with the covariance of the validation residuals.
 
-    The network cannot test whether signals fit its position. Only signals that are weaker than
-    noise, or stronger than any position explains, give no position.
-
-    Raises
-    ------
-    CodebookError
-        If the codebook does not fit the scenario.
-    ModelError
-        If the model cannot be read or was trained for another codebook or scenario.
+    The network cannot test whether signals fit its position. Only signals weaker than noise, or
+    stronger than any position could explain, give no position. Raises CodebookError if the
+    codebook does not fit the scenario, and ModelError if the model cannot be read or was trained
+    for another codebook or scenario.
     """
 
     name = 'neural'
@@ -163,7 +158,7 @@ class NeuralEstimator:
 
     @one_blas_thread
     def estimate(self, received: np.ndarray) -> Estimate:
-        """Estimate positions from received signals, as `Estimator.estimate` describes."""
+        """Estimate positions from received signals; see `Estimator.estimate`."""
         return estimate_each(self._scenario, self._codebook, received, self._locate)
 
     def _locate(self, batch: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, str]]:
@@ -202,19 +197,12 @@ def train(
         scenario: Scenario, codebook: Codebook, n_pairs: int = DEFAULT_PAIRS, seed: int = 0,
         n_hidden: int = DEFAULT_HIDDEN, max_epochs: int = DEFAULT_EPOCHS,
         progress: Callable[[Epoch], None] | None = None, inputs: str = 'parts') -> Network:
-    """Train a network, and return the one of the epoch with the smallest validation error.
+    """Train a network, and return the state with the smallest validation error.
 
-    The seed determines the pairs, at least 20, their order and the initial weights. `n_hidden` is
-    the number of units of the hidden layer, and `inputs` a key of `INPUTS`.
-
-    Raises
-    ------
-    CodebookError
-        If the codebook does not fit the scenario.
-    ValueError
-        If a number is too small, or the inputs are unknown.
-    MissingLibraryError
-        If scikit-learn is not installed.
+    The seed determines the pairs (at least 20), their order and the initial weights. `n_hidden` is
+    the number of hidden units, and `inputs` a key of `INPUTS`. Raises CodebookError if the
+    codebook does not fit the scenario, ValueError if a number is too small or the inputs are
+    unknown, and MissingLibraryError if scikit-learn is not installed.
     """
     for name, value, minimum in (('n_pairs', n_pairs, 20), ('n_hidden', n_hidden, 1),
                                  ('max_epochs', max_epochs, 1)):
@@ -264,7 +252,7 @@ def train(
 def _fit(
         regressor: Any, inputs: np.ndarray, targets: np.ndarray, max_epochs: int,
         after_epoch: Callable[[int], float]) -> tuple[int, float]:
-    """Train up to `max_epochs` epochs, restore the best weights, return their epoch and error."""
+    """Train for at most `max_epochs` epochs, and keep the best weights; return epoch and error."""
     best_weights: tuple[list[np.ndarray], list[np.ndarray]] = [], []
     best_mse, best_epoch, reference_epoch = np.inf, 0, 0
     sizes = [min(size, len(inputs)) for size in _BATCH_SIZES]
@@ -285,7 +273,6 @@ def _fit(
 
 
 def _regressor(n_hidden: int, seed: int) -> Any:
-    """Return the untrained network."""
     with optional_import('training', extra='neural'):
         from sklearn.neural_network import MLPRegressor
     state = int(streams.generator(seed, streams.TRAINING).integers(2**32))

@@ -1,10 +1,10 @@
 """The posterior of a position: weighted samples of its modes, in the region of interest.
 
-A mode is a Gaussian, whose samples have equal weights inside the region, unless the phases of the
-bands are unknown. Then only delays, amplitudes and the curvature of the wavefront reveal the
-range, and a mode extends over metres, over which the likelihood is not quadratic and the volume
-element changes. The samples then serve as a proposal: each has the weight of the posterior
-relative to the mixture of all Gaussians, so that modes may overlap.
+A mode is a Gaussian, and its samples inside the region have equal weights, unless the phases of
+the bands are unknown. Then only delays, amplitudes and the curvature of the wavefront determine
+the range. A mode extends over metres, in which the likelihood is not quadratic and the volume
+element changes. The samples then serve as a proposal: each is weighted by the posterior relative
+to the mixture of all Gaussians, so modes may overlap.
 """
 
 from collections.abc import Sequence
@@ -26,17 +26,17 @@ from rhs_isac_ros.positioning.grid import first_of_each
 from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
 from rhs_isac_ros.positioning.search import Modes, marginal_at
 
-# Factor of the spread of samples that are a proposal. Tails of the posterior may be heavier than
-# Gaussian.
+# Factor by which a proposal is wider than its Gaussian, because the tails of the posterior may be
+# heavier.
 _SPREAD = 1.3
-# Samples whose log-weight is lower than the best by more have no effect, whatever their phases.
+# Samples whose log-weight is further below the best have no effect, whatever their phases.
 _LIKELY_MARGIN = 20.0
-# Phases of bands: spacing of the ranges over which their density is averaged, in standard
-# deviations of the product of the bands' factors, and values of a phase that all bands share: the
-# average over the range nearly removes it.
+# Averages over the phases of the bands: spacing of the ranges, in standard deviations of the
+# product of the bands' factors; and number of values of a phase that all bands share, few because
+# the average over the range nearly removes this phase.
 _SPACING = 1.5
 _N_COMMON = 8
-# From this standard deviation, a wrapped phase is uniform; wraps beyond one turn are negligible.
+# Standard deviation above which a wrapped phase is uniform; wraps beyond one turn are negligible.
 _MAX_STD_RAD = 3.0
 
 
@@ -45,11 +45,11 @@ class Posterior(NamedTuple):
 
     estimate: Estimate
     modes: Modes | None  # None without a position.
-    signals: Signals  # Of the phase, N = 1.
+    signals: Signals  # Signals of the phase, N = 1.
 
 
 class Samples(NamedTuple):
-    """Samples of the Gaussians of M modes, S of each."""
+    """Samples of the Gaussians of M modes, S samples per mode."""
 
     positions: np.ndarray  # Float64 [M, S, 3] [m].
     log_weights: np.ndarray  # Not normalised, float64 [M, S]; -inf outside of the region.
@@ -59,7 +59,7 @@ class Samples(NamedTuple):
 def draw_samples(modes: Modes, normal: np.ndarray, bounds: np.ndarray) -> Samples:
     """Represent the modes by samples, for a uniform prior between the bounds [2, 3] of the region.
 
-    Takes points that represent a standard Gaussian, float64 [S, 3].
+    `normal`, float64 [S, 3], are points that represent a standard Gaussian.
     """
     points, curvature, roi_offset = modes.points, modes.curvature, modes.roi_offset
     starts = first_of_each(modes.phases)
@@ -92,7 +92,7 @@ class WeightedSamples(NamedTuple):
     weights: np.ndarray  # Float64 [M, S].
     spread: np.ndarray  # As in `Samples`.
     starts: np.ndarray  # Index of each phase's first mode, int [N].
-    log_totals: np.ndarray  # Of the weights before they were normalised, float64 [N].
+    log_totals: np.ndarray  # Logarithms of the weights' sums before normalisation, float64 [N].
 
     @classmethod
     def of(cls, samples: Samples, modes: Modes) -> 'WeightedSamples':
@@ -106,7 +106,7 @@ class WeightedSamples(NamedTuple):
         return cls(samples.positions, weights, samples.spread, starts, highest + np.log(totals))
 
     def log_evidence(self, volume_m3: float) -> np.ndarray:
-        """Likelihood averaged over a region of this volume, as its logarithm, float64 [N]."""
+        """Return the logarithm of the likelihood averaged over a region of this volume, [N]."""
         return (self.log_totals - np.log(self.weights.shape[1])
                 + 1.5 * np.log(2 * np.pi) - np.log(volume_m3))
 
@@ -133,7 +133,7 @@ def draw_broad_samples(
         signals: Signals, modes: Modes, normal: np.ndarray) -> Samples:
     """Represent the modes of one phase by samples with the weights of the posterior.
 
-    Takes the likelihood of each state of the surface.
+    `conditionals` are the likelihoods of the states of the surface.
     """
     bounds = likelihood.resolution.bounds_m
     samples = draw_samples(modes, _SPREAD * normal, bounds)
@@ -163,8 +163,8 @@ def draw_broad_samples(
 
 
 def _log_proposal(points: np.ndarray, modes: Modes) -> np.ndarray:
-    """Logarithm of the sum of the densities from which samples of the modes are drawn, [P]."""
-    # As products of matrices, squares about a common centre take far less time.
+    """Return the logarithm of the summed densities from which samples are drawn, [P]."""
+    # Expanded about a common centre, squares are matrix products, which take far less time.
     centre = modes.roi_points.mean(axis=0)
     points, means = points - centre, modes.roi_points - centre
     spread = np.einsum('mab,mb->ma', modes.curvature, means)
@@ -179,10 +179,11 @@ def _log_proposal(points: np.ndarray, modes: Modes) -> np.ndarray:
 class BandPhases:
     """The information in phases of the bands that are neither known nor uniform.
 
-    Relative to uniform phases, the likelihood of a position has one factor for each band: the
-    density of the phase of the matched filter's output, the wrapped normal distribution broadened
-    by the noise. Along the range, their product turns with the carriers, far faster than the rest
-    of the posterior. It is averaged over one wavelength around each sample.
+    Compared with uniform phases, the likelihood of a position has one more factor per band: the
+    density of the phase of the matched filter's output, which is a wrapped normal distribution
+    broadened by noise. Along the range, the product of these factors oscillates with the carriers,
+    far faster than the rest of the posterior. It is averaged over one wavelength around each
+    sample.
     """
 
     def __init__(self, likelihood: Likelihood) -> None:
@@ -203,9 +204,9 @@ class BandPhases:
 
     def factors(self, outputs: np.ndarray, *, averages: bool = True
                 ) -> tuple[np.ndarray, np.ndarray]:
-        """Average the product of the factors over the wavelength around positions, or not.
+        """Multiply the factors at P positions; if `averages`, average over a wavelength of range.
 
-        Takes the outputs of the matched filters, [N_B, P]. Returns the logarithm of the average,
+        `outputs`, [N_B, P], come from the matched filters. Returns the logarithm of the result,
         and the mean offset in range [m], [P].
         """
         ranges_m = self._ranges_m if averages else np.zeros(1)
@@ -221,7 +222,7 @@ class BandPhases:
         return highest + np.log(total), weights @ ranges_m / total
 
     def _broadened(self, magnitude: np.ndarray) -> np.ndarray:
-        """Standard deviation of the phase of outputs of these magnitudes."""
+        """Return the standard deviation of the phase of outputs of these magnitudes."""
         # The phase of the noise has the von Mises density; its first harmonic is that of a
         # wrapped normal distribution.
         from scipy.special import i0e, i1e
@@ -232,7 +233,7 @@ class BandPhases:
 
 
 def _common_phase(std: float) -> tuple[np.ndarray, np.ndarray]:
-    """Values of the phase that all bands share, and the logarithms of their weights."""
+    """Return values of the phase that all bands share, and the logarithms of their weights."""
     if std == 0:
         return np.zeros(1), np.zeros(1)
     if std > UNIFORM_STD_RAD:
@@ -243,7 +244,7 @@ def _common_phase(std: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _log_density(angle: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Density of the wrapped normal distribution relative to the uniform one, as a logarithm."""
+    """Return the log-density of the wrapped normal distribution relative to the uniform one."""
     angle = angle - 2 * np.pi * np.round(angle / (2 * np.pi))
     # The wraps by one turn, relative to the term without a wrap.
     ratio = np.exp(-2 * np.pi**2 / std**2)

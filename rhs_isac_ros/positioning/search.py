@@ -1,8 +1,8 @@
 """The modes of the posterior: found on the grid, refined by Gauss-Newton steps.
 
 Steps maximise over position and nuisance parameters together. Around a mode, the posterior is
-Gaussian, so that the marginal of the position has the Schur complement of the information, and its
-mass contains the determinant of the parameters' information: Laplace's method.
+treated as Gaussian (Laplace's method): the marginal of the position has the Schur complement of
+the information, and the mass of the mode contains the determinant of the parameters' information.
 """
 
 from collections.abc import Callable
@@ -66,7 +66,7 @@ class Modes(NamedTuple):
         return Modes(*(field[chosen] for field in self))
 
     def replace(self, rows: np.ndarray, others: 'Modes') -> None:
-        """Replace modes by others."""
+        """Overwrite the modes in `rows`."""
         for field, new in zip(self, others, strict=True):
             field[rows] = new
 
@@ -78,12 +78,12 @@ class Modes(NamedTuple):
 def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
                aligned: np.ndarray, extra_margin: float = 0.0,
                draw: Callable[[Query, int], bool] | None = None) -> Modes | None:
-    """Find the modes of each of N phases with a substantial weight in the posterior.
+    """Find the modes with a substantial weight in the posterior of each of N phases.
 
-    Each phase has at least one mode, and its most likely one comes first. Takes the parameters
-    that the signals alone reveal, float64 [N, Q], 0 for the others. Modes may be less likely than
-    the best by the `extra_margin` more than usual. With `draw`, phases may have
-    none, as `TemplateTable.starts` describes; the result is None if no phase has any.
+    Each phase has at least one mode, and the most likely mode comes first. `aligned`, float64
+    [N, Q], are the parameters that follow from the signals alone; the others are 0. `extra_margin`
+    admits modes that are less likely than usual. With `draw`, phases may have no modes, as
+    `TemplateTable.starts` describes; the result is None if no phase has any.
     """
     starts = grid.starts(likelihood.whitened(aligned, signals), likelihood.nuisance,
                          GRID_MARGIN + extra_margin, draw)
@@ -97,8 +97,8 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
            n_steps: int, margin: float = EXACT_MARGIN, state: int = 0) -> Modes:
     """Take Gauss-Newton steps from points to the modes of the posterior.
 
-    The first argument is the likelihood of the state of the surface. Modes that are less likely
-    than the best of a phase by more than the margin are dropped.
+    `conditional` is the likelihood for the state of the surface. Modes that are less likely than
+    the best of their phase, by more than the margin, are dropped.
     """
     def step(starts: Starts, moves: bool = True) -> tuple[Modes, np.ndarray]:
         return _step(conditional, likelihood, starts, signals.take(starts.phases), state, moves)
@@ -107,13 +107,13 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     for number in range(n_steps):
         chosen = _prune(likelihood, modes, gain, margin)
         modes, gain = modes.select(chosen), gain[chosen]
-        # At the border of the region, small gains may alternate without end.
+            # At the border of the region, small gains may alternate forever.
         (moving,) = np.nonzero(gain > (_MIN_GAIN if number < _N_USUAL_STEPS else 1.0))
         if not len(moving) or number == n_steps - 1:
             break
         moved, gain[moving] = step(modes.select(moving).starts())
         modes.replace(moving, moved)
-    # A step that has not converged may predict any likelihood.
+    # Before convergence, the predicted likelihood may be arbitrarily wrong.
     (moving,) = np.nonzero((gain > _MIN_GAIN) | (len(likelihood.nuisance) > 0))
     if len(moving):
         again = Starts(modes.phases[moving], modes.points[moving], modes.values[moving])
@@ -127,7 +127,7 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
                 values: np.ndarray, signals: Signals) -> tuple[np.ndarray, np.ndarray]:
     """Compute the marginal log-likelihood of points [M, 3], [M], and the best parameters, [M, Q].
 
-    Takes approximate parameters, [M, Q], from which Newton steps start.
+    Newton steps start from the approximate parameters `values`, [M, Q].
     """
     values = likelihood.settle(points, values, signals)
     for _ in range(2 if values.shape[1] else 1):
@@ -140,10 +140,7 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
 
 def _step(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
           state: int, moves: bool = True) -> tuple[Modes, np.ndarray]:
-    """Take one scoring step; also return the gain of log-likelihood in the region, [M].
-
-    If it does not move the points, the result is the likelihood there, and the gain is 0.
-    """
+    """Take one scoring step, or none without `moves`; also return the gain in likelihood, [M]."""
     points = starts.points
     values = likelihood.settle(points, starts.values, signals)
     local = conditional.local(points, values, signals)
@@ -185,9 +182,9 @@ def _newton(local: Local, likelihood: Likelihood) -> tuple[Marginal, np.ndarray,
 
 
 def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float) -> np.ndarray:
-    """Choose the probable and separate modes of each phase, the most likely first."""
-    # The likelihood of a mode is a prediction. The best is at most the one before the last step,
-    # which is computed. A step that has not converged may predict any likelihood.
+    """Return indices of the probable, separate modes of each phase, the most likely first."""
+    # The likelihood of a mode is a prediction, and may be arbitrarily wrong before convergence.
+    # The best is limited to the highest likelihood before the last step, which is computed.
     value = modes.roi_log_likelihood + np.maximum(gain, 0)
     order = np.lexsort((-modes.roi_log_likelihood, modes.phases))
     phases = modes.phases[order]

@@ -7,7 +7,7 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.threads import map_blocks
 
-# Pairs that share a random generator and every matrix product. A different size changes the pairs
+# Pairs that share a random generator and all matrix products. Another size would change the pairs
 # of every seed.
 _CHUNK = 512
 
@@ -17,22 +17,11 @@ def simulate_pairs(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate positioning phases at random positions of the region of interest.
 
-    A seed defines an infinite sequence of pairs. This function returns the n pairs from `first`
-    on, which are identical bit for bit however the sequence is divided.
-
-    Returns
-    -------
-    positions : numpy.ndarray
-        Uniform in the region of interest, float64 [n, 3] [m].
-    received : numpy.ndarray
-        Complex128 [n, N_B, N_SB F], sub-band-major.
-
-    Raises
-    ------
-    CodebookError
-        If the codebook does not fit the scenario.
-    ValueError
-        If `n`, `seed` or `first` is negative.
+    A seed defines an infinite sequence of pairs, of which this function returns n, beginning with
+    `first`. Its pairs are the same, bit for bit, however the calls divide it. Returns positions,
+    float64 [n, 3] [m], uniform in the region, and received signals, complex128 [n, N_B, N_SB F],
+    sub-band-major. Raises CodebookError if the codebook does not fit the scenario, and ValueError
+    if `n`, `seed` or `first` is negative.
     """
     for name, value in (('n', n), ('seed', seed), ('first', first)):
         if value < 0:

@@ -15,15 +15,15 @@ from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.positioning import alternatives, grid
 from rhs_isac_ros.support.files import write_whole
 
-# Maximum number of tables in a folder; the least recently used ones beyond it are deleted.
+# Maximum number of tables in a folder. Beyond it, the least recently used tables are deleted.
 _MAX_TABLES = 16
 _PREFIX = 'table-'
-# Version of the contents of a table; tables of another version are not used.
+# Version of the contents; tables of other versions are ignored.
 _FORMAT = 5
 
 
 def default_folder() -> Path:
-    """Return ``rhs_isac_ros`` in the user's cache folder, as the XDG convention defines it."""
+    """Return the folder ``rhs_isac_ros`` in the user's cache, according to the XDG convention."""
     base = os.environ.get('XDG_CACHE_HOME', '')
     return (Path(base) if os.path.isabs(base) else Path.home() / '.cache') / 'rhs_isac_ros'
 
@@ -32,9 +32,10 @@ def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = 
                progress: Callable[[float], None] | None = None) -> Mapping[str, np.ndarray]:
     """Load the table of a model from a folder, or compute it and store it there.
 
-    The result contains the arrays of `tabulate` and `tabulate_outside`; from a folder, they are
-    read-only and mapped into memory. Without a folder, or with a `RuntimeWarning` if it cannot be
-    written, the table is in memory only. `progress` is called with the computed share.
+    The result contains the arrays of `tabulate` and `tabulate_outside`. If they come from a
+    folder, they are read-only and mapped into memory. The table stays in memory without a folder,
+    or with a `RuntimeWarning` if the folder cannot be written. `progress` is called with the
+    completed share.
     """
     if folder is None:
         return _tabulate(model, progress)
@@ -60,16 +61,16 @@ def _tabulate(model: MeasurementModel, progress: Callable[[float], None] | None
 
 
 def table_key(model: MeasurementModel, codebook_id: str) -> str:
-    """Return a hash of all that the table of a model depends on, 32 hexadecimal digits."""
+    """Return a hash of everything that determines the table of a model, 32 hexadecimal digits."""
     parts = (model.scenario.id, codebook_id, __version__, _FORMAT,
              *([model.surface.id] if model.surface else []))
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 
 def _write(path: Path, key: str, table: Mapping[str, np.ndarray]) -> None:
-    """Write a table to a temporary file and rename it, so that the file is always complete."""
-    # One record of an .npy file: key and digest, then the arrays, those of the widest numbers
-    # first so that all are aligned.
+    """Write a table atomically, and delete the least recently used tables."""
+    # The file has one record: key and digest, then the arrays. Wide numbers come first, so that
+    # all arrays are aligned.
     names = sorted(table, key=lambda name: -table[name].real.itemsize)
     dtype = np.dtype([('key', 'S32'), ('digest', 'S32')]
                      + [(name, table[name].dtype, table[name].shape) for name in names])

@@ -1,9 +1,9 @@
 """The track of a user over successive positioning phases.
 
-The signals of a phase often fit several positions, 0.6 m apart in range on Table I. The tracker
-keeps them all, as a mixture of Gaussians over position and velocity, until the movement over
-several phases decides between them. It assumes that velocities drift at random, and that there are
-turns. Coordinates are those of `coordinates`.
+The signals of a phase often fit several positions, 0.6 m apart in range with Table I. The tracker
+keeps all of them, as a mixture of Gaussians over position and velocity, until the movement over
+several phases decides between them. Velocities are assumed to drift at random, with sudden turns.
+Coordinates are described in `coordinates`.
 """
 
 import dataclasses
@@ -40,32 +40,32 @@ MAX_GAP_S = 10.0
 _LOSS_RATE_HZ = 1e-3
 # Smallest share of a component inside the region.
 _MIN_INSIDE = 0.02
-# Phases with a smaller share of new information do not update the track: with the likelihood
-# raised to a small power, its modes overlap, and their sum is no longer its value.
+# Phases with a smaller share of new information do not update the track: if the likelihood is
+# raised to a small power, its modes overlap, and their sum no longer equals it.
 _MIN_SHARE = 0.25
 # Components with a smaller weight do not contribute to the estimate.
 _MIN_LOG_WEIGHT = -9.0
-# Maximum number of pairs of a component and a mode, and smallest weight of one relative to the
-# heaviest.
+# Maximum number of pairs of a component and a mode, and smallest log-weight of a pair relative to
+# the heaviest.
 _MAX_PAIRS = 160
 _PAIR_MARGIN = 18.0
-# Pairs whose likelihood the exact model evaluates. The Gaussian of a mode alone has errors that
-# accumulate over the phases and prefer wrong modes.
+# Number of pairs whose likelihood is evaluated with the exact model. Errors of the Gaussians alone
+# accumulate over the phases and favour wrong modes.
 _N_EXACT = 16
 # Squared Mahalanobis distance below which two updates of a component are the same maximum.
 _SAME_MAXIMUM = 1.0
-# Log-likelihood, relative to that of the best mode, of a mode that the search has missed: it finds
-# those above.
+# Log-likelihood of a mode that the search has missed, relative to the best mode: the search finds
+# all modes above it.
 _FLOOR = -EXACT_MARGIN
-# Bounds of the intervals of the time between two phases, as shares of it, in which a turn is
-# distinguished. With one interval, the position after an early turn is too unlikely: the Gaussian
-# has the mean time after a turn.
+# Bounds of the intervals between two phases, as shares of the time, in which a turn is
+# distinguished. One interval would make the position after an early turn too unlikely, because the
+# Gaussian has the mean time after a turn.
 _TURN_INTERVALS = (0.0, 0.5, 1.0)
-# Components that are lighter than the heaviest by more than this, in log-weight, do not turn.
+# Components further below the heaviest in log-weight do not turn.
 _TURN_MARGIN = 10.0
 # Components whose squared Mahalanobis distance is below this are merged.
 _MERGE_DISTANCE = 1.0
-# Components that are lighter than the heaviest by more than this, in log-weight, are discarded.
+# Components further below the heaviest in log-weight are discarded.
 _WEIGHT_MARGIN = 18.0
 
 
@@ -130,7 +130,7 @@ def reduce(mixture: Mixture, max_components: int) -> Mixture:
 
 
 def _merge(mixture: Mixture, group: np.ndarray, n_groups: int) -> Mixture:
-    """Merge the components of each group, with their mean and covariance; discard group -1."""
+    """Merge the components of each group, preserving mean and covariance; discard group -1."""
     mixture = mixture.select(group >= 0)
     group = group[group >= 0]
     member = np.equal.outer(np.arange(n_groups), group)
@@ -149,13 +149,13 @@ def _merge(mixture: Mixture, group: np.ndarray, n_groups: int) -> Mixture:
 class Motion:
     """A random velocity, the same in all directions, with sudden turns.
 
-    Between turns, the velocity is an Ornstein-Uhlenbeck process: over times that are short against
+    Between turns, the velocity is an Ornstein-Uhlenbeck process: over times much shorter than
     `memory_s`, it is constant up to noise. At a turn, which may also be a stop or a start, it is
     drawn anew. The numbers of turns in separate times are independent.
     """
 
-    speed_mps: float = 1.0  #: Root mean square.
-    memory_s: float = 5.0  #: Time over which the velocity loses its memory without a turn.
+    speed_mps: float = 1.0  #: Root-mean-square speed.
+    memory_s: float = 5.0  #: Time over which the velocity becomes independent without a turn.
     turn_s: float = 2.0  #: Mean time between turns.
 
     def __post_init__(self) -> None:
@@ -172,7 +172,7 @@ class Motion:
 
     def start(self, points: np.ndarray, covariances: np.ndarray,
               log_weights: np.ndarray) -> Mixture:
-        """Return a mixture with velocities of the stationary process at points (r [m], u, v)."""
+        """Return a mixture at points (r [m], u, v) with velocities of the stationary process."""
         n = len(points)
         means, joint = np.zeros((n, 6)), np.zeros((n, 6, 6))
         means[:, :3], joint[:, :3, :3] = points, covariances
@@ -182,7 +182,7 @@ class Motion:
     def predict(self, mixture: Mixture, elapsed_s: float) -> Mixture:
         """Return the mixture after a time [s].
 
-        Every component gives one without a turn, and one with a turn in each of the
+        Every component splits into one without a turn and one with a turn in each of the
         `_TURN_INTERVALS`. Means move in straight lines; the covariances neglect the curvature of
         the coordinates.
         """
@@ -212,7 +212,7 @@ class Motion:
             * np.tile(_isotropic(points), (2, 2)))
 
     def _turned(self, mixture: Mixture, begin_s: float, end_s: float, elapsed_s: float) -> Mixture:
-        """Return the mixture of users that have turned once, at a random moment of an interval."""
+        """Return the mixture of users who have turned once, at a random time in an interval."""
         mean_s, variance_s2 = (begin_s + end_s) / 2, (end_s - begin_s)**2 / 12
         rest_s = elapsed_s - mean_s
         points, _ = _moved(mixture, mean_s)
@@ -230,7 +230,7 @@ class Motion:
         return Mixture(mixture.log_weights, means, covariances)
 
     def _noise(self, elapsed_s: float, decay: float) -> np.ndarray:
-        """Covariance of position [m] and velocity [m/s] along an axis, float64 [2, 2]."""
+        """Return the covariance of position and velocity along an axis, float64 [2, 2]."""
         variance, memory_s = self.velocity_variance, self.memory_s
         ratio = elapsed_s / memory_s
         # The difference cancels for short times; its leading term is 2 ratio^3 / 3.
@@ -245,13 +245,13 @@ def _moved(mixture: Mixture, time_s: float) -> tuple[np.ndarray, np.ndarray]:
     points = mixture.means[:, :3]
     velocities = np.matmul(jacobian(points), mixture.means[:, 3:, None])[..., 0]
     positions = to_positions(points) + time_s * velocities
-    # Nobody is behind the surface.
+    # No user is behind the surface.
     positions[:, 0] = np.maximum(positions[:, 0], 1e-3)
     return to_polar(positions), velocities
 
 
 def _isotropic(points: np.ndarray) -> np.ndarray:
-    """Covariance of (r, u, v) for the unit covariance of the position, float64 [C, 3, 3]."""
+    """Return the covariance of (r, u, v) for a unit covariance of the position, [C, 3, 3]."""
     inverse = np.linalg.inv(jacobian(points))
     return np.matmul(inverse, np.swapaxes(inverse, 1, 2))
 
@@ -260,24 +260,24 @@ def _isotropic(points: np.ndarray) -> np.ndarray:
 class TrackEstimate(Estimate):
     """A position and velocity with their uncertainty, or the reason why there is none."""
 
-    #: Float64 [3] [m/s], and its covariance, [3, 3]; NaN without a position.
+    #: Velocity, float64 [3] [m/s], and its covariance, [3, 3]; NaN without a position.
     velocity: np.ndarray = dataclasses.field(default_factory=lambda: np.full(3, np.nan))
     velocity_covariance: np.ndarray = dataclasses.field(
         default_factory=lambda: np.full((3, 3), np.nan))
-    n_phases: int = 0  #: Phases that contribute to the estimate; 0 without a position.
-    is_predicted: bool = False  #: The position is a prediction if the user is blocked.
+    n_phases: int = 0  #: Number of phases behind the estimate; 0 without a position.
+    is_predicted: bool = False  #: Whether the position is a prediction for a blocked user.
 
 
 class Tracker:
     """The track of one user: a Gaussian mixture filter over the modes of the posterior.
 
-    The first position of a track is the estimate itself. A track ends with a gap of more than
-    `MAX_GAP_S`; signals without a position do not change it, and neither do those whose multipath
-    is almost equal to the previous phase's. While the user is blocked, the position is a
+    The first position of a track is the estimate itself. A track ends after a gap of more than
+    `MAX_GAP_S`. A phase does not change the track if it has no position, or if its multipath is
+    almost the same as in the previous phase. While the user is blocked, the position is a
     prediction. Positions are inside the region of interest.
 
-    The attribute `estimator` may be replaced between phases, for example by the estimator of
-    another codebook, whose probabilities of a user outside or blocked are part of the estimates.
+    The attribute `estimator` may be replaced between phases, for example for another codebook. The
+    estimates contain the probabilities of this estimator that the user is outside or blocked.
     """
 
     def __init__(self, estimator: SearchEstimator, motion: Motion | None = None) -> None:
@@ -289,10 +289,10 @@ class Tracker:
 
     @one_blas_thread
     def update(self, time_s: float, received: np.ndarray) -> TrackEstimate:
-        """Return the position and velocity at the time [s] of a phase, from it and earlier ones.
+        """Return position and velocity at the time [s] of a phase, from this and earlier phases.
 
-        Takes signals, complex128 [N_B, N_SB F]; `SignalError` if they cannot be used. The position
-        for a phase that is not later than the last one follows from its signals alone, and the
+        Takes signals, complex128 [N_B, N_SB F]; raises `SignalError` if they are unusable. If the
+        phase is not later than the last one, its position follows from its signals alone, and the
         track does not change.
         """
         posterior = self.estimator.posterior(received)
@@ -319,7 +319,7 @@ class Tracker:
         return _described(estimate, mixture, self._n_phases)
 
     def _predicted(self, time_s: float, found: Estimate) -> TrackEstimate:
-        """Continue the track of a blocked user without a change; other users get no position."""
+        """Continue the track of a blocked user by prediction; other users get no position."""
         elapsed_s = time_s - self._time_s
         if (self._mixture is None or not 0 < elapsed_s <= MAX_GAP_S
                 or not found.blocked_probability > BLOCKED_LIMIT):
@@ -331,7 +331,7 @@ class Tracker:
             _described(estimate, mixture, self._n_phases), is_predicted=True)
 
     def _start(self, modes: Modes, share: float = 1.0) -> Mixture:
-        """Return the mixture of a user anywhere in the region, weighted with its likelihood."""
+        """Return the mixture for a user anywhere in the region, weighted with its likelihood."""
         covariances = np.linalg.inv(modes.curvature) / share
         log_mass = (np.log(np.linalg.det(jacobian(modes.roi_points))) + 1.5 * np.log(2 * np.pi)
                     + np.linalg.slogdet(covariances)[1] / 2)
@@ -351,8 +351,8 @@ class Tracker:
         blocked, outside = np.nan_to_num([
             estimate.blocked_probability, estimate.outside_probability])
         if blocked:
-            # Signals without a direct path say nothing. The probability is relative to that of a
-            # user anywhere in the region.
+            # Signals without a direct path contain no information. The probability is relative to
+            # that of a user anywhere in the region.
             odds = share * np.log(blocked / max(1 - blocked - outside, 1e-12))
             weight = np.logaddexp.reduce(lost.log_weights) + odds
             parts.append(predicted.weighted(weight))
@@ -389,16 +389,16 @@ def _described(estimate: Estimate, mixture: Mixture, n_phases: int) -> TrackEsti
 
 
 def independent_share(scenario: Scenario, elapsed_s: float) -> float:
-    """Return the share of a phase's information that the previous phase does not contain.
+    """Return the share of a phase's information that is not in the previous phase.
 
     With the correlation rho of Eq. (4) between the phases, averaged over the bands, N phases at
     one place contain as much information as N (1 - rho) / (1 + rho) independent ones. A negative
-    correlation, which would add information, counts as none.
+    correlation, which would add information, is treated as 0.
     """
     lag = np.array(elapsed_s / scenario.frame_duration_s)
     rho = np.array([float(time_correlation(scenario, band, lag, np.array(0.0)))
                     for band in range(scenario.n_bands)])
-    # Without movement of the scatterers, the phases are identical.
+    # If the scatterers do not move, the phases are identical.
     rho = np.clip(rho, 0.0, 1 - 1e-6)
     mean = float(np.mean(rho))
     return (1 - mean) / (1 + mean)
@@ -409,10 +409,10 @@ def update(
         signals: Signals) -> Mixture:
     """Return the product of a predicted mixture and the likelihood of a phase, not normalised.
 
-    Every mode updates every component. Components also remain without an update, as if a mode with
-    a low likelihood, as wide as the best one, had been missed at an unknown place inside them. The
-    exponent of the likelihood, from 0 to 1, is below 1 if the multipath was in part received
-    before. The heaviest pairs are evaluated with the likelihood, unless it is None.
+    Every mode updates every component. Components also remain without an update, in case the
+    search has missed an unlikely mode, as wide as the best one, somewhere inside them. `share`,
+    from 0 to 1, is the exponent of the likelihood; it is below 1 if part of the multipath was
+    received before. The heaviest pairs are evaluated with `likelihood`, unless it is None.
     """
     spread = np.linalg.inv(modes.curvature) / share
     offsets = modes.points[:, None] - predicted.means[:, :3]
@@ -440,7 +440,7 @@ def update(
 def _exact_update(
         predicted: Mixture, points: np.ndarray, share: float, likelihood: Likelihood,
         signals: Signals) -> Mixture:
-    """Update every component with the likelihood expanded at a point (r, u, v), [C, 3]."""
+    """Update each component with the likelihood expanded at a point (r, u, v), [C, 3]."""
     value, gradient, curvature, _ = likelihood.local(
         points, np.zeros((len(points), 0)), signals.repeated(0, len(points)))
     step = np.linalg.solve(curvature, gradient[..., None])[..., 0]
@@ -453,7 +453,7 @@ def _exact_update(
 
 
 def _is_first(updated: Mixture, component: np.ndarray) -> np.ndarray:
-    """Return which components are not equal to an earlier one, bool [C]."""
+    """Return which components do not equal an earlier one, bool [C]."""
     # Modes that have not converged may lead one predicted component, given by its index, to the
     # same maximum, which must not count twice.
     points = updated.means[:, :3]
@@ -467,9 +467,9 @@ def _is_first(updated: Mixture, component: np.ndarray) -> np.ndarray:
 def _evidence(
         offsets: np.ndarray, predicted: np.ndarray, spread: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Integrate the product of two Gaussians, one a density, the other with the maximum 1.
+    """Integrate a Gaussian density [...] times a Gaussian with the maximum 1.
 
-    Takes the differences of the means, float64 [..., 3], and the covariances of both. Returns the
+    Takes the differences of the means, float64 [..., 3], and both covariances. Returns the
     logarithm, float64 [...], and the precision of the offset, float64 [..., 3, 3].
     """
     total = predicted + spread

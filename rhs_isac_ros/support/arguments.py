@@ -1,4 +1,4 @@
-"""Command lines: a parser with errors of one line, types of arguments, and exit codes."""
+"""Command lines: a parser with one-line errors, and types of arguments."""
 
 import argparse
 import math
@@ -27,11 +27,11 @@ class ArgumentParser(argparse.ArgumentParser):
 
 class HelpFormatter(
         argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
-    """Shows defaults, and keeps the lines of the description and of the text below."""
+    """Shows defaults, and keeps the line breaks of the description and of the epilog."""
 
 
 def _number(declared: Field) -> Callable[[str], Any]:
-    """Return a type for argparse."""
+    """Return a type for argparse that parses and checks a declared number."""
     def parse(text: str) -> Any:
         try:
             number = declared.kind(text)
@@ -89,7 +89,9 @@ def output_file(text: str) -> Path:
             raise OSError("'', expected a file")
         check_writable(Path(text))
     except (OSError, ValueError) as error:
-        raise argparse.ArgumentTypeError(_reason(error)) from None
+        raise argparse.ArgumentTypeError(
+            f'{error.filename}: {error.strerror}'
+            if isinstance(error, OSError) and error.strerror else str(error)) from None
     return Path(text)
 
 
@@ -121,22 +123,10 @@ def output_folder(text: str) -> Path:
 def check_distinct(
         parser: argparse.ArgumentParser, inputs: Mapping[str, Path | None],
         outputs: Mapping[str, Path | None]) -> None:
-    """Exit with a usage error if an output file is also an input or another output.
-
-    Parameters
-    ----------
-    inputs, outputs
-        Values by the name of the argument; None if it was not given.
-    """
+    """Exit with a usage error if an output file is also an input or another output."""
     names = {path.resolve(): name for name, path in inputs.items() if path}
     for name, path in outputs.items():
         if path:
             other = names.setdefault(path.resolve(), name)
             if other != name:
                 parser.error(f'argument {name}: {path}, expected another file than {other}')
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return f'{error.filename}: {error.strerror}'
-    return str(error)

@@ -1,4 +1,4 @@
-"""The declaration of a value, with one wording of what is expected.
+"""The declaration of a value, with uniform texts about expected values.
 
 Fields of scenarios and messages, settings of roles, ROS parameters and arguments of commands are
 declared in this way.
@@ -18,32 +18,16 @@ class ParameterError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """Declaration of a value.
+    """Declaration of a value."""
 
-    Attributes
-    ----------
-    kind
-        ``bool``, ``int``, ``float`` or ``str``, or ``list`` for numbers.
-    text
-        Description.
-    low, high
-        Range of numbers, inclusive.
-    is_open
-        Whether `low` itself is invalid.
-    choices
-        Valid strings; empty: any.
-    plugins
-        Entry point group whose names are valid too; empty: none.
-    """
-
-    kind: type
-    text: str = ''
+    kind: type  #: ``bool``, ``int``, ``float`` or ``str``, or ``list`` for numbers.
+    text: str = ''  #: Description.
     unit: str = ''
-    low: float = -math.inf
+    low: float = -math.inf  #: Range of numbers, inclusive.
     high: float = math.inf
-    is_open: bool = False
-    choices: tuple[str, ...] = ()
-    plugins: str = ''
+    is_open: bool = False  #: Whether `low` itself is invalid.
+    choices: tuple[str, ...] = ()  #: Valid strings; if empty, all are valid.
+    plugins: str = ''  #: Entry point group whose names are also valid; empty for none.
 
     WORDS: ClassVar[Mapping[type, str]] = {
         bool: 'true or false', int: 'an integer', float: 'a number', str: 'a string',
@@ -74,7 +58,7 @@ class Field:
         return f'{words}, {self.range}' if self.range else words
 
     def problem(self, value: Any) -> str:
-        """Return an invalid value and what is expected instead; empty for a valid value."""
+        """Describe an invalid value and what was expected; return '' for a valid value."""
         if not self._has_type(value):
             return f'{value!r}, expected {self.expected}'
         if self.choices:

@@ -32,7 +32,7 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
     cannot be written; an existing file is left as it was.
     """
     path = Path(path)
-    # Unlike those of `tempfile`, the file has the permissions of any new file.
+    # Files of `tempfile` would have narrower permissions than other new files.
     temporary = path.with_name(f'.{path.name}.{secrets.token_hex(4)}')
     stream = open(temporary, 'xb')
     try:
@@ -48,7 +48,7 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
 
 
 def check_writable(path: Path) -> None:
-    """Raise OSError unless `write_whole` can write a file and would replace no device."""
+    """Raise OSError if `write_whole` cannot write a file, or would replace a device."""
     if path.is_dir():
         raise IsADirectoryError(f'{path}: a directory, expected a file')
     if path.exists() and not path.is_file():
@@ -66,10 +66,10 @@ def check_writable(path: Path) -> None:
 
 
 def read_yaml(path: str | Path) -> Any:
-    """Read a YAML file without references, which let a short text describe an enormous value.
+    """Read a YAML file.
 
     Raise ValueError if the file cannot be read, is invalid, too large or nested too deeply, or
-    contains a reference.
+    contains references, with which a short text can describe an enormous value.
     """
     try:
         with open(path, 'rb') as stream:
@@ -101,9 +101,9 @@ def write_archive(path: str | Path, arrays: Mapping[str, np.ndarray | float],
 def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np.ndarray]:
     """Read the arrays of a file of NumPy's format ``.npz``.
 
-    With names, the result is empty if the arrays apart from ``about`` have other names, or if they
-    are compressed: they may then be far larger than the file. Raise ArchiveError if the file
-    cannot be read, is damaged, or contains more than 256 MiB.
+    With names, the result is empty unless the file has exactly these arrays, apart from ``about``,
+    and does not compress them: compressed arrays may be far larger than the file. Raise
+    ArchiveError if the file cannot be read, is damaged, or contains more than 256 MiB.
     """
     try:
         with open(path, 'rb') as stream:

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 
-# The group of scripts/setup that installs the libraries of an extra; those of others need none.
+# Groups of scripts/setup that install the libraries of extras.
 _GROUPS = {'experiments': 'experiments', 'genetic': 'experiments', 'neural': 'experiments',
            'recording': 'recording', 'view': 'view'}
 

@@ -1,4 +1,4 @@
-"""Pictures as a paper prints them: formats, style, colours and marks."""
+"""Pictures in the style of the paper: formats, fonts, colours and marks."""
 
 import contextlib
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from rhs_isac_ros.support.optional import optional_import
 PICTURE_FORMATS = ('png', 'pdf', 'svg')
 # Width of a column and of a page of two columns in the paper's document class, IEEEtran [in].
 COLUMN_IN, PAGE_IN = 3.5, 7.16
-# For maps: lightness grows with the value, and colour blindness hides no step.
+# Colour map whose lightness grows with the value, also for colour-blind readers.
 COLOUR_MAP = 'cividis'
 # Matplotlib annotates the keys as literals, in some versions only.
 _STYLE: dict[Any, object] = {
@@ -29,11 +29,11 @@ _STYLE: dict[Any, object] = {
     'boxplot.medianprops.color': 'black', 'boxplot.medianprops.linewidth': 1.4,
     'image.cmap': COLOUR_MAP,
     'figure.constrained_layout.use': True, 'savefig.dpi': 300.0,
-    # Publishers refuse type 3. Type 42 is TrueType, in which the text can be searched.
+    # Publishers refuse fonts of type 3. Type 42 is TrueType, whose text can be searched.
     'pdf.fonttype': 42,
-    # As outlines, because an SVG file contains no fonts.
+    # Text as outlines, because an SVG file contains no fonts.
     'svg.fonttype': 'path',
-    # The same ids in each run.
+    # Ids are the same in each run.
     'svg.hashsalt': 'rhs_isac_ros'}
 # Decimal places of positions, relative to the size of a figure.
 _POSITION_DIGITS = 6
@@ -45,8 +45,8 @@ _METADATA: dict[str, dict[str, Any]] = {
 class Look(NamedTuple):
     """How to draw one of several series.
 
-    Colour-blind readers can distinguish the colours, of Okabe and Ito. Marker, style of a line and
-    pattern of an area remain in greyscale.
+    The colours, by Okabe and Ito, differ for colour-blind readers. Markers, line styles and
+    hatches also differ in greyscale.
     """
 
     colour: str
@@ -55,7 +55,7 @@ class Look(NamedTuple):
     hatch: str
 
 
-# The lightness of neighbours differs. Yellow, the palest, is the last.
+# Neighbours differ in lightness. Yellow, the palest colour, comes last.
 LOOKS = (
     Look('#0072B2', 'o', '-', ''),
     Look('#E69F00', 's', '--', '////'),
@@ -68,12 +68,12 @@ LOOKS = (
 
 
 def look(index: int) -> Look:
-    """Return the look of a series by its index from 0; looks repeat after `LOOKS`."""
+    """Return the look of a series by its index; beyond the last one, looks repeat."""
     return LOOKS[index % len(LOOKS)]
 
 
 def to_paler(colour: str, share: float = 0.6) -> tuple[float, float, float]:
-    """Return a colour mixed with a share of white, which is opaque: red, green and blue."""
+    """Mix a colour with a share of white, and return red, green and blue, without transparency."""
     from matplotlib.colors import to_rgb
 
     red, green, blue = (share + (1 - share) * value for value in to_rgb(colour))
@@ -84,7 +84,8 @@ def to_paler(colour: str, share: float = 0.6) -> tuple[float, float, float]:
 def paper_style(purpose: str = 'drawing') -> Iterator[None]:
     """Draw in the style of the paper inside the block, whatever the user's settings are.
 
-    It is also a decorator. Without Matplotlib, `purpose` begins the MissingLibraryError.
+    Can also be used as a decorator. Without Matplotlib, a MissingLibraryError is raised, whose
+    message begins with `purpose`.
     """
     with optional_import(purpose, extra='plot'):
         import matplotlib
@@ -96,9 +97,9 @@ def paper_style(purpose: str = 'drawing') -> Iterator[None]:
 
 
 def new_figure(width_in: float, height_in: float) -> Any:
-    """Return an empty `matplotlib.figure.Figure`, without pyplot's need for a window system.
+    """Return an empty Matplotlib figure, without pyplot, which would need a window system.
 
-    Call this and all that draws on the figure inside `paper_style`.
+    Create the figure and draw on it inside `paper_style`.
     """
     from matplotlib.figure import Figure
 
@@ -117,11 +118,10 @@ def add_panels(
         place: Any, n_rows: int, n_columns: int, **sharing: bool) -> tuple[Any, Any]:
     """Return panels, an array of axes, and axes above for a legend.
 
-    `place` is a `matplotlib.gridspec.SubplotSpec`; `sharing` are ``sharex`` and ``sharey`` of
-    `matplotlib.gridspec.GridSpecBase.subplots`.
+    `place` is a Matplotlib `SubplotSpec`; `sharing` are ``sharex`` and ``sharey``.
     """
-    # The layout adds the height of the legend. A legend of the figure itself gets room from the
-    # layout only since Matplotlib 3.7.
+    # The layout reserves the height of the legend. Before Matplotlib 3.7, it would reserve none
+    # for a legend of the figure itself.
     grid = place.subgridspec(2, 1, height_ratios=(0.001, 1))
     panels = grid[1].subgridspec(n_rows, n_columns).subplots(squeeze=False, **sharing)
     above = panels[0, 0].figure.add_subplot(grid[0])
@@ -164,15 +164,12 @@ def write_picture(path: str | Path, figure: Any) -> None:
 
 
 def _fix_layout(figure: Any) -> None:
-    """Lay a figure out, and round the positions.
-
-    The last digits of the layout, and with them files and ids in SVG, differ between runs.
-    """
+    """Lay out a figure, and round positions, because their last digits differ between runs."""
     from matplotlib import rc_context
     from matplotlib.transforms import Bbox
 
     figure.draw_without_rendering()
-    # The name 'none' of no layout engine exists only since Matplotlib 3.7.
+    # Before Matplotlib 3.7, no layout engine has the name 'none'.
     with rc_context({'figure.constrained_layout.use': False}):
         figure.set_layout_engine(None)
     for axes in figure.axes:

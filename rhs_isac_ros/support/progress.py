@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 @contextlib.contextmanager
 def progress_bar(total: int, unit: str, *, quiet: bool = False, line_every: int = 1
                  ) -> Iterator[Callable[[int, str], None] | None]:
-    """Provide a function of the completed number and a text, or None if `quiet`.
+    """Yield a function that shows the completed number and a text, or None if `quiet`.
 
-    Without tqdm, the function prints a line for each `line_every` units.
+    Without tqdm, the function prints a line every `line_every` units.
     """
     if quiet:
         yield None

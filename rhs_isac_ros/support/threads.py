@@ -20,7 +20,7 @@ from threadpoolctl import ThreadpoolController
 
 _Item = TypeVar('_Item')
 _Result = TypeVar('_Result')
-# A BLAS library, as threadpoolctl represents it, which has no types.
+# A BLAS library in threadpoolctl, which has no types.
 _Library: TypeAlias = Any
 
 
@@ -81,10 +81,9 @@ class _OneBlasThread(contextlib.ContextDecorator):
     def find_libraries(self) -> None:
         """Find the BLAS libraries that the process has loaded.
 
-        The search holds the lock of the dynamic loader and needs the lock of the interpreter, so
-        that it would wait forever for a thread that imports an extension module meanwhile. It is
-        therefore part of the import of this module. Only functions that load SciPy's own BLAS
-        repeat it.
+        The search holds the lock of the dynamic loader and needs the lock of the interpreter. It
+        would wait forever for a thread that is importing an extension module. It therefore runs
+        while this module is imported, and later only in functions that load SciPy's own BLAS.
         """
         found = ThreadpoolController().select(user_api='blas').lib_controllers
         per_thread = [library for library in found
@@ -113,8 +112,8 @@ def _restore(saved: Iterable[tuple[_Library, int]]) -> None:
 
 def _set(library: _Library, number: int) -> None:
     library.set_num_threads(number)
-    # Since threadpoolctl 3.7, only the thread that set a number first can change it, until it
-    # gives this up; here, the last thread restores what the first one has set.
+    # Since threadpoolctl 3.7, only the thread that first set a number can change it, until it
+    # releases control. Here, the last thread restores the number that the first one changed.
     release = getattr(library, 'clear_controlling_thread', None)
     if release:
         release()
