@@ -75,6 +75,8 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
     with SurveyWarning if there are fewer than `MIN_POSITIONS` positions, or if they span less than
     half of a side of the region.
     """
+    from scipy.stats import binomtest
+
     pilots = Pilots(codebook, np.asarray(positions, float), np.asarray(received, complex))
     n = len(pilots.positions)
     if not n:
@@ -97,10 +99,11 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
     if texts:
         warnings.warn('; '.join(texts), SurveyWarning, stacklevel=3)
     inside = int(np.sum(left_out.distances <= inflation * _radius()))
+    interval = binomtest(inside, n_sight).proportion_ci(method='wilson')
     about: dict[str, Any] = {
         'positions': n_sight, 'blocked': n - n_sight, 'prior_weight': fit.weight,
         'inflation': inflation, 'level_std_db': level_std_db,
-        'coverage': [inside / n_sight, *_interval(inside, n_sight)],
+        'coverage': [inside / n_sight, *map(float, interval)],
         'warnings': texts, 'codebook': str(getattr(codebook, 'id', '')), 'version': __version__}
     plain = scenario.fields()
     return MultipathEstimate(
@@ -303,14 +306,6 @@ def _radius() -> float:
     from scipy.special import chdtri
 
     return float(chdtri(3, 1 - COVERAGE))
-
-
-def _interval(successes: int, n: int) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a share."""
-    square = 1.959964**2 / n
-    share = successes / n
-    centre, reach = share + square / 2, np.sqrt(share * (1 - share) * square + square**2 / 4)
-    return float((centre - reach) / (1 + square)), float((centre + reach) / (1 + square))
 
 
 def _warnings(scenario: Scenario, positions: np.ndarray) -> list[str]:

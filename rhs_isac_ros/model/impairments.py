@@ -112,18 +112,6 @@ class Nuisance:
         return np.exp(np.tensordot(values, self.patterns, axes=1))
 
 
-def _gain(scenario: Scenario) -> np.ndarray:
-    return np.ones((1, *_shape(scenario)), complex)
-
-
-def _phase(scenario: Scenario) -> np.ndarray:
-    return np.full((1, *_shape(scenario)), 1j)
-
-
-def _phase_of_each_band(scenario: Scenario) -> np.ndarray:
-    return 1j * np.eye(scenario.n_bands)[:, :, None] * np.ones(_shape(scenario))
-
-
 def _carrier_offset(scenario: Scenario) -> np.ndarray:
     frames = np.arange(scenario.n_frames) * scenario.frame_duration_s
     return 2j * np.pi * np.broadcast_to(
@@ -167,11 +155,13 @@ class Factor(Impairment):
 
 
 BUILT_IN: tuple[Factor, ...] = (
-    Factor('user_gain_std_db', _gain, unit=_NEPERS_PER_DB, scope=Scope.USER),
+    Factor('user_gain_std_db', lambda scenario: np.ones((1, *_shape(scenario)), complex),
+           unit=_NEPERS_PER_DB, scope=Scope.USER),
     Factor('carrier_offset_std_hz', _carrier_offset, needs_search=True, scope=Scope.USER),
-    Factor('phase_std_rad', _phase),
+    Factor('phase_std_rad', lambda scenario: np.full((1, *_shape(scenario)), 1j)),
     Factor('timing_std_s', _timing_offset, needs_search=True),
-    Factor('band_phase_std_rad', _phase_of_each_band),
+    Factor('band_phase_std_rad', lambda scenario: 1j * np.eye(scenario.n_bands)[
+        :, :, None] * np.ones(_shape(scenario))),
 )
 
 

@@ -18,6 +18,7 @@ directions of the signals, or if levels differ between users or places (`Diagnos
 """
 
 import collections
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -127,8 +128,7 @@ class InnovationTest:
 
     def clear(self) -> None:
         """Remove all residuals, for example after a change of the scenario or codebook."""
-        self._residuals: collections.deque[_Residual] = collections.deque()
-        self._sum = _Residual(0.0, 0.0, 0.0, 0.0)
+        self._residuals: collections.deque[_Residual] = collections.deque(maxlen=self._window)
         self.drifts = False
 
     def add(self, energy: float, expected: float) -> None:
@@ -138,28 +138,21 @@ class InnovationTest:
         scale = max(expected, 1.0)
         deviation = (energy - expected) / scale**0.5
         deviation = min(max(deviation, -_MAX_DEVIATIONS), _MAX_DEVIATIONS)
-        self._append(_Residual(
+        self._residuals.append(_Residual(
             expected + deviation * scale**0.5, expected, min(deviation**2, _MAX_SQUARE),
             2 + 6 / scale))
         if self.drifts:
             latest = list(self._residuals)[-MIN_RETURN:]
-            total = _Residual(*np.sum(latest, axis=0).tolist())
+            total = _Residual.total(latest)
             if len(latest) == MIN_RETURN and (
                     _probability(total, MIN_RETURN) >= RETURN
                     and _spread_probability(total, MIN_RETURN) >= SPREAD_RETURN):
                 self.clear()
-                for residual in latest:
-                    self._append(residual)
+                self._residuals.extend(latest)
         elif len(self._residuals) >= MIN_FIXES:
-            n = len(self._residuals)
-            self.drifts = (_probability(self._sum, n) < FALSE_WARNING
-                           or _spread_probability(self._sum, n) < FALSE_SPREAD_WARNING)
-
-    def _append(self, residual: '_Residual') -> None:
-        if len(self._residuals) == self._window:
-            self._sum = self._sum.plus(self._residuals.popleft(), -1)
-        self._residuals.append(residual)
-        self._sum = self._sum.plus(residual, 1)
+            n, total = len(self._residuals), _Residual.total(self._residuals)
+            self.drifts = (_probability(total, n) < FALSE_WARNING
+                           or _spread_probability(total, n) < FALSE_SPREAD_WARNING)
 
     @property
     def n_fixes(self) -> int:
@@ -169,12 +162,14 @@ class InnovationTest:
     @property
     def ratio(self) -> float:
         """Mean energy relative to the expectation; NaN without residuals."""
-        return self._sum.energy / max(self._sum.expected, 0.5) if self._residuals else np.nan
+        total = _Residual.total(self._residuals)
+        return total.energy / max(total.expected, 0.5) if self._residuals else np.nan
 
     @property
     def spread(self) -> float:
         """Variance of the energy about the expectation, relative to the model's, or NaN."""
-        return self._sum.square / len(self._residuals) if self._residuals else np.nan
+        total = _Residual.total(self._residuals)
+        return total.square / len(self._residuals) if self._residuals else np.nan
 
 
 class _Residual(NamedTuple):
@@ -185,8 +180,9 @@ class _Residual(NamedTuple):
     square: float  # Of the normalised deviation.
     square_variance: float
 
-    def plus(self, other: '_Residual', factor: int) -> '_Residual':
-        return _Residual(*(one + factor * two for one, two in zip(self, other, strict=True)))
+    @classmethod
+    def total(cls, residuals: Iterable['_Residual']) -> '_Residual':
+        return cls(*map(sum, zip((0.0,) * 4, *residuals, strict=True)))
 
 
 def _probability(total: _Residual, n: int) -> float:

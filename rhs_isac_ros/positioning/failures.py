@@ -14,7 +14,8 @@ likelihood of a set uses their covariance at each point.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -163,22 +164,32 @@ class Whitening(NamedTuple):
     information: np.ndarray  # One covariance's information about the parameters, float64 [Q, Q].
 
 
-class Site(NamedTuple):
+@dataclasses.dataclass(eq=False)
+class Site:
     """The signals of a phase at a point."""
 
+    model: 'FailureModel'
     point: np.ndarray  # (r [m], u, v), float64 [3].
     values: np.ndarray  # Nuisance parameters, float64 [Q].
     # Residual of an intact surface, and derivatives of the mean with respect to the point and the
-    # parameters, complex128 [4 + Q, N_B, N_SB F]; and their changes if an element fails.
+    # parameters, complex128 [4 + Q, N_B, N_SB F].
     columns: np.ndarray
-    changes: np.ndarray  # Complex128 [N_E, 4 + Q, N_B, N_SB F].
-    # Derivatives with respect to the scaled amplitude of a failed element, complex128
-    # [N_E, N_B, N_SB F].
-    amplitudes: np.ndarray
 
-    def columns_of(self, failed: Failed) -> np.ndarray:
-        """Return the columns of a surface with failed elements."""
-        return self.columns + self.changes[[*failed]].sum(axis=0)
+    @functools.cached_property
+    def elements(self) -> tuple[np.ndarray, np.ndarray]:
+        """Effect of each element that fails; few of the sites need it.
+
+        It is the change of the columns, complex128 [N_E, 4 + Q, N_B, N_SB F], and the derivative
+        by the scaled amplitude, complex128 [N_E, N_B, N_SB F].
+        """
+        return self.model.elements_at(self.point)
+
+    def columns_of(self, failed: Failed) -> tuple[np.ndarray, np.ndarray]:
+        """Return the columns of a surface with failed elements, and those of their amplitudes."""
+        if not failed:
+            return self.columns, self.columns[:0]
+        changes, amplitudes = self.elements
+        return self.columns + changes[[*failed]].sum(axis=0), amplitudes[[*failed]]
 
 
 class FailedSet:
@@ -269,13 +280,17 @@ class FailureModel:
         growth = self._growth(smaller, slice(element, element + 1))[0]
         return Surface(scattered, smaller.covariance + growth)
 
-    def site(self, point: np.ndarray, values: np.ndarray, signals: Signals) -> Site:
-        """Evaluate the signals of a phase, N = 1, at a point [3] with parameters [Q]."""
+    def sites(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> list[Site]:
+        """Evaluate the signals of a phase, N = 1, at points [P, 3] with parameters [P, Q]."""
+        prior = self.likelihood.nuisance
+        mean, slopes = self._model.mean_and_jacobian(to_positions(points), jacobian(points))
+        columns = prior.columns(values, signals.received, mean, slopes)[:, :4 + len(prior)]
+        return [Site(self, *each) for each in zip(points, values, columns, strict=True)]
+
+    def elements_at(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Compute `Site.elements` at a point [3]."""
         prior, position = self.likelihood.nuisance, to_positions(point[None])
-        by_point = jacobian(point[None])
-        mean, slopes = self._model.mean_and_jacobian(position, by_point)
-        columns = prior.columns(values, signals.received, mean, slopes)[0, :4 + len(prior)]
-        gains = []
+        by_point, gains = jacobian(point[None]), []
         for band in range(self.scenario.n_bands):
             gain, slope = los_and_derivative(self.scenario, position, band)
             both = np.concatenate([gain, np.tensordot(by_point[0].T, slope[0], 1)])
@@ -284,19 +299,20 @@ class FailureModel:
         changes = elements * self._shift[:, None]
         fixed = prior.patterns * ~prior.moves_multipath[:, None, None]
         changes = np.concatenate([-changes[:, :1], changes[:, 1:], fixed * changes[:, :1]], axis=1)
-        return Site(point, values, columns, changes, elements[:, 0] * self._amplitudes)
+        return changes, elements[:, 0] * self._amplitudes
 
-    def weigh(self, failed: Failed, site: Site) -> tuple[float, float]:
-        """Return the log-probability of a set at a site, and its deviance, after a step.
+    def weigh(self, failed: Failed, sites: Sequence[Site]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log-probability of a set at sites, and its deviance, after a step, [P] each.
 
         The log-probability is relative to the prior of an intact surface. The deviance is the
         energy of the residual plus the cost of the parameters, because an unknown gain can lower
         any energy.
         """
         whitening = self._whitening(failed)
-        columns = np.concatenate([site.columns_of(failed), site.amplitudes[[*failed]]])[None]
-        value = float(self._predicted(site, columns, whitening, len(failed))[0])
-        return len(failed) * self._log_odds - float(whitening.log_volume[0]) + value, -value
+        columns = np.stack([np.concatenate(site.columns_of(failed)) for site in sites])
+        value = self._predicted(np.stack([site.values for site in sites]), columns, whitening,
+                                len(failed))
+        return len(failed) * self._log_odds - whitening.log_volume + value, -value
 
     def weigh_extensions(self, failed: Failed, site: Site, remainder: float = 0.0) -> np.ndarray:
         """Compute the log-probability of `weigh` if one more element fails, float64 [N_E].
@@ -305,21 +321,21 @@ class FailureModel:
         adds to the covariance. Elements that explain a part of the signals then have a higher
         value than elements that imitate the sum.
         """
-        extended, columns = self._extensions_of(failed, remainder), site.columns_of(failed)
-        own = np.broadcast_to(site.amplitudes[[*failed]],
-                              (len(site.amplitudes), len(failed), *columns.shape[1:]))
-        parts = np.concatenate([columns + site.changes, own, site.amplitudes[:, None]], axis=1)
-        value = self._predicted(site, parts, extended, len(failed) + 1)
+        extended, (columns, own) = self._extensions_of(failed, remainder), site.columns_of(failed)
+        changes, amplitudes = site.elements
+        own = np.broadcast_to(own, (len(changes), *own.shape))
+        parts = np.concatenate([columns + changes, own, amplitudes[:, None]], axis=1)
+        values = np.broadcast_to(site.values, (len(changes), len(site.values)))
+        value = self._predicted(values, parts, extended, len(failed) + 1)
         return (len(failed) + 1) * self._log_odds - extended.log_volume + value
 
-    def _predicted(self, site: Site, columns: np.ndarray, whitening: Whitening,
+    def _predicted(self, values: np.ndarray, columns: np.ndarray, whitening: Whitening,
                    n_failed: int) -> np.ndarray:
         """Return the marginal log-likelihood of columns [H, C, N_B, N_SB F] after a step, [H]."""
-        prior, n = self.likelihood.nuisance, len(columns)
+        n = len(columns)
         white = np.matmul(np.moveaxis(columns, 2, 0), np.swapaxes(whitening.whitener, 2, 3))
         white = np.moveaxis(white, 0, 2).reshape(n, columns.shape[1], -1)
-        values = np.broadcast_to(site.values, (n, len(prior)))
-        local = assemble(prior, values, white, n_linear=n_failed,
+        local = assemble(self.likelihood.nuisance, values, white, n_linear=n_failed,
                          information_of_covariance=whitening.information)
         return predict(local, self.likelihood)
 
@@ -379,8 +395,7 @@ class FailureSearch:
     def add(self, points: np.ndarray, values: np.ndarray, failed: Failed = ()) -> list[Key]:
         """Add sites at points [P, 3] with parameters [P, Q] and a set; the best come first."""
         first = len(self.sites)
-        self.sites += [self._model.site(point, own, self._signals)
-                       for point, own in zip(points, values, strict=True)]
+        self.sites += self._model.sites(points, values, self._signals)
         return self._weigh((failed, index) for index in range(first, len(self.sites)))
 
     def grow(self, parents: list[Key], remainder: float = 0.0) -> None:
@@ -413,11 +428,12 @@ class FailureSearch:
     def _weigh(self, keys: Iterable[Key]) -> list[Key]:
         """Weigh hypotheses, and return them, the most probable first."""
         keys = list(keys)
-        for key in keys:
-            if key not in self.values:
-                failed, index = key
-                self.values[key], self._deviances[key] = self._model.weigh(
-                    failed, self.sites[index])
+        for failed, group in itertools.groupby(
+                sorted(set(keys) - self.values.keys()), key=lambda key: key[0]):
+            new = list(group)
+            value, deviance = self._model.weigh(failed, [self.sites[index] for _, index in new])
+            self.values.update(zip(new, value.tolist(), strict=True))
+            self._deviances.update(zip(new, deviance.tolist(), strict=True))
         return sorted(keys, key=lambda key: -self.values[key])
 
     def _weigh_children(self, parents: list[Key], remainder: float = 0.0) -> list[Key]:

@@ -20,6 +20,7 @@ import numpy as np
 from rhs_isac_ros import __version__
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import check_arrays
 from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 from rhs_isac_ros.positioning.simulate import simulate_pairs
@@ -94,12 +95,8 @@ class Network:
             raise ModelError(f'inputs: {self.inputs!r}, expected one of {sorted(INPUTS)}')
         n_inputs, n_hidden = np.shape(self.w_in) if np.ndim(self.w_in) == 2 else (0, 0)
         sizes = {'D': n_inputs, 'H': n_hidden, '3': 3}
-        for name, letters in _SHAPES.items():
-            value, shape = getattr(self, name), tuple(sizes[letter] for letter in letters)
-            if np.shape(value) != shape:
-                raise ModelError(f'{name}: shape {np.shape(value)}, expected {shape}')
-            if not np.isfinite(value).all():
-                raise ModelError(f'{name}: not finite, expected finite numbers')
+        check_arrays(self, {name: tuple(sizes[letter] for letter in letters)
+                            for name, letters in _SHAPES.items()}, ModelError)
 
     def positions(self, received: np.ndarray) -> np.ndarray:
         """Map received signals, complex128 [N, N_B, N_SB F], to positions, float64 [N, 3] [m]."""

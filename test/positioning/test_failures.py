@@ -104,13 +104,13 @@ def test_the_likelihood_has_the_moments_of_surfaces_with_a_given_set(codebook, m
     average = np.linalg.slogdet(MeasurementModel(SCENARIO, codebook).covariance())[1].sum()
     assert local.value[0] == pytest.approx(log_prior - energy - volume + average, rel=1e-6)
 
-    value, deviance = model.weigh(failed, model.site(POINT, NO_VALUES, signals))
+    value, deviance = model.weigh(failed, model.sites(POINT[None], NO_VALUES[None], signals))
     # The step exceeds no limit here.
     gain = gradient @ np.linalg.solve(information + floor, gradient) / 2
     prior = 2 * np.log(0.02 / 0.98)
-    assert value == pytest.approx(prior - energy - volume + gain, rel=1e-3)
+    assert value[0] == pytest.approx(prior - energy - volume + gain, rel=1e-3)
     spread = volume - np.linalg.slogdet(scattered)[1].sum()
-    assert deviance == pytest.approx(energy - gain + spread, rel=1e-3)
+    assert deviance[0] == pytest.approx(energy - gain + spread, rel=1e-3)
 
 
 def test_element_errors_have_their_covariance_at_the_position(codebook):
@@ -160,8 +160,9 @@ def weighing(request, codebook):
     received = MeasurementModel(scenario, codebook).sample(
         POSITION[None], np.random.default_rng(3))
     model = FailureModel(Likelihood(scenario, codebook))
-    return model, model.site(
-        POINT, np.full(len(request.param), 0.1), model.likelihood.signals(received))
+    (site,) = model.sites(
+        POINT[None], np.full((1, len(request.param)), 0.1), model.likelihood.signals(received))
+    return model, site
 
 
 def tolerance(model):
@@ -174,7 +175,8 @@ def test_a_further_failure_is_weighed_as_the_larger_set(weighing):
     values = model.weigh_extensions((5, 20), site)
     for element in (0, 12, 35):
         larger = tuple(sorted((5, 20, element)))
-        assert values[element] == pytest.approx(model.weigh(larger, site)[0], **tolerance(model))
+        (expected,), _ = model.weigh(larger, [site])
+        assert values[element] == pytest.approx(expected, **tolerance(model))
 
 
 def test_the_remainder_adds_to_the_covariance(weighing, codebook, monkeypatch):
@@ -187,7 +189,8 @@ def test_the_remainder_adds_to_the_covariance(weighing, codebook, monkeypatch):
         larger = surface._replace(covariance=surface.covariance + remainder)
         whitening = larger.whitening(model.likelihood.nuisance)
         monkeypatch.setattr(model, '_whitening', lambda _, whitening=whitening: whitening)
-        assert values[element] == pytest.approx(model.weigh(failed, site)[0], **tolerance(model))
+        (expected,), _ = model.weigh(failed, [site])
+        assert values[element] == pytest.approx(expected, **tolerance(model))
 
 
 @pytest.mark.slow
@@ -241,7 +244,7 @@ def test_sets_grow_to_the_true_one_or_to_one_that_is_more_probable(ambiguous):
         failed = tuple(sorted(rng.choice(36, 3, replace=False).tolist()))
         search, sites = search_at_the_truth(ambiguous, sample_with(ambiguous, failed, seed))
         search.grow(sites, 0.3)
-        true, _ = ambiguous.weigh(failed, search.sites[0])
+        (true,), _ = ambiguous.weigh(failed, search.sites[:1])
         assert search.values[search.best] >= true - 1e-6
 
 
@@ -252,7 +255,7 @@ def test_without_a_remainder_the_growth_often_ends_with_another_set(ambiguous, m
         failed = tuple(sorted(rng.choice(36, 3, replace=False).tolist()))
         search, sites = search_at_the_truth(ambiguous, sample_with(ambiguous, failed, seed))
         search.grow(sites)
-        true, _ = ambiguous.weigh(failed, search.sites[0])
+        (true,), _ = ambiguous.weigh(failed, search.sites[:1])
         missed += search.values[search.best] < true - 1.0
     assert missed > 0
 
