@@ -5,7 +5,9 @@ takes long, and they are not Gaussian. A draw is a direction within a cell of th
 range, the likelihood is integrated. Cells are drawn with the probabilities that the bounds of
 their likelihood imply, and the weight of a draw is its integral over the expected number of draws
 of its cell: importance sampling. The weights show how many draws are effective. As long as these
-are too few, further draws follow the weights so far; peaks of strong signals are too narrow.
+are too few, further draws follow the weights so far; peaks of strong signals are too narrow. The
+expected number is that at the time of the draw: otherwise cells whose first draws missed their
+peaks would have too little weight, and the posterior would be too narrow.
 """
 
 from typing import NamedTuple
@@ -17,13 +19,16 @@ from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, concatenat
 from rhs_isac_ros.positioning.grid import Query, TemplateTable, Windows
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution
 
-# Draws at a time, largest number of times, and number of effective draws that suffices: the mean
-# squared error increases by its inverse.
+# Draws at a time, largest number of times, number of effective draws that suffices, and of those
+# that are at least as good as modes: the mean squared error increases by its inverse.
 _N_DRAWS = 500
-_MAX_ROUNDS = 4
+_MAX_ROUNDS = 8
 _N_EFFECTIVE = 150.0
+_FEWEST_EFFECTIVE = 30.0
 # Share of further draws that follow the bounds instead of the weights.
-_SHARE_OF_BOUNDS = 0.1
+_SHARE_OF_BOUNDS = 0.7
+# Power of the likelihood that bounds imply: draws in cells that they misjudge remain frequent.
+_POWER = 0.8
 # Windows of range whose log-likelihood is lower than the best average by more have no effect.
 _MARGIN = 12.0
 # Range steps per wavelength, at least; a Gaussian peak then has one for each two deviations.
@@ -52,7 +57,7 @@ class _Rays(NamedTuple):
 
     draw: np.ndarray  # Number of the draw, int [R].
     direction: np.ndarray  # Unit vector, float64 [R, 3].
-    log_mass: np.ndarray  # Logarithm of the integral, float64 [R]; -inf outside of the region.
+    log_weight: np.ndarray  # Logarithm of the integral, float64 [R]; -inf outside of the region.
     range_m: np.ndarray  # Mean range, float64 [R] [m].
     variance_m2: np.ndarray  # Variance of the range, float64 [R] [m^2].
     average: np.ndarray  # Mean log-likelihood, float64 [R].
@@ -79,21 +84,20 @@ class DrawnPosterior:
     def of(self, query: Query, phase: int) -> Draws | None:
         """Draw positions of a phase of a query; None if too few of them are effective."""
         bounds = self._probabilities(query, phase)
-        expected, probability = np.zeros(len(bounds)), bounds
-        cells, parts = np.empty(0, int), []
+        probability, cells, rounds = bounds, np.empty(0, int), []
         for _ in range(_MAX_ROUNDS):
-            expected += _N_DRAWS * probability
             drawn = np.searchsorted(
                 np.cumsum(probability), (np.arange(_N_DRAWS) + 0.5) / _N_DRAWS)
             places = (len(cells) + np.arange(_N_DRAWS))[:, None] * _SEQUENCE
             rays = self._rays(query, phase, drawn, places % 1)
-            parts.append(rays._replace(draw=rays.draw + len(cells)))
-            cells, rays = np.append(cells, drawn), concatenate(*parts)
-            log_weights = rays.log_mass - np.log(expected[cells[rays.draw]])
-            highest = log_weights.max(initial=-np.inf)
+            expected = np.log(_N_DRAWS * probability[drawn])[rays.draw]
+            rounds.append(rays._replace(
+                draw=rays.draw + len(cells), log_weight=rays.log_weight - expected))
+            cells, rays = np.append(cells, drawn), concatenate(*rounds)
+            highest = rays.log_weight.max(initial=-np.inf)
             if np.isneginf(highest):
                 return None
-            weights = np.exp(log_weights - highest)
+            weights = np.exp(rays.log_weight - highest)
             total = weights.sum()
             weights /= total
             by_draw = np.bincount(rays.draw, weights, len(cells))
@@ -102,7 +106,7 @@ class DrawnPosterior:
                 break
             found = np.bincount(cells, by_draw, len(bounds))
             probability = (1 - _SHARE_OF_BOUNDS) * found + _SHARE_OF_BOUNDS * bounds
-        else:
+        if variance > 1 / _FEWEST_EFFECTIVE:
             return None
         places = rays.range_m[:, None] * rays.direction
         mean = weights @ places
@@ -110,15 +114,16 @@ class DrawnPosterior:
         covariance = ((weights[:, None] * offsets).T @ offsets
                       + (along[:, None] * rays.direction).T @ rays.direction)
         return Draws(
-            mean, covariance * (1 + variance), float(highest + np.log(total)),
+            mean, covariance * (1 + variance), float(highest + np.log(total / len(rounds))),
             float(rays.highest[weights > 0].max()), float(weights @ rays.average))
 
     def _probabilities(self, query: Query, phase: int) -> np.ndarray:
-        """Share of each cell in the posterior if the bands had random phases, roughly, [C]."""
+        """Share of each cell in the posterior, flattened, if bands had random phases, [C]."""
         # The average of exp(2 A cos(phase)) is nearly exp(2 A) / sqrt(1 + 4 pi A).
         n_bands, bound = len(self._wavenumbers), query.bound[phase]
         amplitude = (bound + self._table.energy) / (2 * n_bands)
-        value = bound - n_bands / 2 * np.log1p(4 * np.pi * amplitude) + self._log_volume
+        value = _POWER * (bound - n_bands / 2 * np.log1p(4 * np.pi * amplitude))
+        value += self._log_volume
         shares: np.ndarray = np.exp(value - value.max(), dtype=float)
         return shares / shares.sum()
 
