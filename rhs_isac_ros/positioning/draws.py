@@ -4,10 +4,9 @@ Below the noise, thousands of beams and range steps explain the signals. Finding
 takes long, and they are not Gaussian. Instead, directions are drawn within cells of the grid, and
 the likelihood is integrated along the range. This is importance sampling: cells are drawn with
 probabilities that follow from bounds of their likelihood, and the weight of a draw is its integral
-divided by the number of draws in its cell that was expected in its round. With the number expected
-in all rounds, cells whose first draws missed their peaks would have too little weight. The weights
-determine the number of effective draws. While it is too small, further draws also follow the
-weights found so far. Peaks of strong signals are too narrow for this method.
+divided by the expected number of draws in its cell. The weights determine the number of effective
+draws. While it is too small, further draws follow the weights found so far. Peaks of strong
+signals are too narrow for this method.
 """
 
 from typing import NamedTuple
@@ -19,16 +18,13 @@ from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, concatenat
 from rhs_isac_ros.positioning.grid import Query, TemplateTable, Windows
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution
 
-# Draws per round, largest number of rounds, sufficient number of effective draws, and the smallest
-# number that is as good as modes. The inverse is the relative increase of the mean squared error.
+# Draws per round, largest number of rounds, and sufficient number of effective draws; its inverse
+# is the relative increase of the mean squared error.
 _N_DRAWS = 500
-_MAX_ROUNDS = 8
+_MAX_ROUNDS = 4
 _N_EFFECTIVE = 150.0
-_FEWEST_EFFECTIVE = 30.0
 # Share of further draws that follow the bounds instead of the weights.
-_SHARE_OF_BOUNDS = 0.7
-# Power of the likelihood that bounds imply; cells whose bounds are too low are still drawn.
-_POWER = 0.8
+_SHARE_OF_BOUNDS = 0.1
 # Windows of range whose log-likelihood is further below the best average have no effect.
 _MARGIN = 12.0
 # Smallest number of range steps per wavelength. A Gaussian peak has one per two deviations.
@@ -57,7 +53,7 @@ class _Rays(NamedTuple):
 
     draw: np.ndarray  # Number of the draw, int [R].
     direction: np.ndarray  # Unit vector, float64 [R, 3].
-    log_weight: np.ndarray  # Logarithm of the integral, float64 [R]; -inf outside of the region.
+    log_mass: np.ndarray  # Logarithm of the integral, float64 [R]; -inf outside of the region.
     range_m: np.ndarray  # Mean range, float64 [R] [m].
     variance_m2: np.ndarray  # Variance of the range, float64 [R] [m^2].
     average: np.ndarray  # Mean log-likelihood, float64 [R].
@@ -84,20 +80,21 @@ class DrawnPosterior:
     def of(self, query: Query, phase: int) -> Draws | None:
         """Draw positions of a phase of a query; None if too few of them are effective."""
         bounds = self._probabilities(query, phase)
-        probability, cells, rounds = bounds, np.empty(0, int), []
+        expected, probability = np.zeros(len(bounds)), bounds
+        cells, parts = np.empty(0, int), []
         for _ in range(_MAX_ROUNDS):
+            expected += _N_DRAWS * probability
             drawn = np.searchsorted(
                 np.cumsum(probability), (np.arange(_N_DRAWS) + 0.5) / _N_DRAWS)
             places = (len(cells) + np.arange(_N_DRAWS))[:, None] * _SEQUENCE
             rays = self._rays(query, phase, drawn, places % 1)
-            expected = np.log(_N_DRAWS * probability[drawn])[rays.draw]
-            rounds.append(rays._replace(
-                draw=rays.draw + len(cells), log_weight=rays.log_weight - expected))
-            cells, rays = np.append(cells, drawn), concatenate(*rounds)
-            highest = rays.log_weight.max(initial=-np.inf)
+            parts.append(rays._replace(draw=rays.draw + len(cells)))
+            cells, rays = np.append(cells, drawn), concatenate(*parts)
+            log_weights = rays.log_mass - np.log(expected[cells[rays.draw]])
+            highest = log_weights.max(initial=-np.inf)
             if np.isneginf(highest):
                 return None
-            weights = np.exp(rays.log_weight - highest)
+            weights = np.exp(log_weights - highest)
             total = weights.sum()
             weights /= total
             by_draw = np.bincount(rays.draw, weights, len(cells))
@@ -106,7 +103,7 @@ class DrawnPosterior:
                 break
             found = np.bincount(cells, by_draw, len(bounds))
             probability = (1 - _SHARE_OF_BOUNDS) * found + _SHARE_OF_BOUNDS * bounds
-        if variance > 1 / _FEWEST_EFFECTIVE:
+        else:
             return None
         places = rays.range_m[:, None] * rays.direction
         mean = weights @ places
@@ -114,16 +111,15 @@ class DrawnPosterior:
         covariance = ((weights[:, None] * offsets).T @ offsets
                       + (along[:, None] * rays.direction).T @ rays.direction)
         return Draws(
-            mean, covariance * (1 + variance), float(highest + np.log(total / len(rounds))),
+            mean, covariance * (1 + variance), float(highest + np.log(total)),
             float(rays.highest[weights > 0].max()), float(weights @ rays.average))
 
     def _probabilities(self, query: Query, phase: int) -> np.ndarray:
-        """Approximate the flattened share of each cell in the posterior for random phases, [C]."""
+        """Approximate the share of each cell in the posterior, as if phases were random."""
         # The average of exp(2 A cos(phase)) is nearly exp(2 A) / sqrt(1 + 4 pi A).
         n_bands, bound = len(self._wavenumbers), query.bound[phase]
         amplitude = (bound + self._table.energy) / (2 * n_bands)
-        value = _POWER * (bound - n_bands / 2 * np.log1p(4 * np.pi * amplitude))
-        value += self._log_volume
+        value = bound - n_bands / 2 * np.log1p(4 * np.pi * amplitude) + self._log_volume
         shares: np.ndarray = np.exp(value - value.max(), dtype=float)
         return shares / shares.sum()
 

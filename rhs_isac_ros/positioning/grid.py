@@ -47,9 +47,8 @@ _STEPS_PER_WAVELENGTH = 8
 _N_OUTPUTS = 1 << 18
 # Number of cells of a phase that are examined first, to find how likely others must be.
 _N_FIRST = 48
-# Number of further relevant cells, times the number of elements, above which positions are drawn
-# instead: the time of exact steps is proportional to both, that of draws to neither.
-_MAX_COST = 3_000
+# Number of further relevant cells above which positions are drawn instead.
+_MAX_CELLS = 100
 # Largest number of peaks of a phase that are kept, to limit memory and time. Only signals below
 # the noise have more, and the remaining peaks have little weight.
 _MAX_PEAKS = 8192
@@ -136,7 +135,6 @@ class TemplateTable:
         self.normal, self.spread = arrays['normal'], arrays['spread']
         self.grid = grid = lay_grid(scenario)
         self._resolution = Resolution.of(scenario)
-        self._max_cells = _MAX_COST // scenario.n_elements
         self._filters, self._slope_filters = arrays['filters'], arrays['slope_filters']
         self._whitener = arrays['whitener']
         self.energy, self._energy_slope = arrays['energy'], arrays['energy_slope']
@@ -239,7 +237,7 @@ class TemplateTable:
         likely = bound + self._loss >= limit[:, None]
         likely[rows, first.ravel()] = False
         if draw:
-            many = np.count_nonzero(likely, axis=1) > self._max_cells
+            many = np.count_nonzero(likely, axis=1) > _MAX_CELLS
             drawn = [row for row in np.flatnonzero(many).tolist() if draw(query, row)]
             if drawn:
                 likely[drawn] = False
