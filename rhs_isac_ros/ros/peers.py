@@ -227,9 +227,13 @@ class Peers:
             try:
                 publisher.publish(convert.to_bytes(
                     self._presences.own, self._node.get_clock().now().nanoseconds, frame=''))
-            # The node was destroyed, or its context was shut down.
-            except (InvalidHandle, rclpy_implementation.RCLError):
+            except InvalidHandle:  # The node was destroyed.
                 return
+            except rclpy_implementation.RCLError as error:
+                if not self._node.context.ok():
+                    return
+                self._node.get_logger().error(
+                    f'others may miss this node: {topics.PRESENCE}: {error}', once=True)
             self._closed.wait(PERIOD_S)
 
     def _receive(self, content: bytes) -> None:

@@ -1,11 +1,13 @@
 """What a node knows about others from the ROS graph."""
 
+import threading
 import time
 from unittest import mock
 
 import numpy as np
 import pytest
 from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
@@ -363,6 +365,23 @@ def test_a_node_announces_itself_periodically_also_while_it_computes(bench, prob
     busy.close()
     assert {(one.sender, one.node, one.scenario_id) for one in received} == {
         (node.instance, '/channel', node.scenario.id)}
+
+
+def test_a_failed_announcement_is_logged_and_the_next_follows():
+    node, announced = mock.MagicMock(), threading.Event()
+
+    def publish(content):
+        if node.create_publisher.return_value.publish.call_count == 1:
+            raise rclpy_implementation.RCLError('no memory')
+        announced.set()
+    node.get_fully_qualified_name.return_value = '/channel'
+    node.get_clock.return_value.now.return_value.nanoseconds = 0
+    node.create_publisher.return_value.publish.side_effect = publish
+    found = Peers(node, 'channel', 1, Scenario(), lambda missing: None, lambda stands_by: None)
+    assert announced.wait(30.0)
+    found.close()
+    (call,) = node.get_logger.return_value.error.call_args_list
+    assert call.args == ('others may miss this node: presence: no memory',)
 
 
 def test_the_own_standstill_is_no_silence_of_others(bench, add_channel, monkeypatch):
