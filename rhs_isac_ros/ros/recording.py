@@ -17,7 +17,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
@@ -163,8 +162,8 @@ class Recorder:
 
 def read(
         path: str | Path, names: Collection[str] | None = None
-) -> Iterator[tuple[str, Any, float]]:
-    """Yield the topic, the ROS message and the time [s] of each message, as recorded.
+) -> Iterator[tuple[str, bytes, float]]:
+    """Yield the topic, the bytes (CDR) and the time [s] of each message, as recorded.
 
     `names` selects topics by their full names; None selects all. Raises RecordingError if the file
     cannot be read, or a recorded message has other fields than the installed one.
@@ -177,8 +176,7 @@ def read(
                 if found.id not in checked:
                     _check_schema(path, found, kinds[found.name])
                     checked.add(found.id)
-                yield (channel.topic, deserialize_message(message.data, kinds[found.name]),
-                       1e-9 * message.log_time)
+                yield channel.topic, message.data, 1e-9 * message.log_time
 
 
 def _check_schema(path: str | Path, found: Any, kind: type) -> None:
