@@ -112,13 +112,11 @@ class InnovationTest:
     Twice an energy has approximately a chi-square distribution; `Estimate.expected_residual` is
     half its mean. Raises ValueError if the window is shorter than `MIN_RETURN`, because no warning
     would end.
-
-    Attributes
-    ----------
-    drifts
-        Whether the residuals deviate from the model: True once their mean or variance over the
-        window is improbable, until both are probable for the latest `MIN_RETURN`.
     """
+
+    #: Whether the residuals deviate from the model: True once their mean or variance over the
+    #: window is improbable, until both are probable for the latest `MIN_RETURN`.
+    drifts: bool
 
     def __init__(self, window: int = WINDOW) -> None:
         if window < MIN_RETURN:
