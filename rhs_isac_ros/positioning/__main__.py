@@ -71,7 +71,7 @@ def _run(options: argparse.Namespace) -> None:
     with progress_bar(options.epochs, 'epoch', quiet=options.quiet) as show:
         network = train(
             scenario, codebook, options.pairs, options.seed, options.hidden, options.epochs,
-            show and (lambda epoch: show(epoch.number, f'{epoch.validation_mse_m2:.3f} m^2')),
+            show and (lambda epoch, mse_m2: show(epoch, f'{mse_m2:.3f} m^2')),
             options.inputs)
     network.save(output)
     about = network.about

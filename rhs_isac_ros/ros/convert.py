@@ -106,14 +106,11 @@ def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
     return Time(sec=message.stamp_ns // 10**9, nanosec=message.stamp_ns % 10**9)
 
 
-def pose(
-        estimate: PositionEstimate, stamp: Time, frame: Frame | None = None
-) -> PoseWithCovarianceStamped:
+def pose(estimate: PositionEstimate, stamp: Time, frame: Frame) -> PoseWithCovarianceStamped:
     """Return a position estimate in a frame, as a pose of unknown orientation.
 
     Each rotation has the variance of an angle that is uniform between -pi and pi.
     """
-    frame = frame or Frame()
     result = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=frame.name))
     result.pose.pose.position = frames.to_ros(Point, frame.from_surface(estimate.position))
     result.pose.covariance = _with_rotation(
@@ -122,12 +119,11 @@ def pose(
 
 
 def odometry(
-        user: int, estimate: TrackEstimate, stamp: Time, frame: Frame | None = None) -> Odometry:
+        user: int, estimate: TrackEstimate, stamp: Time, frame: Frame) -> Odometry:
     """Return the position and velocity of a track; orientation and angular velocity are unknown.
 
     The child frame, in which the velocity is given, has the axes of the frame.
     """
-    frame = frame or Frame()
     result = true_odometry(user, estimate.mean, estimate.velocity, stamp, frame)
     result.pose.covariance = _with_rotation(
         frame.covariance(estimate.covariance), math.pi**2 / 3)

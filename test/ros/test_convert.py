@@ -20,6 +20,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import MessageError, check
 from rhs_isac_ros.ros import cdr, convert, topics
 from rhs_isac_ros.ros.convert import CodebookMessage
+from rhs_isac_ros.ros.frames import Frame
 
 SIZES = Scenario().sizes
 STAMP = Time(sec=12, nanosec=345)
@@ -324,7 +325,7 @@ def test_pose_holds_position_and_covariance():
     estimate = dataclasses.replace(
         random_message(m.PositionEstimate, rng), position=np.array([9.0, -2.0, 0.5]),
         covariance_m2=root @ root.T)
-    pose = convert.pose(estimate, STAMP)
+    pose = convert.pose(estimate, STAMP, Frame())
     assert (pose.header.stamp, pose.header.frame_id) == (STAMP, 'map')
     point, turn = pose.pose.pose.position, pose.pose.pose.orientation
     assert (point.x, point.y, point.z) == (9.0, -2.0, 0.5)
