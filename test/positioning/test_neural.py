@@ -105,7 +105,7 @@ def test_networks_are_reproducible_by_their_seed(scenario, codebook):
 
 def test_training_stops_when_the_validation_error_does_not_fall(scenario, codebook):
     epochs = []
-    network = train(scenario, codebook, 40, 0, 64, 2000, epochs.append)
+    network = train(scenario, codebook, 40, 0, 64, 2000, lambda *epoch: epochs.append(epoch))
     assert network.about['epochs'] + 4 <= len(epochs) < 2000
 
 
