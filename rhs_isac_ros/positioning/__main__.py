@@ -50,8 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help='file to write; an existing file is replaced at the end')
     add('--quiet', action='store_true', help='show no progress')
     options = parser.parse_args(arguments)
-    check_distinct(parser, {'--scenario': options.scenario, '--codebook': options.codebook},
-                   {'--output': options.output})
+    check_distinct(parser, options)
     try:
         _run(options)
     except KeyboardInterrupt:

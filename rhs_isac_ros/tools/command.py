@@ -60,7 +60,6 @@ class ToolError(RuntimeError):
 def entry(
         work: Callable[[argparse.Namespace, list[str]], int],
         make_parser: Callable[[], argparse.ArgumentParser],
-        inputs: Sequence[str] = (), outputs: Sequence[str] = (),
         conflict: Callable[[argparse.Namespace], str] = lambda options: ''
 ) -> Callable[..., int]:
     """Return the main function of a command whose command line may contain ROS arguments.
@@ -73,8 +72,6 @@ def entry(
     ----------
     work
         Takes the options, and the command line with the name of the program.
-    inputs, outputs
-        Options with names of files. All outputs must differ from each other and from the inputs.
     conflict
         Returns an error if options contradict each other, otherwise ''.
     """
@@ -83,9 +80,7 @@ def entry(
         options = parse(parser, arguments)
         if problem := conflict(options):
             parser.error(problem)
-        given, written = ({name: getattr(options, name.removeprefix('--')) for name in names}
-                          for names in (inputs, outputs))
-        check_distinct(parser, given, written)
+        check_distinct(parser, options)
         try:
             return work(options, [parser.prog, *arguments])
         except (KeyboardInterrupt, ExternalShutdownException):

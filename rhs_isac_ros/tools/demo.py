@@ -201,8 +201,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     check_domain(parser)
-    check_distinct(parser, {'--config': options.config, '--codebook': options.codebook},
-                   {'--record': options.record, '--picture': options.picture})
+    check_distinct(parser, options)
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
         recorder = Recorder(options.record, scenario) if options.record else None

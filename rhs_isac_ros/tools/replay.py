@@ -384,4 +384,4 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-main = command.entry(_replay, _parser, conflict=_conflict)
+main = command.entry(_replay, _parser, _conflict)

@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument('--picture', type=picture_file,
                         help='file for the picture of (a) to (c): PNG, PDF or SVG')
     options = parser.parse_args()
-    check_distinct(parser, {}, {'--json': options.json, '--picture': options.picture})
+    check_distinct(parser, options)
     restrict_to(options.threads)
     if not HAVE_JAX:
         print('JAX is not installed, so its figures are omitted; to install it: '
