@@ -27,6 +27,7 @@ import numpy as np
 
 from rhs_isac_ros.model.arrays import check_arrays, read_only
 from rhs_isac_ros.model.external import ArrayFile
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import (
     ArchiveError,
     read_archive,
@@ -120,13 +121,11 @@ class MultipathEstimate(ArrayFile):
     def load(cls, path: str | Path) -> 'MultipathEstimate':
         """Read an estimate from a file; raise ArchiveError if the file is invalid."""
         arrays, about = read_archive(path, 'multipath', _FORMAT, {'radiation', 'excess'})
-        try:
+        with translated((KeyError, TypeError, ValueError), ArchiveError, path):
             content: dict[str, Any] = {name: float(about[name]) for name in FIELDS}
             content |= {name: array.astype(complex) for name, array in arrays.items()}
             content |= {name: dict(about[name]) for name in ('conditions', 'about')}
             return cls(**content, origin=str(path))
-        except (KeyError, TypeError, ValueError) as error:
-            raise ArchiveError(f'{path}: {error}') from None
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -271,12 +270,10 @@ class PathChannel(ArrayFile):
         Raises ArchiveError, with the name of the array, if the content is invalid.
         """
         arrays = read_arrays(path)
-        try:
+        with translated((TypeError, ValueError), ArchiveError, path):
             for name in _TYPES:
                 if name not in arrays and name != 'gains':
                     raise ArchiveError(f'{name}: missing, expected an array of this name')
             content: dict[str, Any] = {
                 name: arrays[name].astype(kind) for name, kind in _TYPES.items() if name in arrays}
             return cls(**content | {'f0': float(arrays['f0'])}, origin=str(path))
-        except (TypeError, ValueError) as error:
-            raise ArchiveError(f'{path}: {error}') from None

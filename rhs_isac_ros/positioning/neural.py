@@ -25,6 +25,7 @@ from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
 from rhs_isac_ros.support.optional import optional_import
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -112,17 +113,13 @@ class Network:
     @classmethod
     def load(cls, path: str | Path) -> 'Network':
         """Read a model from a file, or raise `ModelError`."""
-        try:
+        with translated(ArchiveError, ModelError):
             arrays, about = read_archive(path, 'model', _FORMAT, set(_KEYS.values()))
-        except ArchiveError as error:
-            raise ModelError(str(error)) from error
         inputs = str(about.pop('inputs', 'parts'))
-        try:
+        with translated(ValueError, ModelError, path):
             fields: dict[str, Any] = {
                 name: arrays[key].astype(float) for name, key in _KEYS.items()}
             return cls(**fields, about=about, inputs=inputs)
-        except ValueError as error:
-            raise ModelError(f'{path}: {error}') from None
 
 
 class NeuralEstimator:

@@ -23,6 +23,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, endpoints, topics
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 # Separator between the message definitions of a schema, as in ROS 1 and 2.
@@ -94,11 +95,9 @@ class Recorder:
     """
 
     def __init__(self, path: str | Path, scenario: Scenario) -> None:
-        try:
-            with optional_import('recording', extra='recording'):
-                from mcap.writer import Writer
-        except MissingLibraryError as error:
-            raise RecordingError(str(error)) from None
+        with translated(MissingLibraryError, RecordingError), optional_import(
+                'recording', extra='recording'):
+            from mcap.writer import Writer
         self._path = Path(path)
         self._partial = self._path.with_name(f'{self._path.name}.part')
         try:
@@ -215,12 +214,10 @@ def read_scenario(path: str | Path) -> Scenario | None:
 
 @contextlib.contextmanager
 def _opened(path: str | Path) -> Iterator[Any]:
-    try:
-        with optional_import('reading a recording', extra='recording'):
-            from mcap.exceptions import McapError
-            from mcap.reader import make_reader
-    except MissingLibraryError as error:
-        raise RecordingError(str(error)) from None
+    with translated(MissingLibraryError, RecordingError), optional_import(
+            'reading a recording', extra='recording'):
+        from mcap.exceptions import McapError
+        from mcap.reader import make_reader
     try:
         with Path(path).open('rb') as stream:
             yield make_reader(stream)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field
 from rhs_isac_ros.support.files import check_writable
 from rhs_isac_ros.support.pictures import picture_format
@@ -97,10 +98,8 @@ def output_file(text: str) -> Path:
 
 def picture_file(text: str) -> Path:
     """Parse the path of a picture that can be written, or raise argparse.ArgumentTypeError."""
-    try:
+    with translated(ValueError, argparse.ArgumentTypeError):
         picture_format(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
     return output_file(text)
 
 

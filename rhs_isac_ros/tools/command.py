@@ -34,6 +34,7 @@ from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
 from rhs_isac_ros.ros.run import parse, run
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import check_distinct, input_file
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.optional import MissingLibraryError
 
 # Period of polling the graph [s], whose changes do not wake the executor.
@@ -183,7 +184,7 @@ def recorded(
         by_topic.update(dict.fromkeys(reports, Report))
     for topic, content, time_s in read(path, by_topic):
         kind = by_topic[topic]
-        try:
+        with translated((m.MessageError, CodebookError), RecordingError, f'{path}: {topic}'):
             if kind is Report:
                 array = deserialize_message(content, DiagnosticArray)
                 yield from ((pair, time_s) for pair in diagnostics.from_ros(array, namespace))
@@ -195,8 +196,6 @@ def recorded(
                 message: m.Message = convert.from_bytes(kind, content)
                 m.check(message, scenario.sizes)
                 yield message, time_s
-        except (m.MessageError, CodebookError) as error:
-            raise RecordingError(f'{path}: {topic}: {error}') from None
 
 
 class Session(contextlib.AbstractContextManager['Session']):
