@@ -245,7 +245,7 @@ def quadratic_gradients(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute the gradients of an average, as in `Gradient`, from the sums over n items.
 
-    The sums are `GradientSums` of all bands, complex128 [N_B, N_SB F, N_E] and
+    The sums are those of `Evaluation.sums` for all bands, complex128 [N_B, N_SB F, N_E] and
     [N_B, N_SB F, N_SB F]. An estimate of the surface is treated as exact.
     """
     scenario = model.scenario
