@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import crlb, global_bound
+from rhs_isac_ros.bounds.global_bound import _Lattice
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 
@@ -76,6 +77,23 @@ def test_the_amplitude_of_strong_signals_does_not_exclude_the_truth():
     scenario, codebook, bound = bound_and_codebook(64, multipath_to_los_db=-30.0)
     assert 0 < bound.value < crlb(scenario, codebook, bound.positions).mean()
     assert bound.coarseness > 3
+
+
+def test_log_likelihoods_are_interpolated_over_the_range_also_for_wide_bands():
+    scenario = Scenario(**SMALL, center_frequencies_hz=(2e9,), subband_width_hz=4e8,
+                        roi_size_m=(8.0, 2.0, 2.0))
+    model = MeasurementModel(
+        scenario, random_codebook(scenario, np.random.default_rng(1))).prepare()
+    lattice = _Lattice(model, np.array([0.37, 0.1, 0.1]), np.array([8.0, 0.3, 0.2]))
+    signals = model.whiten(model.mean(np.array([[7.0, 0.2, 0.1]])))
+    products = lattice._products(signals)[0].view(np.float32).reshape(len(lattice._sight), -1)
+    points = lattice._sight[:, None] * lattice._ranges[:, None]
+    means = model.whiten(model.mean(points.reshape(-1, 3)))
+    exact = np.sum(2 * (means.conj() * signals).real - np.abs(means)**2, axis=(1, 2))
+    inside = np.isfinite(lattice._prior)
+    found = (products @ lattice._basis + lattice._offset)[inside] - lattice._prior[inside]
+    np.testing.assert_allclose(found, exact.reshape(inside.shape)[inside],
+                               atol=1e-3 * np.abs(exact).max())
 
 
 def test_too_few_phases_are_an_error():

@@ -15,6 +15,7 @@ from rhs_isac_ros.model import (
 )
 from rhs_isac_ros.model.elements import (
     DeclaredElements,
+    SurfaceEstimate,
     element_correlation,
     error_terms,
 )
@@ -141,6 +142,11 @@ def test_elements_are_exact_if_their_errors_are_known_or_absent(small, damaged):
     assert DeclaredElements(small.scenario).is_exact
     for name in ('element_error_rms', 'failed_element_share'):
         assert not DeclaredElements(Scenario(**{name: 1e-6})).is_exact
+    n, n_bands = small.scenario.n_elements, small.scenario.n_bands
+    for rank in (0, 1):
+        factor = np.ones((2 * n + n_bands, rank), complex)
+        assert SurfaceEstimate(np.ones(n), np.zeros(n), np.ones(n_bands), factor,
+                               np.zeros(n)).is_exact == (rank == 0)
 
 
 def test_a_given_surface_is_used(small, damaged):

@@ -316,5 +316,9 @@ def test_gains_out_of_range_are_errors(gain):
         GainPattern(lambda angles: np.full(angles.shape, gain))
 
 
+def test_a_pattern_may_be_positive_just_above_the_surface_alone():
+    GainPattern(lambda angles: np.where((1.3 < angles) & (angles < 1.5), 1.0, 0.0))
+
+
 def test_a_number_may_be_a_string():
     assert Scenario(element_gain='2e0').element_gain == 2.0

@@ -158,6 +158,11 @@ def test_half_of_the_users_must_be_in_the_region(mirror):
     Scenario(channel=moved(10))
     with pytest.raises(ScenarioError, match=re.escape('channel: users: 45 % in the region')):
         Scenario(channel=moved(11))
+    # The boundary belongs to the region, which may be flat.
+    for vertex in Scenario().roi_bounds_m:
+        Scenario(channel=dataclasses.replace(
+            mirror, users=np.tile(vertex, (20, 1)), src=np.tile(vertex, (20, 2, 1)),
+            a=0.1 * mirror.a))
 
 
 @pytest.fixture(scope='module')

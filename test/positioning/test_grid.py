@@ -99,6 +99,22 @@ def exact_log_likelihood(plain, model, received, points):
     return likelihood - energy, energy
 
 
+def test_windows_have_the_outputs_and_energies_of_their_centres(
+        scenario, model, likelihood, table):
+    y = model.whiten(model.mean(scenario.sample_positions(1, np.random.default_rng(5))))
+    query = table.query(y, likelihood.nuisance, 10.0)
+    cells = np.arange(len(table.energy))
+    windows = table.windows(query, 0, cells, table.grid.nodes[table.grid.node, 1:])
+    assert len(windows.pair) > len(cells)
+    directions = table.grid.nodes[table.grid.node[windows.pair], 1:]
+    means = model.whiten(model.mean(to_positions(np.column_stack([windows.range_m, directions]))))
+    energy = np.sum(np.abs(means)**2, axis=(1, 2))
+    np.testing.assert_allclose(windows.energy, energy, rtol=0.01)
+    outputs = np.einsum('wir,ir->iw', means.conj(), y[0])
+    np.testing.assert_allclose(
+        windows.outputs, outputs, atol=0.02 * np.abs(outputs).max())
+
+
 def test_starts_for_noiseless_signals_contain_the_true_position(scenario, model, starts):
     """Its accuracy is that of one Gauss-Newton step."""
     positions = scenario.sample_positions(20, np.random.default_rng(3))

@@ -27,6 +27,7 @@ def test_a_node_serves_alone(presences):
     assert presences.add(OWN, NOW_NS, 0.0) == []
     assert presences.update(0.0) == []
     assert not presences.stands_by
+    assert presences.rival == 0
     assert not presences.has_conflicts
     assert presences.conflicts() == {}
 

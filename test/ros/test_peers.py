@@ -127,10 +127,10 @@ def test_a_role_is_present_from_the_second_poll_in_a_row_that_finds_it():
         poll()
         return {} in reports
 
-    # A role that every other poll finds is missing.
-    for _ in range(50):
-        assert not poll_while(present=True)
-        assert not poll_while(present=False)
+    # A role that every other poll finds is missing, which is reported after a grace period.
+    for number in range(1, 101):
+        assert not poll_while(present=number % 2)
+        assert bool(reports) == (number >= peers._GRACE_POLLS)
     assert reports == [{'channel': 'channel', 'bs': 'bs'}]
     assert not poll_while(present=True)
     assert poll_while(present=True)

@@ -20,6 +20,15 @@ def test_an_invalid_recording_is_named_before_the_network_starts(tmp_path, capsy
     assert f'--record: {tmp_path}/none/run.mcap: expected a file in a directory' in err
 
 
+def test_progress_is_printed_at_the_start_after_ten_cycles_and_at_the_end(monkeypatch, capsys):
+    monkeypatch.setenv('ROS_DOMAIN_ID', '7')
+    for complete in range(13):
+        demo._show_progress(complete, 12)
+    assert capsys.readouterr().err.splitlines() == [
+        'network started with ROS_DOMAIN_ID=7, waiting for the first cycle',
+        'cycle 10 of 12', 'cycle 12 of 12']
+
+
 def test_a_signal_during_the_start_completes_the_recording(tmp_path, monkeypatch):
     pytest.importorskip('mcap', reason='mcap is not installed')
 

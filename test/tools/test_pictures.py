@@ -13,7 +13,7 @@ from rhs_isac_ros.link import steer
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
 from rhs_isac_ros.monitoring.network_state import SceneState
-from rhs_isac_ros.monitoring.shapes import axes_95
+from rhs_isac_ros.monitoring.shapes import MIN_LEVEL_DB, axes_95
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.support.pictures import look, write_picture
 from rhs_isac_ros.tools.pictures import compose_cycles, compose_scene
@@ -141,6 +141,10 @@ def test_title_beam_and_lobe_are_of_one_user():
     assert [text.get_text() for text in polar.get_legend().get_texts()] == [
         'over azimuth', 'over elevation']
     assert {line.get_color() for line in polar.lines} == {look(1).colour}
+    # Matplotlib would draw lower levels on the opposite side.
+    for line in polar.lines:
+        assert line.get_ydata().max() == pytest.approx(0, abs=1e-9)
+        assert line.get_ydata().min() == pytest.approx(MIN_LEVEL_DB)
     (above,) = [axes for axes in figure.axes if axes.get_ylabel() == '$y$ [m]']
     assert [to_hex(patch.get_facecolor()).upper() for patch in above.patches
             if type(patch) is Polygon] == [look(1).colour]
@@ -221,6 +225,15 @@ def test_every_cycle_has_its_number_beside_its_true_position(panels):
     assert {text.get_text(): tuple(text.xy) for text in numbers} == {
         str(cycle.cycle_id): pytest.approx(cycle.truth.position[:2])
         for cycle in make_cycles(20)}
+
+
+def test_a_line_joins_each_true_position_and_its_estimate(panels):
+    # The surface is a line at x = 0.
+    joined = [line.get_xydata().tolist() for line in panels[1].lines
+              if len(line.get_xydata()) == 2 and line.get_xdata().any()]
+    cycles = make_cycles(20)
+    np.testing.assert_allclose(sorted(joined), sorted(
+        [one.position[:2].tolist() for one in (cycle.truth, cycle.estimate)] for cycle in cycles))
 
 
 def test_the_errors_and_their_bounds_are_in_the_order_of_the_cycles(panels):

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import headless_browser
@@ -20,6 +21,8 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring import network_view
 from rhs_isac_ros.monitoring.shapes import user_colour
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import endpoints
 from rhs_isac_ros.ros.recording import (
     CycleObserver,
     Recorder,
@@ -55,6 +58,7 @@ def test_without_rerun_one_line_names_the_command_that_installs_it(monkeypatch, 
     (['run.mcap', '--track-speed', '2'], 'argument --track-speed: expected together with --track'),
     (['--track'], 'arguments --track and --namespace: expected together with a recording'),
     (['--port', '65534'], 'argument --port: '),
+    (['--cycles', '0'], 'argument --cycles: '),
     (['missing.mcap'], 'argument file: ')])
 def test_an_invalid_argument_is_named(arguments, reason, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
@@ -124,6 +128,40 @@ def test_a_running_network_is_shown(shared_session, monkeypatch):
         shared_session._executor.remove_node(node)
         node.destroy_node()
     assert not node.mismatch
+
+
+def test_signals_wait_for_their_codebook_and_for_the_search_before_them(
+        shared_session, monkeypatch, random_beams):
+    scenario, searched, jobs = Scenario(), [], []
+    codebook = random_beams(scenario, np.random.default_rng(0))
+
+    class Prepared(dict):
+        def add(self, codebook):
+            self[codebook.id] = codebook
+
+        def bound_m2(self, codebook):
+            return 1.0
+
+        def modes(self, received):
+            searched.append(received.cycle_id)
+    monkeypatch.setattr(endpoints, 'BackgroundWorker', lambda node: types.SimpleNamespace(
+        run=lambda job, on_result: jobs.append(lambda: on_result(job())), close=lambda: None))
+    node = ViewNode(scenario, Prepared(), list)
+    try:
+        for _ in range(2):
+            node._on_codebook(codebook)
+        for cycle_id in (3, 4):
+            node._on_message(m.ReceivedSignals(
+                cycle_id=cycle_id, user=1, codebook_id=codebook.id,
+                signals=np.zeros((2, 8, 4), complex)))
+            # The codebook, then its bound and the search.
+            assert len(jobs) == cycle_id - 2
+            jobs.pop(0)()
+        while jobs:
+            jobs.pop(0)()
+    finally:
+        node.destroy_node()
+    assert searched == [3, 4]
 
 
 def test_a_network_of_another_scenario_is_not_shown(shared_session):
