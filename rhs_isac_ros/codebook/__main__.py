@@ -149,10 +149,7 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     output, partial = options.output, _partial(options.output)
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
     objective = options.objective or ('error' if options.spectrum else 'crlb')
-    calibration = None
-    if options.calibration:
-        calibration = Calibration.load(options.calibration)
-        calibration.check(scenario)
+    calibration = Calibration.load(options.calibration) if options.calibration else None
     start = _start(options.start, scenario, options.seed)
     resumed = Codebook.load(partial if partial.exists() else output) if options.resume else None
     for codebook in filter(None, (start, resumed)):

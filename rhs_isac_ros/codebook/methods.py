@@ -34,8 +34,8 @@ def run_lbfgs(
         on_step: Callable[[], None], memory: int = _MEMORY) -> Any:
     """Minimise a function that returns its value and gradient, with SciPy's L-BFGS-B.
 
-    The `OptimizeResult` does not depend on the unit of the positive values. `on_step` is called
-    after each step.
+    The steps do not depend on the unit of the positive values; `fun` and `jac` of the
+    `OptimizeResult` are relative to the first value. `on_step` is called after each step.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import minimize
@@ -51,13 +51,11 @@ def run_lbfgs(
         unit = unit or value or 1.0
         return value / unit, gradient / unit
 
-    result = minimize(
+    return minimize(
         relative, start, jac=True, method='L-BFGS-B', bounds=bounds,
         callback=lambda _: on_step(),
         options={'maxiter': max_steps, 'maxfun': 20 * max_steps,
                  'maxcor': memory, 'ftol': 1e-10, 'gtol': 1e-10})
-    result.fun, result.jac = unit * result.fun, unit * result.jac
-    return result
 
 
 # Objectives with fewer pairs are evaluated with all pairs.

@@ -20,7 +20,7 @@ from rhs_isac_ros.support import plugins, streams
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import ParameterError
 
-# Period at which a frame is looked up [s].
+# Period of looking up a frame, and of checking whether a robot has a position [s].
 _LOOKUP_S = 0.02
 # Maximum difference between a stamp and the clock of the node [s].
 _MAX_AGE_S = 5.0
@@ -133,10 +133,6 @@ def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> Robo
     return mobility
 
 
-# Period of checking whether a robot has a position [s].
-_WATCH_S = 0.1
-
-
 class UserNode(RoleNode[User]):
     """One or many users of the network."""
 
@@ -157,7 +153,7 @@ class UserNode(RoleNode[User]):
         endpoints.create_timer(self, values.ground_truth_period_s, self._publish_ground_truth)
         if robot := self._robot:
             self._watch_robot(robot)
-            endpoints.steady_timer(self, _WATCH_S, functools.partial(self._watch_robot, robot))
+            endpoints.steady_timer(self, _LOOKUP_S, functools.partial(self._watch_robot, robot))
 
     def _mobilities(self) -> dict[int, mobility.Mobility]:
         values = self.values
