@@ -300,10 +300,9 @@ class Positioner(Role):
             self.count(Outcome.DUPLICATE)
             self._actions += self._answered[1]
         elif received.codebook_id in self._estimators:
-            n_before = len(self._actions)
             self._locate(received, now_s)
             self._answered = received, [
-                action for action in self._actions[n_before:] if isinstance(action, events.Send)]
+                action for action in self._actions if isinstance(action, events.Send)]
         elif received.codebook_id in {
                 job.codebook.id for job in (self._building, self._next) if job}:
             self._waiting = received, now_s
