@@ -403,7 +403,7 @@ def test_the_own_standstill_is_no_silence_of_others(bench, add_channel, monkeypa
     assert not older.stands_by
 
 
-@pytest.mark.parametrize('scenario', ['[', '3', 'a: b: c'])
+@pytest.mark.parametrize('scenario', ['[', '3', 'a: b: c', r'{"a": "\ud800"}'])
 def test_invalid_announcements_are_ignored(bench, probe, add_channel, scenario):
     node = add_channel()
     publisher = probe.create_publisher(ros.Presence, topics.PRESENCE, LATCHED)
