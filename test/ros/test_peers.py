@@ -384,6 +384,14 @@ def test_a_failed_announcement_is_logged_and_the_next_follows():
     assert call.args == ('others may miss this node: presence: no memory',)
 
 
+def test_a_node_whose_announcements_have_no_thread_reports_that(bench, add_channel, monkeypatch):
+    with monkeypatch.context() as limited:
+        limited.setattr(threading.Thread, 'start', mock.Mock(side_effect=RuntimeError('no more')))
+        node = add_channel()
+    assert 'thread of announcements was refused: no more' in node.report().summary
+    bench.remove(node)
+
+
 def test_the_own_standstill_is_no_silence_of_others(bench, add_channel, monkeypatch):
     older, newer = (add_channel(name) for name in ('older', 'newer'))
     bench.until(lambda: older.stands_by, 'the newer node')
