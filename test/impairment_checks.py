@@ -35,7 +35,8 @@ def draw(scenario: Scenario, n: int = 3, user: int = 1, cycle: int = 2) -> np.nd
 
 def has_a_prior_and_a_pattern_for_each_value(declared: dict) -> None:
     scenario, impairment = only(declared)
-    size, linear = impairment.size(scenario), impairment.linear(scenario)
+    linear = impairment.linear(scenario)
+    size = len(linear.root)
     assert size > 0
     assert linear.patterns.shape == (size, 3, 8)
     assert linear.patterns.any(axis=(1, 2)).all()

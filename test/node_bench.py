@@ -16,6 +16,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.type_support import check_for_type_support
+from ros_messages import from_ros
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.ros import convert, topics
@@ -81,7 +82,7 @@ class Bench:
         received = []
         subscription = node.create_subscription(
             convert.ros_type(kind), topics.NAMES[kind],
-            lambda message: received.append(convert.from_ros(kind, message)), EXCHANGE)
+            lambda message: received.append(from_ros(kind, message)), EXCHANGE)
         self.until(subscription.get_publisher_count, f'a publisher of {kind.__name__}')
         return received
 

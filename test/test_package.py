@@ -35,8 +35,8 @@ PIP_ONLY = {
 OWN = {
     'rhs_isac_ros', 'parts', 'peers', 'diagram', 'sequence', 'run_notebook', 'pictures',
     'conftest', 'forked',
-    'headless_browser', 'impairment_checks', 'in_memory_network', 'node_processes', 'system',
-    'test_installation'}
+    'headless_browser', 'impairment_checks', 'in_memory_network', 'node_processes', 'ros_messages',
+    'system', 'test_installation'}
 
 
 @functools.cache

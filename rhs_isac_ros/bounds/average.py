@@ -97,12 +97,10 @@ class Average:
         Rows of the form, if they differ from the rows of the source.
     tick
         Called repeatedly while the rows are computed; an exception ends the computation.
-
-    Attributes
-    ----------
-    surface
-        An estimate of the surface that is treated as exact; None for the scenario's elements.
     """
+
+    #: An estimate of the surface that is treated as exact; None for the scenario's elements.
+    surface: SurfaceEstimate | None = None
 
     @one_blas_thread
     def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
@@ -110,7 +108,6 @@ class Average:
                  combination: Combination | None = None, tick: Tick = no_tick) -> None:
         self.scenario, self._loss = scenario, loss
         self._n_rows, self._combination = n_rows, combination
-        self.surface: SurfaceEstimate | None = None
         self.rows = rows_within(
             scenario, source, n_items, n_rows, tolerance, patterns, tick)
 
@@ -248,7 +245,7 @@ def quadratic_gradients(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute the gradients of an average, as in `Gradient`, from the sums over n items.
 
-    The sums are `GradientSums` of all bands, complex128 [N_B, N_SB F, N_E] and
+    The sums are those of `Evaluation.sums` for all bands, complex128 [N_B, N_SB F, N_E] and
     [N_B, N_SB F, N_SB F]. An estimate of the surface is treated as exact.
     """
     scenario = model.scenario

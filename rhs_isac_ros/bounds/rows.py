@@ -7,7 +7,6 @@ of the mean signals, as in Eq. (13). Whitened means take most of the time of an 
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -42,17 +41,6 @@ MIN_TOLERANCE = 1e-7
 
 def no_tick() -> None:
     """Do nothing."""
-
-
-class GradientSums(NamedTuple):
-    """Sums over all items from which the gradients of one band are computed.
-
-    Here, zeta is Lambda^-1 times the means, and w is Lambda^-1 times the weighted means.
-    """
-
-    # Sum of w conj(row) [N_SB F, N_E], and of w zeta^H [N_SB F, N_SB F].
-    mean_term: np.ndarray
-    covariance_term: np.ndarray
 
 
 class MeasurementRows:
@@ -156,8 +144,12 @@ class Evaluation:
                 np.swapaxes(chosen, 1, 2),
                 np.moveaxis(grouped[:, part], 2, 0).reshape(n_groups, chosen.shape[1], -1))
 
-    def sums(self, band: int) -> GradientSums:
-        """Return the sums over all blocks passed to `accumulate`."""
+    def sums(self, band: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sums of w conj(row) [N_SB F, N_E] and of w zeta^H [N_SB F, N_SB F].
+
+        They include all blocks passed to `accumulate`. Here, zeta is Lambda^-1 times the means,
+        and w is Lambda^-1 times the weighted means.
+        """
         whitener, products = self._whitener[band], self._products[band]
         total = np.zeros(())
         for (_, pattern), filters, gathered in zip(
@@ -169,8 +161,7 @@ class Evaluation:
             if pattern is not None:
                 weights = weights * np.conj(pattern[band])
             total = total + weights
-        return GradientSums(
-            self._rows.sums(band, total), np.conj(whitener.T) @ products @ whitener)
+        return self._rows.sums(band, total), np.conj(whitener.T) @ products @ whitener
 
 
 def rows_within(

@@ -12,6 +12,7 @@ from rhs_isac_ros.calibration.estimate import TOLERANCE, Pilots, estimate_surfac
 from rhs_isac_ros.calibration.mixture import SurfacePrior
 from rhs_isac_ros.model import Scenario, SurfaceEstimate
 from rhs_isac_ros.model.arrays import check_arrays, read_only
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
 
 _FORMAT = 1
@@ -89,16 +90,12 @@ class Calibration:
     @classmethod
     def load(cls, path: str | Path) -> 'Calibration':
         """Read a calibration from a file; raise CalibrationError if the file is invalid."""
-        try:
+        with translated(ArchiveError, CalibrationError):
             arrays, about = read_archive(path, 'calibration', _FORMAT, {*_ARRAYS, *_DEVIATIONS})
-        except ArchiveError as error:
-            raise CalibrationError(str(error)) from error
-        try:
+        with translated((TypeError, ValueError), CalibrationError, path):
             surface = SurfaceEstimate(**{
                 name: arrays[name].astype(kind) for name, kind in _ARRAYS.items()})
             return cls(surface, str(about.pop('scenario_id', '')), about)
-        except (TypeError, ValueError) as error:
-            raise CalibrationError(f'{path}: {error}') from None
 
 
 def calibrate(scenario: Scenario, pilots: Sequence[Pilots],
@@ -128,10 +125,8 @@ def load_surface(path: str, scenario: Scenario) -> SurfaceEstimate | None:
     if not path:
         return None
     calibration = Calibration.load(path)
-    try:
+    with translated(CalibrationError, CalibrationError, path):
         calibration.check(scenario)
-    except CalibrationError as error:
-        raise CalibrationError(f'{path}: {error}') from None
     return calibration.surface
 
 

@@ -83,22 +83,22 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
         raise ValueError('positions: none given, expected at least one')
     fit = _fitted(dataclasses.replace(scenario, multipath=None), pilots, surface)
     model, n_sight = MeasurementModel(fit.fields, codebook, surface), int(fit.in_sight.sum())
-    left_out = _left_out(model, pilots.positions[fit.in_sight], fit.residuals[fit.in_sight],
-                         fit.total, fit.weight + n_sight - 1)
+    distances, energies = _left_out(
+        model, pilots.positions[fit.in_sight], fit.residuals[fit.in_sight], fit.total,
+        fit.weight + n_sight - 1)
     n_measurements = int(np.prod(model.shape))
-    level_std_db = _level_std_db(left_out, n_measurements)
+    level_std_db = _level_std_db(energies, n_measurements)
     # Estimators scale the covariance of a position by the level that the residual indicates.
-    relative = left_out.energies / n_measurements
-    left_out = left_out._replace(distances=left_out.distances / relative**share_of_level(
-        n_measurements, level_std_db))
-    inflation = _inflation(left_out, n_measurements)
+    relative = energies / n_measurements
+    distances = distances / relative**share_of_level(n_measurements, level_std_db)
+    inflation = _inflation(distances, energies, n_measurements)
     measured, declared = inflation * fit.total / (fit.weight + n_sight), model.covariance()
     inverse = np.linalg.inv(declared)
     excess = inverse @ (measured - declared) @ inverse
     texts = _warnings(scenario, pilots.positions[fit.in_sight])
     if texts:
         warnings.warn('; '.join(texts), SurveyWarning, stacklevel=3)
-    inside = int(np.sum(left_out.distances <= inflation * _radius()))
+    inside = int(np.sum(distances <= inflation * _radius()))
     interval = binomtest(inside, n_sight).proportion_ci(method='wilson')
     about: dict[str, Any] = {
         'positions': n_sight, 'blocked': n - n_sight, 'prior_weight': fit.weight,
@@ -220,19 +220,13 @@ def _log_evidence(declared: np.ndarray, sample: np.ndarray, n: int, weight: floa
     return float(n_bands * volume + degrees * before - (degrees + n) * after)
 
 
-class _LeftOut(NamedTuple):
-    """Squared Mahalanobis distances of local position errors, and energies of residuals [N]."""
-
-    distances: np.ndarray
-    energies: np.ndarray
-
-
 def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndarray,
-              total: np.ndarray, n_others: float) -> _LeftOut:
+              total: np.ndarray, n_others: float) -> tuple[np.ndarray, np.ndarray]:
     """Evaluate each position under the covariance ``(total - e e^H) / n_others`` of the others.
 
     `total` is complex128 [N_B, R, R]; the residuals e are complex128 [N, N_B, R]. An error is a
-    scoring step from the true position, with unknown nuisance parameters.
+    scoring step from the true position, with unknown nuisance parameters. Returns the squared
+    Mahalanobis distances of the errors, and the energies of the residuals [N].
     """
     whitener = np.linalg.inv(np.linalg.cholesky(total))
     nuisance = nuisance_of(model.scenario).scaled_patterns
@@ -250,8 +244,8 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     information = 2 * n_others * information.real + prior
     gradient = 2 * n_others * np.einsum('nai,ni->na', products[:, :3], own).real
     covariance = np.linalg.inv(information)[:, :3, :3]
-    return _LeftOut(np.einsum('na,nab,nb->n', gradient, covariance, gradient),
-                    n_others * np.sum(own - 1, axis=1))
+    return (np.einsum('na,nab,nb->n', gradient, covariance, gradient),
+            n_others * np.sum(own - 1, axis=1))
 
 
 def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndarray,
@@ -278,24 +272,23 @@ def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     return result if result.any() else np.ones(len(result), bool)
 
 
-def _inflation(left_out: _LeftOut, n_measurements: int) -> float:
+def _inflation(distances: np.ndarray, energies: np.ndarray, n_measurements: int) -> float:
     """Return t, including the margin for small surveys."""
     from scipy.special import gammainccinv
 
-    n = len(left_out.energies)
-    most = max(1.0, float(left_out.energies.mean()) / n_measurements,
-               float(np.quantile(left_out.distances, COVERAGE)) / _radius(),
-               float(np.quantile(left_out.energies, _PASSING)
+    most = max(1.0, float(energies.mean()) / n_measurements,
+               float(np.quantile(distances, COVERAGE)) / _radius(),
+               float(np.quantile(energies, _PASSING)
                      / gammainccinv(n_measurements, _FALSE_ALARM)))
-    weights = np.array([n, _INFLATION_WEIGHT])
+    weights = np.array([len(energies), _INFLATION_WEIGHT])
     return float(np.exp(weights @ np.log([most, _INFLATION]) / weights.sum()))
 
 
-def _level_std_db(left_out: _LeftOut, n_measurements: int) -> float:
+def _level_std_db(energies: np.ndarray, n_measurements: int) -> float:
     """Return the standard deviation of the power of the residuals among users [dB]."""
-    n = len(left_out.energies)
+    n = len(energies)
     # Even energies of Gaussian residuals with equal power vary.
-    excess = max(float(np.var(np.log(left_out.energies))) - 1 / n_measurements, 0.0)
+    excess = max(float(np.var(np.log(energies))) - 1 / n_measurements, 0.0)
     usual = (np.log(10) / 10 * _LEVEL_STD_DB)**2
     variance = (n * excess + _INFLATION_WEIGHT * usual) / (n + _INFLATION_WEIGHT)
     return float(10 / np.log(10) * np.sqrt(variance))

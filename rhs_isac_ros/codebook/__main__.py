@@ -120,11 +120,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Exit with a usage error if options contradict each other or a library is missing."""
-    inputs = {'--scenario': options.scenario, '--calibration': options.calibration}
-    outputs = {'--output': options.output, '--plot': options.plot}
-    if options.spectrum:
-        outputs['--plan'] = Path(options.plan)
-    check_distinct(parser, inputs, outputs)
+    check_distinct(parser, options, '' if options.spectrum else 'plan')
     if bool(options.spectrum) != bool(options.bands):
         parser.error('argument --bands: expected together with --spectrum')
     if options.spectrum and (options.start or options.resume):

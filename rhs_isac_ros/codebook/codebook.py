@@ -21,6 +21,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.scenario import check_shape
 from rhs_isac_ros.model.surface import on_levels
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import read_yaml, write_whole
 
 # Node with the parameters in a codebook file, in any namespace.
@@ -89,11 +90,9 @@ class Codebook:
         Sizes and the power of each frame must be as in the scenario, and configurations must
         consist of its amplitude levels.
         """
-        try:
+        with translated(ValueError, CodebookError):
             check_shape('analog', self.analog, 'N_B F N_E', scenario)
             check_shape('digital', self.digital, 'N_B N_SB F K', scenario)
-        except ValueError as error:
-            raise CodebookError(str(error)) from None
         power = np.sum(np.abs(self.digital)**2, axis=(1, 3))
         worst = power.flat[np.abs(power - scenario.max_power_w).argmax()]
         if abs(worst - scenario.max_power_w) > _POWER_TOLERANCE * scenario.max_power_w:
@@ -157,18 +156,14 @@ class Codebook:
     @classmethod
     def load(cls, path: str | Path) -> 'Codebook':
         """Read a ROS 2 parameter file, or raise CodebookError if it has no valid codebook."""
-        try:
+        with translated(ValueError, CodebookError):
             content = read_yaml(path)
-        except ValueError as error:
-            raise CodebookError(str(error)) from error
         for node in content.values() if isinstance(content, dict) else ():
             parameters = node.get('ros__parameters', {}) if isinstance(node, dict) else {}
             values = parameters.get('codebook') if isinstance(parameters, dict) else None
             if isinstance(values, dict):
-                try:
+                with translated(CodebookError, CodebookError, path):
                     return cls.from_parameters({f'codebook.{k}': v for k, v in values.items()})
-                except CodebookError as error:
-                    raise CodebookError(f'{path}: {error}') from None
         raise CodebookError(f'{path}: expected ros__parameters with a mapping named codebook')
 
 

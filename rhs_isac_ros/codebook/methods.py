@@ -5,22 +5,16 @@ amplitudes if the elements have a few levels. The alternating, direct and geneti
 described in the paper and its references.
 """
 
-from __future__ import annotations
-
 import itertools
 import warnings
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from rhs_isac_ros.codebook.problem import Search
 from rhs_isac_ros.support.optional import optional_import
 from rhs_isac_ros.support.threads import one_blas_thread
-
-if TYPE_CHECKING:
-    # A slow import, which loading a codebook does not need.
-    from scipy.optimize import OptimizeResult
 
 # Number of corrections that approximate the Hessian: more than SciPy's default of 10, because
 # evaluations are expensive.
@@ -37,11 +31,11 @@ def minimize_lbfgs(search: Search) -> str:
 def run_lbfgs(
         objective: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray,
         bounds: Sequence[tuple[float, float] | tuple[None, None]], max_steps: int,
-        on_step: Callable[[], None], memory: int = _MEMORY) -> OptimizeResult:
+        on_step: Callable[[], None], memory: int = _MEMORY) -> Any:
     """Minimise a function that returns its value and gradient, with SciPy's L-BFGS-B.
 
-    The result does not depend on the unit of the positive values. `on_step` is called after each
-    step.
+    The `OptimizeResult` does not depend on the unit of the positive values. `on_step` is called
+    after each step.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import minimize
@@ -270,7 +264,7 @@ def minimize_interior_point(
 
     steps = evaluations = 0
 
-    def on_iteration(_: np.ndarray, state: OptimizeResult) -> bool:
+    def on_iteration(_: np.ndarray, state: Any) -> bool:
         """Count iterations that moved; SciPy also reports the start and each new barrier."""
         nonlocal steps, evaluations
         if steps < max_steps and state.nfev > max(evaluations, 1):

@@ -85,11 +85,6 @@ OBJECTIVES: Mapping[str, Callable[..., Average]] = {
     'ambiguity': ambiguity, 'crlb': average_bound, 'error': error, 'nuisance': nuisance}
 
 
-def monte_carlo(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw independent uniform positions, as the paper does, float64 [n, 3] [m]."""
-    return scenario.sample_positions(n, rng)
-
-
 def sobol(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
     """Draw scrambled Sobol points, which are more evenly spread, float64 [n, 3] [m].
 
@@ -103,8 +98,9 @@ def sobol(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
     return low + (high - low) * points
 
 
+# The paper draws independent uniform positions.
 SAMPLINGS: Mapping[str, Callable[[Scenario, int, np.random.Generator], np.ndarray]] = {
-    'monte_carlo': monte_carlo, 'sobol': sobol}
+    'monte_carlo': Scenario.sample_positions, 'sobol': sobol}
 
 # Grid points of the range lag per shortest carrier wavelength.
 _LAGS_PER_WAVELENGTH = 64

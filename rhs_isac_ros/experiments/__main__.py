@@ -42,6 +42,7 @@ from rhs_isac_ros.support.arguments import (
     positive_int,
     seed,
 )
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.pictures import write_picture
 
@@ -186,10 +187,8 @@ class _Along(argparse.Action):
 def _type(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:
     """Convert a function that raises ValueError for invalid text to a type for argparse."""
     def parse_argument(text: str) -> _Parsed:
-        try:
+        with translated(ValueError, argparse.ArgumentTypeError):
             return parse(text)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
     return parse_argument
 
 

@@ -70,11 +70,6 @@ def families(quantities: Iterable[str]) -> list[str]:
         family for family in found if family in _INCLUSIVE][-1:]
 
 
-def plain_codebook(codebook: Codebook) -> dict[str, Any]:
-    """Return the parameters of a codebook as plain lists."""
-    return {name: np.asarray(value).tolist() for name, value in codebook.to_parameters().items()}
-
-
 def with_power(codebook: Codebook, power_w: float) -> Codebook:
     """Scale the combining vectors so that each frame has a given power.
 
@@ -95,15 +90,16 @@ def design(scenario: Mapping[str, Any], kind: str, seed: int, objective: str = '
     """
     world = Scenario(**scenario)
     if kind == DIRECTIONAL:
-        return plain_codebook(directional_codebook(world))
+        return directional_codebook(world).to_parameters()
     if kind == RANDOM:
-        return plain_codebook(random_codebook(world, streams.generator(seed, streams.START)))
+        generator = streams.generator(seed, streams.START)
+        return random_codebook(world, generator).to_parameters()
     _initialise_sobol()
     result = optimize(world, objective=objective, n_positions=_SAMPLES, seed=seed,
                       max_steps=steps)
     if result.reason == INTERRUPTED:
         raise KeyboardInterrupt
-    return plain_codebook(result.codebook)
+    return result.codebook.to_parameters()
 
 
 def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, Any], seed: int,
@@ -251,7 +247,7 @@ class Sweep:
     def blocks(self, setting: Setting, codebook: Codebook) -> dict[str, list[Job]]:
         """Return the jobs that evaluate a codebook in a setting, by family of quantities."""
         quantities = [MEASURES[measure].quantity for measure in self.measures]
-        common = {'scenario': setting.scenario.changes(), 'codebook': plain_codebook(codebook),
+        common = {'scenario': setting.scenario.changes(), 'codebook': codebook.to_parameters(),
                   'seed': self.seed}
         return {family: [_job(family, {
             **common, 'family': family, 'first': first, 'n': min(BLOCK, self.n_positions - first),

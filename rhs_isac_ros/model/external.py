@@ -10,15 +10,9 @@ import numpy as np
 
 
 class External(abc.ABC):
-    """A value that a scenario writes as an origin and a digest; equal digests mean equal values.
+    """A value that a scenario writes as origin and digest; equal digests mean equal values."""
 
-    Attributes
-    ----------
-    origin
-        Path of the file, or name of the plug-in; empty for other values.
-    """
-
-    origin: str
+    origin: str  #: Path of the file, or name of the plug-in; empty for other values.
     # For error messages: the kind of value, and the values that a scenario accepts.
     WORDS: ClassVar[tuple[str, str]]
 

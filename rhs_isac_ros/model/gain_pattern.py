@@ -13,6 +13,7 @@ import numpy as np
 from rhs_isac_ros.model.arrays import digest
 from rhs_isac_ros.model.external import External
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.errors import translated
 
 # Function of angles [rad], float64 of any shape; the result has the same shape.
 AngleFunction = Callable[[np.ndarray], np.ndarray]
@@ -87,13 +88,11 @@ class GainPattern(External):
         Raises PatternError or PluginError if there is no valid pattern of this name.
         """
         source = plugins.load(plugins.GAIN_PATTERNS, origin)
-        try:
+        with translated(
+                PatternError, PatternError, plugins.describe(plugins.GAIN_PATTERNS, origin)):
             if isinstance(source, GainPattern):
                 return cls(source._amplitude, source._slope, origin)
             return cls(source, origin=origin)
-        except PatternError as error:
-            raise PatternError(
-                f'{plugins.describe(plugins.GAIN_PATTERNS, origin)}: {error}') from None
 
 
 def _evaluate(function: AngleFunction, angles: np.ndarray) -> np.ndarray:

@@ -27,6 +27,7 @@ import numpy as np
 
 from rhs_isac_ros.model.arrays import check_arrays, read_only
 from rhs_isac_ros.model.external import ArrayFile
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import (
     ArchiveError,
     read_archive,
@@ -60,30 +61,19 @@ class MultipathEstimate(ArrayFile):
     """A measured covariance of the multipath, as a value of the field `Scenario.multipath`.
 
     Raises ArchiveError if sizes disagree or a number is not finite.
-
-    Attributes
-    ----------
-    multipath_to_los_db, delay_spread_s, angular_spread_deg
-        The fields that declare C_0.
-    radiation
-        T_i of the survey, complex128 [N_B, N_SB F, N_E].
-    excess
-        M_i, complex128 [N_B, N_SB F, N_SB F] [1/W].
-    conditions
-        Fields of the survey's scenario on which the covariance depends.
-    about
-        Record of the survey: ``positions``, the number of positions; ``prior_weight`` nu;
-        ``inflation`` t; ``level_std_db``, the standard deviation of the power among users [dB];
-        ``coverage``, the expected share of positions in the 95 % region, with its interval;
-        ``warnings``; ``codebook``, its id; ``version``.
     """
 
+    # The fields that declare C_0.
     multipath_to_los_db: float
     delay_spread_s: float
     angular_spread_deg: float
-    radiation: np.ndarray
-    excess: np.ndarray
-    conditions: dict[str, Any]
+    radiation: np.ndarray  #: T_i of the survey, complex128 [N_B, N_SB F, N_E].
+    excess: np.ndarray  #: M_i, complex128 [N_B, N_SB F, N_SB F] [1/W].
+    conditions: dict[str, Any]  #: Fields of the survey's scenario that the covariance depends on.
+    #: Record of the survey: ``positions``, the number of positions; ``prior_weight`` nu;
+    #: ``inflation`` t; ``level_std_db``, the standard deviation of the power among users [dB];
+    #: ``coverage``, the expected share of positions in the 95 % region, with its interval;
+    #: ``warnings``; ``codebook``, its id; ``version``.
     about: dict[str, Any] = dataclasses.field(default_factory=dict)
     origin: str = ''
 
@@ -131,13 +121,11 @@ class MultipathEstimate(ArrayFile):
     def load(cls, path: str | Path) -> 'MultipathEstimate':
         """Read an estimate from a file; raise ArchiveError if the file is invalid."""
         arrays, about = read_archive(path, 'multipath', _FORMAT, {'radiation', 'excess'})
-        try:
+        with translated((KeyError, TypeError, ValueError), ArchiveError, path):
             content: dict[str, Any] = {name: float(about[name]) for name in FIELDS}
             content |= {name: array.astype(complex) for name, array in arrays.items()}
             content |= {name: dict(about[name]) for name in ('conditions', 'about')}
             return cls(**content, origin=str(path))
-        except (KeyError, TypeError, ValueError) as error:
-            raise ArchiveError(f'{path}: {error}') from None
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -146,31 +134,17 @@ class PathChannel(ArrayFile):
 
     Users have at most P paths; the amplitude of missing ones is 0. Raises ArchiveError if sizes
     disagree, or a number is not finite or physically impossible.
-
-    Attributes
-    ----------
-    users
-        Positions, float64 [N, 3] [m], in the frame of the scenario.
-    a
-        Amplitudes at the centre of the surface and at the frequency `f0`, for antennas without
-        gain and without the phase of the distance, complex128 [N, P]; c / (4 pi f0 d) in free
-        space.
-    src
-        Virtual sources, float64 [N, P, 3] [m]; the user itself for the direct path.
-    n
-        Number of reflections, int [N, P]; 0 for the direct path, and -1 for a missing path.
-    f0
-        Frequency of the amplitudes [Hz]. Amplitudes are inversely proportional to the frequency.
-    gains
-        Factors of the paths at each element, complex128 [N, P, N_E], for objects that are visible
-        from only a part of the surface; None if all factors are 1.
     """
 
-    users: np.ndarray
+    users: np.ndarray  #: Positions, float64 [N, 3] [m], in the frame of the scenario.
+    #: Amplitudes at the centre of the surface and at the frequency `f0`, for antennas without gain
+    #: and without the phase of the distance, complex128 [N, P]; c / (4 pi f0 d) in free space.
     a: np.ndarray
-    src: np.ndarray
-    n: np.ndarray
-    f0: float
+    src: np.ndarray  #: Virtual sources, float64 [N, P, 3] [m]; the user for the direct path.
+    n: np.ndarray  #: Number of reflections, int [N, P]; 0: direct path, -1: missing path.
+    f0: float  #: Frequency of the amplitudes [Hz], which are inversely proportional to it.
+    #: Factors of the paths at each element, complex128 [N, P, N_E], for objects that are visible
+    #: from only a part of the surface; None if all factors are 1.
     gains: np.ndarray | None = None
     origin: str = ''
 
@@ -296,12 +270,10 @@ class PathChannel(ArrayFile):
         Raises ArchiveError, with the name of the array, if the content is invalid.
         """
         arrays = read_arrays(path)
-        try:
+        with translated((TypeError, ValueError), ArchiveError, path):
             for name in _TYPES:
                 if name not in arrays and name != 'gains':
                     raise ArchiveError(f'{name}: missing, expected an array of this name')
             content: dict[str, Any] = {
                 name: arrays[name].astype(kind) for name, kind in _TYPES.items() if name in arrays}
             return cls(**content | {'f0': float(arrays['f0'])}, origin=str(path))
-        except (TypeError, ValueError) as error:
-            raise ArchiveError(f'{path}: {error}') from None

@@ -51,16 +51,12 @@ class Linear(NamedTuple):
 class Impairment:
     """An impairment of the signals.
 
-    A subclass defines `size` and `linear`. Its values are Gaussian unless it overrides `values`;
-    estimators and bounds always assume the Gaussian prior of `linear`. `scope` states how often
-    values are drawn anew.
+    A subclass defines `linear`. Its values are Gaussian unless it overrides `values`; estimators
+    and bounds always assume the Gaussian prior of `linear`. `scope` states how often values are
+    drawn anew.
     """
 
     scope: Scope = Scope.CYCLE
-
-    def size(self, scenario: Scenario) -> int:
-        """Return the number q of values that an impairment has."""
-        raise NotImplementedError
 
     def linear(self, scenario: Scenario) -> Linear:
         """Return exponents and prior."""
@@ -144,10 +140,6 @@ class Factor(Impairment):
         """Return the standard deviation that the scenario declares, in the unit of the values."""
         return float(getattr(scenario, self.field)) * self.unit
 
-    def size(self, scenario: Scenario) -> int:
-        """Return the number of values: one, or one for each band."""
-        return len(self.patterns(scenario))
-
     def linear(self, scenario: Scenario) -> Linear:
         """Return exponents and prior."""
         patterns = self.patterns(scenario)
@@ -197,7 +189,7 @@ def draw_factors(
     for group in (BUILT_IN, _installed(scenario)):
         for scope, rng in generators.items():
             members = [one for one in group if one.scope is scope]
-            sizes = [one.size(scenario) for one in members]
+            sizes = [len(one.linear(scenario).root) for one in members]
             white = np.split(rng.standard_normal((n, sum(sizes))), np.cumsum(sizes), axis=1)
             values |= {id(one): one.values(scenario, part)
                        for one, part in zip(members, white, strict=False) if one in declared}

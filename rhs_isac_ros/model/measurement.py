@@ -156,13 +156,6 @@ class MeasurementModel:
         the errors of the estimate. By default, the errors of the elements are unknown and have the
         declared distribution: the mean is an average over surfaces, and the covariance includes
         the errors.
-
-    Attributes
-    ----------
-    elements
-        `surface`, or the distribution that the scenario declares.
-    radiation
-        T_i of Eq. (9) for the coefficients in effect, complex128 [N_B, N_SB F, N_E], read-only.
     """
 
     @one_blas_thread
@@ -170,6 +163,7 @@ class MeasurementModel:
                  surface: Surface | None = None) -> None:
         self.scenario, self.beams, self.surface = scenario, beamforming, surface
         self.elements: SurfaceModel = surface or DeclaredElements(scenario)
+        #: T_i of Eq. (9) for the coefficients in effect, complex128 [N_B, N_SB F, N_E].
         self.radiation = read_only(
             radiation_matrix(scenario, self.elements.applied_beams(beamforming)))
 

@@ -18,6 +18,7 @@ from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.hall import SPEED_OF_LIGHT_MPS as SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.hall import MultipathEstimate, PathChannel
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field
 from rhs_isac_ros.support.files import read_yaml
 from rhs_isac_ros.support.plugins import PluginError
@@ -261,10 +262,8 @@ class Scenario(Extensions, Table1):
         Fields that the file omits keep their defaults. Paths in the file are relative to its
         folder. Raises ScenarioError if the file is invalid.
         """
-        try:
+        with translated(ValueError, ScenarioError):
             content = read_yaml(path)
-        except ValueError as error:
-            raise ScenarioError(str(error)) from error
         content = {} if content is None else content
         if not isinstance(content, dict):
             raise ScenarioError(f'{path}: expected a mapping of field names to values')
@@ -274,10 +273,8 @@ class Scenario(Extensions, Table1):
                 raise ScenarioError(f'{path}: {key}: unknown field, expected one of {known}')
         content |= {name: str(Path(path).parent / content[name])
                     for name in _FILES if isinstance(content.get(name), str)}
-        try:
+        with translated(ScenarioError, ScenarioError, path):
             return cls(**content)
-        except ScenarioError as error:
-            raise ScenarioError(f'{path}: {error}') from None
 
     def changes(self) -> dict[str, Any]:
         """Return the fields that differ from Table I, as values that `from_yaml` can read.
@@ -407,13 +404,11 @@ def _number(field: dataclasses.Field[Any], value: Any) -> Any:
 def _external(field: dataclasses.Field[Any], value: Any, kind: type[External]) -> Any:
     if isinstance(value, kind) or value is None and field.default is None:
         return value
-    try:
+    with translated(ValueError, ScenarioError, field.name):
         if isinstance(value, str | Path):
             return kind.named(str(value))
         if kind is GainPattern and callable(value):
             return GainPattern(value)
-    except ValueError as error:
-        raise ScenarioError(f'{field.name}: {error}') from None
     raise ScenarioError(f'{field.name}: {value!r}, expected {kind.WORDS[1]}')
 
 
@@ -424,10 +419,8 @@ def _strengths(field: dataclasses.Field[Any], value: Any) -> tuple[tuple[str, fl
         raise ScenarioError(
             f'{field.name}: {value!r}, expected a mapping of names to strengths') from None
     for name, _ in pairs:
-        try:
+        with translated(PluginError, ScenarioError, field.name):
             plugins.load(plugins.IMPAIRMENTS, name)
-        except PluginError as error:
-            raise ScenarioError(f'{field.name}: {error}') from None
     # An impairment of strength 0 is the same as none.
     checked_pairs = ((name, _number(field, strength)) for name, strength in pairs)
     return tuple(pair for pair in checked_pairs if pair[1])

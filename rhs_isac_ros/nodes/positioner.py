@@ -28,6 +28,7 @@ from rhs_isac_ros.ros.parameters import calibrated_surface
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import ParameterError
 
 # Minimum time between reports of the progress of a table.
@@ -59,10 +60,8 @@ class PositionerNode(RoleNode[Positioner]):
         calibrated_surface(values, self.scenario)
         if settings.estimator not in positioning.ESTIMATORS:
             # A plug-in that can be imported may still fail when the estimator is built.
-            try:
+            with translated(plugins.PluginError, ParameterError, 'estimator'):
                 plugins.load(plugins.ESTIMATORS, settings.estimator)
-            except plugins.PluginError as error:
-                raise ParameterError(f'estimator: {error}') from None
             return settings
         if settings.estimator != positioning.NeuralEstimator.name:
             # Other estimators do not use the file, so a change of it must not rebuild them.
@@ -74,10 +73,8 @@ class PositionerNode(RoleNode[Positioner]):
         if not settings.model_file:
             raise ParameterError(
                 "model_file: '', expected a trained model for the estimator neural")
-        try:
+        with translated(positioning.ModelError, ParameterError, 'model_file'):
             positioning.Network.load(settings.model_file)
-        except positioning.ModelError as error:
-            raise ParameterError(f'model_file: {error}') from None
         return settings
 
     def _make_estimator(

@@ -17,6 +17,7 @@ from rhs_isac_ros.ros.parameters import ODOMETRY, ROBOTS
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import plugins, streams
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import ParameterError
 
 # Period at which a frame is looked up [s].
@@ -204,12 +205,10 @@ class UserNode(RoleNode[User]):
         if values.mobility == 'static':
             return mobility.Static(
                 self.scenario.sample_positions(1, rng)[0] if position is None else position)
-        try:
+        with translated(plugins.PluginError, ParameterError, 'mobility'):
             return mobility.make_plugin(
                 values.mobility, self.scenario, values.speed_mps, rng,
                 None if position is None else position.tolist())
-        except plugins.PluginError as error:
-            raise ParameterError(f'mobility: {error}') from None
 
     def _points(self, name: str) -> np.ndarray:
         """Return the points of a parameter, [N, 3], which must be in front of the surface."""

@@ -50,8 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help='file to write; an existing file is replaced at the end')
     add('--quiet', action='store_true', help='show no progress')
     options = parser.parse_args(arguments)
-    check_distinct(parser, {'--scenario': options.scenario, '--codebook': options.codebook},
-                   {'--output': options.output})
+    check_distinct(parser, options)
     try:
         _run(options)
     except KeyboardInterrupt:
@@ -71,7 +70,7 @@ def _run(options: argparse.Namespace) -> None:
     with progress_bar(options.epochs, 'epoch', quiet=options.quiet) as show:
         network = train(
             scenario, codebook, options.pairs, options.seed, options.hidden, options.epochs,
-            show and (lambda epoch: show(epoch.number, f'{epoch.validation_mse_m2:.3f} m^2')),
+            show and (lambda epoch, mse_m2: show(epoch, f'{mse_m2:.3f} m^2')),
             options.inputs)
     network.save(output)
     about = network.about

@@ -14,11 +14,11 @@ unknown gains of the users, although the best position absorbs the larger part o
 The mean alone does not distinguish a wrong level of the multipath from a wrong spread, because
 both can raise or lower it. A wrong level scales all residuals, and leaves their relative variance
 unchanged. The relative variance grows if a wrong spread concentrates the energy in a few
-directions of the signals, or if levels differ between users or places (`Diagnosis`).
+directions of the signals, or if levels differ between users or places (`diagnose`).
 """
 
 import collections
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -112,13 +112,11 @@ class InnovationTest:
     Twice an energy has approximately a chi-square distribution; `Estimate.expected_residual` is
     half its mean. Raises ValueError if the window is shorter than `MIN_RETURN`, because no warning
     would end.
-
-    Attributes
-    ----------
-    drifts
-        Whether the residuals deviate from the model: True once their mean or variance over the
-        window is improbable, until both are probable for the latest `MIN_RETURN`.
     """
+
+    #: Whether the residuals deviate from the model: True once their mean or variance over the
+    #: window is improbable, until both are probable for the latest `MIN_RETURN`.
+    drifts: bool
 
     def __init__(self, window: int = WINDOW) -> None:
         if window < MIN_RETURN:
@@ -207,49 +205,36 @@ def _spread_probability(total: _Residual, n: int) -> float:
     return float(gammaincc(mean**2 / variance, max(total.square, 0.0) * mean / variance))
 
 
-class Diagnosis:
-    """The estimates of the latest cycles, and the diagnostics that follow from them."""
+def diagnose(estimates: Collection[Estimate], deviates: bool) -> dict[str, str]:
+    """Return texts for the diagnostics from the estimates of the latest cycles.
 
-    def __init__(self) -> None:
-        self._estimates: collections.deque[Estimate] = collections.deque(maxlen=WINDOW)
+    ``probability.<alternative>`` is the share of such users. ``no_fix.share`` and ``no_fix.cause``
+    exist if there are cycles without a fix. `deviates` states whether the residuals deviate from
+    the scenario, in which case the probabilities are wrong.
+    """
+    values = {}
+    probabilities = [probabilities_of(one) for one in estimates]
+    for kind in ALTERNATIVES:
+        found = [each[kind.name] for each in probabilities if kind.name in each]
+        if found:
+            values[f'probability.{kind.name}'] = f'{np.mean(found):.3f}'
+    # The part of a reason before the colon is its subject.
+    subjects = collections.Counter(
+        str(one.reason).partition(':')[0] for one in estimates if one.reason)
+    if subjects:
+        values['no_fix.share'] = f'{sum(subjects.values())} of {len(estimates)}'
+        values['no_fix.cause'] = _cause(estimates, subjects.most_common()[0][0], deviates)
+    return values
 
-    def add(self, estimate: Estimate) -> None:
-        """Add the estimate of a cycle to the history."""
-        self._estimates.append(estimate)
 
-    def clear(self) -> None:
-        """Remove all cycles."""
-        self._estimates.clear()
-
-    def status(self, deviates: bool) -> dict[str, str]:
-        """Return texts for the diagnostics.
-
-        ``probability.<alternative>`` is the share of such users. ``no_fix.share`` and
-        ``no_fix.cause`` exist if there are cycles without a fix. `deviates` states whether the
-        residuals deviate from the scenario, in which case the probabilities are wrong.
-        """
-        values = {}
-        probabilities = [probabilities_of(one) for one in self._estimates]
-        for kind in ALTERNATIVES:
-            found = [each[kind.name] for each in probabilities if kind.name in each]
-            if found:
-                values[f'probability.{kind.name}'] = f'{np.mean(found):.3f}'
-        # The part of a reason before the colon is its subject.
-        subjects = collections.Counter(
-            str(one.reason).partition(':')[0] for one in self._estimates if one.reason)
-        if subjects:
-            values['no_fix.share'] = f'{sum(subjects.values())} of {len(self._estimates)}'
-            values['no_fix.cause'] = self._cause(subjects.most_common()[0][0], deviates)
-        return values
-
-    def _cause(self, subject: str, deviates: bool) -> str:
-        """Return the likely cause, given the most frequent subject of the reasons."""
-        residual, expected = np.array([
-            (one.residual, one.expected_residual) for one in self._estimates
-            if one.residual > 0 and one.expected_residual > 0]).reshape(-1, 2).T
-        is_alternative = subject in {kind.reason for kind in ALTERNATIVES}
-        if len(residual) < MIN_FIXES or is_alternative and not deviates:
-            return subject
-        # The energy of n complex measurements has the relative variance 1 / n.
-        dispersion = float(np.var(np.log(residual / expected)) * np.mean(expected))
-        return LEVEL if dispersion <= _MAX_DISPERSION else SPREAD
+def _cause(estimates: Collection[Estimate], subject: str, deviates: bool) -> str:
+    """Return the likely cause, given the most frequent subject of the reasons."""
+    residual, expected = np.array([
+        (one.residual, one.expected_residual) for one in estimates
+        if one.residual > 0 and one.expected_residual > 0]).reshape(-1, 2).T
+    is_alternative = subject in {kind.reason for kind in ALTERNATIVES}
+    if len(residual) < MIN_FIXES or is_alternative and not deviates:
+        return subject
+    # The energy of n complex measurements has the relative variance 1 / n.
+    dispersion = float(np.var(np.log(residual / expected)) * np.mean(expected))
+    return LEVEL if dispersion <= _MAX_DISPERSION else SPREAD

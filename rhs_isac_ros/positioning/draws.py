@@ -4,9 +4,11 @@ Below the noise, thousands of beams and range steps explain the signals. Finding
 takes long, and they are not Gaussian. Instead, directions are drawn within cells of the grid, and
 the likelihood is integrated along the range. This is importance sampling: cells are drawn with
 probabilities that follow from bounds of their likelihood, and the weight of a draw is its integral
-divided by the expected number of draws in its cell. The weights determine the number of effective
-draws. While it is too small, further draws follow the weights found so far. Peaks of strong
-signals are too narrow for this method.
+divided by the probability of its cell. The weights determine the number of effective draws. While
+it is too small, further rounds of draws also follow the weights found so far. Each round alone is
+unbiased, because its probabilities do not depend on its own draws, and later rounds have larger
+weights: "The square root rule for adaptive importance sampling" (Owen and Zhou, ACM Transactions
+on Modeling and Computer Simulation, 2020). Peaks of strong signals are too narrow for this method.
 """
 
 from typing import NamedTuple
@@ -21,10 +23,12 @@ from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution
 # Draws per round, largest number of rounds, and sufficient number of effective draws; its inverse
 # is the relative increase of the mean squared error.
 _N_DRAWS = 500
-_MAX_ROUNDS = 4
+_MAX_ROUNDS = 12
 _N_EFFECTIVE = 150.0
 # Share of further draws that follow the bounds instead of the weights.
-_SHARE_OF_BOUNDS = 0.1
+_SHARE_OF_BOUNDS = 0.7
+# Power of the likelihood that the bounds imply, so that cells with low bounds are drawn, too.
+_POWER = 0.8
 # Windows of range whose log-likelihood is further below the best average have no effect.
 _MARGIN = 12.0
 # Smallest number of range steps per wavelength. A Gaussian peak has one per two deviations.
@@ -79,18 +83,19 @@ class DrawnPosterior:
 
     def of(self, query: Query, phase: int) -> Draws | None:
         """Draw positions of a phase of a query; None if too few of them are effective."""
-        bounds = self._probabilities(query, phase)
-        expected, probability = np.zeros(len(bounds)), bounds
-        cells, parts = np.empty(0, int), []
-        for _ in range(_MAX_ROUNDS):
-            expected += _N_DRAWS * probability
+        probability = bounds = self._probabilities(query, phase)
+        cells, log_weights, parts, total_share = np.empty(0, int), np.empty(0), [], 0.0
+        for n_rounds in range(1, _MAX_ROUNDS + 1):
+            share = np.sqrt(n_rounds)
+            total_share += share
             drawn = np.searchsorted(
                 np.cumsum(probability), (np.arange(_N_DRAWS) + 0.5) / _N_DRAWS)
             places = (len(cells) + np.arange(_N_DRAWS))[:, None] * _SEQUENCE
             rays = self._rays(query, phase, drawn, places % 1)
+            log_scale = np.log(share / (_N_DRAWS * probability[drawn]))
+            log_weights = np.append(log_weights, rays.log_mass + log_scale[rays.draw])
             parts.append(rays._replace(draw=rays.draw + len(cells)))
             cells, rays = np.append(cells, drawn), concatenate(*parts)
-            log_weights = rays.log_mass - np.log(expected[cells[rays.draw]])
             highest = log_weights.max(initial=-np.inf)
             if np.isneginf(highest):
                 return None
@@ -111,7 +116,7 @@ class DrawnPosterior:
         covariance = ((weights[:, None] * offsets).T @ offsets
                       + (along[:, None] * rays.direction).T @ rays.direction)
         return Draws(
-            mean, covariance * (1 + variance), float(highest + np.log(total)),
+            mean, covariance * (1 + variance), float(highest + np.log(total / total_share)),
             float(rays.highest[weights > 0].max()), float(weights @ rays.average))
 
     def _probabilities(self, query: Query, phase: int) -> np.ndarray:
@@ -119,7 +124,8 @@ class DrawnPosterior:
         # The average of exp(2 A cos(phase)) is nearly exp(2 A) / sqrt(1 + 4 pi A).
         n_bands, bound = len(self._wavenumbers), query.bound[phase]
         amplitude = (bound + self._table.energy) / (2 * n_bands)
-        value = bound - n_bands / 2 * np.log1p(4 * np.pi * amplitude) + self._log_volume
+        value = _POWER * (bound - n_bands / 2 * np.log1p(4 * np.pi * amplitude))
+        value += self._log_volume
         shares: np.ndarray = np.exp(value - value.max(), dtype=float)
         return shares / shares.sum()
 

@@ -27,33 +27,23 @@ class SignalError(ValueError):
 class Estimate:
     """A position with its uncertainty, or the reason why there is none; or N of these.
 
-    Attributes
-    ----------
-    mean
-        Position, float64 [3] or [N, 3] [m]; NaN if there is none.
-    covariance
-        Covariance of the position, float64 [3, 3] or [N, 3, 3] [m^2]; NaN without a position.
-    reason
-        Reason why there is no position, empty if there is one; a string, or N of them.
-    residual
-        Energy of the whitened residual at the best position, float64 [] or [N]; or NaN.
-    expected_residual
-        Expected `residual` of signals that match the model, given the modes of the posterior,
-        float64 [] or [N]; NaN without a residual, or if the user may be outside or blocked.
-    outside_probability
-        Probability that the user is outside of the region, float64 [] or [N]; NaN if the estimator
-        assumes a user inside. Mean and covariance always apply to a user inside.
-    blocked_probability
-        Probability that there is no direct path, float64 [] or [N]; NaN if the estimator assumes
-        a direct path. Mean and covariance always apply to a user in sight.
+    Mean and covariance always apply to a user in the region and in sight.
     """
 
-    mean: np.ndarray
-    covariance: np.ndarray
+    mean: np.ndarray  #: Position, float64 [3] or [N, 3] [m]; NaN if there is none.
+    covariance: np.ndarray  #: Float64 [3, 3] or [N, 3, 3] [m^2]; NaN without a position.
+    #: Reason why there is no position, empty if there is one; a string, or N of them.
     reason: str | tuple[str, ...] = ''
+    #: Energy of the whitened residual at the best position, float64 [] or [N]; or NaN.
     residual: float | np.ndarray = np.nan
+    #: Expected `residual` of signals that match the model, given the modes of the posterior,
+    #: float64 [] or [N]; NaN without a residual, or if the user may be outside or blocked.
     expected_residual: float | np.ndarray = np.nan
+    #: Probability that the user is outside of the region, float64 [] or [N]; NaN if the estimator
+    #: assumes a user inside.
     outside_probability: float | np.ndarray = np.nan
+    #: Probability that there is no direct path, float64 [] or [N]; NaN if the estimator assumes a
+    #: direct path.
     blocked_probability: float | np.ndarray = np.nan
 
     @property

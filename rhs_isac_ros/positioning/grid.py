@@ -49,6 +49,9 @@ _N_OUTPUTS = 1 << 18
 _N_FIRST = 48
 # Number of further relevant cells above which positions are drawn instead.
 _MAX_CELLS = 100
+# Largest log-likelihood, relative to no signal, of signals for which positions are drawn. Peaks of
+# stronger signals are so narrow that draws may meet some of them and miss others.
+_MAX_DRAWN = 100.0
 # Largest number of peaks of a phase that are kept, to limit memory and time. Only signals below
 # the noise have more, and the remaining peaks have little weight.
 _MAX_PEAKS = 8192
@@ -179,8 +182,8 @@ class TemplateTable:
         `whitened` are the signals of N phases, complex128 [N, N_B, N_SB F], without offsets of
         carrier and timing. `margin` is the negative logarithm of the share of the posterior that
         may be left out. The points of a phase do not depend on the other phases. If very many
-        cells of a phase are relevant, `draw` is called with the query and the phase's row in it;
-        the phase has no points if `draw` returns True.
+        cells of a phase with weak signals are relevant, `draw` is called with the query and the
+        phase's row in it; the phase has no points if `draw` returns True.
         """
         n = max(1, _N_OUTPUTS // (len(self.energy) * len(self._wavenumbers)))
         parts = []
@@ -237,7 +240,7 @@ class TemplateTable:
         likely = bound + self._loss >= limit[:, None]
         likely[rows, first.ravel()] = False
         if draw:
-            many = np.count_nonzero(likely, axis=1) > _MAX_CELLS
+            many = (np.count_nonzero(likely, axis=1) > _MAX_CELLS) & (best <= _MAX_DRAWN)
             drawn = [row for row in np.flatnonzero(many).tolist() if draw(query, row)]
             if drawn:
                 likely[drawn] = False

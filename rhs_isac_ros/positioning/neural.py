@@ -13,7 +13,7 @@ import copy
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
 from rhs_isac_ros.support.optional import optional_import
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -112,17 +113,13 @@ class Network:
     @classmethod
     def load(cls, path: str | Path) -> 'Network':
         """Read a model from a file, or raise `ModelError`."""
-        try:
+        with translated(ArchiveError, ModelError):
             arrays, about = read_archive(path, 'model', _FORMAT, set(_KEYS.values()))
-        except ArchiveError as error:
-            raise ModelError(str(error)) from error
         inputs = str(about.pop('inputs', 'parts'))
-        try:
+        with translated(ValueError, ModelError, path):
             fields: dict[str, Any] = {
                 name: arrays[key].astype(float) for name, key in _KEYS.items()}
             return cls(**fields, about=about, inputs=inputs)
-        except ValueError as error:
-            raise ModelError(f'{path}: {error}') from None
 
 
 class NeuralEstimator:
@@ -181,25 +178,19 @@ def _check_purpose(
         raise ModelError(f'{source}: {len(network.w_in)} inputs, expected {n_inputs}')
 
 
-class Epoch(NamedTuple):
-    """Progress of a training after `number` epochs."""
-
-    number: int
-    validation_mse_m2: float
-
-
 # One thread: more threads change the rounding and do not speed up such small products.
 @one_blas_thread
 def train(
         scenario: Scenario, codebook: Codebook, n_pairs: int = DEFAULT_PAIRS, seed: int = 0,
         n_hidden: int = DEFAULT_HIDDEN, max_epochs: int = DEFAULT_EPOCHS,
-        progress: Callable[[Epoch], None] | None = None, inputs: str = 'parts') -> Network:
+        progress: Callable[[int, float], None] | None = None, inputs: str = 'parts') -> Network:
     """Train a network, and return the state with the smallest validation error.
 
     The seed determines the pairs (at least 20), their order and the initial weights. `n_hidden` is
-    the number of hidden units, and `inputs` a key of `INPUTS`. Raises CodebookError if the
-    codebook does not fit the scenario, ValueError if a number is too small or the inputs are
-    unknown, and MissingLibraryError if scikit-learn is not installed.
+    the number of hidden units, and `inputs` a key of `INPUTS`. `progress` is called with the
+    number of each epoch and its validation error [m^2]. Raises CodebookError if the codebook does
+    not fit the scenario, ValueError if a number is too small or the inputs are unknown, and
+    MissingLibraryError if scikit-learn is not installed.
     """
     for name, value, minimum in (('n_pairs', n_pairs, 20), ('n_hidden', n_hidden, 1),
                                  ('max_epochs', max_epochs, 1)):
@@ -225,7 +216,7 @@ def train(
     def after_epoch(number: int) -> float:
         mse = _mean_square(residuals(validation))
         if progress:
-            progress(Epoch(number, mse))
+            progress(number, mse)
         return mse
 
     best_epoch, best_mse = _fit(

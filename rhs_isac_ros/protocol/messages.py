@@ -144,22 +144,15 @@ class Message:
 
     The adapter to ROS sets `sender` and `scenario_id` when a role sends a message, and drops
     received messages of another scenario.
-
-    Attributes
-    ----------
-    sender
-        Instance of the node that sent the message, given by its start in nanoseconds since 1970; 0
-        if unknown, as in messages sent by hand.
-    scenario_id
-        `Scenario.id` of that node; empty if unknown.
-    stamp_ns
-        Stamp of the header on the clock of the emulated world [ns]. Signals, and messages derived
-        from them, carry the time of the measurement. 0: the adapter inserts the present time.
     """
 
     cycle_id: int
+    #: Instance of the node that sent the message, given by its start in nanoseconds since 1970; 0
+    #: if unknown, as in messages sent by hand.
     sender: int = 0
-    scenario_id: str = ''
+    scenario_id: str = ''  #: `Scenario.id` of that node; empty if unknown.
+    #: Stamp of the header on the clock of the emulated world [ns]. Signals, and messages derived
+    #: from them, carry the time of the measurement. 0: the adapter inserts the present time.
     stamp_ns: int = 0
 
     def time_s(self, now_s: float) -> float:

@@ -1,5 +1,6 @@
 """The positioner, which estimates the positions and the tracks of users from received signals."""
 
+import collections
 import dataclasses
 import enum
 from collections.abc import Callable, Mapping
@@ -21,7 +22,7 @@ from rhs_isac_ros.positioning import (
     surface_of,
 )
 from rhs_isac_ros.positioning.alternatives import describe_doubts, probabilities_of
-from rhs_isac_ros.positioning.diagnosis import Diagnosis, InnovationTest
+from rhs_isac_ros.positioning.diagnosis import WINDOW, InnovationTest, diagnose
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
@@ -110,14 +111,14 @@ class ResidualWatch:
         self._all = InnovationTest()
         self._users: NewestDict[int, InnovationTest] = NewestDict(MAX_USERS)
         self._warning = ''
-        self._diagnosis = Diagnosis()
+        self._estimates: collections.deque[Estimate] = collections.deque(maxlen=WINDOW)
 
     def add(self, user: int, codebook_id: str, estimate: Estimate) -> tuple[str, bool]:
         """Add an estimate; return a text when a warning begins or ends, and whether it begins."""
         if codebook_id != self._codebook_id:
             self.clear()
             self._codebook_id = codebook_id
-        self._diagnosis.add(estimate)
+        self._estimates.append(estimate)
         own = self._users.get(user) or InnovationTest(_USER_WINDOW)
         self._users.put(user, own)
         for monitor in (self._all, own):
@@ -130,18 +131,18 @@ class ResidualWatch:
     def clear(self) -> None:
         """Forget all estimates, because the estimator or the codebook has changed."""
         self._all.clear()
-        self._diagnosis.clear()
+        self._estimates.clear()
         self._users.clear()
         self._warning = ''
 
     def status(self) -> dict[str, str]:
-        """Return values for the diagnostics, including the result of `Diagnosis.status`.
+        """Return values for the diagnostics, including the result of `diagnose`.
 
         ``residual.ratio`` and ``residual.spread`` are the mean and the variance of the energy of
         the residuals relative to the expectation, ``residual.fixes`` is the number of fixes that
         they cover, and ``warning.residual`` is the text of the present warning.
         """
-        values = self._diagnosis.status(bool(self._warning))
+        values = diagnose(self._estimates, bool(self._warning))
         if self._all.n_fixes:
             values |= {'residual.ratio': f'{self._all.ratio:.3f}',
                        'residual.spread': f'{self._all.spread:.3f}',

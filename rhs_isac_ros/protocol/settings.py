@@ -11,6 +11,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import ESTIMATORS, BayesEstimator
 from rhs_isac_ros.protocol.user_registry import MAX_USERS, POLICIES, parse_users
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field
 
 # Priors for the position.
@@ -58,10 +59,8 @@ class BaseStationSettings:
 
     def __post_init__(self) -> None:
         """Check ``allowed_users``."""
-        try:
+        with translated(ValueError, ValueError, 'allowed_users'):
             parse_users(self.allowed_users)
-        except ValueError as error:
-            raise ValueError(f'allowed_users: {error}') from None
 
 
 def _calibration_file() -> Any:

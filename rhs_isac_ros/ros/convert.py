@@ -23,6 +23,8 @@ from rhs_isac_ros.ros.topics import NAMES, RHS_FRAME
 
 # Variance of an unknown angular velocity [rad^2/s^2], the value that ROS drivers use.
 _UNKNOWN_ROTATION_VARIANCE = 1e6
+# The identifier of the encoding; the options after it do not change it.
+_ENCODING = cdr.HEADER[:2]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -62,13 +64,6 @@ def ros_type(kind: type[_MessageT]) -> Any:
     return _ROS_TYPES[kind]
 
 
-def to_ros(
-        message: _MessageT, stamp: Time | None, identity: tuple[int, str] | None = None) -> Any:
-    """Convert a dataclass to a ROS message; the identity is as in `to_bytes`."""
-    stamp_ns = 10**9 * stamp.sec + stamp.nanosec if stamp is not None else 0
-    return deserialize_message(to_bytes(message, stamp_ns, identity), ros_type(type(message)))
-
-
 def to_bytes(
         message: _MessageT, stamp_ns: int, identity: tuple[int, str] | None = None,
         frame: str = RHS_FRAME) -> bytes:
@@ -81,17 +76,6 @@ def to_bytes(
     return _CODECS[type(message)].encode(message, frame, stamp_ns, sender, scenario_id)
 
 
-def from_ros(kind: type[_MessageT], message: Any) -> _MessageT:
-    """Convert a message of `ros_type`, or raise MessageError as `from_bytes` does."""
-    serialized = serialize_message(message)
-    # The options after the identifier do not change the encoding.
-    if serialized[:2] != cdr.HEADER[:2]:
-        raise RuntimeError(f'{kind.__name__}: serialized by rclpy with the representation '
-                           f'{serialized[:2].hex()}, expected {cdr.HEADER[:2].hex()}: '
-                           'CDR version 1, little endian')
-    return _CODECS[kind].decode(serialized)
-
-
 def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
     """Convert a serialized message (CDR) from a raw subscription.
 
@@ -99,22 +83,20 @@ def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
     shape, or the value of an enumeration is undefined. Other subscriptions of rclpy silently drop
     bytes that they cannot deserialize.
     """
-    if serialized.startswith(cdr.HEADER):
-        return _CODECS[kind].decode(serialized)
-    # A machine with another byte order may have sent the message.
-    try:
-        message = deserialize_message(serialized, ros_type(kind))
-    # rclpy raises a RuntimeError without a public class; a string may be invalid UTF-8.
-    except (RuntimeError, ValueError) as error:
-        raise MessageError(
-            f'{kind.__name__}: invalid CDR data of {len(serialized)} bytes: '
-            f'{str(error).splitlines()[0]}') from None
-    return from_ros(kind, message)
-
-
-def codebook_from_ros(message: ros.Codebook) -> Codebook:
-    """Convert a codebook from ROS, or raise MessageError or CodebookError."""
-    return from_ros(CodebookMessage, message).codebook()
+    if not serialized.startswith(_ENCODING):
+        # A machine with another byte order may have sent the message.
+        try:
+            serialized = serialize_message(deserialize_message(serialized, ros_type(kind)))
+        # rclpy raises a RuntimeError without a public class; a string may be invalid UTF-8.
+        except (RuntimeError, ValueError) as error:
+            raise MessageError(
+                f'{kind.__name__}: invalid CDR data of {len(serialized)} bytes: '
+                f'{str(error).splitlines()[0]}') from None
+        if not serialized.startswith(_ENCODING):
+            raise RuntimeError(f'{kind.__name__}: serialized by rclpy with the representation '
+                               f'{serialized[:2].hex()}, expected {_ENCODING.hex()}: CDR '
+                               'version 1, little endian')
+    return _CODECS[kind].decode(serialized)
 
 
 def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
@@ -124,14 +106,11 @@ def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
     return Time(sec=message.stamp_ns // 10**9, nanosec=message.stamp_ns % 10**9)
 
 
-def pose(
-        estimate: PositionEstimate, stamp: Time, frame: Frame | None = None
-) -> PoseWithCovarianceStamped:
+def pose(estimate: PositionEstimate, stamp: Time, frame: Frame) -> PoseWithCovarianceStamped:
     """Return a position estimate in a frame, as a pose of unknown orientation.
 
     Each rotation has the variance of an angle that is uniform between -pi and pi.
     """
-    frame = frame or Frame()
     result = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=frame.name))
     result.pose.pose.position = frames.to_ros(Point, frame.from_surface(estimate.position))
     result.pose.covariance = _with_rotation(
@@ -140,12 +119,11 @@ def pose(
 
 
 def odometry(
-        user: int, estimate: TrackEstimate, stamp: Time, frame: Frame | None = None) -> Odometry:
+        user: int, estimate: TrackEstimate, stamp: Time, frame: Frame) -> Odometry:
     """Return the position and velocity of a track; orientation and angular velocity are unknown.
 
     The child frame, in which the velocity is given, has the axes of the frame.
     """
-    frame = frame or Frame()
     result = true_odometry(user, estimate.mean, estimate.velocity, stamp, frame)
     result.pose.covariance = _with_rotation(
         frame.covariance(estimate.covariance), math.pi**2 / 3)

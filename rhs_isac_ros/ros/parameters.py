@@ -32,6 +32,7 @@ from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import create_or_refuse, refusals
 from rhs_isac_ros.ros.roster import ROSTER
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field, ParameterError
 
 
@@ -242,20 +243,16 @@ def _declare_one(node: Node, parameter: Parameter) -> Any:
 
 def settings_of(kind: type[Any], values: types.SimpleNamespace) -> Any:
     """Return the settings of a class, from the parameters with the names of its fields."""
-    try:
+    with translated(ValueError, ParameterError):
         return kind(**{field.name: getattr(values, field.name)
                        for field in dataclasses.fields(kind)})
-    except ValueError as error:
-        raise ParameterError(str(error)) from None
 
 
 def calibrated_surface(
         values: types.SimpleNamespace, scenario: Scenario) -> SurfaceEstimate | None:
     """Return the surface in the file of the parameter ``calibration_file``; None if empty."""
-    try:
+    with translated(CalibrationError, ParameterError, 'calibration_file'):
         return load_surface(values.calibration_file, scenario)
-    except CalibrationError as error:
-        raise ParameterError(f'calibration_file: {error}') from None
 
 
 def scenario_of(values: types.SimpleNamespace) -> Scenario:

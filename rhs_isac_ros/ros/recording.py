@@ -17,13 +17,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, endpoints, topics
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 # Separator between the message definitions of a schema, as in ROS 1 and 2.
@@ -95,11 +95,9 @@ class Recorder:
     """
 
     def __init__(self, path: str | Path, scenario: Scenario) -> None:
-        try:
-            with optional_import('recording', extra='recording'):
-                from mcap.writer import Writer
-        except MissingLibraryError as error:
-            raise RecordingError(str(error)) from None
+        with translated(MissingLibraryError, RecordingError), optional_import(
+                'recording', extra='recording'):
+            from mcap.writer import Writer
         self._path = Path(path)
         self._partial = self._path.with_name(f'{self._path.name}.part')
         try:
@@ -163,8 +161,8 @@ class Recorder:
 
 def read(
         path: str | Path, names: Collection[str] | None = None
-) -> Iterator[tuple[str, Any, float]]:
-    """Yield the topic, the ROS message and the time [s] of each message, as recorded.
+) -> Iterator[tuple[str, bytes, float]]:
+    """Yield the topic, the bytes (CDR) and the time [s] of each message, as recorded.
 
     `names` selects topics by their full names; None selects all. Raises RecordingError if the file
     cannot be read, or a recorded message has other fields than the installed one.
@@ -177,8 +175,7 @@ def read(
                 if found.id not in checked:
                     _check_schema(path, found, kinds[found.name])
                     checked.add(found.id)
-                yield (channel.topic, deserialize_message(message.data, kinds[found.name]),
-                       1e-9 * message.log_time)
+                yield channel.topic, message.data, 1e-9 * message.log_time
 
 
 def _check_schema(path: str | Path, found: Any, kind: type) -> None:
@@ -217,12 +214,10 @@ def read_scenario(path: str | Path) -> Scenario | None:
 
 @contextlib.contextmanager
 def _opened(path: str | Path) -> Iterator[Any]:
-    try:
-        with optional_import('reading a recording', extra='recording'):
-            from mcap.exceptions import McapError
-            from mcap.reader import make_reader
-    except MissingLibraryError as error:
-        raise RecordingError(str(error)) from None
+    with translated(MissingLibraryError, RecordingError), optional_import(
+            'reading a recording', extra='recording'):
+        from mcap.exceptions import McapError
+        from mcap.reader import make_reader
     try:
         with Path(path).open('rb') as stream:
             yield make_reader(stream)

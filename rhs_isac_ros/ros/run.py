@@ -64,18 +64,6 @@ def check_domain(parser: argparse.ArgumentParser) -> None:
                      f'expected an integer from 0 to {_MAX_DOMAIN}')
 
 
-def node_parser(executable: str, description: str) -> ArgumentParser:
-    """Return a parser for an executable that has only ROS arguments.
-
-    The description is the first line of a docstring; its start up to a colon is omitted.
-    """
-    text = description.rpartition('``: ')[2]
-    return ArgumentParser(
-        prog=executable, usage=f'{executable} [--ros-args -p NAME:=VALUE ...]',
-        description=text[:1].upper() + text[1:], epilog=parameter_help(executable),
-        formatter_class=argparse.RawDescriptionHelpFormatter)
-
-
 def check_parameters(
         parser: argparse.ArgumentParser, executable: str, arguments: Sequence[str]) -> None:
     """Exit with a usage error if ``-p`` sets a parameter that the executable does not have.
@@ -231,12 +219,17 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
 def entry(executable: str, make: Callable[[], Sequence[Node]]) -> Callable[..., int]:
     """Return the main function of an executable that has only ROS arguments.
 
-    The executable is a key of `NODES`; the docstring of the module of `make` describes it.
+    The executable is a key of `NODES`. The first line of the docstring of the module of `make`,
+    after a colon, describes it.
     """
     def main(args: Sequence[str] | None = None) -> int:
         arguments = sys.argv[1:] if args is None else list(args)
         first_line = (sys.modules[make.__module__].__doc__ or '').partition('\n')[0]
-        parser = node_parser(executable, first_line)
+        text = first_line.rpartition('``: ')[2]
+        parser = ArgumentParser(
+            prog=executable, usage=f'{executable} [--ros-args -p NAME:=VALUE ...]',
+            description=text[:1].upper() + text[1:], epilog=parameter_help(executable),
+            formatter_class=argparse.RawDescriptionHelpFormatter)
         parse(parser, arguments)
         check_parameters(parser, executable, arguments)
         return run(make, [executable, *arguments])

@@ -3,10 +3,11 @@
 import argparse
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field
 from rhs_isac_ros.support.files import check_writable
 from rhs_isac_ros.support.pictures import picture_format
@@ -97,10 +98,8 @@ def output_file(text: str) -> Path:
 
 def picture_file(text: str) -> Path:
     """Parse the path of a picture that can be written, or raise argparse.ArgumentTypeError."""
-    try:
+    with translated(ValueError, argparse.ArgumentTypeError):
         picture_format(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
     return output_file(text)
 
 
@@ -121,12 +120,16 @@ def output_folder(text: str) -> Path:
 
 
 def check_distinct(
-        parser: argparse.ArgumentParser, inputs: Mapping[str, Path | None],
-        outputs: Mapping[str, Path | None]) -> None:
-    """Exit with a usage error if an output file is also an input or another output."""
-    names = {path.resolve(): name for name, path in inputs.items() if path}
-    for name, path in outputs.items():
-        if path:
+        parser: argparse.ArgumentParser, options: argparse.Namespace, unused: str = '') -> None:
+    """Exit with a usage error if an output file is also an input or another output.
+
+    The default of the option `unused` has no effect.
+    """
+    outputs, names = (output_file, picture_file), dict[Path, str]()
+    # Inputs come first.
+    for action in sorted(parser._actions, key=lambda action: action.type in outputs):
+        path, name = getattr(options, action.dest, None), (*action.option_strings, action.dest)[0]
+        if isinstance(path, Path) and action.dest != unused:
             other = names.setdefault(path.resolve(), name)
-            if other != name:
+            if other != name and action.type in outputs:
                 parser.error(f'argument {name}: {path}, expected another file than {other}')

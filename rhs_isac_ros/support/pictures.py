@@ -72,14 +72,6 @@ def look(index: int) -> Look:
     return LOOKS[index % len(LOOKS)]
 
 
-def to_paler(colour: str, share: float = 0.6) -> tuple[float, float, float]:
-    """Mix a colour with a share of white, and return red, green and blue, without transparency."""
-    from matplotlib.colors import to_rgb
-
-    red, green, blue = (share + (1 - share) * value for value in to_rgb(colour))
-    return red, green, blue
-
-
 @contextlib.contextmanager
 def paper_style(purpose: str = 'drawing') -> Iterator[None]:
     """Draw in the style of the paper inside the block, whatever the user's settings are.

@@ -253,5 +253,4 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-main = command.entry(
-    _calibrate, _parser, ['file', '--config', '--codebook', '--calibration'], ['--output'])
+main = command.entry(_calibrate, _parser)

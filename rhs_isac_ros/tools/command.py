@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 from rclpy.utilities import try_shutdown
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
@@ -32,6 +34,7 @@ from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
 from rhs_isac_ros.ros.run import parse, run
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import check_distinct, input_file
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.optional import MissingLibraryError
 
 # Period of polling the graph [s], whose changes do not wake the executor.
@@ -58,7 +61,6 @@ class ToolError(RuntimeError):
 def entry(
         work: Callable[[argparse.Namespace, list[str]], int],
         make_parser: Callable[[], argparse.ArgumentParser],
-        inputs: Sequence[str] = (), outputs: Sequence[str] = (),
         conflict: Callable[[argparse.Namespace], str] = lambda options: ''
 ) -> Callable[..., int]:
     """Return the main function of a command whose command line may contain ROS arguments.
@@ -71,8 +73,6 @@ def entry(
     ----------
     work
         Takes the options, and the command line with the name of the program.
-    inputs, outputs
-        Options with names of files. All outputs must differ from each other and from the inputs.
     conflict
         Returns an error if options contradict each other, otherwise ''.
     """
@@ -81,9 +81,7 @@ def entry(
         options = parse(parser, arguments)
         if problem := conflict(options):
             parser.error(problem)
-        given, written = ({name: getattr(options, name.removeprefix('--')) for name in names}
-                          for names in (inputs, outputs))
-        check_distinct(parser, given, written)
+        check_distinct(parser, options)
         try:
             return work(options, [parser.prog, *arguments])
         except (KeyboardInterrupt, ExternalShutdownException):
@@ -145,15 +143,15 @@ def observe(
 def subscribe_codebooks(
         node: Node, scenario: Scenario, on_codebook: Callable[[Codebook], None]) -> None:
     """Subscribe to the codebooks of a network that fit the scenario; drop all others."""
-    def receive(message: ros.Codebook) -> None:
+    def receive(content: bytes) -> None:
         try:
-            codebook = convert.codebook_from_ros(message)
+            codebook = convert.from_bytes(convert.CodebookMessage, content).codebook()
             codebook.check(scenario)
         except (m.MessageError, CodebookError) as error:
             node.get_logger().warning(f'dropped codebook: {error}')
             return
         on_codebook(codebook)
-    subscribe(node, ros.Codebook, topics.CODEBOOK, receive, endpoints.LATCHED)
+    subscribe(node, ros.Codebook, topics.CODEBOOK, receive, endpoints.LATCHED, raw=True)
 
 
 def choose_scenario(config: Path | None, recording: Path | None = None) -> Scenario:
@@ -184,21 +182,20 @@ def recorded(
         # Before version 1.0, the topic was in the namespace.
         reports = topics.DIAGNOSTICS, f'{prefix}{topics.DIAGNOSTICS.lstrip("/")}'
         by_topic.update(dict.fromkeys(reports, Report))
-    for topic, found, time_s in read(path, by_topic):
+    for topic, content, time_s in read(path, by_topic):
         kind = by_topic[topic]
-        try:
+        with translated((m.MessageError, CodebookError), RecordingError, f'{path}: {topic}'):
             if kind is Report:
-                yield from ((pair, time_s) for pair in diagnostics.from_ros(found, namespace))
+                array = deserialize_message(content, DiagnosticArray)
+                yield from ((pair, time_s) for pair in diagnostics.from_ros(array, namespace))
             elif kind is Codebook:
-                codebook = convert.codebook_from_ros(found)
+                codebook = convert.from_bytes(convert.CodebookMessage, content).codebook()
                 codebook.check(scenario)
                 yield codebook, time_s
             else:
-                message: m.Message = convert.from_ros(kind, found)
+                message: m.Message = convert.from_bytes(kind, content)
                 m.check(message, scenario.sizes)
                 yield message, time_s
-        except (m.MessageError, CodebookError) as error:
-            raise RecordingError(f'{path}: {topic}: {error}') from None
 
 
 class Session(contextlib.AbstractContextManager['Session']):

@@ -64,14 +64,6 @@ def add_network_options(parser: argparse.ArgumentParser) -> None:
                         help='codebook file; by default the codebook of the package')
 
 
-def check_users(parser: argparse.ArgumentParser, users: int) -> None:
-    """Exit with a usage error if one process for each user would overload this machine."""
-    limit = max_user_processes()
-    if users > limit:
-        parser.error(f'argument --users: {users}, expected at most {limit} on this machine, '
-                     'because each user is a process')
-
-
 def max_user_processes() -> int:
     """Return the number of users that this machine can run as separate processes."""
     return max_processes() - len(UNIQUE)
@@ -209,8 +201,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     check_domain(parser)
-    check_distinct(parser, {'--config': options.config, '--codebook': options.codebook},
-                   {'--record': options.record, '--picture': options.picture})
+    check_distinct(parser, options)
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
         recorder = Recorder(options.record, scenario) if options.record else None

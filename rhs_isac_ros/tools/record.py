@@ -51,4 +51,4 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-main = entry(_record, _parser, ['--config'], ['file'])
+main = entry(_record, _parser)

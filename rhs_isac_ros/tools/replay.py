@@ -11,7 +11,6 @@ import tempfile
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -75,7 +74,7 @@ class RepublisherNode(Node):
     """
 
     def __init__(
-            self, messages: Iterable[tuple[str, Any, float]], names: Collection[str],
+            self, messages: Iterable[tuple[str, bytes, float]], names: Collection[str],
             rate: float) -> None:
         super().__init__('replay', **WITHOUT_SERVICES)
         self.optimizer: OptimizerNode | None = None
@@ -133,21 +132,22 @@ class RepublisherNode(Node):
         self.finished = True
 
     def _publish(
-            self, messages: Iterable[tuple[str, Any, float]], rate: float) -> Iterator[float]:
+            self, messages: Iterable[tuple[str, bytes, float]], rate: float) -> Iterator[float]:
         """Publish messages; yield the time until the next one is due [s], unless it is due."""
         # Steady time at the recorded time 0 [s]. Codebooks before the first message are due now.
         origin_s = -math.inf
-        for name, message, time_s in messages:
+        for name, content, time_s in messages:
             if origin_s == -math.inf and name != topics.CODEBOOK:
                 origin_s = time.monotonic() - time_s / rate
             while (wait_s := origin_s + time_s / rate - time.monotonic()) > 0:
                 yield wait_s
             if name != topics.CODEBOOK:
-                self._message_publishers[name].publish(message)
+                self._message_publishers[name].publish(content)
                 self.count += 1
             elif self.optimizer:
+                codebook = convert.from_bytes(convert.CodebookMessage, content).codebook()
                 self.optimizer.set_parameters_atomically(
-                    ros_parameters(convert.codebook_from_ros(message).to_parameters()))
+                    ros_parameters(codebook.to_parameters()))
 
     def check(self, end_s: float, timeout_s: float) -> None:
         """Raise ToolError if another node publishes, or there is no subscriber by `end_s`."""
@@ -189,22 +189,23 @@ def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
 
 
 def _messages(
-        options: argparse.Namespace, names: Iterable[str]) -> Iterator[tuple[str, Any, float]]:
-    """Yield the topic (relative name), message and time [s] of the messages in a recording."""
+        options: argparse.Namespace, names: Iterable[str]) -> Iterator[tuple[str, bytes, float]]:
+    """Yield topic (relative name), bytes and time [s] of the messages in a recording."""
     full_names = {f'{command.topic_prefix(options.namespace)}{name}': name for name in names}
-    for topic, message, time_s in read(options.file, full_names):
-        yield full_names[topic], message, time_s
+    for topic, content, time_s in read(options.file, full_names):
+        yield full_names[topic], content, time_s
 
 
 def _first_codebook(options: argparse.Namespace) -> Codebook:
     """Return the codebook that was used to receive the first signals."""
     used = ''
-    codebooks: dict[str, Any] = {}
-    for name, message, _ in _messages(options, [_SIGNALS, topics.CODEBOOK]):
+    codebooks: dict[str, convert.CodebookMessage] = {}
+    for name, content, _ in _messages(options, [_SIGNALS, topics.CODEBOOK]):
         if name == topics.CODEBOOK:
+            message = convert.from_bytes(convert.CodebookMessage, content)
             codebooks.setdefault(message.codebook_id, message)
         else:
-            used = used or message.codebook_id
+            used = used or convert.from_bytes(m.ReceivedSignals, content).codebook_id
     if not used:
         raise RecordingError(f'{options.file}: no {_SIGNALS} in the namespace '
                              f'{options.namespace}')
@@ -218,7 +219,7 @@ def _first_codebook(options: argparse.Namespace) -> Codebook:
     if used not in codebooks:
         raise RecordingError(f'codebook {used}: not in the recording, expected its file: '
                              '--codebook FILE')
-    return convert.codebook_from_ros(codebooks[used])
+    return codebooks[used].codebook()
 
 
 def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
@@ -383,4 +384,4 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-main = command.entry(_replay, _parser, conflict=_conflict)
+main = command.entry(_replay, _parser, _conflict)

@@ -6,15 +6,12 @@ import subprocess
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from rhs_isac_ros.monitoring import network_view, shapes
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
-
-if TYPE_CHECKING:
-    import rerun.blueprint
 
 _VERSION = '0.22'
 # The time line of the viewer.
@@ -131,8 +128,8 @@ def _is_listening(host: str, port: int) -> bool:
     return True
 
 
-def blueprint() -> 'rerun.blueprint.Blueprint':
-    """Return the layout: the scene above the modes, beside charts, the surface and the log."""
+def blueprint() -> Any:
+    """Return the blueprint: the scene above the modes, beside charts, the surface and the log."""
     import rerun.blueprint as rrb
 
     scene = rrb.Spatial3DView(

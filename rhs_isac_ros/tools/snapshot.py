@@ -126,4 +126,4 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-main = command.entry(_snapshot, _parser, ['--config'], ['--output'])
+main = command.entry(_snapshot, _parser)

@@ -279,6 +279,9 @@ def _conflict(options: argparse.Namespace) -> str:
                 'for a running network, --ros-args -r __ns:=/lab selects the namespace')
     if options.track_speed and not options.track:
         return 'argument --track-speed: expected together with --track'
+    # By its suffix, Rerun recognises its files.
+    if options.save and options.save.suffix != '.rrd':
+        return f"argument --save: '{options.save}', expected a name that ends with .rrd"
     return ''
 
 
@@ -347,7 +350,7 @@ def _parser() -> argparse.ArgumentParser:
         'arguments select the namespace of a running network: --ros-args -r __ns:=/lab')
     add = parser.add_argument
     add('file', nargs='?', type=input_file, help='recording; by default the running network')
-    add('--save', type=_recording_file, metavar='FILE',
+    add('--save', type=output_file, metavar='FILE',
         help='write a file for Rerun, *.rrd, instead of serving the viewer')
     add('--cycles', type=positive_int, default=0, metavar='N',
         help='show N cycles; the view of a running network then ends')
@@ -367,13 +370,4 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _recording_file(text: str) -> Path:
-    """Parse a path with the suffix by which Rerun recognises its files, for argparse."""
-    path = output_file(text)
-    if path.suffix != '.rrd':
-        raise argparse.ArgumentTypeError(f'{text!r}, expected a name that ends with .rrd')
-    return path
-
-
-main = command.entry(
-    _view, _parser, ['file', '--config', '--calibration'], ['--save'], _conflict)
+main = command.entry(_view, _parser, _conflict)

@@ -33,8 +33,8 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.processes import private_domain
 from rhs_isac_ros.ros.run import check_domain
 from rhs_isac_ros.ros.startup import use_discovery_profile
-from rhs_isac_ros.support.arguments import positive_int
-from rhs_isac_ros.tools.demo import check_users, start_network
+from rhs_isac_ros.support.arguments import integer, positive_int
+from rhs_isac_ros.tools.demo import max_user_processes, start_network
 
 # Pause between cycles, so that the report of one does not compete with the next for the cores.
 REST_S = 0.05
@@ -53,13 +53,13 @@ WHERE = {'processes': 'one process per node', 'composed': 'all nodes in one proc
 def main() -> int:
     """Run the benchmark."""
     parser = benchmark_parser('cycle', __doc__, default_seed=None)
-    parser.add_argument('--users', type=positive_int, default=2, help='number of users')
+    parser.add_argument('--users', type=integer(1, max_user_processes()), default=2,
+                        help='number of users, each a process')
     parser.add_argument('--cycles', type=positive_int, default=300, help='number of cycles')
     parser.add_argument('--layout', choices=WHERE, action='append',
                         help='only this arrangement of the nodes; by default both')
     options = parser.parse_args()
     check_domain(parser)
-    check_users(parser, options.users)
     os.environ.update(private_domain())
     use_discovery_profile()
     results = {}

@@ -26,7 +26,7 @@ from scipy.optimize import minimize
 
 from rhs_isac_ros.bounds import AverageCrlb, crlb
 from rhs_isac_ros.codebook import METHODS, random_codebook
-from rhs_isac_ros.codebook.objective import ROW_TOLERANCE, monte_carlo, sobol
+from rhs_isac_ros.codebook.objective import ROW_TOLERANCE, sobol
 from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS
 from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Search
 from rhs_isac_ros.executables import exit_code_of
@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument('--picture', type=picture_file,
                         help='file for the picture of (a) to (c): PNG, PDF or SVG')
     options = parser.parse_args()
-    check_distinct(parser, {}, {'--json': options.json, '--picture': options.picture})
+    check_distinct(parser, options)
     restrict_to(options.threads)
     if not HAVE_JAX:
         print('JAX is not installed, so its figures are omitted; to install it: '
@@ -95,7 +95,7 @@ def threads() -> int:
 def gradient() -> dict:
     """Run part (a)."""
     scenario = Scenario()
-    positions = monte_carlo(scenario, POSITIONS, streams.generator(0, streams.SAMPLES))
+    positions = scenario.sample_positions(POSITIONS, streams.generator(0, streams.SAMPLES))
     start = random_codebook(scenario, streams.generator(0, streams.START))
     fast = Problem(scenario, AverageCrlb(scenario, positions, ROW_TOLERANCE))
     exact = Problem(scenario, AverageCrlb(scenario, positions))
@@ -138,13 +138,14 @@ def target(limit_s: float) -> dict:
     scenario = Scenario()
     # Import the lazily loaded parts of SciPy before the measurement starts.
     sobol(scenario, 1, np.random.default_rng(0))
-    held_out = monte_carlo(scenario, HELD_OUT, streams.generator(0, streams.HELD_OUT))
+    held_out = scenario.sample_positions(HELD_OUT, streams.generator(0, streams.HELD_OUT))
     runs = {f'lbfgs, {DEFAULT_POSITIONS} Sobol': run(scenario, 'lbfgs', sobol, limit_s),
             'lbfgs, 1024 Sobol': run(scenario, 'lbfgs', sobol, limit_s, 1024),
-            f'lbfgs, {POSITIONS} random': run(scenario, 'lbfgs', monte_carlo, limit_s, POSITIONS)}
+            f'lbfgs, {POSITIONS} random': run(
+                scenario, 'lbfgs', Scenario.sample_positions, limit_s, POSITIONS)}
     for method in ('alternating', 'direct', 'genetic'):
         runs[f'{method}, {POSITIONS} random'] = run(
-            scenario, method, monte_carlo, limit_s, POSITIONS)
+            scenario, method, Scenario.sample_positions, limit_s, POSITIONS)
     compiled_s = 0.0
     if HAVE_JAX:
         runs['JAX + L-BFGS-B'], compiled_s = run_peer(scenario, limit_s)
@@ -207,7 +208,7 @@ def run(scenario: Scenario, method: str, sample: Callable, limit_s: float,
 def run_peer(scenario: Scenario, limit_s: float) -> tuple[Trace, float]:
     """Run SciPy's L-BFGS-B on the JAX objective; return its trace and the compilation time [s]."""
     begin = time.perf_counter()
-    positions = monte_carlo(scenario, POSITIONS, streams.generator(0, streams.SAMPLES))
+    positions = scenario.sample_positions(POSITIONS, streams.generator(0, streams.SAMPLES))
     peer = JaxAverageCrlb(scenario, positions)
     problem = Problem(scenario, None)
     start = problem.pack(random_codebook(scenario, streams.generator(0, streams.START)))

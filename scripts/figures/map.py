@@ -28,7 +28,7 @@ from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import crlb, global_bound
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.experiments import Job, markdown_table, run_command, run_jobs
-from rhs_isac_ros.experiments.sweep import BLOCK, Sweep, plain_codebook, run_blocks
+from rhs_isac_ros.experiments.sweep import BLOCK, Sweep, run_blocks
 from rhs_isac_ros.experiments.sweep_settings import Setting
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import simulate_pairs
@@ -78,7 +78,7 @@ def maps_of(options: argparse.Namespace, phases: int, steps: int
     maps = {}
     for setting, (codebook,), errors in run_blocks(sweep, folder, options.jobs, options.dask):
         world = setting.scenario
-        case = {'scenario': world.changes(), 'codebook': plain_codebook(codebook)}
+        case = {'scenario': world.changes(), 'codebook': codebook.to_parameters()}
         (bounds,) = run_jobs(
             bound_map, [Job(f'map-{world.id}-{codebook.id}', {**case, 'phases': phases})],
             folder, options.jobs, options.dask)

@@ -253,8 +253,9 @@ def test_zero_rows_alone_give_zeros(wide, model, n_items):
         for band in range(2):
             assert whitened[band].shape == (n_items, 1, 12)
             np.testing.assert_array_equal(whitened[band], 0)
-            np.testing.assert_array_equal(sums[band].mean_term, np.zeros((12, 36)))
-            np.testing.assert_array_equal(sums[band].covariance_term, np.zeros((12, 12)))
+            mean_term, covariance_term = sums[band]
+            np.testing.assert_array_equal(mean_term, np.zeros((12, 36)))
+            np.testing.assert_array_equal(covariance_term, np.zeros((12, 12)))
 
 
 @pytest.mark.parametrize('tolerance', [

@@ -11,7 +11,6 @@ from rhs_isac_ros.codebook.objective import (
     WIDE,
     confusable_volumes,
     draw_confusable,
-    monte_carlo,
     sobol,
 )
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
@@ -65,12 +64,12 @@ def test_sobol_integrates_a_smooth_function_more_accurately(n):
         2 + (y1**3 - y0**3) / 3 / (y1 - y0)) * (
         2 * (np.exp(z1 / 2) - np.exp(z0 / 2)) / (z1 - z0))
     spread = {}
-    for sample in (monte_carlo, sobol):
+    for sample in (Scenario.sample_positions, sobol):
         errors = [function(sample(LOPSIDED, n, np.random.default_rng(seed))).mean() / exact - 1
                   for seed in range(20)]
         spread[sample] = np.sqrt(np.mean(np.square(errors)))
-    assert spread[sobol] < 0.3 * spread[monte_carlo]
-    assert spread[monte_carlo] < 0.2
+    assert spread[sobol] < 0.3 * spread[Scenario.sample_positions]
+    assert spread[Scenario.sample_positions] < 0.2
 
 
 @pytest.mark.parametrize('bands', BANDS)

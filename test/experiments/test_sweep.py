@@ -96,8 +96,8 @@ def test_the_table_has_every_field_of_the_scenario(tmp_path, file):
 
 
 def test_the_table_names_the_origin_of_the_codebooks(tmp_path, file, monkeypatch):
-    monkeypatch.setattr(sweep_module, 'design', lambda scenario, **_: sweep_module.plain_codebook(
-        random_codebook(Scenario(**scenario), np.random.default_rng(0))))
+    monkeypatch.setattr(sweep_module, 'design', lambda scenario, **_: random_codebook(
+        Scenario(**scenario), np.random.default_rng(0)).to_parameters())
     sweep = sweep_over('multipath_to_los_db=-10', f'codebook=optimize,random,{file}',
                        optimize_for=[], n_positions=4)
     rows = list(csv.DictReader(io.StringIO(table(sweep, run_sweep(sweep, tmp_path / 'a', 1)))))

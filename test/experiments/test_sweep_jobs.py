@@ -25,7 +25,7 @@ def codebook():
 
 @pytest.fixture
 def case(codebook):
-    return {'scenario': SMALL, 'codebook': sweep_jobs.plain_codebook(codebook), 'seed': 5}
+    return {'scenario': SMALL, 'codebook': codebook.to_parameters(), 'seed': 5}
 
 
 @pytest.mark.parametrize(('quantities', 'expected'), [

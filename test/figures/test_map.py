@@ -40,8 +40,8 @@ def test_all_maps_share_one_scale_with_a_unit(figure):
 
 @pytest.mark.slow
 def test_the_command_maps_each_plan(figure, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sweep, 'design', lambda scenario, **_: sweep.plain_codebook(
-        random_codebook(Scenario(**scenario), np.random.default_rng(0))))
+    monkeypatch.setattr(sweep, 'design', lambda scenario, **_: random_codebook(
+        Scenario(**scenario), np.random.default_rng(0)).to_parameters())
     monkeypatch.setattr(sweep, 'evaluate', lambda n, **_: {'squared_error_m2': [0.25] * n})
     monkeypatch.setattr(figure, 'bound_map', lambda scenario, codebook, phases: {
         key: np.full((figure.SQUARES, figure.SQUARES), 0.04).tolist()

@@ -28,8 +28,8 @@ def located(monkeypatch):
         return {'squared_error_m2': [0.1 + Scenario(**scenario).band_phase_std_rad] * n}
 
     made = []
-    monkeypatch.setattr(sweep, 'design', lambda scenario, **_: sweep.plain_codebook(
-        random_codebook(Scenario(**scenario), np.random.default_rng(0))))
+    monkeypatch.setattr(sweep, 'design', lambda scenario, **_: random_codebook(
+        Scenario(**scenario), np.random.default_rng(0)).to_parameters())
     monkeypatch.setattr(sweep, 'evaluate', evaluate)
     return made
 

@@ -36,11 +36,12 @@ def sample(scenario, codebook, positions, seed):
     return MeasurementModel(scenario, codebook).sample(positions, np.random.default_rng(seed))
 
 
-def test_built_in_impairments_have_field_scope_std_and_size():
+def test_built_in_impairments_have_field_scope_std_and_patterns():
     fields = {'user_gain_std_db': 2.0, 'carrier_offset_std_hz': 700.0, 'phase_std_rad': 0.4,
               'timing_std_s': 30e-9, 'band_phase_std_rad': 0.7}
     scenario = Scenario(**fields)
-    assert [(one.field, one.scope, one.needs_search, one.size(scenario)) for one in BUILT_IN] == [
+    assert [(one.field, one.scope, one.needs_search, len(one.patterns(scenario)))
+            for one in BUILT_IN] == [
         ('user_gain_std_db', Scope.USER, False, 1), ('carrier_offset_std_hz', Scope.USER, True, 1),
         ('phase_std_rad', Scope.CYCLE, False, 1), ('timing_std_s', Scope.CYCLE, True, 1),
         ('band_phase_std_rad', Scope.CYCLE, False, 2)]
@@ -154,9 +155,6 @@ from rhs_isac_ros.model import Impairment, Linear
 class Walk(Impairment):
     def __init__(self, strength):
         self.strength = strength
-
-    def size(self, scenario):
-        return scenario.n_frames
 
     def linear(self, scenario):
         n = scenario.n_frames

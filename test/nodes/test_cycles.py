@@ -10,13 +10,14 @@ import pytest
 from nav_msgs.msg import Odometry
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
+from ros_messages import to_ros
 
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import check
-from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.role_node import CodebookClient
 
@@ -299,12 +300,12 @@ def test_nan_from_a_faulty_node_is_dropped(network, join):
 
     def send_nan(request):
         signals = np.full((4, 8, 3), complex(math.nan, 0))
-        feeds.publish(convert.to_ros(m.FeedSignals(
+        feeds.publish(to_ros(m.FeedSignals(
             cycle_id=request.cycle_id, user=request.user, band=request.band, signals=signals),
             None))
         stamp = watch.node.get_clock().now().to_msg()
         signals = np.full((2, 8, 4), complex(0, math.inf))
-        received.publish(convert.to_ros(m.ReceivedSignals(
+        received.publish(to_ros(m.ReceivedSignals(
             cycle_id=request.cycle_id, user=request.user, codebook_id=codebook.id,
             signals=signals), stamp))
         sent.update({m.FeedSignals: 1, m.ReceivedSignals: 1})

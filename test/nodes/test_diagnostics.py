@@ -2,9 +2,10 @@
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
+from ros_messages import to_ros
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.roster import UNIQUE
 
@@ -38,7 +39,7 @@ def test_every_node_reports_phase_cycles_drops_and_codebook(processes, make_watc
 
     # Malformed messages are counted where they are dropped.
     publisher = watch.publisher(m.Pilot)
-    publisher.publish(convert.to_ros(
+    publisher.publish(to_ros(
         m.Pilot(cycle_id=1, user=1, band=99, symbols=np.ones(4, complex)), None))
     watch.until(lambda: ('dropped.malformed', '1') in {
         (pair.key, pair.value) for pair in reported['channel'].values}, 'the count', [network])

@@ -11,12 +11,12 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
+from ros_messages import codebook_from_ros
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
-from rhs_isac_ros.ros import convert
 from rhs_isac_ros.ros.endpoints import LATCHED
 
 TYPES = {
@@ -84,7 +84,7 @@ def test_a_late_joiner_receives_the_codebook(bench, optimizer, probe, shipped):
     message, = latched(bench, probe)
     assert message.codebook_id == shipped.id
     assert message.header.frame_id == 'rhs_link'
-    assert convert.codebook_from_ros(message).id == shipped.id
+    assert codebook_from_ros(message).id == shipped.id
 
 
 def test_a_complete_change_is_accepted_and_published(bench, optimizer, client, probe, other):
@@ -93,7 +93,7 @@ def test_a_complete_change_is_accepted_and_published(bench, optimizer, client, p
     assert answer.result.successful
     assert held(optimizer).id == other.id
     bench.until(lambda: len(received) == 2, 'the new codebook')
-    assert convert.codebook_from_ros(received[1]).id == other.id
+    assert codebook_from_ros(received[1]).id == other.id
     assert math.isnan(received[1].average_crlb_m2)
     late, = latched(bench, bench.add(Node, 'late'))
     assert late.codebook_id == other.id

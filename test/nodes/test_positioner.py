@@ -9,6 +9,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from ros_messages import to_ros
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
@@ -17,7 +18,6 @@ from rhs_isac_ros.nodes.positioner import PositionerNode
 from rhs_isac_ros.positioning import Network, make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
-from rhs_isac_ros.ros import convert
 from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.fields import ParameterError
@@ -59,7 +59,7 @@ def send(bench, node, codebooks):
         message = m.ReceivedSignals(
             cycle_id=cycle_id, user=1, codebook_id=codebook.id,
                 signals=signals.reshape(codebook.digital.shape[:3]))
-        publishers[0].publish(convert.to_ros(message, node.get_clock().now().to_msg()))
+        publishers[0].publish(to_ros(message, node.get_clock().now().to_msg()))
         return signals
     return send
 

@@ -6,11 +6,12 @@ import pytest
 import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
+from ros_messages import codebook_from_ros
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.nodes.optimizer import PushError, push
-from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import LATCHED
 
 
@@ -89,7 +90,7 @@ def test_with_options_the_command_optimises_writes_and_holds(
     watch.until(lambda: received, 'the codebook', [process])
     written = Codebook.load(output)
     assert received[0].codebook_id == written.id
-    assert convert.codebook_from_ros(received[0]).id == written.id
+    assert codebook_from_ros(received[0]).id == written.id
     process.signal(signal.SIGINT)
     assert process.wait() == 0
     assert not crashed(process.log), process.log

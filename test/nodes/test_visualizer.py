@@ -8,12 +8,13 @@ import pytest
 import yaml
 from nav_msgs.msg import Path
 from rclpy.parameter import Parameter
+from ros_messages import to_ros
 from visualization_msgs.msg import Marker, MarkerArray
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.nodes.visualizer import VisualizerNode
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE
 
 ROOT = FilePath(__file__).parents[2]
@@ -54,15 +55,15 @@ def test_users_and_estimates_are_shown_at_their_positions(bench, probe, shown):
         bench.publisher(probe, kind) for kind in (m.GroundTruth, m.PositionEstimate))
     stamp = probe.get_clock().now().to_msg()
     for user in (1, 2):
-        truths.publish(convert.to_ros(ground_truth(user, 9.0), stamp))
-    estimates.publish(convert.to_ros(m.PositionEstimate(
+        truths.publish(to_ros(ground_truth(user, 9.0), stamp))
+    estimates.publish(to_ros(m.PositionEstimate(
         cycle_id=1, user=2, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
         covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01), stamp))
     bench.until(lambda: {('truth', 1), ('truth', 2), ('estimate', 2)} <= shown.keys(), 'the users')
     assert shown['truth', 2].pose.position.y == 2.0
     assert shown['estimate', 2].pose.position.x == 8.0
     assert shown['estimate', 2].type == Marker.SPHERE
-    truths.publish(convert.to_ros(ground_truth(1, 9.5), stamp))
+    truths.publish(to_ros(ground_truth(1, 9.5), stamp))
     bench.until(lambda: shown['truth', 1].pose.position.x == 9.5, 'the new position')
 
 
@@ -79,7 +80,7 @@ def test_rviz_lists_the_namespaces_of_all_markers(bench, probe, shown, small):
                 covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01),
             m.Beam(cycle_id=1, user=1, codebook_id='cb', band=0, analog=np.ones(sizes['N_E']),
                    digital=np.ones((sizes['N_SB'], sizes['K']), complex), expected_bps=1.0)):
-        bench.publisher(probe, type(message)).publish(convert.to_ros(message, stamp))
+        bench.publisher(probe, type(message)).publish(to_ros(message, stamp))
     # Only a scenario with propagation paths shows these.
     bench.until(lambda: set(display['Namespaces']) == {'traced', *(name for name, _ in shown)},
                 'every namespace')
@@ -90,7 +91,7 @@ def test_the_board_has_the_colours_of_its_configuration(bench, probe, shown, sma
     scenario = small.scenario
     analog = np.ones((scenario.n_frames, scenario.n_elements))
     publisher.publish(ros.RhsConfiguration(cycle_id=1))
-    publisher.publish(convert.to_ros(m.RhsConfiguration(cycle_id=1, mode=m.Mode.POSITIONING,
+    publisher.publish(to_ros(m.RhsConfiguration(cycle_id=1, mode=m.Mode.POSITIONING,
         band=0, codebook_id='cb', analog=analog),
                                   probe.get_clock().now().to_msg()))
     bench.until(lambda: shown and shown['board', 0].colors[0].r == 1.0, 'the colours')
@@ -100,15 +101,15 @@ def test_messages_of_another_scenario_are_ignored_without_a_warning(bench, probe
     publisher, stamp = bench.publisher(probe, m.Beam), probe.get_clock().now().to_msg()
     beam = m.Beam(cycle_id=1, user=1, codebook_id='cb', band=0, analog=np.ones(9),
                   digital=np.ones((1, 1), complex), expected_bps=1.0)
-    publisher.publish(convert.to_ros(beam, stamp, (7, 'sc2')))
+    publisher.publish(to_ros(beam, stamp, (7, 'sc2')))
     truths = bench.publisher(probe, m.GroundTruth)
-    truths.publish(convert.to_ros(ground_truth(1, 9.0), stamp, (7, 'sc2')))
-    truths.publish(convert.to_ros(ground_truth(2, 9.0), stamp))
+    truths.publish(to_ros(ground_truth(1, 9.0), stamp, (7, 'sc2')))
+    truths.publish(to_ros(ground_truth(2, 9.0), stamp))
     bench.until(lambda: ('truth', 2) in shown, 'the other user')
     assert ('truth', 1) not in shown
     assert 'dropped' not in capfd.readouterr().err
     # The same message of an unknown scenario is an error.
-    publisher.publish(convert.to_ros(beam, stamp))
+    publisher.publish(to_ros(beam, stamp))
     log = []
     bench.until(lambda: log.append(capfd.readouterr().err) or 'Beam.analog' in ''.join(log),
                 'the warning')
@@ -125,9 +126,9 @@ def test_a_user_without_messages_is_removed(bench, probe, shown, small):
 
     def send():
         for user in sending:
-            truths.publish(convert.to_ros(ground_truth(user, 9.0), stamp))
+            truths.publish(to_ros(ground_truth(user, 9.0), stamp))
         if 1 in sending:
-            beams.publish(convert.to_ros(beam, stamp))
+            beams.publish(to_ros(beam, stamp))
     probe.create_timer(0.05, send)
     bench.until(lambda: {('truth', 1), ('truth', 2), ('beam', 0)} <= shown.keys(), 'both users')
     lobe = np.array([[p.x, p.y, p.z] for p in shown['beam', 0].points])
@@ -152,8 +153,8 @@ def test_each_user_has_a_path(bench, probe, shown):
         bench.publisher(probe, kind) for kind in (m.GroundTruth, m.PositionEstimate))
     stamp = probe.get_clock().now().to_msg()
     for cycle_id, x in enumerate((8.0, 8.5, 9.0), start=1):
-        truths.publish(convert.to_ros(ground_truth(7, x), stamp))
-        estimates.publish(convert.to_ros(m.PositionEstimate(
+        truths.publish(to_ros(ground_truth(7, x), stamp))
+        estimates.publish(to_ros(m.PositionEstimate(
             cycle_id=cycle_id, user=7, codebook_id='cb', position=np.array([x + 0.1, 2.5, 0.1]),
             covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01),
             stamp))

@@ -10,6 +10,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from rclpy.parameter import Parameter
 from rclpy.time import Time as RosTime
+from ros_messages import to_ros
 from visualization_msgs.msg import Marker
 
 from rhs_isac_ros.link import beam_pattern, steer
@@ -177,7 +178,7 @@ def test_the_visualizer_publishes_transforms(bench, probe):
     bench.until(lambda: topics.RHS_FRAME in found, 'the surface')
     bench.until(lambda: probe.count_publishers(topics.TF), 'the publisher')
     estimates = bench.publisher(probe, m.PositionEstimate)
-    estimate = convert.to_ros(m.PositionEstimate(
+    estimate = to_ros(m.PositionEstimate(
         cycle_id=1, user=2, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
         covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01), Time())
     probe.create_timer(0.05, lambda: estimates.publish(estimate))
@@ -198,7 +199,7 @@ def test_two_networks_share_one_tree(bench, probe):
             Parameter('frame_id', value='odom'), Parameter('surface_pose', value=pose)])
         estimates = probe.create_publisher(
             convert.ros_type(m.PositionEstimate), f'/{space}/position_estimate', EXCHANGE)
-        estimate = convert.to_ros(m.PositionEstimate(
+        estimate = to_ros(m.PositionEstimate(
             cycle_id=1, user=2, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
             covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01), Time())
         probe.create_timer(0.05, functools.partial(estimates.publish, estimate))

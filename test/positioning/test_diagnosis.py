@@ -23,9 +23,9 @@ from rhs_isac_ros.positioning.diagnosis import (
     MIN_RETURN,
     SPREAD,
     WINDOW,
-    Diagnosis,
     FitTest,
     InnovationTest,
+    diagnose,
 )
 
 
@@ -285,11 +285,8 @@ def one(found, row):
     return Estimate(*(getattr(found, field.name)[row] for field in dataclasses.fields(Estimate)))
 
 
-def diagnosis_of(found):
-    diagnosis = Diagnosis()
-    for row in range(len(found.mean)):
-        diagnosis.add(one(found, row))
-    return diagnosis
+def diagnosis_of(found, deviates):
+    return diagnose([one(found, row) for row in range(len(found.mean))], deviates)
 
 
 def located(world, codebook, estimator):
@@ -307,7 +304,7 @@ def test_wrong_levels_and_spreads_of_the_multipath_are_told_apart(
         change, cause, shipped, table1_estimator):
     found = located(dataclasses.replace(Scenario(), **change), shipped, table1_estimator)
     assert not found.fix.any()
-    values = diagnosis_of(found).status(True)
+    values = diagnosis_of(found, True)
     assert values['no_fix.cause'] == cause
     assert values['no_fix.share'] == f'{N_USERS} of {N_USERS}'
 
@@ -315,26 +312,23 @@ def test_wrong_levels_and_spreads_of_the_multipath_are_told_apart(
 def test_blocked_users_are_the_cause_unless_the_residuals_deviate(shipped):
     declared = dataclasses.replace(Scenario(), blocked_probability=0.3)
     found = located(declared, shipped, make_estimator('bayes', declared, shipped))
-    diagnosis = diagnosis_of(found)
-    values = diagnosis.status(False)
+    values = diagnosis_of(found, False)
     assert values['no_fix.cause'] == Blocked.reason
     assert float(values['probability.blocked']) == pytest.approx(0.3, abs=0.12)
     assert 'probability.outside' not in values
-    assert diagnosis.status(True)['no_fix.cause'] in (LEVEL, SPREAD)
+    assert diagnosis_of(found, True)['no_fix.cause'] in (LEVEL, SPREAD)
 
 
 def test_signals_of_the_model_have_no_cause(shipped, table1_estimator):
-    assert diagnosis_of(located(Scenario(), shipped, table1_estimator)).status(False) == {}
+    assert diagnosis_of(located(Scenario(), shipped, table1_estimator), False) == {}
 
 
 def test_few_residuals_leave_the_reason_as_the_cause():
-    diagnosis, nothing = Diagnosis(), (np.full(3, np.nan), np.full((3, 3), np.nan))
-    for _ in range(MIN_FIXES - 1):
-        diagnosis.add(Estimate(*nothing, 'residual energy: 9, expected at most 5', 9.0, 3.0))
-    assert diagnosis.status(True)['no_fix.cause'] == 'residual energy'
-    for _ in range(WINDOW):
-        diagnosis.add(Estimate(np.zeros(3), np.eye(3)))
-    assert diagnosis.status(True) == {}
+    nothing = np.full(3, np.nan), np.full((3, 3), np.nan)
+    estimate = Estimate(*nothing, 'residual energy: 9, expected at most 5', 9.0, 3.0)
+    values = diagnose([estimate] * (MIN_FIXES - 1), True)
+    assert values['no_fix.cause'] == 'residual energy'
+    assert diagnose([Estimate(np.zeros(3), np.eye(3))], True) == {}
 
 
 def test_doubts_are_described_from_one_percent_on():

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import qmc
 
 from rhs_isac_ros.model import Scenario, simulate_received
+from rhs_isac_ros.positioning import draws as draws_module
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.positioning.coordinates import log_sum
 from rhs_isac_ros.positioning.draws import DrawnPosterior
@@ -24,19 +25,19 @@ def codebook(random_beams):
     return random_beams(WEAK, np.random.default_rng(0))
 
 
-def found_and_exact(scenario, codebook):
-    """Draws for N phases, and mean, covariance and logarithm of the integral from 2^15 points."""
+def found_and_exact(scenario, codebook, n=N):
+    """Draws for n phases, and mean, covariance and logarithm of the integral from 2^15 points."""
     likelihood = Likelihood(scenario, codebook)
     table = TemplateTable(scenario, tabulate(likelihood.model))
     drawn, rng = DrawnPosterior(scenario, table), np.random.default_rng(1)
-    received = simulate_received(scenario, codebook, scenario.sample_positions(N, rng), rng)
+    received = simulate_received(scenario, codebook, scenario.sample_positions(n, rng), rng)
     whitened = likelihood.signals(received).whitened
     query = table.query(whitened, likelihood.nuisance, 8.0)
-    found = [drawn.of(query, phase) for phase in range(N)]
+    found = [drawn.of(query, phase) for phase in range(n)]
     low, high = likelihood.resolution.bounds_m
     positions = low + (high - low) * qmc.Sobol(3, seed=0).random(1 << 15)
     means = likelihood.model.whiten(likelihood.model.mean(positions)).reshape(len(positions), -1)
-    values = (2 * (whitened.reshape(N, -1).conj() @ means.T).real
+    values = (2 * (whitened.reshape(n, -1).conj() @ means.T).real
               - np.sum(np.abs(means)**2, axis=1))
     exact = []
     for value in values:
@@ -60,6 +61,19 @@ def test_draws_have_the_moments_of_the_posterior(changes, codebook):
         assert draws.average < draws.highest
     assert np.mean(errors) < 0.08**2
     assert np.mean(spreads) == pytest.approx(1, abs=0.1)
+
+
+def test_later_rounds_follow_earlier_ones_without_bias(codebook, monkeypatch):
+    """A cell whose first draws miss its peak gets few more of them, and must not lose weight."""
+    monkeypatch.setattr(draws_module, '_N_DRAWS', 50)
+    monkeypatch.setattr(draws_module, '_N_EFFECTIVE', 50.0)
+    found, exact = found_and_exact(WEAK, codebook, 30)
+    spreads = [np.trace(draws.covariance) / np.trace(covariance)
+               for draws, (_, covariance, _) in zip(found, exact, strict=True)]
+    totals = [draws.log_total - log_total
+              for draws, (*_, log_total) in zip(found, exact, strict=True)]
+    assert np.mean(spreads) == pytest.approx(1, abs=0.05)
+    assert np.mean(totals) == pytest.approx(0, abs=0.1)
 
 
 def test_strong_signals_leave_too_few_effective_draws(codebook):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from rclpy.serialization import deserialize_message, serialize_message
+from ros_messages import codebook_from_ros, from_ros, to_ros
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import CodebookError
@@ -19,6 +20,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import MessageError, check
 from rhs_isac_ros.ros import cdr, convert, topics
 from rhs_isac_ros.ros.convert import CodebookMessage
+from rhs_isac_ros.ros.frames import Frame
 
 SIZES = Scenario().sizes
 STAMP = Time(sec=12, nanosec=345)
@@ -87,11 +89,11 @@ def test_a_round_trip_preserves_every_bit(kind):
     rng = np.random.default_rng(KINDS.index(kind))
     for _ in range(20):
         message = random_message(kind, rng)
-        sent = convert.to_ros(message, STAMP)
+        sent = to_ros(message, STAMP)
         assert type(sent) is getattr(ros, kind.__name__)
-        assert_same(message, convert.from_ros(kind, sent))
+        assert_same(message, from_ros(kind, sent))
         received = deserialize_message(serialize_message(sent), type(sent))
-        back = convert.from_ros(kind, received)
+        back = from_ros(kind, received)
         assert_same(message, back)
 
 
@@ -106,7 +108,7 @@ def test_rclpy_and_the_bytes_agree(kind):
         assert len(serialize_message(received)) == len(content)
         assert (received.header.stamp, received.header.frame_id) == (STAMP, 'rhs_link')
         expected = dataclasses.replace(message, sender=7, scenario_id='sc2')
-        assert_same(expected, convert.from_ros(kind, received))
+        assert_same(expected, from_ros(kind, received))
         assert_same(expected, convert.from_bytes(kind, content))
         for name in received.get_fields_and_field_types():
             sent, value = getattr(expected, name, None), getattr(received, name)
@@ -114,12 +116,14 @@ def test_rclpy_and_the_bytes_agree(kind):
                 assert sent == value or sent != sent, name
 
 
+# Representation identifier, stamp, frame, cycle, sender, scenario, user.
+BIG_ENDIAN = b'\0\0\0\0' + struct.pack(
+    '>iII4sQQI4sI', 1, 2, 4, b'map\0', 3, 2**40, 4, b'sc2\0', 7)
+
+
 def test_a_message_in_the_other_byte_order_is_read():
     message = m.Ack(cycle_id=3, sender=2**40, scenario_id='sc2', user=7)
-    # Representation identifier, stamp, frame, cycle, sender, scenario, user.
-    content = b'\0\0\0\0' + struct.pack(
-        '>iII4sQQI4sI', 1, 2, 4, b'map\0', 3, 2**40, 4, b'sc2\0', 7)
-    assert_same(message, convert.from_bytes(m.Ack, content))
+    assert_same(message, convert.from_bytes(m.Ack, BIG_ENDIAN))
 
 
 @pytest.mark.parametrize('kind', KINDS)
@@ -127,8 +131,8 @@ def test_arrays_are_sent_in_c_order_whatever_their_layout(kind):
     message = random_message(kind, np.random.default_rng(0))
     fortran = {field.name: np.asfortranarray(getattr(message, field.name))
               for field in dataclasses.fields(kind) if 'dims' in field.metadata}
-    sent = convert.to_ros(dataclasses.replace(message, **fortran), STAMP)
-    assert_same(message, convert.from_ros(kind, sent))
+    sent = to_ros(dataclasses.replace(message, **fortran), STAMP)
+    assert_same(message, from_ros(kind, sent))
 
 
 @pytest.mark.parametrize(('field', 'dtype', 'expected'), [
@@ -145,7 +149,7 @@ def test_arrays_of_other_numbers_are_converted(field, dtype, expected):
 
 @pytest.mark.parametrize('kind', KINDS)
 def test_header_has_stamp_and_frame(kind):
-    sent = convert.to_ros(random_message(kind, np.random.default_rng(0)), STAMP)
+    sent = to_ros(random_message(kind, np.random.default_rng(0)), STAMP)
     assert sent.header.stamp == STAMP
     assert sent.header.frame_id == 'rhs_link'
 
@@ -207,11 +211,10 @@ def test_a_type_of_a_field_without_a_codec_is_named():
 
 
 def test_an_encoding_of_rclpy_that_is_not_decoded_is_named(monkeypatch):
-    message = convert.to_ros(m.Ack(cycle_id=3, user=7), STAMP)
     monkeypatch.setattr(
         convert, 'serialize_message', lambda sent: b'\0\0' + serialize_message(sent)[2:])
     with pytest.raises(RuntimeError, match='^Ack: serialized by rclpy .* 0000, expected 0001: '):
-        convert.from_ros(m.Ack, message)
+        convert.from_bytes(m.Ack, BIG_ENDIAN)
 
 
 REAL = 'Beam.analog'
@@ -245,33 +248,33 @@ COMPLEX = 'FeedSignals.signals'
 def test_an_array_that_does_not_fill_its_shape_is_rejected(where, array):
     name, _, field = where.partition('.')
     kind = getattr(m, name)
-    message = convert.to_ros(random_message(kind, np.random.default_rng(0)), STAMP)
+    message = to_ros(random_message(kind, np.random.default_rng(0)), STAMP)
     setattr(message, field, array)
     with pytest.raises(MessageError, match=rf'^{where}: .'):
-        convert.from_ros(kind, message)
+        from_ros(kind, message)
 
 
 def test_a_value_without_a_shape_is_not_a_vector():
-    message = convert.to_ros(random_message(m.Beam, np.random.default_rng(0)), STAMP)
+    message = to_ros(random_message(m.Beam, np.random.default_rng(0)), STAMP)
     message.analog = ros.RealArray(data=[1.0])
     with pytest.raises(MessageError, match=r'^Beam.analog: shape \[\], expected \[N_E = 100\]'):
-        check(convert.from_ros(m.Beam, message), SIZES)
+        check(from_ros(m.Beam, message), SIZES)
 
 
 @pytest.mark.parametrize(('kind', 'field', 'number'), [
     (m.RhsConfiguration, 'mode', 2), (m.Data, 'direction', 2), (m.Data, 'stage', 255),
     (m.ProtocolState, 'phase', 5)])
 def test_an_unknown_constant_is_rejected(kind, field, number):
-    message = convert.to_ros(random_message(kind, np.random.default_rng(0)), STAMP)
+    message = to_ros(random_message(kind, np.random.default_rng(0)), STAMP)
     setattr(message, field, number)
     with pytest.raises(MessageError, match=rf'^{kind.__name__}.{field}: {number} '):
-        convert.from_ros(kind, message)
+        from_ros(kind, message)
 
 
 @pytest.mark.parametrize('kind', KINDS, ids=lambda kind: kind.__name__)
 def test_bytes_convert_to_the_message_or_an_error_that_names_it(kind):
     message = random_message(kind, np.random.default_rng(3))
-    serialized = serialize_message(convert.to_ros(message, STAMP))
+    serialized = serialize_message(to_ros(message, STAMP))
     assert_same(message, convert.from_bytes(kind, serialized))
     for broken in (b'', serialized[:4], serialized[:-1], b'\xff' * len(serialized)):
         with pytest.raises(MessageError, match=f'{kind.__name__}'):
@@ -279,11 +282,11 @@ def test_bytes_convert_to_the_message_or_an_error_that_names_it(kind):
 
 
 def test_a_round_trip_preserves_every_bit_of_a_codebook(shipped):
-    sent = convert.to_ros(CodebookMessage.of(shipped), STAMP)
+    sent = to_ros(CodebookMessage.of(shipped), STAMP)
     received = deserialize_message(serialize_message(sent), ros.Codebook)
     assert received.codebook_id == shipped.id
     assert (received.header.stamp, received.header.frame_id) == (STAMP, 'rhs_link')
-    back = convert.codebook_from_ros(received)
+    back = codebook_from_ros(received)
     assert back.analog.tobytes() == shipped.analog.tobytes()
     assert back.digital.tobytes() == shipped.digital.tobytes()
     assert back.average_crlb_m2 == shipped.average_crlb_m2
@@ -292,28 +295,28 @@ def test_a_round_trip_preserves_every_bit_of_a_codebook(shipped):
 
 def test_a_round_trip_preserves_a_codebook_without_a_bound(small):
     assert math.isnan(small.codebook.average_crlb_m2)
-    back = convert.codebook_from_ros(
-        convert.to_ros(CodebookMessage.of(small.codebook), STAMP))
+    back = codebook_from_ros(
+        to_ros(CodebookMessage.of(small.codebook), STAMP))
     assert math.isnan(back.average_crlb_m2)
     assert back.id == small.codebook.id
 
 
 def test_a_malformed_codebook_is_rejected(shipped):
-    sent = convert.to_ros(CodebookMessage.of(shipped), STAMP)
+    sent = to_ros(CodebookMessage.of(shipped), STAMP)
     sent.analog.data = sent.analog.data[:-1]
     with pytest.raises(MessageError, match='^CodebookMessage.analog: 799 values'):
-        convert.codebook_from_ros(sent)
-    sent = convert.to_ros(CodebookMessage.of(shipped), STAMP)
+        codebook_from_ros(sent)
+    sent = to_ros(CodebookMessage.of(shipped), STAMP)
     sent.digital.im = sent.digital.im[:-1]
     with pytest.raises(MessageError, match='^CodebookMessage.digital: 191 values'):
-        convert.codebook_from_ros(sent)
-    sent = convert.to_ros(CodebookMessage.of(shipped), STAMP)
+        codebook_from_ros(sent)
+    sent = to_ros(CodebookMessage.of(shipped), STAMP)
     sent.analog.data[0] = 1.5
     with pytest.raises(CodebookError, match='analog: .* expected 0 to 1'):
-        convert.codebook_from_ros(sent)
+        codebook_from_ros(sent)
     sent.analog.data[0] = math.nan
     with pytest.raises(CodebookError, match='analog: not finite'):
-        convert.codebook_from_ros(sent)
+        codebook_from_ros(sent)
 
 
 def test_pose_holds_position_and_covariance():
@@ -322,7 +325,7 @@ def test_pose_holds_position_and_covariance():
     estimate = dataclasses.replace(
         random_message(m.PositionEstimate, rng), position=np.array([9.0, -2.0, 0.5]),
         covariance_m2=root @ root.T)
-    pose = convert.pose(estimate, STAMP)
+    pose = convert.pose(estimate, STAMP, Frame())
     assert (pose.header.stamp, pose.header.frame_id) == (STAMP, 'map')
     point, turn = pose.pose.pose.position, pose.pose.pose.orientation
     assert (point.x, point.y, point.z) == (9.0, -2.0, 0.5)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from ros_messages import to_ros
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
@@ -21,7 +22,7 @@ from rhs_isac_ros.nodes.positioner import PositionerNode
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import check
-from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros import topics
 
 # Outside tests, warnings are only printed.
 pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')
@@ -77,7 +78,7 @@ class NodeUnderTest:
         stamp = self.node.get_clock().now().to_msg()
         for message in messages:
             before = self._handled
-            self._publishers[type(message)].publish(convert.to_ros(message, stamp))
+            self._publishers[type(message)].publish(to_ros(message, stamp))
             self._bench.until(lambda before=before: self._handled > before, 'the handling')
 
     def until_answer(self, cycle_id):

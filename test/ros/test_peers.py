@@ -11,6 +11,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
+from ros_messages import to_ros
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
@@ -341,13 +342,13 @@ def test_the_older_node_stands_by_and_resumes(each_bench, capfd):
     pilots = each_bench.publisher(probe, m.Pilot)
     pilot = m.Pilot(cycle_id=1, user=1, band=0, symbols=np.ones(4, complex))
     each_bench.until(lambda: pilots.get_subscription_count() == 2, 'both subscriptions')
-    pilots.publish(convert.to_ros(pilot, None))
+    pilots.publish(to_ros(pilot, None))
     each_bench.until(lambda: newer.role.events, 'the pilot')
     each_bench.remove(newer)
     each_bench.until(lambda: publishers() == ['older'], 'the resumption')
     assert not older.report().fault
     assert not older.role.events
-    pilots.publish(convert.to_ros(pilot, None))
+    pilots.publish(to_ros(pilot, None))
     each_bench.until(lambda: older.role.events, 'the pilot after the resumption')
     log = capfd.readouterr().err
     assert log.count('this one stands by for /newer') == 1

@@ -19,6 +19,8 @@ from rclpy.qos import (
     QoSProfile,
     ReliabilityPolicy,
 )
+from rclpy.serialization import deserialize_message
+from ros_messages import to_ros
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
@@ -75,7 +77,8 @@ def recording(bench, probe, tmp_path):
 def test_messages_are_read_back(recording):
     path, sent = recording
     found = list(read(path))
-    assert [message for _, message, _ in found] == sent
+    assert [deserialize_message(content, type(message)) for (_, content, _), message in zip(
+        found, sent, strict=True)] == sent
     assert [topic for topic, _, _ in found] == [
         '/received_signals', '/position_estimate', '/received_signals']
     times = [time_s for _, _, time_s in found]
@@ -332,7 +335,7 @@ def test_the_tool_ends_with_one_line_if_the_disk_is_full(bench, probe, tmp_path)
 def test_nodes_receive_a_recording_that_is_played_with_its_recorded_qos(bench, tmp_path):
     """As ``ros2 bag play`` does, which reads the quality of service from the file."""
     codebook = Codebook.load(default_codebook_file())
-    message = convert.to_ros(
+    message = to_ros(
         convert.CodebookMessage.of(codebook, 1, Scenario().id), Time())
     player = bench.add(Node, 'player')
     (recorded,) = yaml.safe_load(_offered_qos(recorded_topics()[topics.CODEBOOK][1]))

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from rclpy.node import Node
+from ros_messages import to_ros
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, Send, Timeout
@@ -69,7 +70,7 @@ def test_a_malformed_message_is_dropped_counted_and_logged_once(
     start(each_bench, role)
     publisher = each_bench.publisher(each_bench.add(Node, 'probe'), m.FeedSignals)
     for message in (feed_signals(**changes), feed_signals(**changes), feed_signals(user=7)):
-        publisher.publish(convert.to_ros(message, None))
+        publisher.publish(to_ros(message, None))
     each_bench.until(lambda: role.events, 'the good message')
     (event, _), = role.events
     assert event.user == 7
@@ -99,7 +100,7 @@ def test_many_malformed_messages_do_not_fill_the_log(bench, start, probe, capfd)
     for part in range(10):
         for band in range(50):
             message = m.RhsCommand(cycle_id=1, band=2 + 50 * part + band, codebook_id='')
-            publisher.publish(convert.to_ros(message, None))
+            publisher.publish(to_ros(message, None))
         bench.until(lambda part=part: role.counters['malformed'] == 50 * (part + 1), 'all of them')
     assert 1 <= capfd.readouterr().err.count('dropped: ') <= 100
 
@@ -143,7 +144,7 @@ def test_messages_keep_their_order(each_bench, start):
     received = each_bench.collect(probe, m.Grant)
     publisher = each_bench.publisher(probe, m.Ack)
     for user in range(1, 51):
-        publisher.publish(convert.to_ros(m.Ack(cycle_id=3, user=user), None))
+        publisher.publish(to_ros(m.Ack(cycle_id=3, user=user), None))
     each_bench.until(lambda: len(received) == 100, 'the last grant')
     assert [message.user for message in received] == [
         user for number in range(1, 51) for user in (number, 99)]
@@ -161,7 +162,7 @@ def test_a_role_may_connect_to_its_topics_later_and_only_once(bench, probe):
     publisher = bench.publisher(probe, m.Ack)
     assert node.count_publishers('grant') == publisher.get_subscription_count() == 1
     for user in (1, 2):
-        publisher.publish(convert.to_ros(m.Ack(cycle_id=1, user=user), None))
+        publisher.publish(to_ros(m.Ack(cycle_id=1, user=user), None))
     bench.until(lambda: len(role.events) >= 2, 'both messages')
     assert [event.user for event, _ in role.events] == [1, 2]
 
@@ -281,7 +282,7 @@ def test_deadlines_are_kept_while_messages_arrive(each_bench, start):
     start(each_bench, role)
     publisher = each_bench.publisher(each_bench.add(Node, 'probe'), m.Ack)
     for number in range(120):
-        publisher.publish(convert.to_ros(m.Ack(cycle_id=1, user=1 + number), None))
+        publisher.publish(to_ros(m.Ack(cycle_id=1, user=1 + number), None))
         # Short deadlines get time to pass.
         each_bench.until(lambda number=number: len(deadlines_s) > number and (
             number % 2 or role.deadline_s is None or number % 6 == 4), 'message or tick')
@@ -305,10 +306,10 @@ def test_messages_of_another_scenario_are_dropped_counted_and_logged_once_per_se
     node = start(each_bench, role)
     publisher = each_bench.publisher(each_bench.add(Node, 'probe'), m.Ack)
     for sender in (5, 5, 6, *range(100, 140)):
-        publisher.publish(convert.to_ros(
+        publisher.publish(to_ros(
             m.Ack(cycle_id=1, user=1, sender=sender, scenario_id='other'), None))
     for known in ('', node.scenario.id):
-        publisher.publish(convert.to_ros(m.Ack(cycle_id=2, user=1, scenario_id=known), None))
+        publisher.publish(to_ros(m.Ack(cycle_id=2, user=1, scenario_id=known), None))
     each_bench.until(lambda: len(role.events) == 2, 'the messages of this scenario')
     assert {event.cycle_id for event, _ in role.events} == {2}
     assert role.counters == {'wrong_scenario': 43}

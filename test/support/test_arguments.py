@@ -10,7 +10,9 @@ from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
     input_file,
+    output_file,
     output_folder,
+    picture_file,
     positive_int,
 )
 
@@ -68,11 +70,20 @@ def test_a_folder_that_cannot_be_made_is_an_error(name, tmp_path, monkeypatch):
 
 
 def test_an_output_differs_from_inputs_and_other_outputs(tmp_path, capsys):
+    (tmp_path / 'x').mkdir()
+    (tmp_path / 'a.png').touch()
+    file, same = f'{tmp_path}/a.png', f'{tmp_path}/x/../a.png'
     parser = ArgumentParser(prog='command')
-    check_distinct(parser, {'--a': tmp_path / 'a', '--b': None}, {'--c': tmp_path / 'c'})
-    for inputs, outputs in (
-            ({'--a': tmp_path / 'a'}, {'--c': tmp_path / 'x' / '..' / 'a'}),
-            ({}, {'--a': tmp_path / 'a', '--b': None, '--c': tmp_path / 'a'})):
+    parser.add_argument('--c', type=picture_file)
+    parser.add_argument('a', type=input_file, nargs='?')
+    parser.add_argument('--b', type=output_file)
+    parser.add_argument('--d', type=output_file, default=file)
+    check_distinct(parser, parser.parse_args([file, '--c', f'{tmp_path}/c.png']), 'd')
+    for arguments, name, other, unused in (
+            ([file, '--c', same], '--c', 'a', 'd'),
+            (['--b', file, '--c', same], '--b', '--c', 'd'), ([file], '--d', 'a', '')):
         with pytest.raises(SystemExit, match='^2$'):
-            check_distinct(parser, inputs, outputs)
-        assert 'argument --c: ' in capsys.readouterr().err
+            check_distinct(parser, parser.parse_args(arguments), unused)
+        error = capsys.readouterr().err
+        assert f'argument {name}: ' in error
+        assert f', expected another file than {other};' in error

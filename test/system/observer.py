@@ -9,6 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
+from ros_messages import codebook_from_ros
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import CodebookError
@@ -16,7 +17,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, diagnostics, topics
+from rhs_isac_ros.ros import diagnostics, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, subscribe
 from rhs_isac_ros.ros.recording import CycleObserver
 from system import invariants
@@ -107,7 +108,7 @@ class NetworkObserver(CycleObserver):
 
     def _on_codebook(self, message: ros.Codebook) -> None:
         self.n_codebooks += 1
-        self.invariants.add_codebook(convert.codebook_from_ros(message))
+        self.invariants.add_codebook(codebook_from_ros(message))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for name, report in diagnostics.from_ros(message, self.get_namespace()):

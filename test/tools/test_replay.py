@@ -13,6 +13,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
+from ros_messages import from_ros
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
@@ -146,12 +147,12 @@ def test_a_mismatch_is_named(run, capsys, arguments, error):
 
 def estimates_of(path):
     """Return the estimates of a recording by cycle, without their latencies."""
-    return {message.cycle_id: content(message)
-            for _, message, _ in read(path, ['/position_estimate'])}
+    estimates = (convert.from_bytes(m.PositionEstimate, found)
+                 for _, found, _ in read(path, ['/position_estimate']))
+    return {estimate.cycle_id: content(estimate) for estimate in estimates}
 
 
-def content(message):
-    plain = convert.from_ros(m.PositionEstimate, message)
+def content(plain):
     return (plain.user, plain.codebook_id, plain.position.tobytes(),
             plain.covariance_m2.tobytes(), plain.crlb_m2, plain.estimator)
 
@@ -171,10 +172,12 @@ def test_a_running_positioner_reproduces_the_recorded_estimates(run, shared_sess
     received = {}
     subscription = shared_session.node.create_subscription(
         convert.ros_type(m.PositionEstimate), '/again/position_estimate',
-        lambda message: received.update({message.cycle_id: content(message)}), EXCHANGE)
+        lambda message: received.update({
+            message.cycle_id: content(from_ros(m.PositionEstimate, message))}), EXCHANGE)
     assert shared_session.spin_until(lambda: subscription.get_publisher_count() > 0, 60)
     # A cycle that was repeated has its signals twice.
-    signals = [message.cycle_id for _, message, _ in read(run.path, ['/received_signals'])]
+    signals = [convert.from_bytes(m.ReceivedSignals, found).cycle_id
+               for _, found, _ in read(run.path, ['/received_signals'])]
     with subprocess.Popen(
             [SCRIPTS / 'replay', run.path, '--publish', '--rate', '20', '--ros-args', '-r',
              '__ns:=/again'], stdout=subprocess.PIPE, stderr=subprocess.PIPE,

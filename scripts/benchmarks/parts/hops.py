@@ -8,6 +8,7 @@ import numpy as np
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 
 from rhs_isac_msgs.msg import FeedSignals
 from rhs_isac_ros.model import Scenario
@@ -32,7 +33,8 @@ def ping_pong(scenario: Scenario, composed: bool = False) -> np.ndarray:
         Whether both nodes run in this process, rather than one in another process.
     """
     feeds = np.ones((scenario.n_frames, scenario.n_subbands, scenario.n_feeds), complex)
-    message = convert.to_ros(m.FeedSignals(cycle_id=1, user=1, band=0, signals=feeds), None)
+    message = deserialize_message(convert.to_bytes(
+        m.FeedSignals(cycle_id=1, user=1, band=0, signals=feeds), 0), FeedSignals)
     times_s: list[float] = []
     node = Node('ping')
     publisher = node.create_publisher(FeedSignals, 'benchmark/ping', EXCHANGE)

@@ -15,7 +15,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds import AverageCrlb
 from rhs_isac_ros.codebook import Progress, optimize, random_codebook
-from rhs_isac_ros.codebook.objective import ROW_TOLERANCE, monte_carlo
+from rhs_isac_ros.codebook.objective import ROW_TOLERANCE
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import streams
 
@@ -87,7 +87,7 @@ def measure(sizes: dict[str, int]) -> dict:
 def grow(sizes: dict[str, int]) -> dict:
     """Measure set-up time, evaluation time, and peak memory of this process."""
     scenario = scenario_of(sizes)
-    positions = monte_carlo(scenario, sizes['N_sam'], streams.generator(0, streams.SAMPLES))
+    positions = scenario.sample_positions(sizes['N_sam'], streams.generator(0, streams.SAMPLES))
     codebook = random_codebook(scenario, streams.generator(0, streams.START))
     begin = time.perf_counter()
     average = AverageCrlb(scenario, positions, ROW_TOLERANCE)

@@ -11,7 +11,6 @@ from rhs_isac_ros.support.pictures import (
     look,
     new_figure,
     paper_style,
-    to_paler,
 )
 
 
@@ -30,9 +29,11 @@ def draw(figures: dict) -> Any:
 
 def draw_gradient(axes: Any, times_ms: dict) -> None:
     """Draw the times of value and gradient."""
+    from matplotlib.colors import to_rgb
+
     own = look(0)
-    axes.barh(list(times_ms), list(times_ms.values()), facecolor=to_paler(own.colour),
-              edgecolor=own.colour)
+    axes.barh(list(times_ms), list(times_ms.values()), edgecolor=own.colour,
+              facecolor=0.6 + 0.4 * np.array(to_rgb(own.colour)))
     axes.invert_yaxis()
     axes.set(title='(a) value and gradient', xlabel='time [ms]', xlim=(0, None))
 

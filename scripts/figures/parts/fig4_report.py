@@ -14,7 +14,6 @@ from rhs_isac_ros.support.pictures import (
     look,
     new_panels,
     paper_style,
-    to_paler,
     write_picture,
 )
 
@@ -116,8 +115,12 @@ def picture(results: Results) -> Any:
 
 def box_style(index: int) -> dict[str, Any]:
     """Return the style of the boxes of a condition by its index."""
+    from matplotlib.colors import to_rgb
+
     own = look(index)
-    return {'facecolor': to_paler(own.colour), 'edgecolor': own.colour, 'hatch': own.hatch}
+    # Mixed with white, because not every format has transparency.
+    return {'facecolor': 0.6 + 0.4 * np.array(to_rgb(own.colour)), 'edgecolor': own.colour,
+            'hatch': own.hatch}
 
 
 def loss_limits_bps(results: Results) -> tuple[float, float]:

@@ -58,8 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     check_domain(parser)
-    check_distinct(parser, {'--config': options.config, '--codebook': options.codebook},
-                   {'--json': options.json})
+    check_distinct(parser, options)
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
     except (ScenarioError, CodebookError) as error:

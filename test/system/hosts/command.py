@@ -25,8 +25,8 @@ from rhs_isac_ros.support.arguments import (
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.tools.demo import (
     add_network_options,
-    check_users,
     load_files,
+    max_user_processes,
     start_network,
 )
 from system.hosts import plan
@@ -57,9 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options = parser.parse_args(arguments)
-    check_users(parser, options.users)
-    check_distinct(parser, {'--config': options.config, '--codebook': options.codebook},
-                   {'--json': options.json})
+    check_distinct(parser, options)
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
     except (ScenarioError, CodebookError) as error:
@@ -155,8 +153,8 @@ def _parser() -> argparse.ArgumentParser:
                         'default each in turn')
     parser.add_argument('--seconds', type=_positive, default=6.0,
                         help='duration of each outage')
-    parser.add_argument('--users', type=integer(1, 64), metavar='N', default=2,
-                        help='number of users')
+    parser.add_argument('--users', type=integer(1, min(64, max_user_processes())), metavar='N',
+                        default=2, help='number of users, each a process')
     add_network_options(parser)
     parser.add_argument('--usual-discovery', action='store_true',
                         help="use Fast DDS's default settings instead of the package's profile")

@@ -14,14 +14,10 @@ class PhaseNoise(Impairment):
     def __init__(self, strength):
         self._std_rad = strength
 
-    def size(self, scenario):
-        """Return the number of values: one for each frame of each band."""
-        return scenario.n_bands * scenario.n_frames
-
     def linear(self, scenario):
         """Return the exponent of each frame's phase, and the prior of a random walk."""
         shape = scenario.n_bands, scenario.n_subbands, scenario.n_frames
-        patterns = np.zeros((self.size(scenario), *shape), complex)
+        patterns = np.zeros((scenario.n_bands * scenario.n_frames, *shape), complex)
         for number, pattern in enumerate(patterns):
             band, frame = divmod(number, scenario.n_frames)
             pattern[band, :, frame] = 1j
