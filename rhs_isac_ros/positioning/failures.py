@@ -318,7 +318,7 @@ class FailureModel:
         """Compute the log-probability of `weigh` if one more element fails, float64 [N_E].
 
         The other elements are assumed to fail with the declared share times `remainder`, which
-        adds to the covariance. Elements that explain a part of the signals then have a higher
+        adds to the covariance. Elements that explain part of the signals then have a higher
         value than elements that imitate the sum.
         """
         extended, (columns, own) = self._extensions_of(failed, remainder), site.columns_of(failed)

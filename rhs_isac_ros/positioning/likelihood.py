@@ -66,8 +66,8 @@ class Signals(NamedTuple):
 class Local(NamedTuple):
     """The log-likelihood of M points (r [m], u, v) with nuisance parameters, and its derivatives.
 
-    `information` is the expected information. Observed curvatures of range and phase differ by
-    noise, which would spoil the marginal, where the two nearly cancel.
+    `information` is the expected information. Noise in observed curvatures would spoil the
+    marginal, in which the curvatures of range and phase nearly cancel.
     """
 
     value: np.ndarray  # Logarithm of likelihood and prior of the parameters, float64 [M].
