@@ -67,6 +67,8 @@ def _decode_mapping(items: Sequence[str]) -> dict[str, Any]:
     # Unlike YAML, JSON has no references, with which a short text can describe an enormous value.
     try:
         mapping = json.loads(items[0])
+        # It can escape surrogates, which neither a log nor a message can contain.
+        json.dumps(mapping, ensure_ascii=False).encode()
     except RecursionError as error:
         raise ValueError(str(error)) from None
     if not isinstance(mapping, dict):

@@ -96,7 +96,7 @@ class Peers:
             self._thread = threading.Thread(
                 target=self._announce, daemon=True, args=[endpoints.create_publisher(
                     node, ros.Presence, topics.PRESENCE, endpoints.LATCHED)])
-            self._thread.start()
+            endpoints.create_or_refuse(node, 'thread of announcements', self._thread.start)
         self._timer = endpoints.steady_timer(node, _POLL_S, self._poll)
         self.restart()
 

@@ -73,8 +73,7 @@ def check_parameters(
     accepted = set(_names(executable)).union(*map(_names, _composed(executable)))
     for name in _assigned(arguments):
         if name not in parameters.known_names() and not name.startswith(_OF_RCLPY):
-            parser.error(
-                f'argument -p: {name}: unknown parameter{parameters.hint(name)}; see --help')
+            parser.error(f'argument -p: {name}: unknown parameter{parameters.hint(name)}')
         owners = [owner for owner in NODES if name in _names(owner)]
         if owners and name not in accepted:
             parser.error(f'argument -p: {name} is a parameter of {", ".join(owners)}, '
