@@ -177,10 +177,10 @@ class Site:
 
     @functools.cached_property
     def elements(self) -> tuple[np.ndarray, np.ndarray]:
-        """Effect of each element that fails; few of the sites need it.
+        """Effect of each element that fails, computed at first use.
 
         It is the change of the columns, complex128 [N_E, 4 + Q, N_B, N_SB F], and the derivative
-        by the scaled amplitude, complex128 [N_E, N_B, N_SB F].
+        with respect to the scaled amplitude, complex128 [N_E, N_B, N_SB F].
         """
         return self.model.elements_at(self.point)
 
