@@ -101,7 +101,7 @@ class Resolution(NamedTuple):
         return self._radii(is_coarse, _STEP_WAVELENGTHS, _STEP_RAD)
 
     def separation(self, is_coarse: bool) -> np.ndarray:
-        """Return radii in (r [m], u, v) of an ellipsoid around a mode without others, [3]."""
+        """Return radii in (r [m], u, v) of an ellipsoid around a single mode, [3]."""
         return self._radii(is_coarse, _SEPARATION_WAVELENGTHS, _SEPARATION_RAD)
 
     def _radii(self, is_coarse: bool, wavelengths: float, radians: float) -> np.ndarray:

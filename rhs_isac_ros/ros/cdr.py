@@ -165,7 +165,7 @@ class Codec:
 
     def encode(
             self, message: Any, frame: str, stamp_ns: int, sender: int, scenario_id: str) -> bytes:
-        """Return the bytes of a message, whose own values the other arguments replace.
+        """Return the bytes of a message; the other arguments replace the message's own values.
 
         Raises MessageError if a string has no UTF-8 encoding.
         """

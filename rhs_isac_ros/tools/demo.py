@@ -110,7 +110,7 @@ def watch(
     """Spin an observer until it has received a number of complete cycles.
 
     `on_progress` is called with the present and the final number whenever the former changes, and
-    `on_discovered` when the observer has discovered all nodes. Return the error that ended the
+    `on_discovered` when the observer has discovered all nodes. Returns the error that ended the
     wait, or ''.
     """
     seen, changed_s = -1, time.monotonic()
