@@ -78,7 +78,7 @@ def _join_network(name: str) -> None:
 
 
 def _end_with_parent() -> None:
-    """Make the kernel send SIGTERM to this process when the parent dies, if the parent wants it.
+    """Make the kernel send SIGTERM to this process when the parent dies, if so requested.
 
     The parent may have several threads, so it cannot arrange this between fork and exec.
     """
@@ -107,8 +107,8 @@ def exit_code_of(
         program: str = '') -> int:
     """Run a main function, handle the standard streams, and return the exit code.
 
-    This is the exit code of `main`, where None means 0; 0 if the reader of the output closes it
-    early, as ``head`` does; 1 if the output cannot be written; 2 after one of the `errors`, whose
+    The code is the result of `main` (0 for None); 0 if the reader of the output closes it early,
+    as ``head`` does; 1 if the output cannot be written; 2 after one of the `errors`, whose
     messages are for the user.
     """
     # If a standard stream is closed, the next file that opens would take its descriptor.

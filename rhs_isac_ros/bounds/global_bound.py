@@ -2,8 +2,8 @@
 
 The position is uniform in the region of interest; q = (r, u, v) are its range and direction
 cosines. No estimator has a smaller mean squared error than the posterior mean. The error is
-smaller still if the estimator is also told q modulo a lattice, because the position is then one of
-M known points. With the whitened differences d_k = L^-1 (mu(p_k) - mu(p)), Lambda = L L^H, and
+smaller still if q modulo a lattice is also known, because the position is then one of M known
+points. With the whitened differences d_k = L^-1 (mu(p_k) - mu(p)), Lambda = L L^H, and
 white noise n of unit covariance, the log-likelihood of point k relative to the true one is -d_k^H
 d_k + 2 Re(d_k^H n). The error of the informed estimator is therefore an M-ary average over n,
 which is drawn at random. This extends the Ziv-Zakai bound (Bell, Steinberg, Ephraim and Van Trees,

@@ -1,4 +1,4 @@
-"""Bias and covariance of an estimator that assumes another model than the true one.
+"""Bias and covariance of an estimator that assumes a model other than the true one.
 
 Suppose that the assumed model has the mean mu(p) and the covariance L, and that the true mean is
 m. The maximum-likelihood estimator then tends to the pseudo-true position p*, which minimises (m -

@@ -128,7 +128,7 @@ class PairwiseErrorCost(Average):
 
 
 def best_phases(products: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the phases theta that bring signals a closest to signals b, almost always.
+    """Find phases theta that bring signals a close to signals b: the better of two local minima.
 
     `products` are 2 a_i^H b_i of the whitened signals, complex128 [n, N_B], and `scales` is the
     matrix A, float64 [N_B, Q] [rad]. Returns theta, float64 [n, N_B] [rad], and the cost ``|z|^2``
@@ -161,7 +161,7 @@ def _rows_of_bands(n_bands: int) -> Combination:
 
 
 def _repeated_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
-    """Compute line-of-sight gains [n, N_SB, N_E], once for equal positions that are adjacent."""
+    """Compute line-of-sight gains [n, N_SB, N_E], once for each run of equal positions."""
     is_new = np.concatenate([[True], np.any(np.diff(positions, axis=0) != 0, axis=1)])
     return los_gain(scenario, positions[is_new], band)[np.cumsum(is_new) - 1]
 

@@ -295,7 +295,7 @@ def _compress(rows_of: Callable[[slice], np.ndarray], every: list[slice], n_rows
     if not MIN_TOLERANCE <= tolerance < 1:
         raise ValueError(
             f'tolerance: {tolerance:g}, expected {MIN_TOLERANCE:g} to 1, or 0 for exact rows')
-    # The basis is found from a part of many rows, and accepted if its error for all rows is small.
+    # The basis is found from some of many rows, and accepted if its error for all rows is small.
     used = every[::max(n_rows // _SKETCHED_ROWS, 1)]
     while True:
         wanted = tolerance if len(used) == len(every) else _SKETCH_MARGIN * tolerance

@@ -157,7 +157,7 @@ def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
 
 
 def _change(before: Posterior, after: Posterior, n_bands: int) -> float:
-    """Return the largest change of a parameter; band parameters already are changes."""
+    """Return the largest change of a parameter; band parameters are changes already."""
     moved = np.abs(after.complex_mean() - before.complex_mean())
     moved[-n_bands:] = np.abs(after.complex_mean()[-n_bands:])
     std = np.sqrt(np.maximum(np.diagonal(after.complex_covariance()).real, 1e-300))

@@ -58,7 +58,7 @@ _ROUNDS, _ALIGNMENT_STEPS = 4, 6
 
 
 class SurveyWarning(UserWarning):
-    """A survey is too small, or covers only a part of the region."""
+    """A survey is too small, or covers only part of the region."""
 
 
 @one_blas_thread

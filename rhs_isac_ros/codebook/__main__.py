@@ -61,7 +61,7 @@ ERRORS = (MissingLibraryError, ValueError, OSError, MemoryError)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, also after Ctrl-C, or 2 if an argument or a file is invalid."""
+    """Run the command; return 0, even after Ctrl-C, or 2 if an argument or a file is invalid."""
     parser = ArgumentParser(
         prog='python3 -m rhs_isac_ros.codebook', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)

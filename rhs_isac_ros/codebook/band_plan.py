@@ -182,7 +182,7 @@ def choose_bands(
 
     `spectrum_hz` are intervals of centre frequencies, including their ends, `raster_hz` is the
     spacing of frequencies from the low end of each interval, and `min_gap_hz` the smallest
-    distance of two frequencies, by default the width of a band. Returns the plans for which
+    distance between two frequencies, by default the width of a band. Returns the plans for which
     codebooks were compared, the best one first; `report` is called with each. Raises ValueError if
     an argument is out of range, or no plan has the gap.
     """

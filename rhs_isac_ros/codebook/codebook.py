@@ -121,7 +121,7 @@ class Codebook:
     def from_parameters(cls, parameters: dict[str, Any]) -> 'Codebook':
         """Create a codebook from the parameters of `to_parameters`.
 
-        ``codebook.id`` may be empty or missing. Raise CodebookError if a parameter is missing or
+        ``codebook.id`` may be empty or missing. Raises CodebookError if a parameter is missing or
         malformed, or the id does not match the content.
         """
         shape = parameters.get('codebook.shape')
@@ -237,7 +237,7 @@ class Provenance:
     def resumed(self, text: str) -> 'Provenance':
         """Return the provenance of an earlier result, to resume it.
 
-        Raise ValueError unless it comes from an optimisation with the same arguments.
+        Raises ValueError unless it comes from an optimisation with the same arguments.
         """
         earlier = Provenance.parse(text)
         if earlier is None:

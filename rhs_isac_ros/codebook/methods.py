@@ -326,7 +326,7 @@ def minimize_genetic(search: Search) -> str:
     """Minimise with pymoo's genetic algorithm, one step a generation.
 
     Only the direction of a combining vector matters, so its unscaled parts are searched within
-    [-1, 1]. The first generation contains the start. Raise MissingLibraryError without pymoo.
+    [-1, 1]. The first generation contains the start. Raises MissingLibraryError without pymoo.
     """
     with optional_import("method 'genetic'", extra='genetic'):
         from pymoo.algorithms.soo.nonconvex.ga import GA

@@ -43,8 +43,8 @@ def nuisance(
     """Objective [m^2]: average bound with unknown phases of the bands and the region as prior.
 
     Even a known phase would determine the range only up to whole wavelengths, so phases are
-    treated as unknown. The region as prior keeps positions that the signals do not determine
-    from dominating the average. The scenario may declare further nuisance parameters. `rng` is
+    treated as unknown. With the region as prior, positions that the signals do not determine
+    cannot dominate the average. The scenario may declare further nuisance parameters. `rng` is
     unused.
     """
     uniform = dataclasses.replace(
@@ -122,7 +122,7 @@ def draw_confusable(
 
     Two positions are hard to distinguish if their ranges differ by about a whole number of
     wavelengths in every band. Range lags are therefore drawn with a density proportional to
-    exp(-sum_i (1 - cos 2 pi f_i lag / v_0)). For a part of the positions, the lag is 0: these
+    exp(-sum_i (1 - cos 2 pi f_i lag / v_0)). For some of the positions, the lag is 0: these
     pairs differ only in direction. Across the line of sight, displacements range from well below
     the beam width up to the side lobes. `scales` are the limits of the log-uniform scale of this
     displacement, in widths of the narrowest beam.

@@ -36,7 +36,7 @@ def directional_codebook(
 
     The configuration follows the holographic principle. The weights of each sub-band are the
     matched filter of the resulting feed signals, with equal power in all sub-bands. `rng` is
-    unused, as the codebook is deterministic. `scan` is one of `SCANS`. Raise ValueError if it is
+    unused, as the codebook is deterministic. `scan` is one of `SCANS`. Raises ValueError if it is
     unknown, or a gain pattern of the scenario is zero at a focal point.
     """
     if scan not in SCANS:

@@ -153,7 +153,7 @@ def _interrupts_ignored() -> Iterator[None]:
     """Ignore SIGINT inside the block, and in processes that are started there.
 
     A terminal sends SIGINT to the whole process group, but only this process may end the workers.
-    Blocking the signal instead would not lose it, but joblib unblocks it.
+    A blocked signal would stay pending instead, but joblib unblocks it.
     """
     # Only the main thread can set handlers, and only there SIGINT raises KeyboardInterrupt.
     if threading.current_thread() is not threading.main_thread():

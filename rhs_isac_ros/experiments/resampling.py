@@ -52,7 +52,7 @@ def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -
     `results` are float64 [members, cases], NaN where a member has no result for a case. Of M
     members, M - 1 are drawn with replacement, which makes the variance of the replicates unbiased
     (Rao and Wu, Resampling inference with complex survey data, 1988). A single member contributes
-    no variance. Other members should have another seed. Results with the same number of cases
+    no variance. Use different seeds for different members. Results with the same number of cases
     share the resampled cases. Quantiles are from 0 to 1; by default, the mean is computed.
     """
     if results.ndim != 2 or not np.isfinite(results).any():
@@ -111,8 +111,8 @@ def _interval(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
 
     With few members, the percentiles are too close together. They are moved apart by the ratio of
     the quantiles of Student's t and of the normal distribution, with Satterthwaite's degrees of
-    freedom. Each part has the replicates due to the members of one sample, and their number. The
-    scale is logarithmic if all replicates are positive.
+    freedom. Each part contains the replicates due to the members of one sample, and the number of
+    members. The scale is logarithmic if all replicates are positive.
     """
     with np.errstate(invalid='ignore'):
         if all(np.nanmin(array) > 0 for array in (values, *(part for part, _ in parts))):

@@ -183,7 +183,7 @@ class Sweep:
     """The measures of a sweep, its settings, and the options of its codebooks.
 
     Raises ValueError if a measure is unknown, a number is out of range, a file has no codebook
-    that fits its settings, or base values contradict those that an optimisation takes from a
+    that fits its settings, or fields of `base` contradict those that an optimisation takes from a
     setting.
     """
 

@@ -79,7 +79,7 @@ def draw(axes: Sequence[Axis], points: Sequence[Point],
 
 def draw_panel(panel: Any, first: Axis, others: Sequence[Axis], points: Sequence[Point],
                names: Sequence[str]) -> None:
-    """Draw measures of one unit over the first axis, with a line for each value of the others."""
+    """Draw measures of one unit against the first axis, a line for each value of the others."""
     values = [entry[0] for entry in first.values]
     numeric = all(isinstance(value, int | float) for value in values)
     places = np.array(values if numeric else range(len(values)), float)
@@ -153,7 +153,7 @@ def is_geometric(values: Sequence[float]) -> bool:
 
 
 def _set_scale(panel: Any, values: Sequence[float]) -> None:
-    """Set the scale of the x axis: logarithmic for geometric values, even after a zero."""
+    """Make the x axis logarithmic if `is_geometric` holds for the values without a first zero."""
     if is_geometric(values):
         panel.set_xscale('log')
     elif values[0] == 0 and is_geometric(values[1:]):

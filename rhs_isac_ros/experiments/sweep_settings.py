@@ -92,7 +92,7 @@ def measured(measure: Measure, results: np.ndarray) -> Interval:
 def parse_measures(text: str) -> list[list[str]]:
     """Parse ``NAME,...``, where ``+`` joins measures of one unit that share a panel.
 
-    Raise ValueError if a measure is unknown or repeated, or units in a panel differ.
+    Raises ValueError if a measure is unknown or repeated, or units in a panel differ.
     """
     panels = [panel.split('+') for panel in text.split(',')]
     names = names_of(panels)
@@ -187,7 +187,7 @@ def settings_of(
         base: Scenario, axes: Sequence[Axis], codebook: str, estimator: str) -> list[Setting]:
     """List all combinations; the last axis varies fastest.
 
-    `codebook` and `estimator` apply unless an axis varies them. Raise ValueError if a field is on
+    `codebook` and `estimator` apply unless an axis varies them. Raises ValueError if a field is on
     two axes, or values contradict each other.
     """
     names = [name for axis in axes for name in axis.fields]

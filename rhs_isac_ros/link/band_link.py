@@ -73,7 +73,7 @@ class BandLink:
            surface: SurfaceEstimate | None = None) -> 'BandLink':
         """Return the links to a position, float64 [3] [m], in bands, counted from 0.
 
-        Coefficients of an estimated surface are included in the propagation on the board. Raise
+        Coefficients of an estimated surface are included in the propagation on the board. Raises
         ValueError if the position is not a finite [3] array.
         """
         onboard, fixed = arrays(scenario, surface)

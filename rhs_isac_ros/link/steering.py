@@ -204,7 +204,7 @@ def choose_beam(
     The posterior is Gaussian, with the mean, float64 [3] [m], and the covariance, float64 [3, 3]
     [m^2]; without a covariance, the position is exact. The capacity at the mean position alone
     would mislead: a stronger but narrower beam may lose more capacity to the positioning error
-    than it gains. `bands` are counted from 0, and all by default; the first of equal bands is
+    than it gains. `bands` are counted from 0, and all by default; in a tie, the first band is
     chosen. Raises ValueError if `mean` or `covariance` has a wrong shape or is not finite, there
     is no band, or a band is out of range.
     """

@@ -12,7 +12,7 @@ independent. Signals are treated as circular, although failures also cause a pse
 sum over elements whose terms differ in phase.
 
 An estimated coefficient is ``gain c + offset``: the offset of a working element is 0, as is the
-gain of a failed one. All signals of a band are also multiplied by a gain of its receiving chain.
+gain of a failed one. All signals of a band are also multiplied by a gain of its receive chain.
 The mean signals are therefore linear in the elements and in the gain of each band, and their
 errors have a covariance in closed form.
 """

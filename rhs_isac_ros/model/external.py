@@ -25,7 +25,7 @@ class External(abc.ABC):
     def named(cls, text: str) -> 'External':
         """Load a value by its origin, which may be followed by ``@`` and the expected digest.
 
-        Raise ValueError if there is no valid value or the digest differs.
+        Raises ValueError if there is no valid value or the digest differs.
         """
         origin, expected = re.fullmatch(  # type: ignore[union-attr]
             r'(.*?)(?:@([0-9a-f]{16}))?', text, re.DOTALL).groups()

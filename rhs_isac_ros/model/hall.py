@@ -144,7 +144,7 @@ class PathChannel(ArrayFile):
     n: np.ndarray  #: Number of reflections, int [N, P]; 0: direct path, -1: missing path.
     f0: float  #: Frequency of the amplitudes [Hz], which are inversely proportional to it.
     #: Factors of the paths at each element, complex128 [N, P, N_E], for objects that are visible
-    #: from only a part of the surface; None if all factors are 1.
+    #: from only part of the surface; None if all factors are 1.
     gains: np.ndarray | None = None
     origin: str = ''
 

@@ -17,7 +17,7 @@ RECEIVES = (m.Beacon, m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Ca
 
 @dataclasses.dataclass
 class CycleTimes:
-    """The times of one cycle at which a subscriber received messages [s]; NaN if it has not."""
+    """Times at which a subscriber received the messages of one cycle [s]; NaN if missing."""
 
     cycle_id: int
     user: int = 0  # 0 before the grant
@@ -99,8 +99,8 @@ class CycleRecord(CycleTimes):
 class CycleLog:
     """Collects the cycles of one network, even if its base station restarts.
 
-    `ended` lists all cycles that have ended, in order; `complete` lists the served cycles of which
-    no message is missing.
+    `ended` lists all cycles that have ended, in order; `complete` lists the served cycles without
+    missing messages.
     """
 
     def __init__(self) -> None:

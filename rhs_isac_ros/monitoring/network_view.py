@@ -95,7 +95,7 @@ class Charts:
                 yield Entry(cycle, path, Number(float(value)))
 
     def dropped(self, node: str, count: int) -> Iterator[Sample]:
-        """Yield how many messages all nodes have dropped since they started, and this node.
+        """Yield the numbers of messages dropped by all nodes together, and by this node.
 
         Only the first four nodes that dropped a message have their own series.
         """

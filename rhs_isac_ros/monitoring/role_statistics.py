@@ -108,7 +108,7 @@ class RoleStatistics:
         return Report(True, summary, values)
 
     def _codebook_ids(self, in_use: str) -> dict[str, str]:
-        """Return the id of the codebook in use (at first, offered) and the id of a pending one."""
+        """Return the ids of the codebook in use (or first offered) and of a pending one."""
         if not self._codebook_id:
             return {}
         if in_use in ('', self._codebook_id):

@@ -73,7 +73,7 @@ class Picture(NamedTuple):
 
 
 class Series(NamedTuple):
-    """The name and the style of the numbers on a path, a line or dots."""
+    """The name of the numbers on a path, and their style: a line or dots."""
 
     name: str
     colour: Colour
@@ -287,7 +287,7 @@ def lobe(shown: BeamPattern, user: int) -> Mesh:
 
 def _ellipsoids(
         centres: np.ndarray, covariances_m2: np.ndarray, colours: np.ndarray) -> Ellipsoids:
-    # This import takes long, and a program may never need it.
+    # This import is slow, and a program may never need it.
     from scipy.spatial.transform import Rotation
 
     shapes = [axes_95(covariance) for covariance in covariances_m2]

@@ -80,7 +80,7 @@ class LocateServer:
                     self._end(goal, f'no fix: {message.reason}')
 
     def destroy(self, delay_s: float = 0.0) -> None:
-        """Abort all goals, then withdraw the action after `delay_s`, which the results need."""
+        """Abort all goals, and withdraw the action `delay_s` later, when the results are sent."""
         for goal in list(self._goals):
             self._end(goal, 'the base station ends or stands by')
         server, self._server = self._server, None

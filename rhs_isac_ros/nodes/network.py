@@ -13,7 +13,7 @@ from rhs_isac_ros.ros.run import entry
 
 
 def _make(role: str) -> Node:
-    """Create the node of a role; its class is called after the role."""
+    """Create the node of a role; its class is named after the role."""
     module = importlib.import_module(f'rhs_isac_ros.nodes.{role}')
     node: Node = getattr(module, f'{role.title().replace("_", "")}Node')()
     return node

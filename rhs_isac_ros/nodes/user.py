@@ -29,7 +29,7 @@ _MAX_AGE_S = 5.0
 class RobotMobility:
     """Mobility of a robot: the latest position, extrapolated with the velocity.
 
-    A position is valid for `timeout_s`. Texts contain the `source` of the positions.
+    A position is valid for `timeout_s`. The text of `lack` begins with `source`.
     """
 
     def __init__(self, node: Node, frame: Frame, source: str, timeout_s: float) -> None:

@@ -169,7 +169,7 @@ class VisualizerNode(Node):
         self._frame = Frame.of(self, values)
         self._forget_s = values.forget_s
         self._scene = SceneState()
-        # The latest beam and its marker, because a beam pattern takes long to compute.
+        # The latest beam and its marker, because a beam pattern is slow to compute.
         self._drawn: tuple[m.Beam, Marker] | None = None
         self._shown: set[tuple[str, int]] = set()
         self._publisher = endpoints.create_publisher(

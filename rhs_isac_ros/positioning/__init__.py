@@ -13,8 +13,8 @@ The modules, in reading order:
 * `likelihood`: the likelihood of positions and nuisance parameters
 * `grid`: starts of the search; `search`: ascent from the starts to the modes; `failures`: modes if
   elements have failed
-* `posterior`: from modes to samples; `draws`: samples without modes; `alternatives` to a user in
-  the region; `diagnosis`: tests of the fit between signals and model
+* `posterior`: from modes to samples; `draws`: samples without modes; `alternatives`: users outside
+  or blocked; `diagnosis`: tests of the fit between signals and model
 * `tracking`; `neural`: the paper's network; `store`: tables in files
 """
 

@@ -1,9 +1,9 @@
 """Alternatives to a user in the region with a direct path: a user outside, or a blocked one.
 
 An alternative has prior odds and an evidence: the likelihood averaged over its own unknowns. Its
-probability follows from a comparison with the evidence for the region. Above the limit of the
-alternative, there is no fix. The limit of a user outside is high, because the prior odds are even
-although most users are inside, and none of them should lose a fix.
+probability follows from a comparison with the evidence for the region. If it exceeds a limit,
+there is no fix. The limit of a user outside is high, because the prior odds are even although most
+users are inside, and none of them should lose a fix.
 """
 
 import math
@@ -104,7 +104,7 @@ class Blocked:
                         prior: NuisancePrior) -> float:
         """Compute the evidence from the energies of the signals; see `Alternative`."""
         energy = np.array([residual, np.sum(np.abs(whitened)**2)])
-        # The gain of the user is a part of the level.
+        # The gain of the user is part of the level.
         std_db = math.hypot(BLOCKED_STD_DB, self._std_db, _DB_PER_NEPER * prior.gain_std)
         in_sight, blocked = (
             float(log_evidence_of_level(energy[[index]], whitened.size, std, self._median_db)[0])

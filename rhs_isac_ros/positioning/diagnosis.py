@@ -111,7 +111,7 @@ class InnovationTest:
 
     Twice an energy has approximately a chi-square distribution; `Estimate.expected_residual` is
     half its mean. Raises ValueError if the window is shorter than `MIN_RETURN`, because no warning
-    would end.
+    could then end.
     """
 
     #: Whether the residuals deviate from the model: True once their mean or variance over the

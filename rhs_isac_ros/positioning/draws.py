@@ -1,14 +1,14 @@
 """The posterior of weak signals: positions drawn all over the grid, instead of modes.
 
-Below the noise, thousands of beams and range steps explain the signals. Finding all of these modes
-takes long, and they are not Gaussian. Instead, directions are drawn within cells of the grid, and
-the likelihood is integrated along the range. This is importance sampling: cells are drawn with
+Signals below the noise fit thousands of beams and range steps. The search for all of these modes
+would be slow, and they are not Gaussian. Instead, directions are drawn within cells of the grid,
+and the likelihood is integrated along the range. This is importance sampling: cells are drawn with
 probabilities that follow from bounds of their likelihood, and the weight of a draw is its integral
 divided by the probability of its cell. The weights determine the number of effective draws. While
-it is too small, further rounds of draws also follow the weights found so far. Each round alone is
-unbiased, because its probabilities do not depend on its own draws, and later rounds have larger
-weights: "The square root rule for adaptive importance sampling" (Owen and Zhou, ACM Transactions
-on Modeling and Computer Simulation, 2020). Peaks of strong signals are too narrow for this method.
+this number is too small, further rounds of draws also follow the weights found so far. Each round
+is unbiased, because its probabilities do not depend on its own draws. Later rounds have larger
+weights (Owen and Zhou, The square root rule for adaptive importance sampling, ACM Transactions on
+Modeling and Computer Simulation, 2020). Peaks of strong signals are too narrow for this method.
 """
 
 from typing import NamedTuple

@@ -177,10 +177,10 @@ class Site:
 
     @functools.cached_property
     def elements(self) -> tuple[np.ndarray, np.ndarray]:
-        """Effect of each element that fails; few of the sites need it.
+        """Effect of each element that fails, computed at first use.
 
         It is the change of the columns, complex128 [N_E, 4 + Q, N_B, N_SB F], and the derivative
-        by the scaled amplitude, complex128 [N_E, N_B, N_SB F].
+        with respect to the scaled amplitude, complex128 [N_E, N_B, N_SB F].
         """
         return self.model.elements_at(self.point)
 
@@ -318,7 +318,7 @@ class FailureModel:
         """Compute the log-probability of `weigh` if one more element fails, float64 [N_E].
 
         The other elements are assumed to fail with the declared share times `remainder`, which
-        adds to the covariance. Elements that explain a part of the signals then have a higher
+        adds to the covariance. Elements that explain part of the signals then have a higher
         value than elements that imitate the sum.
         """
         extended, (columns, own) = self._extensions_of(failed, remainder), site.columns_of(failed)

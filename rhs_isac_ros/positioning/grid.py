@@ -49,8 +49,8 @@ _N_OUTPUTS = 1 << 18
 _N_FIRST = 48
 # Number of further relevant cells above which positions are drawn instead.
 _MAX_CELLS = 100
-# Largest log-likelihood, relative to no signal, of signals for which positions are drawn. The peaks
-# of stronger signals are so narrow that draws may meet some of them and miss others.
+# Largest log-likelihood, relative to no signal, of signals for which positions are drawn. Peaks of
+# stronger signals are so narrow that draws may meet some of them and miss others.
 _MAX_DRAWN = 100.0
 # Largest number of peaks of a phase that are kept, to limit memory and time. Only signals below
 # the noise have more, and the remaining peaks have little weight.

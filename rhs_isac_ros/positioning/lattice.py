@@ -33,7 +33,7 @@ _STEP_RAD = 0.5
 PHASE_ERROR = 0.2
 _AMPLITUDE_ERROR = 0.05
 # Phase at the edge of the aperture within which points share an expansion [rad].
-_SHARED_RAD = 0.05
+_SHARED_RAD = 0.1
 # Radii of an ellipsoid around a mode that contains no other mode, in wavelengths and radians.
 _SEPARATION_WAVELENGTHS = 0.37
 _SEPARATION_RAD = 0.57
@@ -101,7 +101,7 @@ class Resolution(NamedTuple):
         return self._radii(is_coarse, _STEP_WAVELENGTHS, _STEP_RAD)
 
     def separation(self, is_coarse: bool) -> np.ndarray:
-        """Return radii in (r [m], u, v) of an ellipsoid around a mode without others, [3]."""
+        """Return radii in (r [m], u, v) of an ellipsoid around a single mode, [3]."""
         return self._radii(is_coarse, _SEPARATION_WAVELENGTHS, _SEPARATION_RAD)
 
     def _radii(self, is_coarse: bool, wavelengths: float, radians: float) -> np.ndarray:

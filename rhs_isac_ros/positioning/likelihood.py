@@ -66,8 +66,8 @@ class Signals(NamedTuple):
 class Local(NamedTuple):
     """The log-likelihood of M points (r [m], u, v) with nuisance parameters, and its derivatives.
 
-    `information` is the expected information. Observed curvatures of range and phase differ by
-    noise, which would spoil the marginal, where the two nearly cancel.
+    `information` is the expected information. Noise in observed curvatures would spoil the
+    marginal, in which the curvatures of range and phase nearly cancel.
     """
 
     value: np.ndarray  # Logarithm of likelihood and prior of the parameters, float64 [M].
@@ -159,9 +159,9 @@ class NuisancePrior:
                 slopes: np.ndarray, *linear: np.ndarray) -> np.ndarray:
         """Return the residual and its derivatives at M points, complex128 [M, C, N_B, N_SB F].
 
-        The residual is followed by four groups of derivatives: of the mean by the point, of the
-        informative signals by the parameters, of the mean by further `linear` parameters, and of
-        the received signals by the parameters.
+        Four groups of derivatives follow the residual: of the mean with respect to the point, of
+        the informative signals to the parameters, of the mean to further `linear` parameters, and
+        of the received signals to the parameters.
         """
         divided = self.divide(received, values)
         # A parameter that moves the multipath acts on the received multipath, so the information

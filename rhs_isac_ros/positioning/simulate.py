@@ -18,7 +18,7 @@ def simulate_pairs(
     """Simulate positioning phases at random positions of the region of interest.
 
     A seed defines an infinite sequence of pairs, of which this function returns n, beginning with
-    `first`. Its pairs are the same, bit for bit, however the calls divide it. Returns positions,
+    `first`. The pairs do not depend on how calls divide the sequence. Returns positions,
     float64 [n, 3] [m], uniform in the region, and received signals, complex128 [n, N_B, N_SB F],
     sub-band-major. Raises CodebookError if the codebook does not fit the scenario, and ValueError
     if `n`, `seed` or `first` is negative.

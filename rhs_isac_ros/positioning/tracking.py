@@ -409,10 +409,10 @@ def update(
         signals: Signals) -> Mixture:
     """Return the product of a predicted mixture and the likelihood of a phase, not normalised.
 
-    Every mode updates every component. Components also remain without an update, in case the
-    search has missed an unlikely mode, as wide as the best one, somewhere inside them. `share`,
-    from 0 to 1, is the exponent of the likelihood; it is below 1 if part of the multipath was
-    received before. The heaviest pairs are evaluated with `likelihood`, unless it is None.
+    Every mode updates every component. Each component also remains without an update, in case the
+    search has missed an unlikely mode inside it that is as wide as the best one. `share`, from 0
+    to 1, is the exponent of the likelihood; it is below 1 if part of the multipath was received
+    before. The heaviest pairs are evaluated with `likelihood`, unless it is None.
     """
     spread = np.linalg.inv(modes.curvature) / share
     offsets = modes.points[:, None] - predicted.means[:, :3]

@@ -221,7 +221,7 @@ class Positioner(Role):
         # Users whose latest signals yielded no position, so that only changes are logged.
         self._lost: NewestDict[int, _Loss] = NewestDict(MAX_USERS)
         self._residuals = ResidualWatch()
-        # The last signals that were answered, and the answer.
+        # The last signals that were answered, and the messages of the answer.
         self._answered: tuple[m.ReceivedSignals, list[events.Action]] | None = None
 
     def status(self) -> Mapping[str, str]:
@@ -301,9 +301,9 @@ class Positioner(Role):
             self.count(Outcome.DUPLICATE)
             self._actions += self._answered[1]
         elif received.codebook_id in self._estimators:
-            n_before = len(self._actions)
             self._locate(received, now_s)
-            self._answered = received, self._actions[n_before:]
+            self._answered = received, [
+                action for action in self._actions if isinstance(action, events.Send)]
         elif received.codebook_id in {
                 job.codebook.id for job in (self._building, self._next) if job}:
             self._waiting = received, now_s

@@ -41,10 +41,10 @@ class Presence:
 class Presences:
     """Decides from the announcements of other nodes whether this node serves or stands by.
 
-    A node announces itself periodically; a node that falls silent has gone. Among the nodes with
-    the same role and scenario, the one that started last serves, as with the fencing tokens of
-    leases: a restarted node serves at once, and an older node resumes when the newer one has gone.
-    Nodes with another scenario are reported and otherwise ignored.
+    A node announces itself periodically, and counts as gone when it falls silent. Among the nodes
+    with the same role and scenario, the one that started last serves, as with the fencing tokens
+    of leases: a restarted node serves at once, and an older node resumes when the newer one has
+    gone. Nodes with another scenario are reported and otherwise ignored.
 
     The clock of the arguments `now_s` [s] stops while this node cannot receive announcements.
     """
@@ -80,7 +80,7 @@ class Presences:
                   for scenario_id in ended), *self._choose()]
 
     def silent(self) -> set[str]:
-        """Return the names of the nodes that have announced themselves and have gone."""
+        """Return the names of the nodes that have announced themselves and fallen silent."""
         return {other.node for other, _ in self._known.values()} - {
             other.node for other in self._present()}
 

@@ -39,7 +39,7 @@ class BaseStationSettings:
         True, 'Whether to add thermal noise; false if the radio adds its own.')
     ack_timeout_s: float = setting(
         0.1, 'Time to wait for acks.', unit='s', low=0.001, high=60.0)
-    # Users have the same timeout and would not notice a change.
+    # Users have the same timeout and would miss a change.
     step_timeout_s: float = setting(
         1.0, 'Time to wait for the next message of a cycle.', unit='s', low=0.01, high=60.0,
         dynamic=False)
@@ -120,7 +120,7 @@ def _of_scenario(name: str) -> Any:
 class Impairments:
     """Impairments of the air interface, and deviations of the signals from their model.
 
-    The other roles do not know the values that replace fields of the scenario.
+    Only the channel uses the values that replace fields of the scenario.
     """
 
     loss_probability: float = setting(

@@ -67,6 +67,8 @@ def _decode_mapping(items: Sequence[str]) -> dict[str, Any]:
     # Unlike YAML, JSON has no references, with which a short text can describe an enormous value.
     try:
         mapping = json.loads(items[0])
+        # It can escape surrogates, which neither a log nor a message can contain.
+        json.dumps(mapping, ensure_ascii=False).encode()
     except RecursionError as error:
         raise ValueError(str(error)) from None
     if not isinstance(mapping, dict):
@@ -163,7 +165,7 @@ class Codec:
 
     def encode(
             self, message: Any, frame: str, stamp_ns: int, sender: int, scenario_id: str) -> bytes:
-        """Return the bytes of a message, whose own values the other arguments replace.
+        """Return the bytes of a message; the other arguments replace the message's own values.
 
         Raises MessageError if a string has no UTF-8 encoding.
         """

@@ -122,7 +122,7 @@ def odometry(
         user: int, estimate: TrackEstimate, stamp: Time, frame: Frame) -> Odometry:
     """Return the position and velocity of a track; orientation and angular velocity are unknown.
 
-    The child frame, in which the velocity is given, has the axes of the frame.
+    The child frame, in which the velocity is given, has the same axes.
     """
     result = true_odometry(user, estimate.mean, estimate.velocity, stamp, frame)
     result.pose.covariance = _with_rotation(

@@ -18,7 +18,6 @@ from typing import Any, TypeVar
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -73,8 +72,8 @@ def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> 
     """Return the result of `create`, or None after logging once that the middleware refused it."""
     try:
         return create()
-    # For an action, rclpy raises a ValueError.
-    except (rclpy_implementation.RCLError, ValueError) as error:
+    # For an action, rclpy raises a ValueError. RCLError is a RuntimeError, as is that of a thread.
+    except (RuntimeError, ValueError) as error:
         # The end of the text is a position in the sources of ROS.
         text = f'{what} was refused: {str(error).partition(", at ")[0].splitlines()[0]}'
         known = _refusals.setdefault(node, {})

@@ -23,7 +23,7 @@ def surface_frame(namespace: str) -> str:
 
 
 def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Return the matrix [3, 3] of a quaternion x, y, z, w, whose length may be any except 0."""
+    """Return the matrix [3, 3] of a quaternion x, y, z, w of any length except 0."""
     x, y, z, w = quaternion / np.linalg.norm(quaternion)
     return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
                      [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
@@ -108,6 +108,6 @@ def _quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:
 
 
 def _product(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the quaternion of the rotation `other`, followed by `one`."""
+    """Return the quaternion of two successive rotations: first `other`, then `one`."""
     (u, a), (v, b) = (one[:3], one[3]), (other[:3], other[3])
     return np.append(a * v + b * u + np.cross(u, v), a * b - u @ v)

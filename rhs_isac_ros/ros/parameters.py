@@ -279,7 +279,7 @@ class ParameterizedNode(Node):
 
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
         super().__init__(name or executable, **node_options)
-        # Ends, before the node is destroyed, what it has started.
+        # Callbacks that run before the node is destroyed.
         self.endings = contextlib.ExitStack()
         self._executable = executable
         self.values = declare(self, executable)
@@ -293,7 +293,7 @@ class ParameterizedNode(Node):
         self.add_post_set_parameters_callback(self._on_set)
 
     def destroy_node(self) -> None:
-        """End what the node has started, then destroy it."""
+        """Run the callbacks in `endings`, then destroy the node."""
         self.endings.close()
         super().destroy_node()  # type: ignore[no-untyped-call]
 

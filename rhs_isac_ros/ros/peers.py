@@ -1,4 +1,4 @@
-"""Who is in the network: the topics of the ROS graph, and announcements of the nodes."""
+"""Presence of the nodes, from the topics of the ROS graph and their announcements."""
 
 import itertools
 import threading
@@ -45,12 +45,12 @@ def new_instance() -> int:
 
 
 class Peers:
-    """Polls the ROS graph for what a node needs to know about the others.
+    """Polls the ROS graph for the roles that a node requires.
 
-    A role is missing if no node has all `identifying_endpoints`, and present once two polls in a
-    row have found them, which gives it time to discover this node as well. Nodes of unique roles
-    also announce themselves to each other periodically: one that has fallen silent does not count,
-    although the graph contains it for some time. Of two with the same role, the newer serves.
+    A role is missing if no node has all its `identifying_endpoints`. It is present once two polls
+    in a row have found them, so that its node has time to discover this one. Nodes of unique
+    roles also announce themselves periodically. A node that falls silent does not count, although
+    the graph contains it for some time. Of two nodes with the same role, the newer serves.
     Endpoints that cannot exchange messages, because one requests a quality of service that the
     other does not offer, are logged.
 
@@ -64,7 +64,7 @@ class Peers:
         Called with the roles that are missing, by name with a description: as soon as none is
         missing or after a grace period, and then on every change.
     on_rival
-        Called with whether the node stands by, when nodes with the same role appear or go.
+        Called with True if this node has to stand by for another one, or False if it may serve.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Peers:
             self._thread = threading.Thread(
                 target=self._announce, daemon=True, args=[endpoints.create_publisher(
                     node, ros.Presence, topics.PRESENCE, endpoints.LATCHED)])
-            self._thread.start()
+            endpoints.create_or_refuse(node, 'thread of announcements', self._thread.start)
         self._timer = endpoints.steady_timer(node, _POLL_S, self._poll)
         self.restart()
 
@@ -131,7 +131,7 @@ class Peers:
         self._set_period(_POLL_S if busy else _IDLE_POLL_S)
 
     def _now_s(self) -> float:
-        """Return a time that excludes those in which this process stood still [s]."""
+        """Return the time, not counting intervals in which this process stalled [s]."""
         now_s = time.monotonic()
         if now_s - self._last_s > _IDLE_POLL_S + PERIOD_S:
             # Announcements that arrived meanwhile may still be waiting.

@@ -22,7 +22,7 @@ from rhs_isac_ros.executables import PARENT_ID
 from rhs_isac_ros.ros.startup import OVERRIDE
 
 # Maximum number of users with nodes of their own, unless more are requested; more share one node,
-# because every process takes memory and CPU time, also between its cycles.
+# because every process takes memory and CPU time, even between its cycles.
 MAX_USER_NODES = 16
 # Memory of the process of a node [bytes], and the number of nodes that a core can run.
 _MEMORY_BYTES = 67_000_000
@@ -70,7 +70,7 @@ def claim_domain() -> str:
 def max_processes() -> int:
     """Return the number of nodes that this machine can run as processes of their own.
 
-    The process that observes them counts as one where discovery limits the number.
+    If discovery limits the number, the process that observes them counts as well.
     """
     fields = dict(line.split(':') for line in
                   _MEMORY_FILE.read_text(encoding='ascii').splitlines())
@@ -84,10 +84,10 @@ def max_processes() -> int:
 
 def run_executable(
         command: Sequence[str], log: Path, environment: Mapping[str, str]) -> None:
-    """Run an executable in this process, a new copy of another one, as its command would.
+    """Run an executable as its command would, in this process, a new copy of another one.
 
     Output is appended to `log`. After SIGINT, which the caller has blocked, the exit code is 0,
-    also before the executable handles the signal.
+    even before the executable handles the signal.
     """
     signal.signal(signal.SIGINT, lambda number, _: sys.exit(0))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
@@ -144,8 +144,8 @@ class Processes:
     Parameters
     ----------
     fork
-        Whether to start them as copies of this process, which must not have used ROS before: they
-        need a tenth of the time, because they have no imports. Otherwise each starts anew.
+        Whether to start them as copies of this process, which must not have used ROS before.
+        Copies start in a tenth of the time, because they import nothing.
     """
 
     def __init__(

@@ -165,7 +165,7 @@ def read(
     """Yield the topic, the bytes (CDR) and the time [s] of each message, as recorded.
 
     `names` selects topics by their full names; None selects all. Raises RecordingError if the file
-    cannot be read, or a recorded message has other fields than the installed one.
+    cannot be read, or the fields of a recorded and an installed message differ.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
     checked: set[int] = set()
@@ -193,7 +193,7 @@ def _fields(text: str) -> list[str]:
 
 
 def read_scenario(path: str | Path) -> Scenario | None:
-    """Return the scenario of a recording, or None, as in a recording made with ``ros2 bag``.
+    """Return the scenario of a recording; None if there is none, as after ``ros2 bag record``.
 
     Raises RecordingError if the file cannot be read, ScenarioError if the scenario is invalid.
     """

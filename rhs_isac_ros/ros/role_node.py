@@ -283,7 +283,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 f'{self._codebook_client.codebook_id or "none"}')
 
     def set_lacking(self, text: str) -> None:
-        """Describe what is missing for the role apart from other roles; '' if nothing is."""
+        """Describe what the role lacks, apart from other roles; '' if nothing."""
         if text != self._lacking:
             self._lacking = text
             # Before discovery, it is unknown which roles are missing.

@@ -73,8 +73,7 @@ def check_parameters(
     accepted = set(_names(executable)).union(*map(_names, _composed(executable)))
     for name in _assigned(arguments):
         if name not in parameters.known_names() and not name.startswith(_OF_RCLPY):
-            parser.error(
-                f'argument -p: {name}: unknown parameter{parameters.hint(name)}; see --help')
+            parser.error(f'argument -p: {name}: unknown parameter{parameters.hint(name)}')
         owners = [owner for owner in NODES if name in _names(owner)]
         if owners and name not in accepted:
             parser.error(f'argument -p: {name} is a parameter of {", ".join(owners)}, '
@@ -189,7 +188,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         gc.freeze()
         while ok() and not signals and not done():
             # This call returns after each message. Other ways of spinning do not return until the
-            # queue is empty, so that a busy node would not notice signals.
+            # queue is empty, so that a busy node would miss signals.
             executor.spin_once(timeout_sec=_POLL_S)
     except ExternalShutdownException:
         pass
@@ -219,8 +218,8 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
 def entry(executable: str, make: Callable[[], Sequence[Node]]) -> Callable[..., int]:
     """Return the main function of an executable that has only ROS arguments.
 
-    The executable is a key of `NODES`. The first line of the docstring of the module of `make`,
-    after a colon, describes it.
+    The executable is a key of `NODES`. Its description is the part after the colon in the first
+    line of the docstring of `make`'s module.
     """
     def main(args: Sequence[str] | None = None) -> int:
         arguments = sys.argv[1:] if args is None else list(args)

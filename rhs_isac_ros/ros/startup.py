@@ -1,7 +1,7 @@
 """How a process joins the network: discovery, and an enclave of SROS 2.
 
 Fast DDS takes a tenth of a second for discovery, and a second longer for each message that it
-misses. A node therefore joins while it imports its modules; this one imports little.
+misses. A node therefore joins while it imports its modules; this module imports little.
 """
 
 import contextlib
@@ -87,9 +87,9 @@ def is_enabled() -> bool:
 def prepare(args: Sequence[str]) -> list[str]:
     """Return a command line that names an enclave, if DDS security is enabled.
 
-    The command line begins with the name of the program. By default, the enclave of a node has its
-    full name, that of a tool is ``operator``. ROS reports an error of the environment with a
-    traceback or not at all, so that it is checked here.
+    The command line begins with the name of the program. By default, the enclave of a node is the
+    node's full name, and the enclave of a tool is ``operator``. The environment is checked here,
+    because ROS reports its errors with a traceback or not at all.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def prepare(args: Sequence[str]) -> list[str]:
 
 
 def _enclave(args: Sequence[str]) -> str:
-    """Return the enclave that a command line names, or that of its node or tool."""
+    """Return the enclave that a command line names, or the default of its node or tool."""
     if '--enclave' in args[:-1]:
         return args[args.index('--enclave') + 1]
     rules = {match[1]: match[2] for match in map(_RULE.fullmatch, args) if match}

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 def translated(
         caught: type[Exception] | tuple[type[Exception], ...], kind: type[Exception],
         place: object = '') -> Iterator[None]:
-    """Raise exceptions of the block as another kind, after the name of a file or a field."""
+    """Convert exceptions of the block to another kind, prefixed by a file or a field."""
     try:
         yield
     except caught as error:

@@ -28,7 +28,7 @@ class ArchiveError(ValueError):
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:
     """Write a file atomically: write a temporary file, then rename it to `path`.
 
-    The content may be a callable that writes it to a binary stream. Raise OSError if the file
+    The content may be a callable that writes it to a binary stream. Raises OSError if the file
     cannot be written; an existing file is left as it was.
     """
     path = Path(path)
@@ -68,7 +68,7 @@ def check_writable(path: Path) -> None:
 def read_yaml(path: str | Path) -> Any:
     """Read a YAML file.
 
-    Raise ValueError if the file cannot be read, is invalid, too large or nested too deeply, or
+    Raises ValueError if the file cannot be read, is invalid, too large or nested too deeply, or
     contains references, with which a short text can describe an enormous value.
     """
     try:
@@ -102,7 +102,7 @@ def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np
     """Read the arrays of a file of NumPy's format ``.npz``.
 
     With names, the result is empty unless the file has exactly these arrays, apart from ``about``,
-    and does not compress them: compressed arrays may be far larger than the file. Raise
+    and does not compress them: compressed arrays may be far larger than the file. Raises
     ArchiveError if the file cannot be read, is damaged, or contains more than 256 MiB.
     """
     try:
@@ -127,8 +127,8 @@ def read_archive(path: str | Path, kind: str, version: int, names: set[str]
                  ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Read arrays and their description, without its ``format``.
 
-    Raise ArchiveError if the file cannot be read, is damaged, or has another format than `version`
-    or other arrays than `names`. `kind` describes the content, for errors.
+    Raises ArchiveError if the file cannot be read, is damaged, or its format or arrays are not
+    `version` and `names`. `kind` describes the content, for errors.
     """
     arrays = read_arrays(path, names)
     try:

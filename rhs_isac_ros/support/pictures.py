@@ -12,7 +12,7 @@ from rhs_isac_ros.support.optional import optional_import
 PICTURE_FORMATS = ('png', 'pdf', 'svg')
 # Width of a column and of a page of two columns in the paper's document class, IEEEtran [in].
 COLUMN_IN, PAGE_IN = 3.5, 7.16
-# Colour map whose lightness grows with the value, also for colour-blind readers.
+# Colour map whose lightness grows with the value, even for colour-blind readers.
 COLOUR_MAP = 'cividis'
 # Matplotlib annotates the keys as literals, in some versions only.
 _STYLE: dict[Any, object] = {
@@ -45,7 +45,7 @@ _METADATA: dict[str, dict[str, Any]] = {
 class Look(NamedTuple):
     """How to draw one of several series.
 
-    The colours, by Okabe and Ito, differ for colour-blind readers. Markers, line styles and
+    The colours of Okabe and Ito remain distinct for colour-blind readers. Markers, line styles and
     hatches also differ in greyscale.
     """
 
@@ -144,8 +144,8 @@ def picture_format(path: str | Path) -> str:
 def write_picture(path: str | Path, figure: Any) -> None:
     """Write a figure of Matplotlib atomically, in the format of the suffix of `path`.
 
-    Equal figures give equal files. Raise OSError if the file cannot be written, ValueError if the
-    suffix is not one of `PICTURE_FORMATS`.
+    Identical figures give identical files. Raises OSError if the file cannot be written, and
+    ValueError if the suffix is not one of `PICTURE_FORMATS`.
     """
     kind = picture_format(path)
     # Matplotlib makes ticks and loads fonts only now.

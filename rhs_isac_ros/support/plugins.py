@@ -29,7 +29,7 @@ def describe(group: str, name: str) -> str:
 def load(group: str, name: str) -> Any:
     """Import the object of an entry point.
 
-    Raise PluginError unless exactly one entry point has that name and its import succeeds.
+    Raises PluginError unless exactly one entry point has that name and its import succeeds.
     """
     points = tuple(metadata.entry_points(group=group, name=name))
     if not points:
@@ -49,7 +49,7 @@ def load(group: str, name: str) -> Any:
 def make(group: str, name: str, *arguments: Any, **options: Any) -> Any:
     """Import the object of an entry point, call it, and return its result.
 
-    Raise PluginError if the object cannot be loaded, or the call fails.
+    Raises PluginError if the object cannot be loaded, or the call fails.
     """
     factory = load(group, name)
     try:

@@ -110,7 +110,7 @@ def watch(
     """Spin an observer until it has received a number of complete cycles.
 
     `on_progress` is called with the present and the final number whenever the former changes, and
-    `on_discovered` when the observer has discovered all nodes. Return the error that ended the
+    `on_discovered` when the observer has discovered all nodes. Returns the error that ended the
     wait, or ''.
     """
     seen, changed_s = -1, time.monotonic()
@@ -270,8 +270,12 @@ def _observe(
                      lambda: discovered_s.append(time.monotonic()))
     finally:
         if log.complete:
-            begin_s = log.complete[0].began_s
-            # On a busy machine, a cycle may end before this process has discovered all nodes.
+            # The first cycles may end before this process has discovered all nodes, or while it
+            # prepares to draw. Their messages contain the time at which they were sent.
+            first, last = log.complete[0].state, log.complete[-1].state
+            assert first and last
+            begin_s = (log.complete[-1].ended_s - (last.stamp_ns - first.stamp_ns) / 1e9
+                       - first.elapsed_s)
             parts += [('start and discovery of the nodes', min([*discovered_s, begin_s])),
                       ('codebook and tables', begin_s),
                       ('cycles', log.complete[-1].ended_s)]

@@ -172,7 +172,7 @@ def _draw_positions(view: Any, user: int, cycles: Sequence[CompleteCycle]) -> No
 
 
 def _number(view: Any, cycle: CompleteCycle) -> None:
-    """Write the number of a cycle beside the true position, opposite to the estimate."""
+    """Write the number of a cycle beside the true position, on the side away from the estimate."""
     from matplotlib.patheffects import withStroke
 
     right = cycle.estimate.position[0] < cycle.truth.position[0]

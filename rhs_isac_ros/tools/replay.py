@@ -208,7 +208,7 @@ def _first_codebook(options: argparse.Namespace) -> Codebook:
             used = used or convert.from_bytes(m.ReceivedSignals, content).codebook_id
     if not used:
         raise RecordingError(f'{options.file}: no {_SIGNALS} in the namespace '
-                             f'{options.namespace}')
+                             f'{options.namespace}; see --namespace')
     if options.codebook:
         codebook = Codebook.load(options.codebook)
         if codebook.id != used:
@@ -259,7 +259,8 @@ def load(path: Path, namespace: str = '/', config: Path | None = None) -> Record
         else:
             log.add(found, time_s)
     if not log.complete:
-        raise RecordingError(f'{path}: no complete cycle in the namespace {namespace}')
+        raise RecordingError(
+            f'{path}: no complete cycle in the namespace {namespace}; see --namespace')
     return Recording(scenario, log.complete, codebooks)
 
 

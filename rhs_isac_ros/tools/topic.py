@@ -22,7 +22,7 @@ from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run
 _MAX_LENGTH = 128
 # Maximum number of latest messages in a rate.
 _MAX_TIMES = 10001
-# Time for the discovery of other nodes [s]: unlike for ``ros2``, no daemon knows them already.
+# Time for the discovery of other nodes [s], without the daemon of ``ros2``.
 _DISCOVERY_TIMEOUT_S = 3.0
 
 

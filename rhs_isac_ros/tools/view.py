@@ -91,7 +91,7 @@ class Posteriors:
             self._scenario, codebook, default_folder(), surface=self._surface))
 
     def bound_m2(self, codebook: Codebook) -> float:
-        """Compute the global bound on the mean squared error [m^2], in some seconds."""
+        """Compute the global bound on the mean squared error [m^2], which takes a few seconds."""
         return global_bound(
             self._scenario, codebook, np.random.default_rng(0), _N_PHASES).value
 
@@ -107,7 +107,7 @@ class Posteriors:
     ) -> TrackEstimate | None:
         """Continue the track of a user with signals that arrived at `now_s` [s].
 
-        The typical speed of users is `speed_mps`. Return None before the second position, or
+        The typical speed of users is `speed_mps`. Returns None before the second position, or
         without a known codebook.
         """
         estimator = self._estimators.get(received.codebook_id)

@@ -44,7 +44,8 @@ CASES = {
     'users': ('network', {'users': 0}, ['users', '0', '1 to 4096']),
     'network': ('network', {'policy': 'best'}, ['policy', "'best'"]),
     'allowed users': ('bs', {'allowed_users': '7, 5-3'}, ['allowed_users', "'5-3'", '10-20']),
-    'unknown parameter': ('user', {'user_di': 2}, ['user_di: unknown parameter', 'user_id']),
+    'unknown parameter': ('user', {'user_di': 2}, [
+        'user_di: unknown parameter (the closest is user_id); see user --help']),
     'unknown to a composed node': ('network', {'rest': 2.0}, ['rest: unknown', 'rest_s']),
     'of another node': ('user', {'policy': 'random'},
                         ['argument -p: policy is a parameter of bs, expected one of user']),

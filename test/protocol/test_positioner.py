@@ -180,6 +180,8 @@ def test_without_a_fix_the_positioner_reports_the_reason(positioner, codebooks, 
     assert note == LogMessage(
         'cycle 9: no fix of user 2: received: all wrong', warning=True)
     assert positioner.counters == {'no_fix': 1}
+    # The answer may be lost, but not the line of the log.
+    assert positioner.handle(signals(9), 0.0) == [send]
 
 
 @pytest.mark.parametrize('error', [ValueError('bad model'), OSError('disk full'), MemoryError()])

@@ -1,8 +1,11 @@
 """The diagnostics of the nodes."""
 
+import re
 import socket
+from pathlib import Path
 
 import pytest
+import yaml
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
@@ -22,6 +25,17 @@ def test_a_report_becomes_one_status(fault, level):
     assert (status.level, status.name, status.message) == (level, 'a/bs', 'a summary')
     assert status.hardware_id == f'{socket.gethostname()}:/a/bs'
     assert {pair.key: pair.value for pair in status.values} == values
+
+
+def test_the_analyzer_of_the_pages_selects_the_nodes_of_its_namespace():
+    """A status belongs to a GenericAnalyzer if its name starts with one of these texts."""
+    page = (Path(__file__).parents[2] / 'docs' / 'robots.rst').read_text(encoding='utf-8')
+    (block,) = re.findall(r'code-block:: yaml\n\n((?: {3}.*\n)+)', page)
+    (settings,) = yaml.safe_load(block).values()
+    prefixes = tuple(settings['ros__parameters']['positioning']['startswith'])
+    names = [to_ros(Report(False, '', {}), name, Time()).status[0].name
+             for name in ('/lab/bs', '/lab/user_1', '/bs', '/hall/bs')]
+    assert [name.startswith(prefixes) for name in names] == [True, True, False, False]
 
 
 @pytest.mark.parametrize('fault', [False, True])

@@ -385,6 +385,14 @@ def test_a_failed_announcement_is_logged_and_the_next_follows():
     assert call.args == ('others may miss this node: presence: no memory',)
 
 
+def test_a_node_whose_announcements_have_no_thread_reports_that(bench, add_channel, monkeypatch):
+    with monkeypatch.context() as limited:
+        limited.setattr(threading.Thread, 'start', mock.Mock(side_effect=RuntimeError('no more')))
+        node = add_channel()
+    assert 'thread of announcements was refused: no more' in node.report().summary
+    bench.remove(node)
+
+
 def test_the_own_standstill_is_no_silence_of_others(bench, add_channel, monkeypatch):
     older, newer = (add_channel(name) for name in ('older', 'newer'))
     bench.until(lambda: older.stands_by, 'the newer node')
@@ -404,7 +412,7 @@ def test_the_own_standstill_is_no_silence_of_others(bench, add_channel, monkeypa
     assert not older.stands_by
 
 
-@pytest.mark.parametrize('scenario', ['[', '3', 'a: b: c'])
+@pytest.mark.parametrize('scenario', ['[', '3', 'a: b: c', r'{"a": "\ud800"}'])
 def test_invalid_announcements_are_ignored(bench, probe, add_channel, scenario):
     node = add_channel()
     publisher = probe.create_publisher(ros.Presence, topics.PRESENCE, LATCHED)

@@ -133,7 +133,7 @@ def test_another_codebook_is_assumed_with_a_warning(run, random_beams, tmp_path,
 
 
 @pytest.mark.parametrize('arguments, error', [
-    (['--namespace', '/lab'], 'no complete cycle in the namespace /lab'),
+    (['--namespace', '/lab'], 'no complete cycle in the namespace /lab; see --namespace'),
     (['--codebook', CONFIG / 'codebook.yaml'], 'analog: shape'),
     (['--config', CONFIG / 'table1.yaml'], 'shape'),
     (['--estimator', 'neural'], 'model'),
@@ -204,7 +204,7 @@ def test_topics_of_a_running_network_are_not_published(built_scripts, run, share
 
 
 @pytest.mark.parametrize('arguments, error', [
-    (['--namespace', '/lab'], 'no received_signals in the namespace /lab'),
+    (['--namespace', '/lab'], 'no received_signals in the namespace /lab; see --namespace'),
     (['--codebook', CONFIG / 'codebook.yaml'], 'running nodes would drop them'),
     (['--config', CONFIG / 'table1.yaml'], 'replay: error: analog: shape (2, 3, 36), expected'),
 ])
