@@ -33,7 +33,7 @@ _STEP_RAD = 0.5
 PHASE_ERROR = 0.2
 _AMPLITUDE_ERROR = 0.05
 # Phase at the edge of the aperture within which points share an expansion [rad].
-_SHARED_RAD = 0.1
+_SHARED_RAD = 0.05
 # Radii of an ellipsoid around a mode that contains no other mode, in wavelengths and radians.
 _SEPARATION_WAVELENGTHS = 0.37
 _SEPARATION_RAD = 0.57
