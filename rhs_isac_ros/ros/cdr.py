@@ -223,6 +223,10 @@ class Codec:
                                f'{error}') from None
         values: dict[str, Any] = {}
         if self._keeps_stamp:
+            # Larger numbers could exceed the range of seconds when the stamp is sent on.
+            if items[1] >= _NANOSECONDS:
+                raise MessageError(f'{self._kind.__name__}.header: stamp with {items[1]} ns, '
+                                   f'expected less than {_NANOSECONDS}')
             values['stamp_ns'] = _NANOSECONDS * items[0] + items[1]
         for name, first, last, encode, decode in self._fields:
             if decode is None:

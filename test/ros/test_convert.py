@@ -126,6 +126,14 @@ def test_a_message_in_the_other_byte_order_is_read():
     assert_same(message, convert.from_bytes(m.Ack, BIG_ENDIAN))
 
 
+def test_a_stamp_with_a_second_or_more_of_nanoseconds_is_refused():
+    """Together with many seconds, it would exceed the range of a stamp that is sent on."""
+    content = bytearray(convert.to_bytes(m.Ack(cycle_id=3, user=7), 0))
+    struct.pack_into('<iI', content, len(cdr.HEADER), 2**31 - 1, 10**9)
+    with pytest.raises(m.MessageError, match='1000000000 ns, expected less than'):
+        convert.from_bytes(m.Ack, bytes(content))
+
+
 @pytest.mark.parametrize('kind', KINDS)
 def test_arrays_are_sent_in_c_order_whatever_their_layout(kind):
     message = random_message(kind, np.random.default_rng(0))
