@@ -212,13 +212,17 @@ class UserTopics:
     def __init__(self, node: Node, kinds: Mapping[str, type], max_users: int) -> None:
         self._node, self._kinds, self._max_users = node, kinds, max_users
         self._publishers: dict[int, tuple[Publisher, ...]] = {}
+        self._is_limit_logged = False
 
     def publishers(self, user: int) -> tuple[Publisher, ...]:
         """Return the publishers for a user, in the order of `kinds`; empty above the limit."""
         if user > self._max_users:
-            self._node.get_logger().warning(
-                f'no topics for user {user}, because the limit user_topics is {self._max_users}',
-                once=True)
+            # Not once=True: rclpy would examine the stack at each call, which takes 0.5 ms.
+            if not self._is_limit_logged:
+                self._is_limit_logged = True
+                self._node.get_logger().warning(
+                    f'no topics for user {user}, because the limit user_topics is '
+                    f'{self._max_users}')
             return ()
         if user not in self._publishers:
             self._publishers[user] = tuple(

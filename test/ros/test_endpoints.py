@@ -150,6 +150,14 @@ def test_users_with_higher_numbers_have_none_and_one_is_logged(user_topics, capf
     assert capfd.readouterr().err.count('no topics for user') == 1
 
 
+def test_further_users_above_the_limit_do_not_reach_the_logger(user_topics, probe, monkeypatch):
+    user_topics.publishers(8)
+    # rclpy examines the stack at each call, which would take half a second for 1000 users.
+    monkeypatch.setattr(probe, 'get_logger', None)
+
+    assert user_topics.publishers(8) == user_topics.publishers(9) == ()
+
+
 def test_the_topics_of_a_user_that_was_removed_are_created_again(user_topics, probe):
     user_topics.publishers(1)
     user_topics.remove(1)
