@@ -406,7 +406,7 @@ class BaseStation(StateMachine):
         """End the cycle without service; log this unless the outage is known."""
         assert self.outcome
         cycle, reason = self._cycle, self.outcome.value
-        self._report(m.Phase.BEACONING, reason)
+        self._end_cycle(reason)
         outage = reason, cycle.user if self.outcome in _USER_REASONS else 0
         if outage not in self._outages:
             self._outages.put(outage, None)
@@ -417,7 +417,7 @@ class BaseStation(StateMachine):
     def _finish(self, event: m.Data) -> None:
         """End the cycle with service; log the start of service, or the outages that ended."""
         cycle, n_users = self._cycle, len(self._users)
-        self._report(m.Phase.BEACONING, 'served')
+        self._end_cycle('served')
         if not self._serving:
             self._serving = True
             self.log(f'serving: codebook {cycle.codebook_id}, {n_users} user{"s"[:n_users != 1]}')
@@ -428,6 +428,13 @@ class BaseStation(StateMachine):
             reasons = ', '.join(sorted({reason for reason, _ in ended}))
             self.log(f'cycle {cycle.cycle_id}: user {cycle.user} served again after: {reasons}')
         self._apply_settings(event)
+
+    def _end_cycle(self, outcome: str) -> None:
+        """Report a cycle; a user without a fix has completed its part of it."""
+        self._users.end_cycle(
+            self._cycle.user, self._cycle.began_s[m.Phase.BEACONING], self.now_s,
+            completed=outcome in ('served', Outcome.NO_FIX.value))
+        self._report(m.Phase.BEACONING, outcome)
 
     def _announce(self, phase: m.Phase) -> None:
         self._cycle.began_s[phase] = self.now_s

@@ -2,7 +2,7 @@
 
 import bisect
 import dataclasses
-import operator
+import math
 import re
 from collections.abc import Callable, Iterable
 
@@ -17,7 +17,8 @@ LAST_NUMBER = 2**32 - 1
 # Number of registered users that the first beacon of a cycle invites, and the factor by which each
 # further beacon increases it. A cycle serves one user, but each ack takes time.
 INVITED, _EXTENSION = 8, 8
-# Number of consecutive beacons without an answer after which a user is removed.
+# Number of consecutive beacons without an answer after which a user is removed, and of consecutive
+# incomplete cycles after which a senior loses this rank.
 _MAX_MISSED = 3
 # The owner of a number is silent if it has not answered for this time [s], in which other nodes
 # with the number have answered _MAX_MISSED beacons. A beacon invites all of them or none.
@@ -44,7 +45,9 @@ class UserRegistry:
 
     A number belongs to the first node that answers with it, until this node is silent. The policy
     selects the user served longest ago (``round_robin``), the ``first`` to answer, or one at
-    ``random``.
+    ``random``. The first `INVITED` users that completed a cycle are seniors. When another user
+    does not complete a cycle, the seniors precede all others for as long as this cycle took.
+    Numbers that answer beacons and nothing else thus take at most half of the time.
     """
 
     def __init__(self, policy: str, rng: np.random.Generator) -> None:
@@ -58,6 +61,10 @@ class UserRegistry:
         self._awaited: set[int] = set()
         # Users to serve once before all others, in the order of the requests.
         self._requested: dict[int, None] = {}
+        # Number of consecutive incomplete cycles of each senior.
+        self._seniors: dict[int, int] = {}
+        # Whether seniors precede all others, and the time at which this ends [s].
+        self._seniors_first, self._until_s = False, -math.inf
         self._turn = 0
         # Whether the latest beacon invited all users.
         self.all_invited = True
@@ -93,14 +100,24 @@ class UserRegistry:
 
     def _next(self) -> int:
         """Return the registered user whose turn it is."""
-        if requested := next((user for user in self._requested if user in self._users), 0):
-            return requested
+        users = self._preferred(self._numbers)
+        return users[self._turn * INVITED % len(users)] if self.policy == 'first' else (
+            self._choose(users))
+
+    def _preferred(self, users: Iterable[int]) -> list[int]:
+        """Return those of some users who precede the others: a requested one, or seniors."""
+        users = list(users)
+        requested = [user for user in self._requested if user in users][:1]
+        seniors = [user for user in users if self._seniors_first and user in self._seniors]
+        return requested or seniors or users
+
+    def _choose(self, users: list[int]) -> int:
         match self.policy:
             case 'first':
-                return self._numbers[self._turn * INVITED % len(self._numbers)]
+                return users[0]
             case 'random':
-                return int(self._rng.choice(self._numbers))
-        return min(map(operator.attrgetter('turn'), self._users.values()))[-1]
+                return int(self._rng.choice(users))
+        return min(users, key=lambda user: self._users[user].turn)
 
     def is_taken(self, number: int, instance: int, now_s: float) -> bool:
         """Return whether another instance owns a number and is not silent."""
@@ -168,9 +185,8 @@ class UserRegistry:
 
     def is_complete_with(self, user: int) -> bool:
         """Return whether the answer of `user` is the last that the cycle needs."""
-        if user in self._requested:
-            return True
-        if self.policy == 'first' and not self._awaited & self._requested.keys():
+        if user in self._requested or (
+                self.policy == 'first' and user in self._preferred({*self._awaited, user})):
             return True
         return self._awaited <= {user}
 
@@ -186,18 +202,25 @@ class UserRegistry:
 
     def select(self) -> int:
         """Choose the user to serve among the users that answered."""
-        if requested := [user for user in self._requested if user in self.answered]:
-            chosen = requested[0]
-            del self._requested[chosen]
-        elif self.policy == 'first':
-            chosen = next(iter(self.answered))
-        elif self.policy == 'random':
-            chosen = int(self._rng.choice(list(self.answered)))
-        else:
-            chosen = min(self.answered, key=lambda user: self._users[user].turn)
+        chosen = self._choose(self._preferred(self.answered))
+        self._requested.pop(chosen, None)
         self._turn += 1
         self._users[chosen].turn = self._turn, 1, chosen
         return chosen
+
+    def end_cycle(self, user: int, begin_s: float, now_s: float, *, completed: bool) -> None:
+        """Update the seniors, and decide whether they precede all others in the next cycle."""
+        seniors = self._seniors
+        if completed and user not in seniors and len(seniors) == INVITED:
+            # A senior that has left keeps its place until another user takes it.
+            seniors.pop(next((other for other in seniors if other not in self._users), 0), None)
+        if user in seniors or completed and len(seniors) < INVITED:
+            seniors[user] = 0 if completed else seniors[user] + 1
+            if seniors[user] == _MAX_MISSED:
+                del seniors[user]
+        elif not completed:
+            self._until_s = now_s + (now_s - begin_s)
+        self._seniors_first = now_s < self._until_s
 
 
 _RANGE = re.compile(r'\s*(\d+)\s*(?:-\s*(\d+)\s*)?')

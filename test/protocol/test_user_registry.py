@@ -317,6 +317,86 @@ def test_only_invited_users_miss_a_beacon(make):
     assert len(registry) > 100 - 2 * INVITED
 
 
+# Seniors
+
+SENIORS, OTHERS = [*range(1, INVITED + 1)], [*range(101, 121)]
+
+
+@pytest.fixture
+def crowd(make):
+    """A registry with seniors, and with other users."""
+    registry = make()
+    for user in SENIORS:
+        registry.register(user)
+        registry.end_cycle(user, 0.0, 0.1, completed=True)
+    for user in OTHERS:
+        registry.register(user)
+    return registry
+
+
+def fail(registry, user, begin_s=10.0):
+    registry.end_cycle(user, begin_s, begin_s + 1.0, completed=False)
+
+
+def next_users(registry, n, now_s=11.0):
+    """Return the users served in cycles without duration, in which all users answer."""
+    users = []
+    for _ in range(n):
+        users.append(cycle(registry, *SENIORS, *OTHERS))
+        registry.end_cycle(users[-1], now_s, now_s, completed=True)
+    return users
+
+
+def test_without_failures_all_users_take_turns(crowd):
+    assert sorted(next_users(crowd, 28)) == [*SENIORS, *OTHERS]
+
+
+def test_seniors_are_served_first_for_as_long_as_the_cycle_of_another_user_took(crowd):
+    fail(crowd, OTHERS[3])
+    assert {*next_users(crowd, 10, now_s=11.9)} == {*SENIORS}
+    assert {*next_users(crowd, 1, now_s=12.0)} <= {*SENIORS}
+    assert {*next_users(crowd, 19, now_s=12.1)} <= {*OTHERS}
+
+
+def test_others_are_served_if_no_senior_answers(crowd):
+    fail(crowd, OTHERS[3])
+    assert cycle(crowd, *OTHERS) in OTHERS
+
+
+def test_a_request_precedes_the_seniors(crowd):
+    crowd.request(OTHERS[5])
+    fail(crowd, OTHERS[3])
+    assert next_users(crowd, 1) == [OTHERS[5]]
+
+
+def test_incomplete_cycles_of_a_senior_do_not_change_the_turns(crowd):
+    fail(crowd, 1)
+    assert sorted(next_users(crowd, 28)) == [*SENIORS, *OTHERS]
+
+
+def test_three_incomplete_cycles_in_a_row_end_the_rank_of_a_senior(crowd):
+    for _ in range(2):
+        fail(crowd, 1)
+        fail(crowd, 1)
+        fail(crowd, OTHERS[0])
+        assert 1 in next_users(crowd, 8)
+    for _ in range(3):
+        fail(crowd, 1)
+    fail(crowd, OTHERS[0])
+    assert {*next_users(crowd, 8)} == {*SENIORS[1:]}
+
+
+def test_a_senior_that_has_left_keeps_its_place_until_another_user_is_served(crowd):
+    crowd.remove(1)
+    crowd.register(1)
+    fail(crowd, OTHERS[0])
+    assert 1 in next_users(crowd, 8)
+    crowd.remove(1)
+    crowd.end_cycle(OTHERS[0], 12.0, 12.1, completed=True)
+    fail(crowd, OTHERS[1])
+    assert {*next_users(crowd, 8)} == {*SENIORS[1:], OTHERS[0]}
+
+
 # The nodes that own the numbers
 
 FIRST, SECOND = 1_700_000_000 * 10**9, 1_800_000_000 * 10**9
