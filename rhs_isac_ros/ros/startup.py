@@ -88,8 +88,8 @@ def prepare(args: Sequence[str]) -> list[str]:
     """Return a command line that names an enclave, if DDS security is enabled.
 
     The command line begins with the name of the program. By default, the enclave of a node is the
-    node's full name, and the enclave of a tool is ``operator``. The environment is checked here,
-    because ROS reports its errors with a traceback or not at all.
+    node's full name, and the enclave of a tool is ``operator``, whatever its name. The environment
+    is checked here, because ROS reports its errors with a traceback or not at all.
 
     Raises
     ------
@@ -121,9 +121,9 @@ def _enclave(args: Sequence[str]) -> str:
         return args[args.index('--enclave') + 1]
     rules = {match[1]: match[2] for match in map(_RULE.fullmatch, args) if match}
     program = os.path.basename(args[0])
-    own = 'operator' if EXECUTABLES.get(program, 'tools') == 'tools' else program
-    name = program if program == 'replay' else own
-    return f'{rules.get("ns", "").rstrip("/")}/{rules.get("node", name)}'
+    is_tool = EXECUTABLES.get(program, 'tools') == 'tools' and program != 'replay'
+    name = 'operator' if is_tool else rules.get('node', program)
+    return f'{rules.get("ns", "").rstrip("/")}/{name}'
 
 
 def _check_enclave(enclave: str) -> None:

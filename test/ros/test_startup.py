@@ -39,7 +39,7 @@ def keystore(tmp_path, monkeypatch):
     (['/opt/ros/lib/bs', '--ros-args', '-p', 'seed:=1'], '/bs'),
     (['user', '--ros-args', '-r', '__node:=user_1', '-r', '__ns:=/lab'], '/lab/user_1'),
     (['watch', '--once'], '/operator'),
-    (['record', 'a', '--ros-args', '-r', '__ns:=/lab', '--remap', 'recorder:__node:=operator'],
+    (['record', 'a', '--ros-args', '-r', '__ns:=/lab', '--remap', '__node:=recorder'],
      '/lab/operator'),
     (['replay'], '/replay'), ([''], '/operator')])
 def test_each_process_has_the_enclave_of_its_node(args, enclave):
