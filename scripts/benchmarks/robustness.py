@@ -6,10 +6,10 @@ deviation is measured twice: with a scenario that is silent about it, and with o
 it, as an uncertainty or as the true value. Users outside of the region should have no fix.
 
 The 95 % region of an estimate is the ellipsoid of its covariance that contains 95 % of a Gaussian.
-Brackets contain 95 % intervals: Wilson's for shares, the percentile bootstrap for mean squared
-errors. The last column is the share of windows in which the monitor of the residuals warns; the
-windows are random draws of phases. The predicted error is that of fixes that are not possibly from
-outside of the region.
+Brackets contain 95 % intervals: Wilson's for shares, and for mean squared errors the percentile
+bootstrap over surfaces, each of which serves five positions. The last column is the share of
+windows in which the monitor of the residuals warns; the windows are random draws of phases. The
+predicted error is that of fixes that are not possibly from outside of the region.
 
 The time is the median of the CPU time of an estimate, on one core.
 
@@ -169,7 +169,8 @@ def inside_rows(name: str, silent: Scenario, codebook: Codebook, changes: dict[s
             reference = reference_means(
                 scenario, codebook, positions[:n], received[:n], surfaces[:n],
                 options.log2_points)
-            row |= ratio_to_reference(reference, estimate, positions[:n])
+            row |= ratio_to_reference(
+                reference, estimate, positions[:n], np.arange(n) // PER_SURFACE)
         rows.append(report(row))
     return rows
 
@@ -260,7 +261,7 @@ def figures(estimate: Estimate, positions: np.ndarray, n_windows: int) -> dict[s
         'positions': n, 'no_fix': n - n_fixes, 'no_fix_share': share_percent(n - n_fixes, n),
         'reasons': {text: sum(reason.startswith(text) for reason in estimate.reason)
                     for text in ('position', 'residual', 'energy')},
-        'mse_m2': mean_interval(squares),
+        'mse_m2': mean_interval(squares, np.flatnonzero(fix) // PER_SURFACE),
         'covered_share': share_percent(covered, n_fixes) if n_fixes else None,
         'missed_share': share_percent(n_fixes - covered, n),
         'predicted_mse_m2': float(np.trace(covariance, axis1=1, axis2=2)[certain].mean())
@@ -271,12 +272,15 @@ def figures(estimate: Estimate, positions: np.ndarray, n_windows: int) -> dict[s
     }
 
 
-def mean_interval(samples: np.ndarray) -> tuple[float, float, float] | None:
-    """Return a mean with its 95 % interval by the percentile bootstrap."""
+def mean_interval(samples: np.ndarray, surface: np.ndarray) -> tuple[float, float, float] | None:
+    """Return a mean with its 95 % interval by the percentile bootstrap over surfaces [N]."""
     if not len(samples):
         return None
-    picks = np.random.default_rng(0).integers(len(samples), size=(RESAMPLES, len(samples)))
-    low, high = np.percentile(samples[picks].mean(axis=1), (2.5, 97.5))
+    _, index = np.unique(surface, return_inverse=True)
+    sums, counts = np.bincount(index, samples), np.bincount(index)
+    picks = np.random.default_rng(0).integers(len(sums), size=(RESAMPLES, len(sums)))
+    means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
+    low, high = np.percentile(means, (2.5, 97.5))
     return float(samples.mean()), float(low), float(high)
 
 

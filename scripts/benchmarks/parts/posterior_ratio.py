@@ -26,17 +26,21 @@ def reference_means(
 
 
 def ratio_to_reference(
-        reference: np.ndarray, estimate: Estimate, positions: np.ndarray) -> dict[str, Any]:
+        reference: np.ndarray, estimate: Estimate, positions: np.ndarray, surface: np.ndarray
+) -> dict[str, Any]:
     """Compare the squared errors of fixes with those of the exhaustive posterior.
 
     The mean of finitely many points has an additional error. It is independent between the two
-    sets of points, so that the product of their errors has the expectation without it.
+    sets of points, so that the product of their errors has the expectation without it. The
+    interval resamples surfaces, because the errors at positions that share a surface, given by its
+    number, int [N], are not independent.
     """
     n = len(positions)
     fix = estimate.fix[:n]
     own = np.sum((estimate.mean[:n] - positions)[fix]**2, axis=1)
     best = np.sum(np.prod(reference - positions, axis=0)[fix], axis=1)
-    found, exact = (replicate(errors[None], 0)[0] for errors in (own, best))
+    found, exact = (replicate(np.bincount(surface[:n][fix], errors)[None], 0)[0]
+                    for errors in (own, best))
     value, low, high = found.reduction_from(exact)
     return {'mse_to_reference': (1 - value / 100, 1 - high / 100, 1 - low / 100),
             'reference_positions': n}
