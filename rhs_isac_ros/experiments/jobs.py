@@ -77,8 +77,9 @@ def _file(folder: Path, job: Job) -> Path:
     return folder / f'{job.name}.json'
 
 
-# Timeout for the scheduler of a cluster, and for its first worker.
-_TIMEOUT_S = 30
+# Timeouts for the scheduler of a cluster, and for its first worker.
+_SCHEDULER_TIMEOUT_S = 30
+_WORKER_TIMEOUT_S = 30
 _THREAD_TIMEOUT_S = 5
 
 
@@ -134,8 +135,8 @@ def run_on_cluster(
     with contextlib.ExitStack() as stack:
         try:
             client = stack.enter_context(Client(  # type: ignore[no-untyped-call]
-                address, timeout=_TIMEOUT_S, set_as_default=False))
-            client.wait_for_workers(1, timeout=_TIMEOUT_S)
+                address, timeout=_SCHEDULER_TIMEOUT_S, set_as_default=False))
+            client.wait_for_workers(1, timeout=_WORKER_TIMEOUT_S)
         except (OSError, TimeoutError, ValueError) as error:
             raise ConnectionError(f'Dask cluster {address}: {error}') from error
         jobs_by_future = {

@@ -250,7 +250,7 @@ def test_an_error_on_a_dask_cluster_names_its_job(tmp_path, cluster):
 
 def test_a_dask_cluster_without_workers_is_an_error(tmp_path, monkeypatch):
     distributed = pytest.importorskip('distributed')
-    monkeypatch.setattr(jobs_module, '_TIMEOUT_S', 0.1)
+    monkeypatch.setattr(jobs_module, '_WORKER_TIMEOUT_S', 0.1)
     with distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=':0') as empty:
         with pytest.raises(ConnectionError, match='^Dask cluster inproc://.*workers'):
             run_jobs(Worker(), JOBS, tmp_path, dask=empty.scheduler_address)
