@@ -96,7 +96,8 @@ class Average:
     combination
         Rows of the form, if they differ from the rows of the source.
     tick
-        Called repeatedly while the rows are computed; an exception ends the computation.
+        Called repeatedly while the rows are computed; it can end the computation with an
+        exception.
     """
 
     #: An estimate of the surface that is treated as exact; None for the scenario's elements.
@@ -288,7 +289,7 @@ def _by_error(scenario: Scenario, radiation: np.ndarray, covariance_terms: np.nd
 def _through_term(
         scenario: Scenario, codebook: Beamforming, constant: np.ndarray | float,
         slope: np.ndarray | float, by_radiation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gradients through a matrix (constant + slope C) * (S B), numbers or [N_E]."""
+    """Return gradients through (constant + slope C) * (S B), each factor a number or [N_E]."""
     beams = AppliedBeams(np.conj(constant + slope * codebook.analog), codebook.digital)
     return (gradient_analog(scenario, codebook, np.conj(slope) * by_radiation),
             gradient_digital(scenario, beams, by_radiation))

@@ -119,7 +119,7 @@ class _Lattice:
         self._interpolate(sight, ranges, box[:, 0])
 
     def _interpolate(self, sight: np.ndarray, ranges: np.ndarray, limits: np.ndarray) -> None:
-        """Compute signals at the nodes, and weights that interpolate them to all ranges."""
+        """Compute the signals at the nodes, and weights that interpolate them to all ranges."""
         model, scenario = self._model, self._model.scenario
         span_hz = scenario.n_subbands * scenario.subband_width_hz
         turns = span_hz * np.ptp(limits) / SPEED_OF_LIGHT_MPS
@@ -163,7 +163,7 @@ class _Lattice:
                 yield self._moments(products, ray, index)
 
     def _products(self, signals: np.ndarray) -> np.ndarray:
-        """Return products of signals and templates at the nodes, [n, rays, bands, nodes]."""
+        """Return the products of signals and templates at the nodes, [n, rays, bands, nodes]."""
         products = np.stack([
             np.matmul(np.conj(signals[:, band]), smooth).reshape(
                 len(signals), len(self._offset), -1)

@@ -291,7 +291,7 @@ def blocks(n_items: int, n_rows: int = 3, width: int = 0) -> Iterator[slice]:
 
 def _compress(rows_of: Callable[[slice], np.ndarray], every: list[slice], n_rows: int,
               tolerance: float, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients [n_rows, R] and orthonormal basis [N_SB N_E, R] of rows of blocks."""
+    """Return the rows as coefficients [n_rows, R] in an orthonormal basis [N_SB N_E, R]."""
     if not MIN_TOLERANCE <= tolerance < 1:
         raise ValueError(
             f'tolerance: {tolerance:g}, expected {MIN_TOLERANCE:g} to 1, or 0 for exact rows')
@@ -317,7 +317,7 @@ def _compress(rows_of: Callable[[slice], np.ndarray], every: list[slice], n_rows
 
 def _project(rows_of: Callable[[slice], np.ndarray], chosen: Sequence[slice],
              basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients [n, R] of the rows of blocks, and of nonzero rows scaled to length 1."""
+    """Return the coefficients [n, R] of rows, and of the nonzero rows scaled to length 1."""
     coefficients, norms = [], []
     for block in chosen:
         rows = rows_of(block)

@@ -104,11 +104,11 @@ class Alignment:
         self._moves_multipath = nuisance.moves_multipath[:, None, None]
 
     def aligned(self, signals: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return signals [N, N_B, N_SB F] without the factors of values [N, Q]."""
+        """Remove the factors of values [N, Q] from the signals, complex128 [N, N_B, N_SB F]."""
         return signals * np.exp(-np.tensordot(values, self.patterns, axes=1))
 
     def slopes(self, aligned: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Return derivatives of aligned signals with respect to values, [N, Q, N_B, N_SB F].
+        """Return the derivatives of aligned signals with respect to values, [N, Q, N_B, N_SB F].
 
         Offsets of carrier and timing are visible because they move the multipath out of the nulls
         of its covariance. Their derivatives therefore contain the signals instead of the mean.
@@ -157,7 +157,7 @@ def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
 
 
 def _change(before: Posterior, after: Posterior, n_bands: int) -> float:
-    """Return the largest change of a parameter; band parameters are changes already."""
+    """Return the largest change of a parameter; band parameters are already changes."""
     moved = np.abs(after.complex_mean() - before.complex_mean())
     moved[-n_bands:] = np.abs(after.complex_mean()[-n_bands:])
     std = np.sqrt(np.maximum(np.diagonal(after.complex_covariance()).real, 1e-300))
@@ -192,7 +192,7 @@ class PilotStatistics:
 
     def evaluate(self, gains: np.ndarray, mean: np.ndarray, covariance: np.ndarray
                  ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute information [2 P, 2 P] and shift [2 P] for real and then imaginary parts.
+        """Compute the information [2 P, 2 P] and shift [2 P], for real and then imaginary parts.
 
         The model is linear about the band gains `gains`, complex128 [N_B]. `mean` and `covariance`
         describe gains and offsets of the elements, [2 N_E] and [2 N_E, 2 N_E].

@@ -140,7 +140,7 @@ class _Search:
         return covariance @ self._shift[indices], (covariance + covariance.T) / 2
 
     def moments(self, failed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean [2 P] and covariance [2 P, 2 P] given the states."""
+        """Return the mean [2 P] and the covariance [2 P, 2 P] given the states."""
         indices = self._indices(failed)
         mean, covariance = np.zeros(2 * self._size), np.zeros((2 * self._size, 2 * self._size))
         mean[indices], covariance[np.ix_(indices, indices)] = self._solve(indices)

@@ -250,7 +250,7 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
 
 def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndarray,
               in_sight: np.ndarray, total: np.ndarray, weight: float) -> np.ndarray:
-    """Return which positions probably have a direct path, given the others, bool [N].
+    """Mark the positions that probably have a direct path, given the others, bool [N].
 
     Otherwise, signals are multipath of an unknown level. `total`, complex128 [N_B, R, R], is the
     sum over the positions that are `in_sight` and the prior, which has this weight.

@@ -86,7 +86,7 @@ def _coordinate_search(
 
 
 def has_gap(plans: np.ndarray, gap_hz: float) -> np.ndarray:
-    """Return which ascending plans have a gap between all bands, up to rounding, bool [P]."""
+    """Mark the ascending plans that have the gap between all bands, up to rounding, bool [P]."""
     return np.all(np.diff(plans, axis=1) >= gap_hz * (1 - 1e-9), axis=1)
 
 
@@ -212,7 +212,7 @@ def choose_bands(
 
 
 def with_bands(scenario: Scenario, frequencies_hz: Sequence[float]) -> Scenario:
-    """Return the scenario with other bands and the same number of frames over all bands."""
+    """Return the scenario with other bands, and with the same total number of frames."""
     return dataclasses.replace(
         scenario, center_frequencies_hz=tuple(frequencies_hz),
         n_frames=scenario.n_bands * scenario.n_frames // len(frequencies_hz))
@@ -263,7 +263,7 @@ def expected_error(
 
 
 def _energies(scenario: Scenario) -> np.ndarray:
-    """Return quantiles of the energies of whitened mean signals over the region, float64 [n]."""
+    """Return quantiles of the energy of the whitened mean over the region, float64 [n]."""
     rng = streams.generator(0, streams.PLANS, 2)
     model = MeasurementModel(scenario, random_codebook(scenario, rng))
     whitened = model.whiten(model.mean(scenario.sample_positions(_POSITIONS, rng)))

@@ -168,7 +168,7 @@ def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int)
 
 
 def _exchange(search: Search, variables: np.ndarray, max_steps: int) -> str:
-    """Exchange single amplitudes until none lowers the objective; return why this stopped."""
+    """Exchange single amplitudes as long as this lowers the objective; return why it stops."""
     levels = _top_level(search)
     variables = np.array(variables)
     variables[:search.n_analog] = np.rint(variables[:search.n_analog] * levels) / levels

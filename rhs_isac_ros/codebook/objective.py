@@ -3,7 +3,7 @@
 The arguments of an objective are a scenario, sampled positions, float64 [N_sam, 3] [m], a
 generator and `tick`. It raises ValueError unless the positions are a finite [N, 3] array with at
 least one row. It calls `tick` repeatedly during computations that do not depend on the codebook;
-an exception of `tick` ends them.
+`tick` can end them with an exception.
 """
 
 import dataclasses
@@ -65,11 +65,12 @@ def ambiguity(
 def error(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
         tick: Tick = no_tick) -> Average:
-    """Objective [m^2]: the cost of `ambiguity`, with weights close to those of the squared error.
+    """Objective [m^2]: the cost of `ambiguity`, weighted almost as in the mean squared error.
 
-    Pairs extend farther across the line of sight, up to the far side lobes. Their weights grow
-    with the volumes that they represent (`confusable_volumes`). With the volumes themselves as
-    weights, the cost would be proportional to the union bound on the mean squared error.
+    Pairs extend farther across the line of sight than those of `ambiguity`, up to the far side
+    lobes. Their weights grow with the volumes that they represent (`confusable_volumes`). With the
+    volumes themselves as weights, the cost would be proportional to the union bound on the mean
+    squared error.
     """
     first_positions = np.repeat(checked_positions(positions), _PAIRS_PER_POSITION, axis=0)
     second_positions = draw_confusable(scenario, first_positions, rng, WIDE)

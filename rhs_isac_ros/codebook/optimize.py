@@ -91,8 +91,8 @@ def optimize(
         One of `METHODS`.
     objective
         One of `OBJECTIVES`: ``crlb``, the average bound; ``ambiguity``, the confusion of distant
-        positions, which a local bound ignores; ``error``, the same with weights close to those of
-        the mean squared error; or ``nuisance``, the bound with unknown phases of the bands and the
+        positions, which a local bound ignores; ``error``, the same, weighted almost as in the
+        mean squared error; or ``nuisance``, the bound with unknown phases of the bands and the
         region as prior.
     sampling
         One of `SAMPLINGS`: ``sobol``, or ``monte_carlo`` as in the paper.

@@ -1,9 +1,9 @@
 """Codebooks without optimisation: random ones, and focused beams that scan the region of interest.
 
-Both are benchmarks of the paper and starts of its optimisation. The paper does not specify the
-focal points. `SCANS` contains three interpretations, functions that return focal points, float64
-[F, N_B, 3] [m]. The frames of the first two alternate between points below and above mid-height,
-because beams that are all symmetric in height could not distinguish up from down.
+Both are benchmarks of the paper, and its optimisation starts from them. The paper does not specify
+the focal points. `SCANS` contains three interpretations, functions that return focal points,
+float64 [F, N_B, 3] [m]. The frames of the first two alternate between points below and above
+mid-height, because beams that are all symmetric in height could not distinguish up from down.
 """
 
 from collections.abc import Callable, Mapping

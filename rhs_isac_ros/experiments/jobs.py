@@ -156,7 +156,7 @@ def _interrupts_ignored() -> Iterator[None]:
     A terminal sends SIGINT to the whole process group, but only this process may end the workers.
     A blocked signal would stay pending instead, but joblib unblocks it.
     """
-    # Only the main thread can set handlers, and only there SIGINT raises KeyboardInterrupt.
+    # Only the main thread can set handlers, and SIGINT raises KeyboardInterrupt only there.
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -74,7 +74,7 @@ def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -
 
 
 def share_percent(count: int, total: int) -> tuple[float, float, float]:
-    """Return a share of a positive total and Wilson's 95 % interval: value and ends [%]."""
+    """Return a share of a positive total, with the ends of Wilson's 95 % interval [%]."""
     if total < 1:
         raise ValueError(f'total: {total}, expected at least 1')
     z2 = float(ndtri(0.975))**2

@@ -290,7 +290,7 @@ def run_blocks(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = 
 
 
 def table(sweep: Sweep, points: Sequence[Point]) -> str:
-    """Return the points as CSV, one row for each, with all fields of the setting."""
+    """Return the points as CSV, with one row for each point and all fields of its setting."""
     stream = io.StringIO()
     rows = csv.writer(stream, lineterminator='\n')
     rows.writerow(['measure', 'value', 'low', 'high', 'unit', 'estimator', 'codebook',
@@ -320,7 +320,7 @@ def _fitted(codebook: Codebook, setting: Setting) -> Codebook:
 
 def _stacked(blocks: Sequence[Mapping[str, Sequence[Job]]],
              found: Mapping[str, Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """Return quantities by name, [codebooks, positions], from the results of blocks."""
+    """Return the quantities by name, [codebooks, positions], from the results of blocks."""
     return {quantity: np.array([
         np.concatenate([found[job.name][quantity] for job in of_codebook[family]])
         for of_codebook in blocks])

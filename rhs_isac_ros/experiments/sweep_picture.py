@@ -153,7 +153,7 @@ def is_geometric(values: Sequence[float]) -> bool:
 
 
 def _set_scale(panel: Any, values: Sequence[float]) -> None:
-    """Make the x axis logarithmic if `is_geometric` holds for the values without a first zero."""
+    """Make the x axis logarithmic if the values, apart from a leading zero, are geometric."""
     if is_geometric(values):
         panel.set_xscale('log')
     elif values[0] == 0 and is_geometric(values[1:]):
@@ -215,7 +215,7 @@ def _draw_line(panel: Any, x: np.ndarray, intervals: np.ndarray, line: _Line) ->
 
 
 def _styles(names: Sequence[str]) -> dict[str, Any]:
-    """Return legend marks for the measures of a panel, by label."""
+    """Return the legend marks for the measures of a panel, keyed by label."""
     from matplotlib.lines import Line2D
     handles = {}
     for number, name in enumerate(names):

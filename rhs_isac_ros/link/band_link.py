@@ -130,7 +130,7 @@ class BandLink:
 
 
 def band_index(bands: int | Sequence[int]) -> int | slice | list[int]:
-    """Return an index of bands for arrays: a slice if possible, because it avoids a copy."""
+    """Return an array index that selects bands; if possible a slice, which avoids a copy."""
     if isinstance(bands, int):
         return bands
     first, n = bands[0], len(bands)

@@ -54,7 +54,7 @@ def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray)
 @one_blas_thread
 def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray,
                     blocked: np.ndarray | None = None) -> np.ndarray:
-    """Compute the capacity on the paths of a channel file, or `capacity` without such a file.
+    """Compute the capacity over the paths of a channel file; without a file, `capacity`.
 
     With a channel file, `blocked`, bool [N], marks the users without a direct path.
     """
@@ -110,7 +110,7 @@ def posterior_points(
 
 @functools.lru_cache(maxsize=8)
 def _standard_rule(varies: tuple[bool, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes [n, 3] and weights [n] for a Gaussian of unit variance along some axes."""
+    """Return the nodes [n, 3] and weights [n] for a Gaussian of unit variance along some axes."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(_N_NODES)
     weights = weights / weights.sum()
     rule = list(zip(nodes, weights, strict=True))
@@ -147,13 +147,13 @@ class BeamPattern:
     distance_m: float
 
     def azimuth_cut(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return azimuths [rad] and power at the elevation of the peak, both [n_az]."""
+        """Return the azimuths [rad], and the power at the elevation of the peak, both [n_az]."""
         row, _ = self.peak
         x, y, _ = self.directions[len(self.directions) // 2].T
         return np.arctan2(y, x), self.relative[row]
 
     def elevation_cut(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return elevations [rad] and power at the azimuth of the peak, both [n_el]."""
+        """Return the elevations [rad], and the power at the azimuth of the peak, both [n_el]."""
         _, column = self.peak
         return np.arcsin(self.directions[:, column, 2]), self.relative[:, column]
 

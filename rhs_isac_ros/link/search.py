@@ -194,7 +194,7 @@ class _Waves(NamedTuple):
     @classmethod
     def at(cls, paths: np.ndarray, analog: np.ndarray,
            on_board: np.ndarray | None = None) -> '_Waves':
-        """Improve waves on the board by a power step, or begin with those of the direct path."""
+        """Improve the waves on the board by a power step, or begin with the direct path."""
         n_bands, n_elements, *shape = paths.shape
         channels = (analog @ paths.reshape(n_bands, n_elements, -1).view(np.float32)).view(
             np.complex64).reshape(n_bands, -1, *shape)
@@ -217,7 +217,7 @@ class _Waves(NamedTuple):
         return _Waves.at(paths, analog, self.on_board)
 
     def best(self, n: int) -> '_Waves':
-        """Return the `n` best of each band; equal capacities count once if possible."""
+        """Return the `n` best configurations of each band; ties count once if possible."""
         bands = np.arange(len(self.rate))[:, None]
         order = np.argsort(-self.rate, axis=1)
         ranked = self.rate[bands, order]

@@ -1,4 +1,4 @@
-"""Operations on arrays that all parts of the model share."""
+"""Array operations that all parts of the model use."""
 
 import functools
 import hashlib
@@ -20,13 +20,13 @@ def adjoint(matrices: np.ndarray) -> np.ndarray:
 
 
 def blocks(n: int, size: int) -> list[slice]:
-    """Split n items into blocks of a size; the last one may be smaller."""
+    """Split n items into blocks of the given size; the last one may be smaller."""
     return [slice(start, start + size) for start in range(0, n, size)]
 
 
 @functools.cache
 def gauss_legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights of Gauss-Legendre quadrature from -1 to 1."""
+    """Return the nodes and weights of Gauss-Legendre quadrature from -1 to 1."""
     nodes, weights = np.polynomial.legendre.leggauss(n)
     return read_only(nodes), read_only(weights)
 

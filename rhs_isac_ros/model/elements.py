@@ -48,7 +48,7 @@ DirectErrors = Callable[[int, np.ndarray], np.ndarray]
 
 
 class SurfaceModel:
-    """Knowledge of the elements of a surface: expected coefficients and their errors.
+    """Knowledge about the elements of a surface: expected coefficients and their errors.
 
     A subclass defines `applied_beams` and, if there are errors, `is_exact` and `errors`.
     """
@@ -240,7 +240,7 @@ def draw_surface(scenario: Scenario, rng: np.random.Generator) -> ElementErrors:
 
 
 def error_terms(scenario: Scenario) -> list[tuple[float, float]]:
-    """Return the factors of the coefficients' covariance, as constants and slopes over c.
+    """Return the factors of the coefficients' covariance, as constants and slopes in c.
 
     The covariance of an element's coefficient between two frames is a sum over T terms: one for
     errors, and two more if elements can fail. Each term is a product of one factor per frame.

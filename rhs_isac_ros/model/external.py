@@ -10,7 +10,7 @@ import numpy as np
 
 
 class External(abc.ABC):
-    """A value that a scenario writes as origin and digest; equal digests mean equal values."""
+    """A value that a scenario writes as its origin and digest; equal digests mean equal values."""
 
     origin: str  #: Path of the file, or name of the plug-in; empty for other values.
     # For error messages: the kind of value, and the values that a scenario accepts.
@@ -44,7 +44,7 @@ class External(abc.ABC):
         raise NotImplementedError
 
     def __str__(self) -> str:
-        """Return origin and digest in the form that `named` reads."""
+        """Return the origin and the digest in the form that `named` reads."""
         return f'{self.origin}@{self.digest}'
 
     def __repr__(self) -> str:

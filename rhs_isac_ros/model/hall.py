@@ -200,7 +200,7 @@ class PathChannel(ArrayFile):
 
     @classmethod
     def joined(cls, parts: Sequence['PathChannel']) -> 'PathChannel':
-        """Join the users of several channels, which must have one frequency and no `gains`."""
+        """Join the users of several channels that have the same frequency and no `gains`."""
         n_paths = max(part.a.shape[1] for part in parts)
 
         def padded(name: str, value: float) -> np.ndarray:

@@ -32,7 +32,7 @@ _NEPERS_PER_DB = np.log(10) / 20
 
 
 class Scope(enum.Enum):
-    """When the values of an impairment are drawn anew: for every user, or in every cycle."""
+    """How often the values of an impairment are redrawn: for every user, or in every cycle."""
 
     USER = 'user'
     CYCLE = 'cycle'
@@ -53,13 +53,13 @@ class Impairment:
 
     A subclass defines `linear`. Its values are Gaussian unless it overrides `values`; estimators
     and bounds always assume the Gaussian prior of `linear`. `scope` states how often values are
-    drawn anew.
+    redrawn.
     """
 
     scope: Scope = Scope.CYCLE
 
     def linear(self, scenario: Scenario) -> Linear:
-        """Return exponents and prior."""
+        """Return the exponents and the prior."""
         raise NotImplementedError
 
     def values(self, scenario: Scenario, white: np.ndarray) -> np.ndarray:
@@ -141,7 +141,7 @@ class Factor(Impairment):
         return float(getattr(scenario, self.field)) * self.unit
 
     def linear(self, scenario: Scenario) -> Linear:
-        """Return exponents and prior."""
+        """Return the exponents and the prior."""
         patterns = self.patterns(scenario)
         return Linear(patterns, self.std(scenario) * np.eye(len(patterns)), self.needs_search)
 

@@ -19,7 +19,7 @@ class Mobility(Protocol):
     """Path of a user."""
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position, float64 [3] [m], and velocity, float64 [3] [m/s].
+        """Return the position, float64 [3] [m], and velocity, float64 [3] [m/s].
 
         The times of successive calls must not decrease.
         """
@@ -44,7 +44,7 @@ class StraightMobility(Mobility, Protocol):
         ...
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [3] [m] and velocity [3] [m/s] on the current leg."""
+        """Return the position [3] [m] and velocity [3] [m/s] on the current leg."""
         leg = self.leg(now_s)
         return leg.origin + leg.velocity * (now_s - leg.departure_s), leg.velocity.copy()
 
@@ -79,7 +79,7 @@ class Crowd:
 
 
 class Static(StraightMobility):
-    """User that stands still at a position, float64 [3] [m]."""
+    """A user that stands still at a position, float64 [3] [m]."""
 
     def __init__(self, position: ArrayLike) -> None:
         self._position = _checked_position(position)
@@ -90,7 +90,7 @@ class Static(StraightMobility):
 
 
 class Waypoints:
-    """User that follows a closed polygon of waypoints, float64 [N, 3] [m], at constant speed.
+    """A user that follows a closed polygon of waypoints, float64 [N, 3] [m], at constant speed.
 
     The first call of `state` returns the first waypoint.
     """
@@ -104,7 +104,7 @@ class Waypoints:
         self._start_s: float | None = None
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [3] [m] and velocity [3] [m/s] on the polygon."""
+        """Return the position [3] [m] and velocity [3] [m/s] on the polygon."""
         if self._start_s is None:
             self._start_s = now_s
         perimeter = self._lengths.sum()
@@ -119,7 +119,7 @@ class Waypoints:
 
 
 class RandomWalk(StraightMobility):
-    """User that walks in straight lines between random positions of the region of interest.
+    """A user that walks in straight lines between random positions of the region of interest.
 
     The first position is random, unless it is given as `start`, float64 [3] [m].
     """
@@ -148,7 +148,7 @@ class RandomWalk(StraightMobility):
         return self._scenario.sample_positions(1, self._rng)[0]
 
     def _begin_leg(self) -> None:
-        """Compute velocity and duration once per leg, because a node may have many users."""
+        """Compute the velocity and duration once per leg, because a node may have many users."""
         leg = self._target - self._origin
         length = float(np.linalg.norm(leg))
         self._velocity = leg / length * self._speed_mps
@@ -162,7 +162,7 @@ class Traced:
         self._mobility, self._channel = mobility, channel
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [3] [m] and velocity [3] [m/s]."""
+        """Return the position [3] [m] and velocity [3] [m/s]."""
         position, velocity = self._mobility.state(now_s)
         return self._channel.users[self._channel.nearest(position[None])[0]].copy(), velocity
 

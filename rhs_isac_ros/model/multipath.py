@@ -152,7 +152,7 @@ def _matrix(lattice: np.ndarray, scenario: Scenario) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def _lattice(scenario: Scenario) -> np.ndarray:
-    """Compute V_i by lattice offset, 0 in the middle, [N_B, 2 rows - 1, 2 columns - 1]."""
+    """Compute V_i by lattice offset, [N_B, 2 rows - 1, 2 columns - 1]; 0 is in the middle."""
     is_even = [not angle for angle in scenario.multipath_direction_deg]
     lattice = np.empty((scenario.n_bands, 2 * scenario.n_rows - 1, 2 * scenario.n_columns - 1),
                        complex)
@@ -385,7 +385,7 @@ def _fields(scenario: Scenario) -> Scenario | MultipathEstimate:
 
 def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase: float
                         ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute angles and normalised weights of a Laplacian [n]; if even, positive angles only."""
+    """Compute the angles and normalised weights of a Laplacian [n]; positive angles if even."""
     nodes, weights = gauss_legendre(_ANGLE_NODES)
     mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)
     angles, density = [], []

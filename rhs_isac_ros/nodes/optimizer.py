@@ -67,7 +67,7 @@ class GroupParameterService(ParameterService):
 
 
 def ros_parameters(values: Mapping[str, Any]) -> list[Parameter]:
-    """Convert values by name to parameters."""
+    """Convert a mapping of names to values into parameters."""
     return [Parameter(name, value=value) for name, value in values.items()]
 
 

@@ -13,7 +13,7 @@ from rhs_isac_ros.support.fields import ParameterError
 
 
 class TransmissionNode(RoleNode[Transmission]):
-    """The transmission, which serves once it has a codebook."""
+    """The ROS node of the role ``transmission``, which serves once it has a codebook."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('transmission', **node_options)

@@ -53,7 +53,7 @@ class RobotMobility:
 
     @property
     def lack(self) -> str:
-        """Reason why there is no position at present; empty if there is one."""
+        """Reason why there is currently no position; empty if there is one."""
         if self._error:
             return f'{self._source}: {self._error}'
         if time.monotonic() > self._arrived_s + self._timeout_s:
@@ -66,7 +66,7 @@ class RobotMobility:
         return ''
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the present position [3] [m] and velocity [3] [m/s] in the surface's frame."""
+        """Return the current position [3] [m] and velocity [3] [m/s] in the surface's frame."""
         age_s = min(max(self._age_s(), 0.0), self._timeout_s)
         return self._position + age_s * self._velocity, self._velocity.copy()
 

@@ -76,14 +76,14 @@ def marker(
 
 
 def deletion(namespace: str, number: int, stamp: Time) -> Marker:
-    """Return a message that deletes the marker with a namespace and an id."""
+    """Return a message that deletes the marker with the given namespace and id."""
     marker = _marker(namespace, number, Marker.SPHERE, stamp)
     marker.action = Marker.DELETE
     return marker
 
 
 def place(marker: Marker, frame: Frame) -> Marker:
-    """Move the pose of a marker, to which its points are relative, to a frame."""
+    """Express the pose of a marker, to which its points are relative, in a frame."""
     marker.header.frame_id = frame.name
     marker.pose = frame.pose(marker.pose)
     return marker

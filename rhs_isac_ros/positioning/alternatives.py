@@ -223,7 +223,7 @@ ALTERNATIVES: tuple[type[Outside] | type[Blocked], ...] = (Outside, Blocked)
 
 
 def probabilities_of(estimate: object) -> dict[str, float]:
-    """Return the known probabilities in an `Estimate` or a message, by alternative."""
+    """Return the known probabilities in an `Estimate` or a message, keyed by alternative."""
     values = {kind.name: float(getattr(estimate, f'{kind.name}_probability'))
               for kind in ALTERNATIVES}
     return {name: value for name, value in values.items() if not math.isnan(value)}
@@ -279,7 +279,7 @@ def _directions(scenario: Scenario) -> np.ndarray:
 
 
 def _points(ranges: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return every range in every direction, (r [m], u, v), float64 [R, V, 3]."""
+    """Return the points at all ranges in all directions, (r [m], u, v), float64 [R, V, 3]."""
     points = np.empty((len(ranges), len(directions), 3))
     points[..., 0] = ranges[:, None]
     points[..., 1:] = directions

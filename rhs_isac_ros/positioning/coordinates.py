@@ -25,7 +25,7 @@ def carrier_wavenumbers(scenario: Scenario) -> np.ndarray:
 
 
 def is_inside(positions: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Return which positions, [..., 3] [m], are between the bounds [2, 3] of the region."""
+    """Mark the positions, [..., 3] [m], between the bounds [2, 3] of the region, bool [...]."""
     low, high = bounds
     inside = np.ones(positions.shape[:-1], bool)
     # A reduction over the coordinates takes several times as long.

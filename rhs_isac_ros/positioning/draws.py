@@ -82,7 +82,7 @@ class DrawnPosterior:
         self._log_volume = np.log(volume) + self._log_area
 
     def of(self, query: Query, phase: int) -> Draws | None:
-        """Draw positions of a phase of a query; None if too few of them are effective."""
+        """Draw positions for one phase of a query; return None if too few are effective."""
         probability = bounds = self._probabilities(query, phase)
         cells, log_weights, parts, total_share = np.empty(0, int), np.empty(0), [], 0.0
         for n_rounds in range(1, _MAX_ROUNDS + 1):
@@ -130,7 +130,7 @@ class DrawnPosterior:
         return shares / shares.sum()
 
     def _rays(self, query: Query, phase: int, cells: np.ndarray, places: np.ndarray) -> _Rays:
-        """Integrate along directions, given by places [K, 2] in the unit squares of cells [K]."""
+        """Integrate along directions, each at a place [K, 2] in the unit square of a cell [K]."""
         directions = np.empty((len(cells), 3))
         directions[:, 1:] = self._low[cells] + places * self._extent[cells]
         directions[:, 0] = _boresight(directions[:, 1:])

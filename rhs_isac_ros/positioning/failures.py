@@ -94,7 +94,7 @@ class FailedElements:
         self._usual_residual = float(gammainccinv(np.prod(likelihood.model.shape), _UNUSUAL))
 
     def refine(self, modes: Modes, signals: Signals) -> tuple[Modes, list['FailedSet']]:
-        """Return modes of one phase for all probable sets, and the likelihoods of the sets.
+        """Return the modes of one phase for all probable sets, and the likelihoods of these sets.
 
         Takes the modes found without sets, and the signals of the phase, N = 1.
         """
@@ -185,7 +185,7 @@ class Site:
         return self.model.elements_at(self.point)
 
     def columns_of(self, failed: Failed) -> tuple[np.ndarray, np.ndarray]:
-        """Return the columns of a surface with failed elements, and those of their amplitudes."""
+        """Return the columns for a surface with failed elements, and for their amplitudes."""
         if not failed:
             return self.columns, self.columns[:0]
         changes, amplitudes = self.elements
@@ -331,7 +331,7 @@ class FailureModel:
 
     def _predicted(self, values: np.ndarray, columns: np.ndarray, whitening: Whitening,
                    n_failed: int) -> np.ndarray:
-        """Return the marginal log-likelihood of columns [H, C, N_B, N_SB F] after a step, [H]."""
+        """Return the marginal log-likelihood after a step from columns [H, C, N_B, N_SB F]."""
         n = len(columns)
         white = np.matmul(np.moveaxis(columns, 2, 0), np.swapaxes(whitening.whitener, 2, 3))
         white = np.moveaxis(white, 0, 2).reshape(n, columns.shape[1], -1)
@@ -393,7 +393,7 @@ class FailureSearch:
         return any(self._deviances[key] <= self._usual_residual for key in keys)
 
     def add(self, points: np.ndarray, values: np.ndarray, failed: Failed = ()) -> list[Key]:
-        """Add sites at points [P, 3] with parameters [P, Q] and a set; the best come first."""
+        """Add a site at each point [P, 3] with parameters [P, Q]; return keys, the best first."""
         first = len(self.sites)
         self.sites += self._model.sites(points, values, self._signals)
         return self._weigh((failed, index) for index in range(first, len(self.sites)))

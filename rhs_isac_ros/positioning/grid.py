@@ -172,7 +172,7 @@ class TemplateTable:
         self._fine = np.ascontiguousarray(phase.T.astype(np.complex64))
 
     def _turns(self, ranges_m: np.ndarray) -> np.ndarray:
-        """Return the factors of conjugate templates at ranges [R], complex128 [N_B, N_SB, R]."""
+        """Return the carriers of conjugate templates at ranges [R], complex128 [N_B, N_SB, R]."""
         return np.exp(1j * self._wavenumbers[..., None] * ranges_m) / ranges_m
 
     def starts(self, whitened: np.ndarray, prior: NuisancePrior, margin: float,
@@ -281,7 +281,10 @@ class TemplateTable:
         return np.stack(bounds) - self.energy
 
     def _peaks_of(self, phases: np.ndarray, cells: np.ndarray, query: 'Query') -> '_Peaks':
-        """Find all peaks along the range in pairs [K] of the grid; their phases [K] ascend."""
+        """Find all peaks along the range in (template, cell) pairs [K].
+
+        Phases [K] are in ascending order.
+        """
         grid, outputs, prior = self.grid, query.outputs, query.prior
         pair, window = self._windows_of(cells)
         phases, cells = phases[pair], cells[pair]
@@ -337,9 +340,9 @@ class TemplateTable:
 
     def windows(self, query: 'Query', phase: int, cells: np.ndarray, directions: np.ndarray
                 ) -> 'Windows':
-        """Evaluate windows of range at directions (u, v), [K, 2], in pairs [K] of the grid.
+        """Evaluate range windows of (template, cell) pairs [K] in directions (u, v), [K, 2].
 
-        Means change linearly with the offset from the template's direction, energies
+        Means change linearly with the offset from the template's direction, and energies
         quadratically.
         """
         grid, curvature = self.grid, self._curvature[cells][:, 1:, 1:]
@@ -477,7 +480,8 @@ def first_of_each(phases: np.ndarray) -> np.ndarray:
 def heaviest(phases: np.ndarray, value: np.ndarray, margin: float | np.ndarray) -> np.ndarray:
     """Mark the points that contain almost all of the weight of their phase, bool [M].
 
-    `phases`, int [M], ascend; log-likelihoods `value`, float64 [M], descend within each phase.
+    `phases`, int [M], are in ascending order; log-likelihoods `value`, float64 [M], are in
+    descending order within each phase.
     `margin` is the negative logarithm of the share that may be left out, a number or [M].
     """
     firsts = first_of_each(phases)
@@ -493,9 +497,9 @@ def separate(phases: np.ndarray, points: np.ndarray, radii: np.ndarray,
              curvature: np.ndarray | None = None) -> np.ndarray:
     """Choose the points that do not belong to the mode of a better point.
 
-    `phases`, int [M], ascend; the best of the points (r [m], u, v), float64 [M, 3], of a phase
-    comes first. An ellipsoid with the `radii` [3] around a mode contains no other mode. Given the
-    curvature [M, 3, 3] of the log-likelihood, broad modes extend further.
+    `phases`, int [M], are in ascending order; the best of the points (r [m], u, v), float64 [M,
+    3], of a phase comes first. An ellipsoid with the `radii` [3] around a mode contains no other
+    mode. Given the curvature [M, 3, 3] of the log-likelihood, broad modes extend further.
     """
     from scipy.spatial import cKDTree
 

@@ -97,11 +97,11 @@ class Resolution(NamedTuple):
         return min(2 * _AMPLITUDE_ERROR * range_m, 2 * PHASE_ERROR * self.delay_m)
 
     def step_limits(self, is_coarse: bool) -> np.ndarray:
-        """Return the longest steps in (r [m], u, v) for which the linear mean holds, [3]."""
+        """Return the longest steps in (r [m], u, v) over which the mean is nearly linear, [3]."""
         return self._radii(is_coarse, _STEP_WAVELENGTHS, _STEP_RAD)
 
     def separation(self, is_coarse: bool) -> np.ndarray:
-        """Return radii in (r [m], u, v) of an ellipsoid around a single mode, [3]."""
+        """Return the radii in (r [m], u, v) of an ellipsoid around a single mode, [3]."""
         return self._radii(is_coarse, _SEPARATION_WAVELENGTHS, _SEPARATION_RAD)
 
     def _radii(self, is_coarse: bool, wavelengths: float, radians: float) -> np.ndarray:
@@ -142,7 +142,7 @@ class Grid(NamedTuple):
 
     @property
     def points(self) -> np.ndarray:
-        """Centres of all pairs, (r [m], u, v), float64 [C, 3]."""
+        """Centres of all pairs of template and range cell, (r [m], u, v), float64 [C, 3]."""
         points: np.ndarray = self.nodes[self.node]
         points[:, 0] = self.ranges_m[self.cell]
         return points

@@ -181,7 +181,7 @@ class NuisancePrior:
         return values @ self.phases.T
 
     def log_prior(self, values: np.ndarray) -> np.ndarray:
-        """Return the logarithm of prior and change of volume, float64 [M]."""
+        """Return the logarithm of the prior times the change of volume, float64 [M]."""
         return -(values**2 @ self.precision / 2 + values @ self.volume)
 
     def log_evidence_of_aligned(self, aligned: np.ndarray) -> float:
@@ -414,7 +414,7 @@ def _average_of(states: list[Local]) -> Local:
 
 
 def _failure_counts(n_elements: int, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return numbers of failures relative to their mean, and logarithms of their probability."""
+    """Return numbers of failures relative to the mean, and the logs of their probabilities."""
     if share == 0:
         return np.zeros(1), np.zeros(1)
     from scipy.stats import binom
@@ -453,7 +453,7 @@ class Alignment:
         self._whitener = np.linalg.inv(np.linalg.cholesky(spread + np.eye(spread.shape[1])))
 
     def values_of_each(self, received: np.ndarray) -> np.ndarray:
-        """Return parameters [N, Q] for signals [N, N_B, N_SB F]; 0 if they move no multipath."""
+        """Estimate the parameters [N, Q] that move the multipath; all others are 0."""
         if not self._prior.moves_multipath.any():
             return np.zeros((len(received), len(self._prior)))
         return np.stack([self._values(one) for one in received])

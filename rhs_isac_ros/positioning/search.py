@@ -58,7 +58,7 @@ class Modes(NamedTuple):
         return self.points + self.roi_offset
 
     def starts(self) -> Starts:
-        """Return the most likely points inside the region as starts of another search."""
+        """Return the most likely points inside the region, to start another search from them."""
         return Starts(self.phases, self.roi_points, self.values)
 
     def select(self, chosen: np.ndarray | slice) -> 'Modes':

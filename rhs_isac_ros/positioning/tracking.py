@@ -151,7 +151,7 @@ class Motion:
 
     Between turns, the velocity is an Ornstein-Uhlenbeck process: over times much shorter than
     `memory_s`, it is constant up to noise. At a turn, which may also be a stop or a start, it is
-    drawn anew. The numbers of turns in separate times are independent.
+    redrawn. The numbers of turns in separate times are independent.
     """
 
     speed_mps: float = 1.0  #: Root-mean-square speed.
@@ -241,7 +241,7 @@ class Motion:
 
 
 def _moved(mixture: Mixture, time_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (r, u, v) after a time in a straight line, and velocities, float64 [C, 3]."""
+    """Move points (r, u, v) in a straight line; return them and velocities, float64 [C, 3]."""
     points = mixture.means[:, :3]
     velocities = np.matmul(jacobian(points), mixture.means[:, 3:, None])[..., 0]
     positions = to_positions(points) + time_s * velocities
@@ -289,7 +289,7 @@ class Tracker:
 
     @one_blas_thread
     def update(self, time_s: float, received: np.ndarray) -> TrackEstimate:
-        """Return position and velocity at the time [s] of a phase, from this and earlier phases.
+        """Estimate position and velocity at the time [s] of a phase, from this and earlier ones.
 
         Takes signals, complex128 [N_B, N_SB F]; raises `SignalError` if they are unusable. If the
         phase is not later than the last one, its position follows from its signals alone, and the
@@ -360,7 +360,7 @@ class Tracker:
         return reduce(concatenate(*parts, lost), MAX_COMPONENTS).normalised()
 
     def _inside(self, mixture: Mixture) -> tuple[Mixture, np.ndarray, np.ndarray]:
-        """Return the components that reach the region, and mean and covariance inside."""
+        """Return the components that reach the region, and their mean and covariance inside."""
         heavy = mixture.log_weights >= _MIN_LOG_WEIGHT
         mixture, light = mixture.select(heavy), mixture.select(~heavy)
         positions = mixture.positions(self.estimator.normal)
@@ -453,7 +453,7 @@ def _exact_update(
 
 
 def _is_first(updated: Mixture, component: np.ndarray) -> np.ndarray:
-    """Return which components do not equal an earlier one, bool [C]."""
+    """Mark the components that differ from all earlier ones, bool [C]."""
     # Modes that have not converged may lead one predicted component, given by its index, to the
     # same maximum, which must not count twice.
     points = updated.means[:, :3]

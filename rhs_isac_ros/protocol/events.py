@@ -201,6 +201,6 @@ class Outcome(enum.Enum):
 
 
 def kind_of(counter: str) -> Kind:
-    """Return the kind of a counter; one without an `Outcome` counts dropped messages."""
+    """Return the kind of a counter; counters without an `Outcome` count dropped messages."""
     kinds = {outcome.value: outcome.kind for outcome in Outcome}
     return kinds.get(counter, Kind.DROPPED)

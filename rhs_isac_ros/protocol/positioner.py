@@ -91,7 +91,7 @@ class Tracks:
 
 
 def _stacked(received: m.ReceivedSignals) -> np.ndarray:
-    """Return the signals in the shape for estimators, complex128 [N_B, N_SB F]."""
+    """Return the signals in the shape that estimators expect, complex128 [N_B, N_SB F]."""
     return received.signals.reshape(len(received.signals), -1)
 
 
@@ -140,7 +140,7 @@ class ResidualWatch:
 
         ``residual.ratio`` and ``residual.spread`` are the mean and the variance of the energy of
         the residuals relative to the expectation, ``residual.fixes`` is the number of fixes that
-        they cover, and ``warning.residual`` is the text of the present warning.
+        they cover, and ``warning.residual`` is the text of the current warning.
         """
         values = diagnose(self._estimates, bool(self._warning))
         if self._all.n_fixes:
@@ -164,7 +164,7 @@ def _deviation(prefix: str, monitor: InnovationTest) -> str:
 
 
 class _Loss(enum.Enum):
-    """Why the signals of a user yield no position; the value is the text for the recovery."""
+    """Why the signals of a user yield no position; the value is the log text of the recovery."""
 
     NO_FIX = 'has a position again'
     BLOCKED = 'is in sight again'

@@ -94,7 +94,7 @@ class PositionerSettings:
 
 @dataclasses.dataclass(frozen=True)
 class TransmissionSettings:
-    """Settings of the transmission."""
+    """Settings of the role ``transmission``."""
 
     band: int = setting(
         -1, 'Band of the transmission, from 0; -1: the best band of each cycle.',

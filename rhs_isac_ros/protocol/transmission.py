@@ -1,4 +1,4 @@
-"""The transmission, which steers a beam towards the estimate and reports the capacity."""
+"""The role ``transmission``, which steers a beam towards the estimate and reports the capacity."""
 
 import collections
 import math

@@ -43,11 +43,11 @@ class _User:
 class UserRegistry:
     """Registers the users that answer beacons, and selects the next one to serve.
 
-    A number belongs to the first node that answers with it, until this node is silent. The policy
-    selects the user served longest ago (``round_robin``), the ``first`` to answer, or one at
-    ``random``. The first `INVITED` users that completed a cycle are seniors. When another user
-    does not complete a cycle, the seniors precede all others for as long as this cycle took.
-    Numbers that answer beacons and nothing else thus take at most half of the time.
+    A number belongs to the first node that answers with it, until this node falls silent. The
+    policy selects the user served longest ago (``round_robin``), the ``first`` to answer, or one
+    at ``random``. The first `INVITED` users that completed a cycle are seniors. When another user
+    does not complete a cycle, the seniors precede all others for as long as this cycle took. User
+    numbers that answer only beacons therefore take at most half of the time.
     """
 
     def __init__(self, policy: str, rng: np.random.Generator) -> None:
@@ -105,7 +105,7 @@ class UserRegistry:
             self._choose(users))
 
     def _preferred(self, users: Iterable[int]) -> list[int]:
-        """Return those of some users who precede the others: a requested one, or seniors."""
+        """Return the given users that precede the others: a requested user, or seniors."""
         users = list(users)
         requested = [user for user in self._requested if user in users][:1]
         seniors = [user for user in users if self._seniors_first and user in self._seniors]

@@ -100,7 +100,7 @@ def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
 
 
 def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
-    """Return the stamp of a message, or the present time of a node if it is unknown."""
+    """Return the stamp of a message, or the current time of a node if it is unknown."""
     if not message.stamp_ns:
         return node.get_clock().now().to_msg()
     return Time(sec=message.stamp_ns // 10**9, nanosec=message.stamp_ns % 10**9)

@@ -53,7 +53,7 @@ _LATCHED_MESSAGES = {m.CapacityStatistics}
 
 
 def profile_for(kind: type[m.Message], exchange: QoSProfile = EXCHANGE) -> QoSProfile:
-    """Return the profile of a message: `LATCHED` for a current value, `ACKS`, or `exchange`."""
+    """Return the quality of service of a message: `LATCHED`, `ACKS` or `exchange`."""
     if kind is m.Ack and exchange is EXCHANGE:
         return ACKS
     return LATCHED if kind in _LATCHED_MESSAGES else exchange

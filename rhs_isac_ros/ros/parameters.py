@@ -211,7 +211,7 @@ def known_names() -> set[str]:
 
 
 def hint(name: str) -> str:
-    """Return a hint at the known parameter closest to a name; empty if none is close."""
+    """Return a text that suggests the closest known parameter; empty if none is close."""
     close = difflib.get_close_matches(name, known_names(), 1)
     return f' (the closest is {close[0]})' if close else ''
 

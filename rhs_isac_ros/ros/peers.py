@@ -107,7 +107,7 @@ class Peers:
             self._thread.join()
 
     def restart(self) -> None:
-        """Report the missing roles anew, as after the start."""
+        """Report the missing roles again, as after the start."""
         self._absent_before = frozenset(self._required)
         self._reported: dict[str, str] | None = None
         self._polls = 0
@@ -185,7 +185,7 @@ class Peers:
     # Quality of service
 
     def _examine_qos(self) -> None:
-        """Log endpoints of others that cannot exchange messages with those of this node."""
+        """Log endpoints of other nodes that cannot exchange messages with this node."""
         node = self._node
         ours = {*(publisher.topic_name for publisher in node.publishers),
                 *(subscription.topic_name for subscription in node.subscriptions)}
@@ -202,7 +202,7 @@ class Peers:
         self._incompatible = found
 
     def _mismatches(self, topic: str) -> Iterator[tuple[str, str]]:
-        """Yield node and description of each incompatible endpoint of a topic."""
+        """Yield the node and a description of each incompatible endpoint of a topic."""
         own = self._node.get_fully_qualified_name()
         publishers = self._node.get_publishers_info_by_topic(topic)
         subscriptions = self._node.get_subscriptions_info_by_topic(topic)

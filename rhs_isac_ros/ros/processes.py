@@ -68,7 +68,7 @@ def claim_domain() -> str:
 
 
 def max_processes() -> int:
-    """Return the number of nodes that this machine can run as processes of their own.
+    """Return the number of nodes that this machine can run as separate processes.
 
     If discovery limits the number, the process that observes them counts as well.
     """
@@ -161,7 +161,8 @@ class Processes:
             self, executable: str, name: str = '', process: str = '', **parameters: Any) -> None:
         """Start an executable with ROS parameters.
 
-        By default, the node has the name of the executable, and the process that of the node.
+        By default, the node has the name of the executable, and the process has the name of the
+        node.
         Processes of nodes with the same name need different names.
         """
         program = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros' / executable
@@ -203,7 +204,7 @@ class Processes:
         return (self._logs / f'{name}.log').read_text(encoding='utf-8', errors='replace')
 
     def interrupt(self) -> None:
-        """Send SIGINT to all processes, and do not wait for their end."""
+        """Send SIGINT to all processes, without waiting for them to end."""
         for process in self._running.values():
             process.send_signal(signal.SIGINT)
 

@@ -127,8 +127,8 @@ def read_archive(path: str | Path, kind: str, version: int, names: set[str]
                  ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Read arrays and their description, without its ``format``.
 
-    Raises ArchiveError if the file cannot be read, is damaged, or its format or arrays are not
-    `version` and `names`. `kind` describes the content, for errors.
+    Raises ArchiveError if the file cannot be read, is damaged, has a format other than `version`
+    or arrays other than `names`. `kind` describes the content in errors.
     """
     arrays = read_arrays(path, names)
     try:

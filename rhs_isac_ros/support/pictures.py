@@ -108,7 +108,7 @@ def new_panels(
 
 def add_panels(
         place: Any, n_rows: int, n_columns: int, **sharing: bool) -> tuple[Any, Any]:
-    """Return panels, an array of axes, and axes above for a legend.
+    """Return panels, an array of axes, and axes above them for a legend.
 
     `place` is a Matplotlib `SubplotSpec`; `sharing` are ``sharex`` and ``sharey``.
     """

@@ -20,7 +20,7 @@ def names(group: str) -> tuple[str, ...]:
 
 
 def describe(group: str, name: str) -> str:
-    """Describe, for an error, all entry points of a name: group, name, object and package."""
+    """Describe all entry points with a name for an error: group, name, object and package."""
     return ' and '.join(sorted(
         f'entry point {group}: {name} = {point.value} of {point.dist.name if point.dist else "?"}'
         for point in metadata.entry_points(group=group, name=name)))

@@ -55,7 +55,7 @@ _N_COMPARED = 200
 
 
 class PilotLog:
-    """Collects the signals, true positions and codebooks of one user, or of all users for 0.
+    """Collects signals, true positions and codebooks of one user, or of all users (user 0).
 
     Unlike `CycleLog`, it includes cycles without a fix: before a calibration, there may be only
     such cycles.

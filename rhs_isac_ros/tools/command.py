@@ -119,7 +119,7 @@ def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) 
 
 
 def none_within(what: str, timeout_s: float) -> ToolError:
-    """Return the error for something that a network did not provide within a time [s]."""
+    """Return the error that a network did not provide something within a time [s]."""
     return ToolError(f'{what} within {timeout_s:g} s, in the domain '
                      f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace')
 

@@ -83,7 +83,7 @@ def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Pa
 def start_network(
         processes: Processes, users: int, scenario: Scenario, *, together: bool = False,
         **given: Any) -> None:
-    """Start each node of a network in a separate process; `together`, the users share a node.
+    """Start each node of a network in a separate process; if `together`, the users share a node.
 
     Users walk at random at the scenario's maximum speed. The parameters `given`, which should
     include the file of the scenario, apply to all nodes that have them; None selects the default.
@@ -109,9 +109,9 @@ def watch(
         on_discovered: Callable[[], None] | None = None) -> str:
     """Spin an observer until it has received a number of complete cycles.
 
-    `on_progress` is called with the present and the final number whenever the former changes, and
-    `on_discovered` when the observer has discovered all nodes. Returns the error that ended the
-    wait, or ''.
+    `on_progress` is called with the current and the final number whenever the current one changes,
+    and `on_discovered` when the observer has discovered all nodes. Returns the error that ended
+    the wait, or ''.
     """
     seen, changed_s = -1, time.monotonic()
     while seen < cycles:

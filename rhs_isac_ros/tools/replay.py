@@ -190,7 +190,7 @@ def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
 
 def _messages(
         options: argparse.Namespace, names: Iterable[str]) -> Iterator[tuple[str, bytes, float]]:
-    """Yield topic (relative name), bytes and time [s] of the messages in a recording."""
+    """Yield the topic (relative name), the bytes and the time [s] of each recorded message."""
     full_names = {f'{command.topic_prefix(options.namespace)}{name}': name for name in names}
     for topic, content, time_s in read(options.file, full_names):
         yield full_names[topic], content, time_s
