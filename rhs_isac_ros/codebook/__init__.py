@@ -9,7 +9,7 @@ from rhs_isac_ros.codebook.codebook import (
 from rhs_isac_ros.codebook.objective import OBJECTIVES, SAMPLINGS
 from rhs_isac_ros.codebook.optimize import METHODS, OptimizeResult, optimize
 from rhs_isac_ros.codebook.problem import Progress
-from rhs_isac_ros.codebook.starts import directional_codebook, random_codebook
+from rhs_isac_ros.codebook.unoptimised import directional_codebook, random_codebook
 
 __all__ = [
     'METHODS', 'OBJECTIVES', 'SAMPLINGS', 'Codebook', 'CodebookError', 'OptimizeResult',

@@ -31,7 +31,7 @@ from rhs_isac_ros.codebook.optimize import (
 )
 from rhs_isac_ros.codebook.plot import plot_optimization
 from rhs_isac_ros.codebook.problem import Progress
-from rhs_isac_ros.codebook.starts import STARTS
+from rhs_isac_ros.codebook.unoptimised import STARTS
 from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.support import streams

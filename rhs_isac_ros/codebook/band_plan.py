@@ -17,7 +17,7 @@ from rhs_isac_ros.bounds import crlb_of, global_bound
 from rhs_isac_ros.bounds.range_ambiguity import range_confusion_error, range_confusion_error_of
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.codebook.optimize import INTERRUPTED, OptimizeResult, optimize
-from rhs_isac_ros.codebook.starts import random_codebook
+from rhs_isac_ros.codebook.unoptimised import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.support import streams

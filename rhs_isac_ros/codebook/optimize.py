@@ -21,7 +21,7 @@ from rhs_isac_ros.codebook.methods import (
 )
 from rhs_isac_ros.codebook.objective import OBJECTIVES, SAMPLINGS
 from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Progress, Search
-from rhs_isac_ros.codebook.starts import STARTS, random_codebook
+from rhs_isac_ros.codebook.unoptimised import STARTS, random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.surface import on_levels

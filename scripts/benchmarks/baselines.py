@@ -31,7 +31,7 @@ from parts.array_receiver import ArrayReceiver, posterior_means
 from parts.command import benchmark_parser, write_results
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.codebook.starts import SCANS
+from rhs_isac_ros.codebook.unoptimised import SCANS
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.experiments import markdown_table
 from rhs_isac_ros.model import Scenario, ScenarioError

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import directional_codebook
-from rhs_isac_ros.codebook.starts import SCANS, width_points
+from rhs_isac_ros.codebook.unoptimised import SCANS, width_points
 from rhs_isac_ros.model import MeasurementModel, Scenario
 
 SCENARIOS = [

@@ -7,7 +7,7 @@ import pytest
 
 from rhs_isac_ros.codebook import Progress, directional_codebook, plot
 from rhs_isac_ros.codebook.plot import beam_powers, plot_optimization
-from rhs_isac_ros.codebook.starts import width_points
+from rhs_isac_ros.codebook.unoptimised import width_points
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.pictures import PICTURE_FORMATS, write_picture
