@@ -48,6 +48,11 @@ def test_a_group_contains_what_its_libraries_require(group, others):
     assert not {name: lacks for name, lacks in missing.items() if lacks}
 
 
+def test_groups_add_to_requirements_txt():
+    """Pip installs both at the same time."""
+    assert not {group for group in FILES if group and pins(group).keys() & pins('').keys()}
+
+
 def test_all_groups_agree():
     versions = {}
     for group in FILES:

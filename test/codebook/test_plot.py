@@ -10,7 +10,7 @@ from rhs_isac_ros.codebook.plot import beam_powers, plot_optimization
 from rhs_isac_ros.codebook.unoptimised import width_points
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support.optional import MissingLibraryError
-from rhs_isac_ros.support.pictures import PICTURE_FORMATS, write_picture
+from rhs_isac_ros.support.pictures import write_picture
 
 HISTORY = [Progress(0, 1, 3.0, 0.1), Progress(1, 2, 1.0, 0.2)]
 
@@ -43,17 +43,6 @@ def test_axes_have_units_and_the_beams_one_legend():
         f'frame {frame}' for frame in range(4)]
     (beams,) = [axes for axes in figure.axes if axes.get_title() == 'beams of band 0, 2.5 GHz']
     assert len({line.get_linestyle() for line in beams.lines}) == 4
-
-
-@pytest.mark.slow
-def test_repeated_runs_write_the_same_files(scenario, tmp_path):
-    pytest.importorskip('matplotlib')
-    for run in 'ab':
-        figure = plot_optimization(scenario, directional_codebook(scenario), HISTORY)
-        for kind in PICTURE_FORMATS:
-            write_picture(tmp_path / f'{run}.{kind}', figure)
-    for kind in PICTURE_FORMATS:
-        assert (tmp_path / f'a.{kind}').read_bytes() == (tmp_path / f'b.{kind}').read_bytes()
 
 
 def test_without_matplotlib_the_error_names_the_extra(scenario, monkeypatch):
