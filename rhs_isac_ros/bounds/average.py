@@ -9,10 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import (
-    inverse_information,
-    without_nuisance,
-)
+from rhs_isac_ros.bounds.fisher import inverse_information, without_nuisance
 from rhs_isac_ros.bounds.rows import (
     PLAIN,
     Evaluation,
@@ -192,18 +189,15 @@ class AverageCrlb(Average):
 
     def _bounds(self, _: slice, joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the bounds [n] and their negative derivatives with respect to the forms."""
-        information, regression = without_nuisance(joint)
-        inverse = inverse_information(information + self._prior)
+        marginal = without_nuisance(joint)
+        inverse = inverse_information(marginal.information + self._prior)
         values = np.trace(inverse, axis1=1, axis2=2)
         # If the signals do not determine the position, the value is infinite and the slope zero.
         finite = np.where(np.isfinite(values)[:, None, None], inverse, 0.0)
-        slopes = np.matmul(finite, finite)
-        if not regression.shape[1]:
-            return values, slopes
         # W = [I; regression] minimises the Schur complement W^T J W, and is therefore held fixed.
         identity = np.broadcast_to(np.eye(3), (len(joint), 3, 3))
-        whole = np.concatenate([identity, regression], axis=1)
-        return values, whole @ slopes @ np.swapaxes(whole, 1, 2)
+        whole = np.concatenate([identity, marginal.regression], axis=1)
+        return values, whole @ np.matmul(finite, finite) @ np.swapaxes(whole, 1, 2)
 
 
 def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:

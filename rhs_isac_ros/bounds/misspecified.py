@@ -17,7 +17,7 @@ import numpy as np
 from rhs_isac_ros.bounds.fisher import inverse_information
 from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.arrays import adjoint
-from rhs_isac_ros.model.gaussian import quadratic_form
+from rhs_isac_ros.model.gaussian import quadratic_form, step_to_maximum
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
@@ -111,7 +111,7 @@ def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndar
         mean, slopes = model.mean_and_jacobian(places, whitened=True)
         information, gradient = _curvature(slopes), 2 * _projections(slopes, target - mean)
         ridge = 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        step = np.linalg.solve(information + ridge, gradient[..., None])[..., 0]
+        step = step_to_maximum(information + ridge, gradient)
         for _ in range(_HALVINGS):
             # The mean is defined only in front of the surface.
             trial = places + step
@@ -187,7 +187,7 @@ def _ambiguities(model: MeasurementModel, place: np.ndarray, mean: np.ndarray,
     # The maximum of an ambiguity is beside the ray.
     information = _curvature(slopes) / 2 + np.diag([_MAX_OFFSET_M**-2] * 3)
     gradient = _projections(slopes, mean + residual - means)
-    offset = np.linalg.solve(information, gradient[..., None])[..., 0]
+    offset = step_to_maximum(information, gradient)
     difference = means + np.einsum('na,nair->nir', offset, slopes) - mean
     excess = np.sum(np.abs(difference)**2, axis=(1, 2)) - 2 * np.einsum(
         'nir,ir->n', difference.conj(), residual).real

@@ -11,7 +11,7 @@ import numpy as np
 from rhs_isac_ros.bounds.pairwise_error import best_phases
 from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.arrays import blocks
-from rhs_isac_ros.model.gaussian import eliminate
+from rhs_isac_ros.model.gaussian import step_to_maximum
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
@@ -119,7 +119,7 @@ def _differences(
     information = np.einsum('nur,nvr->nuv', directions, directions)
     # Phases have a prior; the information of real parts is half the curvature.
     information[:, 3:, 3:] += np.eye(scales.shape[1]) / 2
-    _, displacement = eliminate(information, information[..., :0], by_position)
+    displacement = step_to_maximum(information, by_position)
     return difference - np.einsum('nu,nur->nr', displacement, directions), penalties
 
 

@@ -21,7 +21,7 @@ from rhs_isac_ros.calibration.mixture import (
 from rhs_isac_ros.model import Beamforming, Scenario, SurfaceEstimate
 from rhs_isac_ros.model.arrays import blocks, check_arrays
 from rhs_isac_ros.model.elements import direct_design, element_radiation, scattered_errors
-from rhs_isac_ros.model.gaussian import eliminate, quadratic_form
+from rhs_isac_ros.model.gaussian import quadratic_form, step_to_maximum
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.measurement import signal_covariance
@@ -133,7 +133,7 @@ class Alignment:
         residual = whiten(aligned) - whiten(mean)
         gradient = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), residual).real - values
         curvature = self.curvature(slopes)
-        values += eliminate(curvature, curvature[..., :0], gradient)[1]
+        values += step_to_maximum(curvature, gradient)
 
     def curvature(self, slopes: np.ndarray) -> np.ndarray:
         """Return the curvature [N, Q, Q] that results from whitened slopes and the prior."""
@@ -252,8 +252,8 @@ class PilotStatistics:
                        for band, columns in enumerate(part.columns))
         coupling = 2 * np.concatenate([coupling.real, -coupling.imag], axis=2)
         of_signals = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), part.whiten(signals)).real
-        regression, _ = eliminate(self._alignment.curvature(slopes), coupling, of_signals)
-        flat = -regression.reshape(-1, regression.shape[2])
+        regression = np.linalg.solve(self._alignment.curvature(slopes), coupling)
+        flat = regression.reshape(-1, regression.shape[2])
         return coupling.reshape(flat.shape).T @ flat, of_signals.reshape(-1) @ flat
 
 

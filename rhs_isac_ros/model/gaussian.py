@@ -64,18 +64,9 @@ def quadratic_form(whitened: np.ndarray) -> np.ndarray:
     return 2 * form
 
 
-def eliminate(
-        curvature: np.ndarray, coupling: np.ndarray, gradient: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Maximise a quadratic log-likelihood over nuisance parameters.
-
-    Takes the curvature in these parameters, float64 [N, Q, Q], their coupling with n other
-    unknowns, [N, Q, n], and the gradient, [N, Q]. Returns how the maximum moves with the other
-    unknowns, [N, Q, n], and the step to the maximum, [N, Q].
-    """
-    both = np.linalg.solve(
-        curvature, np.concatenate([-coupling, gradient[..., None]], axis=-1))
-    return both[..., :-1], both[..., -1]
+def step_to_maximum(information: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Compute the Gauss-Newton step [..., Q] for information [..., Q, Q] and gradient [..., Q]."""
+    return np.linalg.solve(information, gradient[..., None])[..., 0]
 
 
 def marginalise(information: np.ndarray, gradient: np.ndarray, n: int = 3) -> Marginal:
@@ -83,8 +74,14 @@ def marginalise(information: np.ndarray, gradient: np.ndarray, n: int = 3) -> Ma
 
     Takes information, float64 [N, n + Q, n + Q], and gradient, [N, n + Q], of a log-likelihood.
     """
+    if information.shape[1] == n:
+        n_points = len(gradient)
+        return Marginal(information, gradient, np.zeros((n_points, 0, n)),
+                        np.zeros((n_points, 0)), np.zeros(n_points))
     among, coupling = information[:, n:, n:], information[:, n:, :n]
-    regression, offset = eliminate(among, coupling, gradient[:, n:])
+    both = np.linalg.solve(
+        among, np.concatenate([-coupling, gradient[:, n:, None]], axis=2))
+    regression, offset = both[..., :-1], both[..., -1]
     explained = np.matmul(np.swapaxes(coupling, 1, 2), regression)
     return Marginal(
         information[:, :n, :n] + (explained + np.swapaxes(explained, 1, 2)) / 2,

@@ -18,7 +18,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.gaussian import eliminate, marginalise, quadratic_form
+from rhs_isac_ros.model.gaussian import marginalise, quadratic_form, step_to_maximum
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, nuisance_of
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.coordinates import to_positions
@@ -474,7 +474,7 @@ class Alignment:
             curvature += np.diag(prior.precision[moves])
             gradient = 2 * scale * (slopes.conj() @ residual).real
             gradient -= prior.precision[moves] * values[moves]
-            values[moves] += eliminate(curvature, curvature[:, :0], gradient)[1]
+            values[moves] += step_to_maximum(curvature, gradient)
         return values
 
     def _best_on_grid(self, received: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.gaussian import Marginal, marginalise
+from rhs_isac_ros.model.gaussian import Marginal, marginalise, step_to_maximum
 from rhs_isac_ros.positioning.coordinates import likelihood_loss, offset_to_roi
 from rhs_isac_ros.positioning.grid import (
     Query,
@@ -167,14 +167,11 @@ def predict(local: Local, likelihood: Likelihood) -> np.ndarray:
 
 def _newton(local: Local, likelihood: Likelihood) -> tuple[Marginal, np.ndarray, np.ndarray]:
     """Return the marginal, the limited step of all unknowns [M, 3 + Q], and its rise [M]."""
-    n, n_values = len(local.value), len(likelihood.nuisance)
-    marginal = (marginalise(local.information, local.gradient) if n_values
-                else Marginal(local.information, local.gradient, np.zeros((n, 0, 3)),
-                              np.zeros((n, 0)), np.zeros(n)))
-    step = np.linalg.solve(marginal.information, marginal.gradient[..., None])[..., 0]
+    marginal = marginalise(local.information, local.gradient)
     limits = likelihood.resolution.step_limits(likelihood.nuisance.is_coarse)
-    whole = np.clip(step, -limits, limits)
-    if n_values:
+    whole = np.clip(
+        step_to_maximum(marginal.information, marginal.gradient), -limits, limits)
+    if len(likelihood.nuisance):
         whole = np.hstack([whole, marginal.offset + np.einsum(
             'mqp,mp->mq', marginal.regression, whole)])
     rise = np.sum(local.gradient * whole, axis=1) - likelihood_loss(whole, local.information)

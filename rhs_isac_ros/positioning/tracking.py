@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.gaussian import step_to_maximum
 from rhs_isac_ros.model.multipath import time_correlation
 from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT
 from rhs_isac_ros.positioning.coordinates import (
@@ -443,7 +444,7 @@ def _exact_update(
     """Update each component with the likelihood expanded at a point (r, u, v), [C, 3]."""
     value, gradient, curvature, _ = likelihood.local(
         points, np.zeros((len(points), 0)), signals.repeated(0, len(points)))
-    step = np.linalg.solve(curvature, gradient[..., None])[..., 0]
+    step = step_to_maximum(curvature, gradient)
     offsets = points + step - predicted.means[:, :3]
     log_weights, precision = _evidence(
         offsets, predicted.covariances[:, :3, :3], np.linalg.inv(curvature) / share)

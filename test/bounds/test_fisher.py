@@ -198,7 +198,7 @@ def test_nothing_declared_gives_the_plain_bound(case):
     model = MeasurementModel(case.scenario, case.codebook)
     joint = fisher.joint_information_of(model, positions)
     np.testing.assert_allclose(
-        fisher.without_nuisance(joint)[0], case.vectors['fim'], rtol=1e-8,
+        fisher.without_nuisance(joint).information, case.vectors['fim'], rtol=1e-8,
         atol=1e-9 * np.abs(case.vectors['fim']).max())
     # An impairment too small to matter, through the code of nuisance parameters.
     tiny = dataclasses.replace(case.scenario, band_phase_std_rad=1e-9, user_gain_std_db=1e-9)
