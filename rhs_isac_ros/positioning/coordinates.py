@@ -83,6 +83,12 @@ def symmetric(covariances: np.ndarray) -> np.ndarray:
     return (covariances + np.swapaxes(covariances, -1, -2)) / 2
 
 
+def select(rows: _Rows, chosen: Any) -> _Rows:
+    """Return the rows with the given indices or mask, of a named tuple of arrays."""
+    kind: Any = type(rows)
+    return kind(*(field[chosen] for field in rows))
+
+
 def concatenate(*parts: _Rows) -> _Rows:
     """Concatenate the fields of named tuples of arrays."""
     kind: Any = type(parts[0])

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, concatenate
+from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, concatenate, select
 from rhs_isac_ros.positioning.grid import Query, TemplateTable, Windows
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution
 
@@ -135,16 +135,16 @@ class DrawnPosterior:
         directions[:, 1:] = self._low[cells] + places * self._extent[cells]
         directions[:, 0] = _boresight(directions[:, 1:])
         windows = self._table.windows(query, phase, cells, directions[:, 1:])
-        amplitude = np.abs(windows.outputs).sum(axis=0)
+        amplitude = np.abs(windows.outputs).sum(axis=1)
         bound = 2 * amplitude - windows.energy
         best = int(np.argmax(bound))
         limit = bound[best] - np.log1p(4 * np.pi * amplitude[best]) / 2 - _MARGIN
-        windows = windows.select(np.flatnonzero(bound >= limit))
+        windows = select(windows, np.flatnonzero(bound >= limit))
         per_wavelength = max(_MIN_STEPS, np.pi * np.sqrt(2 * amplitude[best]))
         n_steps = int(np.ceil(self._table.window_m / self._wavelength_m * per_wavelength))
         low, high = self._inside(directions)
         rows, n = windows.pair, max(_BLOCK // n_steps, 1)
-        parts = [self._integrate(windows.select(slice(k, k + n)), low, high, n_steps)
+        parts = [self._integrate(select(windows, slice(k, k + n)), low, high, n_steps)
                  for k in range(0, len(rows), n)]
         log_mass, *moments = (np.concatenate(fields) for fields in zip(*parts, strict=True))
         log_mass += (self._log_area[cells] - np.log(directions[:, 0]))[rows]
@@ -158,7 +158,7 @@ class DrawnPosterior:
         phase = np.exp(1j * self._wavenumbers[:, None] * offsets_m)
         rotation = (2 * np.concatenate([phase.real, -phase.imag])).astype(np.float32)
         outputs = windows.outputs
-        value = np.concatenate([outputs.real, outputs.imag]).T @ rotation
+        value = np.hstack([outputs.real, outputs.imag]) @ rotation
         value -= windows.energy[:, None]
         highest = value.max(axis=1)
         value -= highest[:, None]

@@ -20,7 +20,13 @@ from rhs_isac_ros.positioning.alternatives import (
     rejection,
     shares,
 )
-from rhs_isac_ros.positioning.coordinates import concatenate, jacobian, symmetric, to_positions
+from rhs_isac_ros.positioning.coordinates import (
+    concatenate,
+    jacobian,
+    select,
+    symmetric,
+    to_positions,
+)
 from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.draws import DrawnPosterior
 from rhs_isac_ros.positioning.estimate import (
@@ -160,7 +166,7 @@ class SearchEstimator(abc.ABC):
         signals = self._likelihood.signals(batch)
         blocks = map_blocks(
             lambda start: self._locate_block(
-                signals.take(slice(start, start + _BLOCK)), draws=True),
+                select(signals, slice(start, start + _BLOCK)), draws=True),
             range(0, len(batch), _BLOCK))
         return (located for located, _ in itertools.chain.from_iterable(blocks))
 
@@ -173,7 +179,7 @@ class SearchEstimator(abc.ABC):
             ((*_no_fix(), reason), None) for reason in reasons]
         (usable,) = np.nonzero([not reason for reason in reasons])
         if len(usable):
-            signals = signals.take(usable)
+            signals = select(signals, usable)
             aligned = self._alignment.values_of_each(signals.received)
             fits = self._search(signals, aligned, draws)
             for row, *phase in zip(usable.tolist(), fits, self._likelihood.whitened(
@@ -215,14 +221,14 @@ class SearchEstimator(abc.ABC):
             parts = []
             for phase in rows:
                 one, conditionals[phase] = self._failures.refine(
-                    modes.of_phase(phase), signals.repeated(phase))
+                    modes.of_phase(phase), select(signals, [phase]))
                 # Each part counts its phases from 0.
                 parts.append(one._replace(phases=np.full(len(one.phases), phase)))
             modes = concatenate(*parts)
         if likelihood.nuisance.is_coarse:
             drawn = concatenate(*(
                 draw_broad_samples(likelihood, conditionals[phase], self._phases,
-                                   signals.repeated(phase), modes.of_phase(phase), self._normal)
+                                   select(signals, [phase]), modes.of_phase(phase), self._normal)
                 for phase in rows))
         else:
             drawn = draw_samples(modes, self._normal, self._bounds)
@@ -239,7 +245,7 @@ class SearchEstimator(abc.ABC):
             residual = float(modes.residual[best])
             yield _Fit(means[row], covariances[row], float(log_evidence[row]), residual,
                        expected[row] + residual, modes.values[best] @ likelihood.nuisance.gain,
-                       modes.select(slice(start, end)))
+                       select(modes, slice(start, end)))
 
     def _judge(self, fit: _Fit, whitened: np.ndarray, aligned: np.ndarray
                ) -> tuple[Located, Modes | None]:

@@ -25,7 +25,7 @@ from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import onboard_matrix
-from rhs_isac_ros.positioning.coordinates import concatenate, jacobian, to_positions
+from rhs_isac_ros.positioning.coordinates import concatenate, jacobian, select, to_positions
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.lattice import Means
 from rhs_isac_ros.positioning.likelihood import (
@@ -138,7 +138,7 @@ class FailedElements:
                                 _FIRST_MARGIN, number))
         modes = concatenate(*parts)
         order = np.argsort(-modes.roi_log_likelihood)[:_MAX_HYPOTHESES]
-        return modes.select(order), conditionals
+        return select(modes, order), conditionals
 
 
 class Surface(NamedTuple):

@@ -24,6 +24,7 @@ from rhs_isac_ros.positioning.coordinates import (
     is_inside,
     likelihood_loss,
     offset_to_roi,
+    select,
     to_positions,
 )
 from rhs_isac_ros.positioning.lattice import (
@@ -244,7 +245,7 @@ class TemplateTable:
             drawn = [row for row in np.flatnonzero(many).tolist() if draw(query, row)]
             if drawn:
                 likely[drawn] = False
-                peaks = peaks.select(~np.isin(peaks.phases, drawn))
+                peaks = select(peaks, ~np.isin(peaks.phases, drawn))
         rows, others = np.nonzero(likely)
         if len(rows):
             peaks = concatenate(peaks, self._peaks_of(rows, others, query))
@@ -252,9 +253,9 @@ class TemplateTable:
         order = order[np.lexsort((-peaks.value[order], peaks.phases[order]))]
         phases = peaks.phases[order]
         place = np.arange(len(order)) - np.searchsorted(phases, phases)
-        peaks = peaks.select(order[place < _MAX_PEAKS])
+        peaks = select(peaks, order[place < _MAX_PEAKS])
         radii = self._resolution.separation(query.prior.is_coarse)
-        return peaks.select(separate(peaks.phases, self._points(peaks), radii))
+        return select(peaks, separate(peaks.phases, self._points(peaks), radii))
 
     def _points(self, peaks: '_Peaks') -> np.ndarray:
         """Return the points (r [m], u, v) of peaks, float64 [P, 3]."""
@@ -352,7 +353,7 @@ class TemplateTable:
         energy = (self.energy[cells] + np.sum(slope[:, 1:] * offset, axis=1)
                   + likelihood_loss(offset, curvature))
         pair, window = self._windows_of(cells)
-        outputs = np.einsum('wis,isw->iw', by_subband[pair], self._window_turns[:, :, window])
+        outputs = np.einsum('wis,isw->wi', by_subband[pair], self._window_turns[:, :, window])
         range_m = self._window_ranges_m[window]
         along = (slope[:, 0] + 2 * self.energy[cells] / cell_m)[pair]
         energy = (cell_m[pair] / range_m)**2 * (energy[pair] + along * (range_m - cell_m[pair]))
@@ -444,13 +445,8 @@ class Windows(NamedTuple):
     pair: np.ndarray  # Index of the window's pair, int [W], ascending.
     range_m: np.ndarray  # Centre, float64 [W] [m].
     width_m: np.ndarray  # Float64 [W] [m].
-    outputs: np.ndarray  # Matched-filter outputs of the bands at the centre, complex64 [N_B, W].
+    outputs: np.ndarray  # Matched-filter outputs of the bands at the centre, complex64 [W, N_B].
     energy: np.ndarray  # Energy of the whitened mean, float32 [W].
-
-    def select(self, chosen: np.ndarray | slice) -> 'Windows':
-        """Return the windows with the given indices."""
-        return Windows(self.pair[chosen], self.range_m[chosen], self.width_m[chosen],
-                       self.outputs[:, chosen], self.energy[chosen])
 
 
 class _Peaks(NamedTuple):
@@ -462,9 +458,6 @@ class _Peaks(NamedTuple):
     value: np.ndarray  # Log-likelihood, float32 [P].
     gain: np.ndarray  # Most likely gain [nepers], float64 [P].
     outputs: np.ndarray  # Matched-filter outputs of the bands, complex64 [P, N_B].
-
-    def select(self, chosen: np.ndarray) -> '_Peaks':
-        return _Peaks(*(field[chosen] for field in self))
 
 
 def first_of_each(phases: np.ndarray) -> np.ndarray:

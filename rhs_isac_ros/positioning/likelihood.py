@@ -54,14 +54,6 @@ class Signals(NamedTuple):
     received: np.ndarray
     whitened: np.ndarray
 
-    def take(self, rows: np.ndarray | slice) -> 'Signals':
-        """Return the signals of some phases, which may be repeated."""
-        return Signals(self.received[rows], self.whitened[rows])
-
-    def repeated(self, phase: int, n: int = 1) -> 'Signals':
-        """Return the signals of a phase n times."""
-        return self.take(np.full(n, phase))
-
 
 class Local(NamedTuple):
     """The log-likelihood of M points (r [m], u, v) with nuisance parameters, and its derivatives.
@@ -80,7 +72,7 @@ class Conditional(Protocol):
     """The likelihood given one state of the surface."""
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate points [M, 3] with parameters [M, Q], each for its own signals, N = M."""
+        """Evaluate points [M, 3] with parameters [M, Q] for the signals of M phases or of one."""
         ...
 
 

@@ -18,6 +18,7 @@ from rhs_isac_ros.positioning.coordinates import (
     is_inside,
     jacobian,
     likelihood_loss,
+    select,
     to_polar,
     to_positions,
 )
@@ -145,14 +146,12 @@ def draw_broad_samples(
         points = to_polar(positions[chosen])
         values = np.repeat(modes.values, inside.sum(axis=1) * rows, axis=0)
         evidence, values = marginal_at(
-            conditionals[state], likelihood, points, values,
-            signals.repeated(0, len(points)))
+            conditionals[state], likelihood, points, values, signals)
         evidence += (np.log(np.linalg.det(jacobian(points))) - 1.5 * np.log(2 * np.pi)
-                     - _log_proposal(points, modes.select(rows)))
+                     - _log_proposal(points, select(modes, rows)))
         if phases.is_informative:
             likely = evidence >= evidence.max() - _LIKELY_MARGIN
-            outputs = likelihood.outputs(points[likely], values[likely], signals.repeated(
-                0, int(np.count_nonzero(likely))))
+            outputs = likelihood.outputs(points[likely], values[likely], signals)
             turned = likelihood.nuisance.band_angles(values[likely])
             log_factors, offsets_m = phases.factors(outputs.T * np.exp(1j * turned.T))
             evidence[likely] += log_factors

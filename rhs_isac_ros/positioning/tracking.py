@@ -21,6 +21,7 @@ from rhs_isac_ros.positioning.coordinates import (
     is_inside,
     jacobian,
     log_sum,
+    select,
     symmetric,
     to_polar,
     to_positions,
@@ -77,10 +78,6 @@ class Mixture(NamedTuple):
     means: np.ndarray  # (r [m], u, v) and its rate [1/s], float64 [C, 6].
     covariances: np.ndarray  # Float64 [C, 6, 6].
 
-    def select(self, chosen: np.ndarray) -> 'Mixture':
-        """Return the components with the given indices or mask."""
-        return Mixture(*(field[chosen] for field in self))
-
     def normalised(self) -> 'Mixture':
         """Return the mixture with weights whose sum is one."""
         return self.weighted(-log_sum(self.log_weights))
@@ -113,7 +110,7 @@ def reduce(mixture: Mixture, max_components: int) -> Mixture:
     """Merge components that are close to a heavier one, and discard those of little weight."""
     order = np.argsort(-mixture.log_weights)
     order = order[mixture.log_weights[order] >= mixture.log_weights[order[0]] - _WEIGHT_MARGIN]
-    mixture = mixture.select(order)
+    mixture = select(mixture, order)
     means = mixture.means
     precisions = np.linalg.inv(mixture.covariances)
     free = np.ones(len(means), bool)
@@ -132,7 +129,7 @@ def reduce(mixture: Mixture, max_components: int) -> Mixture:
 
 def _merge(mixture: Mixture, group: np.ndarray, n_groups: int) -> Mixture:
     """Merge the components of each group, preserving mean and covariance; discard group -1."""
-    mixture = mixture.select(group >= 0)
+    mixture = select(mixture, group >= 0)
     group = group[group >= 0]
     member = np.equal.outer(np.arange(n_groups), group)
     weights = np.exp(mixture.log_weights - mixture.log_weights.max())
@@ -190,7 +187,8 @@ class Motion:
         log_no_turn = -elapsed_s / self.turn_s
         turn = -np.expm1(log_no_turn)
         straight = self._straight(mixture, elapsed_s).weighted(log_no_turn)
-        mixture = mixture.select(mixture.log_weights >= mixture.log_weights.max() - _TURN_MARGIN)
+        heavy = mixture.log_weights >= mixture.log_weights.max() - _TURN_MARGIN
+        mixture = select(mixture, heavy)
         return concatenate(
             straight,
             *(self._turned(mixture.weighted(np.log(turn * (end - begin))),
@@ -363,13 +361,13 @@ class Tracker:
     def _inside(self, mixture: Mixture) -> tuple[Mixture, np.ndarray, np.ndarray]:
         """Return the components that reach the region, and mean and covariance inside."""
         heavy = mixture.log_weights >= _MIN_LOG_WEIGHT
-        mixture, light = mixture.select(heavy), mixture.select(~heavy)
+        mixture, light = select(mixture, heavy), select(mixture, ~heavy)
         positions = mixture.positions(self.estimator.normal)
         bounds_m = Resolution.of(self.estimator.scenario).bounds_m
         inside = is_inside(positions, bounds_m)
         reaches = inside.mean(axis=1) >= _MIN_INSIDE
         if reaches.any():
-            mixture, positions = mixture.select(reaches), positions[reaches]
+            mixture, positions = select(mixture, reaches), positions[reaches]
             inside = inside[reaches]
         else:
             inside[...] = True
@@ -423,15 +421,16 @@ def update(
     order = np.argsort(-flat)[:_MAX_PAIRS]
     order = order[flat[order] >= flat[order[0]] - _PAIR_MARGIN]
     mode, component = np.unravel_index(order, log_weights.shape)
-    updated = _shifted(predicted.select(component)._replace(log_weights=flat[order]),
+    updated = _shifted(select(predicted, component)._replace(log_weights=flat[order]),
                        precision[mode, component], offsets[mode, component])
     if likelihood is not None:
         # The pairs are in the order of their weights.
         head = np.arange(min(_N_EXACT, len(order)))
         exact = _exact_update(
-            predicted.select(component[head]), updated.means[head, :3], share, likelihood, signals)
-        exact = exact.select(_is_first(exact, component[head]))
-        updated = concatenate(exact, updated.select(np.arange(len(head), len(order))))
+            select(predicted, component[head]), updated.means[head, :3], share, likelihood,
+            signals)
+        exact = select(exact, _is_first(exact, component[head]))
+        updated = concatenate(exact, select(updated, slice(len(head), None)))
     best = int(np.argmax(modes.roi_log_likelihood))
     floor, _ = _evidence(np.zeros(3), predicted.covariances[:, :3, :3], spread[best])
     floor += share * (modes.roi_log_likelihood[best] + _FLOOR)
@@ -443,7 +442,7 @@ def _exact_update(
         signals: Signals) -> Mixture:
     """Update each component with the likelihood expanded at a point (r, u, v), [C, 3]."""
     value, gradient, curvature, _ = likelihood.local(
-        points, np.zeros((len(points), 0)), signals.repeated(0, len(points)))
+        points, np.zeros((len(points), 0)), signals)
     step = step_to_maximum(curvature, gradient)
     offsets = points + step - predicted.means[:, :3]
     log_weights, precision = _evidence(
