@@ -4,7 +4,7 @@ The average Cramer-Rao bound is one example. `by_radiation` is the gradient
 d/dRe(T_i) + i d/dIm(T_i) of an objective, complex128 [N_B, N_SB F, N_E].
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,6 @@ from rhs_isac_ros.bounds.rows import (
     Pattern,
     RowSource,
     Tick,
-    blocks,
     no_tick,
     rows_within,
 )
@@ -88,25 +87,18 @@ class Average:
     tolerance
         Relative error of the rows (see `CompressedRows`); 0 selects exact rows. Raises ValueError
         if a positive tolerance is too small.
-    patterns
-        Factors of the means of the rows.
     combination
         Rows of the form, if they differ from the rows of the source.
-    tick
-        Called repeatedly while the rows are computed; an exception ends the computation.
     """
 
     #: An estimate of the surface that is treated as exact; None for the scenario's elements.
     surface: SurfaceEstimate | None = None
 
     @one_blas_thread
-    def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
-                 loss: Loss, tolerance: float, patterns: Sequence[Pattern] = PLAIN,
-                 combination: Combination | None = None, tick: Tick = no_tick) -> None:
-        self.scenario, self._loss = scenario, loss
-        self._n_rows, self._combination = n_rows, combination
-        self.rows = rows_within(
-            scenario, source, n_items, n_rows, tolerance, patterns, tick)
+    def __init__(self, source: RowSource, loss: Loss, tolerance: float,
+                 combination: Combination | None = None) -> None:
+        self.scenario, self._loss, self._combination = source.scenario, loss, combination
+        self.rows = rows_within(source, tolerance)
 
     @one_blas_thread
     def value(self, codebook: Beamforming) -> float:
@@ -121,14 +113,14 @@ class Average:
         evaluation = Evaluation(self.rows, model)
         bands = range(self.scenario.n_bands)
         total = 0.0
-        for block in blocks(self.rows.n_items, self._n_rows, self.rows.width):
+        for block in self.rows.blocks():
             whitened = self._whitened(evaluation, block)
             losses, weights = self._loss(block, _sum_of_forms(whitened))
             total += float(losses.sum())
             for band in bands:
                 weighted = _weighted(weights, whitened[band])
                 if self._combination:
-                    weighted = self._combination.backward(band, weighted, self._n_rows)
+                    weighted = self._combination.backward(band, weighted, self.rows.n_rows)
                 evaluation.accumulate(block, band, weighted)
         mean_terms, covariance_terms = map(
             np.stack, zip(*map(evaluation.sums, bands), strict=True))
@@ -138,7 +130,7 @@ class Average:
 
     def _losses(self, codebook: Beamforming) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         evaluation = Evaluation(self.rows, self._model(codebook))
-        for block in blocks(self.rows.n_items, self._n_rows, self.rows.width):
+        for block in self.rows.blocks():
             yield self._loss(block, _sum_of_forms(self._whitened(evaluation, block)))
 
     def _model(self, codebook: Beamforming) -> MeasurementModel:
@@ -167,8 +159,9 @@ def average_crlb(
 class AverageCrlb(Average):
     """Average bound at fixed positions, float64 [N, 3] [m], for evaluation with many codebooks.
 
-    Nuisance parameters, errors of the elements and `region_prior` are treated as in `crlb`;
-    `tolerance` and `tick` are passed to `Average`.
+    Nuisance parameters, errors of the elements and `region_prior` are treated as in `crlb`.
+    `tolerance` is that of `Average`. `tick` is called repeatedly while the rows are computed; an
+    exception ends the computation.
     """
 
     def __init__(self, scenario: Scenario, positions: np.ndarray, tolerance: float = 0.0, *,
@@ -184,8 +177,8 @@ class AverageCrlb(Average):
             return np.concatenate([derivative, *[gain[:, None]] * len(patterns)], axis=1)
 
         super().__init__(
-            scenario, source, len(self.positions), 3 + len(patterns), self._bounds, tolerance,
-            patterns or PLAIN, combination, tick)
+            RowSource(scenario, source, len(self.positions), 3 + len(patterns), patterns or PLAIN,
+                      tick), self._bounds, tolerance, combination)
 
     def _bounds(self, _: slice, joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the bounds [n] and their negative derivatives with respect to the forms."""
@@ -207,7 +200,7 @@ def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
     scaled = nuisance_of(scenario).scaled_patterns
     if not len(scaled):
         return [], None
-    patterns: list[Pattern] = [(slice(0, 4), None)]
+    patterns: list[Pattern] = [(slice(0, 4), 1.0)]
     index, scale = [0, 1, 2], np.ones((scenario.n_bands, 3 + len(scaled)), complex)
     for row, pattern in enumerate(scaled, 3):
         if np.ptp(pattern, axis=1).any():
