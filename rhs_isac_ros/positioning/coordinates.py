@@ -78,6 +78,13 @@ def log_sum(values: np.ndarray) -> float:
     return highest + float(np.log(np.sum(np.exp(values - highest))))
 
 
+def moments(weights: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean [..., n] and covariance [..., n, n] of points [..., S, n]; weights add to 1."""
+    mean = np.matmul(weights[..., None, :], points)
+    offsets = points - mean
+    return mean[..., 0, :], np.matmul(np.swapaxes(offsets * weights[..., None], -1, -2), offsets)
+
+
 def symmetric(covariances: np.ndarray) -> np.ndarray:
     """Return matrices [..., n, n] without the asymmetry that rounding causes."""
     return (covariances + np.swapaxes(covariances, -1, -2)) / 2

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, concatenate, select
+from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, concatenate, moments, select
 from rhs_isac_ros.positioning.grid import Query, TemplateTable, Windows
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution
 
@@ -111,10 +111,9 @@ class DrawnPosterior:
         else:
             return None
         places = rays.range_m[:, None] * rays.direction
-        mean = weights @ places
-        offsets, along = places - mean, weights * rays.variance_m2
-        covariance = ((weights[:, None] * offsets).T @ offsets
-                      + (along[:, None] * rays.direction).T @ rays.direction)
+        mean, covariance = moments(weights, places)
+        along = weights * rays.variance_m2
+        covariance += (along[:, None] * rays.direction).T @ rays.direction
         return Draws(
             mean, covariance * (1 + variance), float(highest + np.log(total / total_share)),
             float(rays.highest[weights > 0].max()), float(weights @ rays.average))

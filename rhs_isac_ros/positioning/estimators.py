@@ -23,6 +23,7 @@ from rhs_isac_ros.positioning.alternatives import (
 from rhs_isac_ros.positioning.coordinates import (
     concatenate,
     jacobian,
+    moments,
     select,
     symmetric,
     to_positions,
@@ -340,16 +341,12 @@ def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> Weighted
     modes = estimator.posterior(received.reshape(len(received), -1)).modes
     if modes is None:
         return None
-    samples = draw_samples(modes, estimator.normal, Resolution.of(estimator.scenario).bounds_m)
-    weights = np.exp(samples.log_weights - samples.log_weights.max())
-    shares = weights.sum(axis=1)
+    samples = WeightedSamples.of(draw_samples(
+        modes, estimator.normal, Resolution.of(estimator.scenario).bounds_m), modes)
+    shares = samples.weights.sum(axis=1)
     order = np.argsort(-shares)[:np.count_nonzero(shares)]
-    shares, places = shares[order], samples.positions[order]
-    weights = weights[order] / shares[:, None]
-    means = np.einsum('ms,msa->ma', weights, places)
-    offsets = places - means[:, None]
-    covariances = np.einsum('ms,msa,msb->mab', weights, offsets, offsets)
-    return WeightedModes(shares / shares.sum(), means, covariances)
+    weights = samples.weights[order] / shares[order, None]
+    return WeightedModes(shares[order], *moments(weights, samples.positions[order]))
 
 
 def surface_of(estimator: Estimator) -> Surface | None:

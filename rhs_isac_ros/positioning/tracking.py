@@ -21,6 +21,7 @@ from rhs_isac_ros.positioning.coordinates import (
     is_inside,
     jacobian,
     log_sum,
+    moments,
     select,
     symmetric,
     to_polar,
@@ -96,14 +97,10 @@ class Mixture(NamedTuple):
         """Return mean, float64 [3] [m/s], and covariance, float64 [3, 3], of the velocity."""
         weights = np.exp(self.log_weights - log_sum(self.log_weights))
         by_rate = jacobian(self.means[:, :3])
-        means = np.matmul(by_rate, self.means[:, 3:, None])[..., 0]
-        mean = weights @ means
-        offsets = means - mean
         within = np.matmul(np.matmul(by_rate, self.covariances[:, 3:, 3:]),
                            np.swapaxes(by_rate, 1, 2))
-        covariance = np.tensordot(weights, within, axes=1)
-        covariance += (weights[:, None] * offsets).T @ offsets
-        return mean, symmetric(covariance)
+        mean, between = moments(weights, np.matmul(by_rate, self.means[:, 3:, None])[..., 0])
+        return mean, symmetric(np.tensordot(weights, within, axes=1) + between)
 
 
 def reduce(mixture: Mixture, max_components: int) -> Mixture:
@@ -373,12 +370,8 @@ class Tracker:
             inside[...] = True
             positions = np.clip(positions, *bounds_m)
         weights = np.exp(mixture.log_weights)[:, None] * inside
-        flat, points = (weights / weights.sum()).ravel(), positions.reshape(-1, 3)
-        mean = flat @ points
-        offsets = points - mean
-        covariance = (flat[:, None] * offsets).T @ offsets
-        mixture = concatenate(mixture, light).normalised()
-        return mixture, mean, symmetric(covariance)
+        mean, covariance = moments((weights / weights.sum()).ravel(), positions.reshape(-1, 3))
+        return concatenate(mixture, light).normalised(), mean, symmetric(covariance)
 
 
 def _described(estimate: Estimate, mixture: Mixture, n_phases: int) -> TrackEstimate:
