@@ -16,7 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, concatenate, moments, select
+from rhs_isac_ros.positioning.coordinates import (
+    carrier_wavenumbers,
+    concatenate,
+    moments,
+    select,
+    symmetric,
+)
+from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.grid import Query, TemplateTable, Windows
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution
 
@@ -42,16 +49,6 @@ _SEQUENCE = 1.324717957244746**-np.array([1.0, 2.0])
 _TINY = 1e-12
 
 
-class Draws(NamedTuple):
-    """The posterior of one phase."""
-
-    mean: np.ndarray  # Float64 [3] [m].
-    covariance: np.ndarray  # Float64 [3, 3] [m^2], with the uncertainty of the mean.
-    log_total: float  # Logarithm of the integral of the likelihood over the region [m^3].
-    highest: float  # Log-likelihood at the best position.
-    average: float  # Log-likelihood averaged over the posterior.
-
-
 class _Rays(NamedTuple):
     """Integrals of the likelihood over intervals of range, each in the direction of a draw."""
 
@@ -71,6 +68,7 @@ class DrawnPosterior:
         self._table, resolution = table, Resolution.of(scenario)
         self._wavelength_m, self._bounds = resolution.wavelength_m, resolution.bounds_m
         self._wavenumbers = carrier_wavenumbers(scenario)
+        self._log_region = np.log(resolution.volume_m3)
         grid, points = table.grid, table.grid.points
         # Directions of each cell: lowest (u, v) and extent, float64 [C, 2].
         self._low, high = (np.clip(points[:, 1:] + sign * PHASE_ERROR * resolution.direction,
@@ -81,7 +79,7 @@ class DrawnPosterior:
         volume = points[:, 0]**2 * grid.widths_m[grid.cell] / _boresight(points[:, 1:])
         self._log_volume = np.log(volume) + self._log_area
 
-    def of(self, query: Query, phase: int) -> Draws | None:
+    def of(self, query: Query, phase: int) -> Fit | None:
         """Draw positions of a phase of a query; None if too few of them are effective."""
         probability = bounds = self._probabilities(query, phase)
         cells, log_weights, parts, total_share = np.empty(0, int), np.empty(0), [], 0.0
@@ -114,9 +112,12 @@ class DrawnPosterior:
         mean, covariance = moments(weights, places)
         along = weights * rays.variance_m2
         covariance += (along[:, None] * rays.direction).T @ rays.direction
-        return Draws(
-            mean, covariance * (1 + variance), float(highest + np.log(total / total_share)),
-            float(rays.highest[weights > 0].max()), float(weights @ rays.average))
+        # Log-likelihoods are relative to no signal.
+        energy, best = float(query.energies[phase]), float(rays.highest[weights > 0].max())
+        return Fit(
+            mean, symmetric(covariance * (1 + variance)),
+            float(highest + np.log(total / total_share)) - energy - self._log_region,
+            energy - best, query.signals[0].size + float(weights @ rays.average) - best, 0.0)
 
     def _probabilities(self, query: Query, phase: int) -> np.ndarray:
         """Approximate the share of each cell in the posterior, as if phases were random."""

@@ -218,7 +218,7 @@ class FailedSet:
             white, log_volume = white.reshape(*columns.shape[:2], -1), self._whitening.log_volume
         else:
             roots = np.linalg.cholesky(self._covariance + self._model.excess_at(positions))
-            white, log_volume = whiten_each(roots, columns), log_determinant(roots).sum(axis=1)
+            white, log_volume = whiten_each(roots, columns)
         local = assemble(
             prior, values, white, information_of_covariance=self._whitening.information,
             n_linear=len(self._failed))

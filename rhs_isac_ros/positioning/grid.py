@@ -277,7 +277,8 @@ class TemplateTable:
             amplitude *= 2
             amplitude -= self.energy
             return amplitude
-        bounds = [query.over_gain(one, energy)[0]
+        n_rows = query.signals[0].size
+        bounds = [query.prior.over_gain(one, energy, n_rows)[0]
                   for one, energy in zip(amplitude, query.energies.tolist(), strict=True)]
         return np.stack(bounds) - self.energy
 
@@ -303,7 +304,8 @@ class TemplateTable:
                     itertools.pairwise(ends), query.energies.tolist(), strict=True):
                 if last > first:
                     part = np.s_[:, first:last]
-                    likelihood[part], gain[part] = query.over_gain(likelihood[part] / 2, of_phase)
+                    likelihood[part], gain[part] = prior.over_gain(
+                        likelihood[part] / 2, of_phase, query.signals[0].size)
         likelihood -= energy
         is_peak = np.full(likelihood.shape, prior.is_coarse)
         if not prior.is_coarse:
@@ -433,10 +435,6 @@ class Query(NamedTuple):
     bound: np.ndarray  # Bound of the log-likelihood in each cell, float32 [N, C].
     prior: NuisancePrior
     margin: float
-
-    def over_gain(self, amplitude: np.ndarray, energy: float) -> tuple[np.ndarray, np.ndarray]:
-        """Maximise over the gain; see `NuisancePrior.over_gain`."""
-        return self.prior.over_gain(amplitude, energy, self.signals[0].size)
 
 
 class Windows(NamedTuple):

@@ -317,10 +317,14 @@ def log_determinant(roots: np.ndarray) -> np.ndarray:
     return 2 * np.log(np.diagonal(roots, axis1=-2, axis2=-1).real).sum(axis=-1)
 
 
-def whiten_each(roots: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Whiten columns [M, C, N_B, N_SB F] by Cholesky factors of each point, [M, C, N_B N_SB F]."""
+def whiten_each(roots: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whiten columns [M, C, N_B, N_SB F] by Cholesky factors of each point, [M, C, N_B N_SB F].
+
+    Also return the logarithms of the determinants, float64 [M].
+    """
     white = np.linalg.solve(roots, np.moveaxis(columns, 1, 3))
-    return np.moveaxis(white, 3, 1).reshape(*columns.shape[:2], -1)
+    return (np.moveaxis(white, 3, 1).reshape(*columns.shape[:2], -1),
+            log_determinant(roots).sum(axis=1))
 
 
 class DispersedLikelihood:
@@ -369,10 +373,9 @@ class DispersedLikelihood:
         columns = prior.columns(values, signals.received, *self._means(points))
         for roots, offset, information in zip(
                 self._roots_at(points), self._offsets, self._information, strict=True):
-            local = assemble(prior, values, whiten_each(roots, columns),
-                             information_of_covariance=information)
-            volume = log_determinant(roots).sum(axis=1)
-            states.append(local._replace(value=local.value + offset - volume))
+            white, log_volume = whiten_each(roots, columns)
+            local = assemble(prior, values, white, information_of_covariance=information)
+            states.append(local._replace(value=local.value + offset - log_volume))
         return _average_of(states)
 
     def _roots_at(self, points: np.ndarray) -> list[np.ndarray]:
