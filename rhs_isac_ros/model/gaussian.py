@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import mixture_weights
+
 # Standard deviation of the level of multipath without a direct path [dB].
 BLOCKED_STD_DB = 10.0
 
@@ -34,9 +36,7 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
     normal = np.linspace(-4, 4, 2 * int(np.ceil(4 * std * np.sqrt(n))) + 61)
     level, prior = np.log(10) / 10 * median_db + std * normal, -normal**2 / 2
     exponents = -energy[:, None] * np.exp(-level) - n * level + prior
-    highest = exponents.max(axis=1)
-    total = np.exp(exponents - highest[:, None]).sum(axis=1)
-    return highest + np.log(total) - np.log(np.exp(prior).sum())
+    return mixture_weights(exponents)[1] - mixture_weights(prior)[1]
 
 
 def share_of_level(n: int, std_db: float) -> float:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.positioning.coordinates import (
     carrier_wavenumbers,
     concatenate,
@@ -94,12 +95,9 @@ class DrawnPosterior:
             log_weights = np.append(log_weights, rays.log_mass + log_scale[rays.draw])
             parts.append(rays._replace(draw=rays.draw + len(cells)))
             cells, rays = np.append(cells, drawn), concatenate(*parts)
-            highest = log_weights.max(initial=-np.inf)
-            if np.isneginf(highest):
+            if np.isneginf(log_weights.max(initial=-np.inf)):
                 return None
-            weights = np.exp(log_weights - highest)
-            total = weights.sum()
-            weights /= total
+            weights, log_total = mixture_weights(log_weights)
             by_draw = np.bincount(rays.draw, weights, len(cells))
             variance = np.sum(by_draw**2)
             if variance <= 1 / _N_EFFECTIVE:
@@ -116,7 +114,7 @@ class DrawnPosterior:
         energy, best = float(query.energies[phase]), float(rays.highest[weights > 0].max())
         return Fit(
             mean, symmetric(covariance * (1 + variance)),
-            float(highest + np.log(total / total_share)) - energy - self._log_region,
+            float(log_total) - np.log(total_share) - energy - self._log_region,
             energy - best, query.signals[0].size + float(weights @ rays.average) - best, 0.0)
 
     def _probabilities(self, query: Query, phase: int) -> np.ndarray:

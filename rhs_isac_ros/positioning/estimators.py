@@ -10,6 +10,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.gaussian import share_of_level
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.alternatives import (
@@ -18,7 +19,6 @@ from rhs_isac_ros.positioning.alternatives import (
     Blocked,
     Outside,
     rejection,
-    shares,
 )
 from rhs_isac_ros.positioning.coordinates import (
     concatenate,
@@ -240,7 +240,7 @@ class SearchEstimator(abc.ABC):
             one.log_odds + one.log_evidence_of(
                 whitened, aligned, fit.residual, self._likelihood.nuisance)
             for one in self._alternatives)])
-        probabilities = shares(log_weights[None])[0]
+        probabilities, _ = mixture_weights(log_weights)
         reason = self._reason(whitened * np.exp(-fit.gain), fit.residual, log_weights)
         mean, covariance = _no_fix() if reason else (fit.mean, self._covariance(fit))
             # Without a fix, only a residual that nothing explains is evidence against the
@@ -268,8 +268,8 @@ class SearchEstimator(abc.ABC):
             float(np.sum(np.abs(whitened)**2)), residual)
         for index in np.argsort(-log_weights[1:]).tolist():
             one = self._alternatives[index]
-            share = float(shares(log_weights[None, [0, 1 + index]])[0, 1])
-            reason = rejection(one, share)
+            (_, share), _ = mixture_weights(log_weights[[0, 1 + index]])
+            reason = rejection(one, float(share))
             if reason and (not unexplained or one.explain(whitened, self._test.max_residual)):
                 return reason
         return unexplained

@@ -18,6 +18,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.gaussian import marginalise, quadratic_form, step_to_maximum
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, nuisance_of
 from rhs_isac_ros.model.measurement import Surface
@@ -396,13 +397,10 @@ class DispersedLikelihood:
 def _average_of(states: list[Local]) -> Local:
     """Average likelihoods; the residual is that of the most probable state."""
     value = np.stack([one.value for one in states])
-    highest = value.max(axis=0)
-    weights = np.exp(value - highest)
-    total = weights.sum(axis=0)
-    weights /= total
+    weights, log_total = mixture_weights(value, axis=0)
     residual = np.stack([one.residual for one in states])
     return Local(
-        highest + np.log(total),
+        log_total,
         np.einsum('km,kmp->mp', weights, np.stack([one.gradient for one in states])),
         np.einsum('km,kmpq->mpq', weights, np.stack([one.information for one in states])),
         np.take_along_axis(residual, value.argmax(axis=0)[None], axis=0)[0])

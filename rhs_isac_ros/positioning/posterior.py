@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD
 from rhs_isac_ros.positioning.coordinates import (
     carrier_wavenumbers,
@@ -215,10 +216,8 @@ class BandPhases:
             std = self._broadened(np.abs(output))[:, None, None]
             log_factor += _log_density(np.angle(output)[:, None, None] + turns, std)
         log_factor += self._log_weights - np.log(len(ranges_m))
-        highest = log_factor.max(axis=(1, 2))
-        weights = np.exp(log_factor - highest[:, None, None]).sum(axis=2)
-        total = weights.sum(axis=1)
-        return highest + np.log(total), weights @ ranges_m / total
+        weights, log_total = mixture_weights(log_factor, axis=(1, 2))
+        return log_total, weights.sum(axis=2) @ ranges_m
 
     def _broadened(self, magnitude: np.ndarray) -> np.ndarray:
         """Return the standard deviation of the phase of outputs of these magnitudes."""
