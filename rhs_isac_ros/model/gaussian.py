@@ -8,6 +8,8 @@ from rhs_isac_ros.model.arrays import mixture_weights
 
 # Standard deviation of the level of multipath without a direct path [dB].
 BLOCKED_STD_DB = 10.0
+# Share of valid signals that each test of the energy of one phase may reject.
+FALSE_ALARM = 1e-9
 
 
 class Marginal(NamedTuple):
@@ -22,6 +24,14 @@ class Marginal(NamedTuple):
     # Logarithm of the integral over the others relative to the maximum [N], without the factors
     # 2 pi.
     log_volume: np.ndarray
+
+
+def energy_limit(n: int, probability: float = FALSE_ALARM) -> float:
+    """Return the energy that n complex Gaussian numbers of unit variance rarely exceed."""
+    # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
+    from scipy.special import gammainccinv
+
+    return float(gammainccinv(n, probability))
 
 
 def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: float = 0.0

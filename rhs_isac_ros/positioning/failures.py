@@ -22,6 +22,7 @@ import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
+from rhs_isac_ros.model.gaussian import energy_limit
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import onboard_matrix
@@ -229,12 +230,9 @@ class FailureModel:
     """Likelihood of positions and sets of failed elements under the declared share of failures."""
 
     def __init__(self, likelihood: Likelihood) -> None:
-        # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
-        from scipy.special import gammainccinv
-
         scenario, codebook = likelihood.scenario, likelihood.codebook
         self.likelihood, self.scenario = likelihood, scenario
-        self.usual_residual = float(gammainccinv(np.prod(likelihood.model.shape), _UNUSUAL))
+        self.usual_residual = energy_limit(int(np.prod(likelihood.model.shape)), _UNUSUAL)
         intact = dataclasses.replace(scenario, failed_element_share=0.0)
         self._model = MeasurementModel(intact, codebook).prepare(jacobian=True)
         # Weights of the elements' direct paths, [N_E, N_B, N_SB F]: their change by a failure, and
