@@ -99,27 +99,13 @@ class Alignment:
     """Scoring steps that fit nuisance parameters, scaled to standard normal, to pilot signals."""
 
     def __init__(self, scenario: Scenario) -> None:
-        nuisance = nuisance_of(scenario)
-        self.patterns, self._phases = nuisance.scaled_patterns, nuisance.phases
-        self._moves_multipath = nuisance.moves_multipath[:, None, None]
-
-    def aligned(self, signals: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return signals [N, N_B, N_SB F] without the factors of values [N, Q]."""
-        return signals * np.exp(-np.tensordot(values, self.patterns, axes=1))
-
-    def slopes(self, aligned: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Return derivatives of aligned signals with respect to values, [N, Q, N_B, N_SB F].
-
-        Offsets of carrier and timing are visible because they move the multipath out of the nulls
-        of its covariance. Their derivatives therefore contain the signals instead of the mean.
-        """
-        return self.patterns * np.where(self._moves_multipath, aligned[:, None], mean[:, None])
+        self.nuisance = nuisance_of(scenario)
 
     def start(self, white: np.ndarray, white_mean: np.ndarray, values: np.ndarray) -> None:
         """Set the values that only rotate whole bands, one by one, to the likeliest values."""
         outputs = np.sum(np.conj(white_mean) * white, axis=2)
-        for q in np.flatnonzero(self._phases.any(axis=0)):
-            turns = self._phases[:, q]
+        for q in np.flatnonzero(self.nuisance.phases.any(axis=0)):
+            turns = self.nuisance.phases[:, q]
             output = outputs[:, turns != 0].sum(axis=1)
             turn, magnitude = turns[turns != 0].mean(), 2 * np.abs(output)
             values[:, q] = turn * magnitude * np.angle(output) / (turn**2 * magnitude + 1)
@@ -128,8 +114,8 @@ class Alignment:
     def step(self, whiten: Callable[[np.ndarray], np.ndarray], signals: np.ndarray,
              mean: np.ndarray, values: np.ndarray) -> None:
         """Improve the values by one scoring step, for signals and their mean [N, N_B, N_SB F]."""
-        aligned = self.aligned(signals, values)
-        slopes = whiten(self.slopes(aligned, mean))
+        aligned = self.nuisance.divide(signals, values)
+        slopes = whiten(self.nuisance.derivatives(aligned, mean))
         residual = whiten(aligned) - whiten(mean)
         gradient = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), residual).real - values
         curvature = self.curvature(slopes)
@@ -187,7 +173,7 @@ class PilotStatistics:
         self._radiation = [element_radiation(scenario, group.beams) for group in pilots]
         self._size = 2 * scenario.n_elements + scenario.n_bands
         self._alignment = Alignment(scenario)
-        self._n_values = len(self._alignment.patterns)
+        self._n_values = len(self._alignment.nuisance)
         self._values: list[np.ndarray] = []
 
     def evaluate(self, gains: np.ndarray, mean: np.ndarray, covariance: np.ndarray
@@ -241,8 +227,8 @@ class PilotStatistics:
                     ) -> tuple[np.ndarray, np.ndarray]:
         """Improve the values; return signals linear in them, and their whitened slopes."""
         self._alignment.step(part.whiten, signals, part.mean, values)
-        aligned = self._alignment.aligned(signals, values)
-        slopes = self._alignment.slopes(aligned, part.mean)
+        aligned = self._alignment.nuisance.divide(signals, values)
+        slopes = self._alignment.nuisance.derivatives(aligned, part.mean)
         return aligned + np.einsum('nq,nqir->nir', values, slopes), part.whiten(slopes)
 
     def _integrated(self, part: '_Block', signals: np.ndarray, slopes: np.ndarray

@@ -166,11 +166,11 @@ def _fitted(fields: Scenario, pilots: Pilots, surface: Surface | None) -> _Fit:
 def _residuals(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
     """Return signals without the likeliest impairments and without their mean, [N, N_B, R]."""
     alignment, mean = Alignment(model.scenario), model.mean(pilots.positions)
-    values = np.zeros((len(mean), len(alignment.patterns)))
+    values = np.zeros((len(mean), len(alignment.nuisance)))
     alignment.start(model.whiten(pilots.received), model.whiten(mean), values)
     for _ in range(_ALIGNMENT_STEPS if values.shape[1] else 0):
         alignment.step(model.whiten, pilots.received, mean, values)
-    return alignment.aligned(pilots.received, values) - mean
+    return alignment.nuisance.divide(pilots.received, values) - mean
 
 
 def _most_likely(scenario: Scenario, model: MeasurementModel, sample: np.ndarray, n: int

@@ -293,7 +293,7 @@ class FailureModel:
             gains.append(np.repeat(both, self.scenario.n_frames, axis=1))
         elements = np.moveaxis(np.stack(gains), (0, 1, 2, 3), (2, 1, 3, 0))
         changes = elements * self._shift[:, None]
-        fixed = prior.patterns * ~prior.moves_multipath[:, None, None]
+        fixed = prior.scaled_patterns * ~prior.moves_multipath[:, None, None]
         changes = np.concatenate([-changes[:, :1], changes[:, 1:], fixed * changes[:, :1]], axis=1)
         return changes, elements[:, 0] * self.amplitudes
 

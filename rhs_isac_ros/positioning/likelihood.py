@@ -20,7 +20,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.gaussian import marginalise, quadratic_form, step_to_maximum
-from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, nuisance_of
+from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, Exponents, nuisance_of
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.coordinates import to_positions
 from rhs_isac_ros.positioning.lattice import Means, Resolution, whiten
@@ -77,7 +77,7 @@ class Conditional(Protocol):
         ...
 
 
-class NuisancePrior:
+class NuisancePrior(Exponents):
     """Prior and effect of the nuisance parameters, in units in which they are standard normal.
 
     A uniform phase has no prior, and its unit is `_UNIFORM_EQUIVALENT`. If the phases of the bands
@@ -111,9 +111,9 @@ class NuisancePrior:
         # Per unit: exponents of the signals, complex128 [Q, N_B, N_SB F]; phase of each band
         # [rad], float64 [N_B, Q]; precision of the prior; gain of all signals [nepers]; and change
         # of the logarithm of the signals' volume, float64 [Q].
-        self.patterns, self.phases = patterns * scale[:, None, None], phases * scale
+        self.scaled_patterns, self.phases = patterns * scale[:, None, None], phases * scale
         self.precision = np.where(uniform, 0.0, 1.0)
-        self.gain = self.patterns.real.mean(axis=(1, 2))
+        self.gain = self.scaled_patterns.real.mean(axis=(1, 2))
         # Standard deviations of the gain of all signals [nepers], 0 if it is negligible, and of
         # the phase of each band, infinite if it is uniform, float64 [N_B].
         gain_std = np.linalg.norm(self.gain)
@@ -121,21 +121,13 @@ class NuisancePrior:
         self.gain_std = float(gain_std) if gain_std > _MIN_GAIN_STD else 0.0
         self.phase_std_rad = np.where(
             self.is_coarse | (phase_std > UNIFORM_STD_RAD), np.inf, phase_std)
-        self.volume = 2 * self.patterns.real.sum(axis=(1, 2))
+        self.volume = 2 * self.scaled_patterns.real.sum(axis=(1, 2))
         self.needs_search = np.append(nuisance.needs_search[keeps], np.zeros(n_added, bool))
         self.moves_multipath = np.append(nuisance.moves_multipath[keeps], np.zeros(n_added, bool))
         self._operators = self._multiplying(model.root, model.whitener)
         self.information = self.information_of(model.root, model.whitener)
         # Curvature in (r, u, v) that is added to every log-likelihood, float64 [3].
         self.floor = Resolution.of(model.scenario).curvature_floor
-
-    def __len__(self) -> int:
-        """Return the number Q of parameters."""
-        return len(self.patterns)
-
-    def divide(self, received: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Remove the factors of parameters [..., Q] from signals [..., N_B, N_SB F]."""
-        return received * np.exp(-np.tensordot(values, self.patterns, axes=1))
 
     def information_of(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
         """Compute the Fisher information of a covariance, tr(L^-1 dL L^-1 dL'), float64 [Q, Q]."""
@@ -146,7 +138,7 @@ class NuisancePrior:
 
     def _multiplying(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
         """Compute W P W^-1, which multiplies whitened signals, [Q, N_B, N_SB F, N_SB F]."""
-        return np.matmul(whitener * self.patterns[:, :, None], root)
+        return np.matmul(whitener * self.scaled_patterns[:, :, None], root)
 
     def columns(self, values: np.ndarray, received: np.ndarray, mean: np.ndarray,
                 slopes: np.ndarray, *linear: np.ndarray) -> np.ndarray:
@@ -157,12 +149,9 @@ class NuisancePrior:
         of the received signals to the parameters.
         """
         divided = self.divide(received, values)
-        # A parameter that moves the multipath acts on the received multipath, so the information
-        # about it varies from phase to phase.
-        sources = np.where(self.moves_multipath[:, None, None], divided[:, None], mean[:, None])
         return np.concatenate([
-            (divided - mean)[:, None], slopes, self.patterns * sources, *linear,
-            self.patterns * divided[:, None]], axis=1)
+            (divided - mean)[:, None], slopes, self.derivatives(divided, mean), *linear,
+            self.scaled_patterns * divided[:, None]], axis=1)
 
     def slopes(self, whitened: np.ndarray) -> np.ndarray:
         """Compute W P W^-1 times whitened signals [M, N_B, N_SB F], [M, Q, N_B N_SB F]."""
@@ -459,7 +448,7 @@ class Alignment:
         for _ in range(_N_REFINEMENTS):
             divided = prior.divide(received, values)
             residual = self._whitened(divided[None]).reshape(-1)
-            slopes = self._whitened(prior.patterns[moves] * divided)
+            slopes = self._whitened(prior.scaled_patterns[moves] * divided)
             slopes = slopes.reshape(len(slopes), -1)
             # With an unknown gain, the energy is normalised.
             scale = residual.size / np.sum(np.abs(residual)**2) if prior.gain_std else 1.0

@@ -87,7 +87,7 @@ def test_an_alignment_starts_at_the_phases_of_the_bands(scenario, beams):
     alignment = Alignment(declared)
     alignment.start(model.whiten(signals), model.whiten(mean), values)
     np.testing.assert_allclose(
-        alignment.aligned(signals, values), mean, rtol=0, atol=1e-2 * np.abs(mean).max())
+        alignment.nuisance.divide(signals, values), mean, rtol=0, atol=1e-2 * np.abs(mean).max())
 
 
 def test_several_codebooks_reveal_more_of_the_elements(scenario, damaged, send, random_beams):
