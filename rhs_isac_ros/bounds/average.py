@@ -103,8 +103,12 @@ class Average:
     @one_blas_thread
     def value(self, codebook: Beamforming) -> float:
         """Compute the average without its gradients."""
-        total = sum(float(losses.sum()) for losses, _ in self._losses(codebook))
-        return total / self.rows.n_items
+        return float(np.mean(self.losses(codebook)))
+
+    def losses(self, codebook: Beamforming) -> np.ndarray:
+        """Compute the loss of each item, float64 [n]."""
+        evaluation = Evaluation(self.rows, self._model(codebook))
+        return np.concatenate([losses for _, _, losses, _ in self._blocks(evaluation)])
 
     @one_blas_thread
     def __call__(self, codebook: Beamforming) -> Gradient:
@@ -112,11 +116,9 @@ class Average:
         model = self._model(codebook)
         evaluation = Evaluation(self.rows, model)
         bands = range(self.scenario.n_bands)
-        total = 0.0
-        for block in self.rows.blocks():
-            whitened = self._whitened(evaluation, block)
-            losses, weights = self._loss(block, _sum_of_forms(whitened))
-            total += float(losses.sum())
+        every = []
+        for block, whitened, losses, weights in self._blocks(evaluation):
+            every.append(losses)
             for band in bands:
                 weighted = _weighted(weights, whitened[band])
                 if self._combination:
@@ -126,23 +128,22 @@ class Average:
             np.stack, zip(*map(evaluation.sums, bands), strict=True))
         gradients = quadratic_gradients(
             model, codebook, mean_terms, covariance_terms, self.rows.n_items, self.surface)
-        return Gradient(total / self.rows.n_items, *gradients)
-
-    def _losses(self, codebook: Beamforming) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        evaluation = Evaluation(self.rows, self._model(codebook))
-        for block in self.rows.blocks():
-            yield self._loss(block, _sum_of_forms(self._whitened(evaluation, block)))
+        return Gradient(float(np.mean(np.concatenate(every))), *gradients)
 
     def _model(self, codebook: Beamforming) -> MeasurementModel:
         exact = self.surface.without_errors() if self.surface else None
         return MeasurementModel(self.scenario, codebook, exact)
 
-    def _whitened(self, evaluation: Evaluation, block: slice) -> list[np.ndarray]:
-        """Return the whitened means of the form's rows, [n, G, N_SB F], for each band."""
-        whitened = [evaluation.whitened(block, i) for i in range(self.scenario.n_bands)]
-        if self._combination is None:
-            return whitened
-        return [self._combination.forward(band, rows) for band, rows in enumerate(whitened)]
+    def _blocks(self, evaluation: Evaluation
+                ) -> Iterator[tuple[slice, list[np.ndarray], np.ndarray, np.ndarray]]:
+        """Yield blocks, their whitened means [n, G, N_SB F] by band, and results of the loss."""
+        for block in self.rows.blocks():
+            whitened = [evaluation.whitened(block, i) for i in range(self.scenario.n_bands)]
+            if self._combination:
+                whitened = [self._combination.forward(band, rows)
+                            for band, rows in enumerate(whitened)]
+            forms = np.sum([quadratic_form(means) for means in whitened], axis=0, dtype=float)
+            yield block, whitened, *self._loss(block, forms)
 
 
 def average_crlb(
@@ -210,11 +211,6 @@ def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
             index.append(3)
             scale[:, row] = pattern[:, 0]
     return patterns, Combination(np.array(index), scale)
-
-
-def _sum_of_forms(whitened: list[np.ndarray]) -> np.ndarray:
-    """Return the sum of the quadratic forms of the bands, [n, G, G]."""
-    return np.sum([quadratic_form(means) for means in whitened], axis=0, dtype=float)
 
 
 def _weighted(weights: np.ndarray, whitened: np.ndarray) -> np.ndarray:

@@ -83,7 +83,7 @@ class PairwiseErrorCost(Average):
             raise ValueError(f'n: {n}, expected 1 to {total}, the number of pairs')
         if not isinstance(self.rows, CompressedRows):
             raise ValueError('tolerance: 0, expected compressed differences to draw a sample of')
-        costs = np.concatenate([losses for losses, _ in self._losses(codebook)])
+        costs = self.losses(codebook)
         shares = np.full(total, 1 / total)
         if costs.any():
             shares += (1 - _UNIFORM_SHARE) * (costs / costs.sum() - shares)

@@ -203,11 +203,9 @@ class PilotStatistics:
                     signals, slopes = self._linearised(part, signals, values)
                     of_values = self._integrated(part, signals, slopes)
                     lost, moved = lost + of_values[0], moved + of_values[1]
-                whitened = part.whiten(signals)
-                for columns, white in zip(part.columns, np.swapaxes(whitened, 0, 1), strict=True):
-                    flat = columns.reshape(-1, size)
-                    normal += np.conj(flat.T) @ flat
-                    product += np.conj(flat.T) @ white.reshape(-1)
+                flat = part.columns.reshape(-1, size)
+                normal += np.conj(flat.T) @ flat
+                product += np.conj(flat.T) @ part.whiten(signals).reshape(-1)
         information = 2 * np.block([[normal.real, -normal.imag], [normal.imag, normal.real]])
         return information - lost, 2 * np.concatenate([product.real, product.imag]) - moved
 
@@ -234,8 +232,7 @@ class PilotStatistics:
     def _integrated(self, part: '_Block', signals: np.ndarray, slopes: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the information [2 P, 2 P] and shift [2 P] lost because values are unknown."""
-        coupling = sum(np.einsum('nqr,nrp->nqp', np.conj(slopes[:, :, band]), columns)
-                       for band, columns in enumerate(part.columns))
+        coupling = np.einsum('nqir,nirp->nqp', np.conj(slopes), part.columns)
         coupling = 2 * np.concatenate([coupling.real, -coupling.imag], axis=2)
         of_signals = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), part.whiten(signals)).real
         regression = np.linalg.solve(self._alignment.curvature(slopes), coupling)
@@ -246,23 +243,21 @@ class PilotStatistics:
 class _Block:
     """Linear model of several pilots.
 
-    `columns` are the whitened derivatives of each band's signals, complex128 [N, N_SB F, P], and
+    `columns` are the whitened derivatives of the signals, complex128 [N, N_B, N_SB F, P], and
     `mean` the expected signals, complex128 [N, N_B, N_SB F].
     """
 
     def __init__(self, scenario: Scenario, radiation: np.ndarray, whiteners: np.ndarray,
                  positions: np.ndarray, mean: np.ndarray) -> None:
         self._whiteners = whiteners
-        self.columns: list[np.ndarray] = []
-        self.mean = np.empty((len(positions), *radiation.shape[:2]), complex)
-        n = 2 * scenario.n_elements
+        shape, n = (len(positions), *radiation.shape[:2]), 2 * scenario.n_elements
+        self.mean = np.empty(shape, complex)
+        self.columns = np.zeros((*shape, n + scenario.n_bands), complex)
         for band, whitener in enumerate(whiteners):
             design = direct_design(scenario, radiation, band, positions)
             self.mean[:, band] = design @ mean
-            columns = np.zeros((*design.shape[:2], n + scenario.n_bands), complex)
-            columns[..., :n] = np.matmul(whitener, design)
-            columns[..., n + band] = self.mean[:, band] @ whitener.T
-            self.columns.append(columns)
+            self.columns[:, band, :, :n] = np.matmul(whitener, design)
+            self.columns[:, band, :, n + band] = self.mean[:, band] @ whitener.T
 
     def whiten(self, signals: np.ndarray) -> np.ndarray:
         """Whiten signals [..., N_B, N_SB F]."""

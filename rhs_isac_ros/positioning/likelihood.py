@@ -239,19 +239,12 @@ class Likelihood:
         """Evaluate points; see `Conditional.local`."""
         n, white = len(points), whiten(self.model, *self._means(points))
         mean, whitened = white[:, 0], self.whitened(values, signals)
-        residual, derivative = (whitened - mean).reshape(n, -1), white[:, 1:].reshape(n, 3, -1)
+        columns = [(whitened - mean).reshape(n, 1, -1), white[:, 1:].reshape(n, 3, -1)]
         if len(self.nuisance):
             observed = self.nuisance.slopes(whitened)
             moves = self.nuisance.moves_multipath[:, None]
-            expected = np.where(moves, observed, self.nuisance.slopes(mean))
-            return assemble(self.nuisance, values, np.concatenate(
-                [residual[:, None], derivative, expected, observed], axis=1))
-        # The same as `assemble`, but without its copies.
-        parts = residual.view(float)
-        gradient = 2 * np.matmul(derivative.view(float), parts[..., None])[..., 0]
-        energy = np.sum(parts**2, axis=1)
-        information = quadratic_form(derivative) + np.diag(self.nuisance.floor)
-        return Local(-energy, gradient, information, energy)
+            columns += [np.where(moves, observed, self.nuisance.slopes(mean)), observed]
+        return assemble(self.nuisance, values, np.concatenate(columns, axis=1))
 
     def settle(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Replace uniform phases of all bands, in parameters [M, Q], by the most likely ones."""
@@ -279,21 +272,23 @@ def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
     standard normal parameters in which the mean is linear; they are integrated out.
     """
     n, end = 3 + len(prior), 4 + len(prior) + n_linear
-    expected, observed = white[:, 1:end], white[:, end:]
+    expected, observed = np.ascontiguousarray(white[:, 1:end]), white[:, end:]
     # Re(a^H b) is the inner product of real and imaginary parts.
     parts = np.ascontiguousarray(white[:, 0]).view(float)
     information = quadratic_form(expected)
     information += np.diag(np.concatenate([prior.floor, prior.precision, np.ones(n_linear)]))
-    # Derivatives of parameters that move the multipath already include this information.
-    still = ~prior.moves_multipath
-    information[:, 3:n, 3:n] += np.outer(still, still) * (
-        prior.information if information_of_covariance is None else information_of_covariance)
     if observed.shape[1]:
         expected = np.concatenate([expected[:, :3], observed, expected[:, n:]], axis=1)
-    gradient = 2 * np.matmul(np.ascontiguousarray(expected).view(float), parts[..., None])[..., 0]
-    gradient[:, 3:n] -= prior.precision * values + prior.volume
+    gradient = 2 * np.matmul(expected.view(float), parts[..., None])[..., 0]
     energy = np.sum(parts**2, axis=1)
-    value = prior.log_prior(values) - energy
+    value = -energy
+    if len(prior):
+        # Derivatives of parameters that move the multipath already include this information.
+        still = ~prior.moves_multipath
+        information[:, 3:n, 3:n] += np.outer(still, still) * (
+            prior.information if information_of_covariance is None else information_of_covariance)
+        gradient[:, 3:n] -= prior.precision * values + prior.volume
+        value = prior.log_prior(values) - energy
     if not n_linear:
         return Local(value, gradient, information, energy)
     marginal = marginalise(information, gradient, n)
