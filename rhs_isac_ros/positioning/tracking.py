@@ -83,12 +83,6 @@ class Mixture(NamedTuple):
         """Return the mixture with weights whose sum is one."""
         return self.weighted(-log_sum(self.log_weights))
 
-    def positions(self, normal: np.ndarray) -> np.ndarray:
-        """Map points that represent a standard Gaussian, [S, 3], to positions, [C, S, 3] [m]."""
-        factors = np.linalg.cholesky(self.covariances[:, :3, :3])
-        points = self.means[:, None, :3] + np.matmul(normal, np.swapaxes(factors, 1, 2))
-        return to_positions(points)
-
     def weighted(self, log_factor: float | np.ndarray) -> 'Mixture':
         """Return the mixture with its weights multiplied by a factor."""
         return self._replace(log_weights=self.log_weights + log_factor)
@@ -194,36 +188,21 @@ class Motion:
 
     def _straight(self, mixture: Mixture, elapsed_s: float) -> Mixture:
         decay = np.exp(-elapsed_s / self.memory_s)
-        reach_s = self.memory_s * (1 - decay)
-        points, velocity = _moved(mixture, reach_s)
-        rates = decay * np.linalg.solve(jacobian(points), velocity[..., None])[..., 0]
-        means = np.concatenate([points, rates], axis=1)
-        transition = np.eye(6)
-        transition[:3, 3:] += reach_s * np.eye(3)
-        transition[3:, 3:] *= decay
-        return Mixture(
-            mixture.log_weights, means,
-            transition @ mixture.covariances @ transition.T
-            + np.kron(self._noise(elapsed_s, decay), np.ones((3, 3)))
-            * np.tile(_isotropic(points), (2, 2)))
+        return _moved(
+            mixture, self.memory_s * (1 - decay), decay, self._noise(elapsed_s, decay))
 
     def _turned(self, mixture: Mixture, begin_s: float, end_s: float, elapsed_s: float) -> Mixture:
         """Return the mixture of users who have turned once, at a random time in an interval."""
         mean_s, variance_s2 = (begin_s + end_s) / 2, (end_s - begin_s)**2 / 12
         rest_s = elapsed_s - mean_s
-        points, _ = _moved(mixture, mean_s)
-        means = np.concatenate([points, np.zeros_like(points)], axis=1)
-        transition = np.hstack([np.eye(3), mean_s * np.eye(3)])
+        noise = self.velocity_variance * np.array([
+            [rest_s**2 + variance_s2, rest_s], [rest_s, 1.0]])
+        moved = _moved(mixture, mean_s, 0.0, noise)
+        # The velocity before the turn acts for a random time.
         rates, within = mixture.means[:, 3:], mixture.covariances[:, 3:, 3:]
-        turned = self.velocity_variance * _isotropic(points)
-        covariances = np.empty_like(mixture.covariances)
-        covariances[:, :3, :3] = (
-            transition @ mixture.covariances @ transition.T
-            + variance_s2 * (within + rates[:, :, None] * rates[:, None])
-            + (rest_s**2 + variance_s2) * turned)
-        covariances[:, :3, 3:] = covariances[:, 3:, :3] = rest_s * turned
-        covariances[:, 3:, 3:] = turned
-        return Mixture(mixture.log_weights, means, covariances)
+        moved.covariances[:, :3, :3] += variance_s2 * (
+            within + rates[:, :, None] * rates[:, None])
+        return moved
 
     def _noise(self, elapsed_s: float, decay: float) -> np.ndarray:
         """Return the covariance of position and velocity along an axis, float64 [2, 2]."""
@@ -236,14 +215,20 @@ class Motion:
             [memory_s * (1 - decay)**2, 1 - decay**2]])
 
 
-def _moved(mixture: Mixture, time_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (r, u, v) after a time in a straight line, and velocities, float64 [C, 3]."""
+def _moved(mixture: Mixture, reach_s: float, decay: float, noise: np.ndarray) -> Mixture:
+    """Move straight, decay the velocities, and add the noise [2, 2] of position and velocity."""
     points = mixture.means[:, :3]
-    velocities = np.matmul(jacobian(points), mixture.means[:, 3:, None])[..., 0]
-    positions = to_positions(points) + time_s * velocities
+    velocities = np.matmul(jacobian(points), mixture.means[:, 3:, None])
+    positions = to_positions(points) + reach_s * velocities[..., 0]
     # No user is behind the surface.
     positions[:, 0] = np.maximum(positions[:, 0], 1e-3)
-    return to_polar(positions), velocities
+    points = to_polar(positions)
+    rates = decay * np.linalg.solve(jacobian(points), velocities)[..., 0]
+    transition = np.kron([[1.0, reach_s], [0.0, decay]], np.eye(3))
+    return Mixture(
+        mixture.log_weights, np.concatenate([points, rates], axis=1),
+        transition @ mixture.covariances @ transition.T
+        + np.kron(noise, np.ones((3, 3))) * np.tile(_isotropic(points), (2, 2)))
 
 
 def _isotropic(points: np.ndarray) -> np.ndarray:
@@ -359,7 +344,9 @@ class Tracker:
         """Return the components that reach the region, and mean and covariance inside."""
         heavy = mixture.log_weights >= _MIN_LOG_WEIGHT
         mixture, light = select(mixture, heavy), select(mixture, ~heavy)
-        positions = mixture.positions(self.estimator.normal)
+        factors = np.linalg.cholesky(mixture.covariances[:, :3, :3])
+        positions = to_positions(mixture.means[:, None, :3] + np.matmul(
+            self.estimator.normal, np.swapaxes(factors, 1, 2)))
         bounds_m = Resolution.of(self.estimator.scenario).bounds_m
         inside = is_inside(positions, bounds_m)
         reaches = inside.mean(axis=1) >= _MIN_INSIDE
