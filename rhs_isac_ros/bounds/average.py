@@ -4,6 +4,7 @@ The average Cramer-Rao bound is one example. `by_radiation` is the gradient
 d/dRe(T_i) + i d/dIm(T_i) of an objective, complex128 [N_B, N_SB F, N_E].
 """
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -127,11 +128,12 @@ class Average:
         mean_terms, covariance_terms = map(
             np.stack, zip(*map(evaluation.sums, bands), strict=True))
         gradients = quadratic_gradients(
-            model, codebook, mean_terms, covariance_terms, self.rows.n_items, self.surface)
+            model, codebook, mean_terms, covariance_terms, self.rows.n_items)
         return Gradient(float(np.mean(np.concatenate(every))), *gradients)
 
     def _model(self, codebook: Beamforming) -> MeasurementModel:
-        exact = self.surface.without_errors() if self.surface else None
+        exact = self.surface and dataclasses.replace(
+            self.surface, factor=self.surface.factor[:, :0])
         return MeasurementModel(self.scenario, codebook, exact)
 
     def _blocks(self, evaluation: Evaluation
@@ -224,12 +226,11 @@ def _weighted(weights: np.ndarray, whitened: np.ndarray) -> np.ndarray:
 
 def quadratic_gradients(
         model: MeasurementModel, codebook: Beamforming, mean_terms: np.ndarray,
-        covariance_terms: np.ndarray, n_items: int, surface: SurfaceEstimate | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+        covariance_terms: np.ndarray, n_items: int) -> tuple[np.ndarray, np.ndarray]:
     """Compute the gradients of an average, as in `Gradient`, from the sums over n items.
 
     The sums are those of `Evaluation.sums` for all bands, complex128 [N_B, N_SB F, N_E] and
-    [N_B, N_SB F, N_SB F]. An estimate of the surface is treated as exact.
+    [N_B, N_SB F, N_SB F].
     """
     scenario = model.scenario
     correlation = np.conj(measurement_correlation(scenario))
@@ -242,13 +243,8 @@ def quadratic_gradients(
             correlation * (covariance_terms @ to_survey @ measured.excess),
             declared.scatter(measured.radiation))
     by_radiation = 4 * (through_covariance - mean_terms) / n_items
-    terms: list[tuple[np.ndarray | float, np.ndarray | float, np.ndarray]]
-    if surface:
-        by_radiation = np.conj(surface.band_gains)[:, None, None] * by_radiation
-        terms = [(surface.offsets, surface.gains, by_radiation)]
-    else:
-        share = scenario.failed_element_share
-        terms = [(share / 2, 1 - share, by_radiation)]
+    slope, offset, band_gains = model.elements.response
+    terms = [(offset, slope, np.reshape(np.conj(band_gains), (-1, 1, 1)) * by_radiation)]
     if not model.elements.is_exact:
         radiation = error_radiation(scenario, codebook)
         terms += [
