@@ -158,10 +158,6 @@ class NuisancePrior(Exponents):
         slopes = np.einsum('qimn,kin->kqim', self._operators, whitened, optimize=True)
         return slopes.reshape(*slopes.shape[:2], -1)
 
-    def band_angles(self, values: np.ndarray) -> np.ndarray:
-        """Return the phases of the bands for parameters [M, Q], float64 [M, N_B] [rad]."""
-        return values @ self.phases.T
-
     def log_prior(self, values: np.ndarray) -> np.ndarray:
         """Return the logarithm of prior and change of volume, float64 [M]."""
         return -(values**2 @ self.precision / 2 + values @ self.volume)

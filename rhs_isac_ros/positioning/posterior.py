@@ -153,8 +153,8 @@ def draw_broad_samples(
         if phases.is_informative:
             likely = evidence >= evidence.max() - _LIKELY_MARGIN
             outputs = likelihood.outputs(points[likely], values[likely], signals)
-            turned = likelihood.nuisance.band_angles(values[likely])
-            log_factors, offsets_m = phases.factors(outputs.T * np.exp(1j * turned.T))
+            turns = np.exp(1j * (likelihood.nuisance.phases @ values[likely].T))
+            log_factors, offsets_m = phases.factors(outputs.T * turns)
             evidence[likely] += log_factors
             points[likely, 0] += offsets_m
             positions[chosen] = to_positions(points)

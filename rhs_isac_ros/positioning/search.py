@@ -104,7 +104,7 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     for number in range(n_steps):
         chosen = _prune(likelihood, modes, gain, margin)
         modes, gain = select(modes, chosen), gain[chosen]
-            # At the border of the region, small gains may alternate forever.
+        # At the border of the region, small gains may alternate forever.
         (moving,) = np.nonzero(gain > (_MIN_GAIN if number < _N_USUAL_STEPS else 1.0))
         if not len(moving) or number == n_steps - 1:
             break

@@ -157,7 +157,7 @@ class _Posterior:
         if self._phases.is_informative:
             signals = select(self._signals, [phase])
             outputs = likelihood.outputs(points, values, signals)
-            turned = outputs * np.exp(1j * prior.band_angles(values))
+            turned = outputs * np.exp(1j * values @ prior.phases.T)
             value += self._phases.factors(turned.T, averages=False)[0]
         return value
 
