@@ -190,10 +190,13 @@ class AverageCrlb(Average):
         values = np.trace(inverse, axis1=1, axis2=2)
         # If the signals do not determine the position, the value is infinite and the slope zero.
         finite = np.where(np.isfinite(values)[:, None, None], inverse, 0.0)
+        slopes = np.matmul(finite, finite)
+        if joint.shape[1] == 3:
+            return values, slopes
         # W = [I; regression] minimises the Schur complement W^T J W, and is therefore held fixed.
         identity = np.broadcast_to(np.eye(3), (len(joint), 3, 3))
         whole = np.concatenate([identity, marginal.regression], axis=1)
-        return values, whole @ np.matmul(finite, finite) @ np.swapaxes(whole, 1, 2)
+        return values, whole @ slopes @ np.swapaxes(whole, 1, 2)
 
 
 def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
@@ -203,7 +206,7 @@ def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
     scaled = nuisance_of(scenario).scaled_patterns
     if not len(scaled):
         return [], None
-    patterns: list[Pattern] = [(slice(0, 4), 1.0)]
+    patterns: list[Pattern] = [(slice(0, 4), None)]
     index, scale = [0, 1, 2], np.ones((scenario.n_bands, 3 + len(scaled)), complex)
     for row, pattern in enumerate(scaled, 3):
         if np.ptp(pattern, axis=1).any():

@@ -17,9 +17,10 @@ from rhs_isac_ros.support import streams
 
 # Function that long computations call repeatedly; it may raise an exception to end them.
 Tick = Callable[[], None]
-# Rows, and the factor of their means in each band and measurement, complex128 [N_B, N_SB F], or 1.
-Pattern = tuple[slice, np.ndarray | float]
-PLAIN: Sequence[Pattern] = ((slice(None), 1.0),)
+# Rows, and the factor of their means in each band and measurement, complex128 [N_B, N_SB F], or
+# None for 1. Together, the slices cover all rows.
+Pattern = tuple[slice, np.ndarray | None]
+PLAIN: Sequence[Pattern] = ((slice(None), None),)
 # Number of items of three rows in a block, whose arrays fit into the cache.
 _BLOCK = 128
 # Largest number of complex numbers in a block of exact rows.
@@ -51,7 +52,7 @@ class RowSource:
     rows: Callable[[slice, int], np.ndarray]
     n_items: int
     n_rows: int  #: Number G of rows of an item.
-    patterns: Sequence[Pattern] = PLAIN  #: Their slices cover all rows.
+    patterns: Sequence[Pattern] = PLAIN
     tick: Tick = no_tick
 
     @property
@@ -109,21 +110,22 @@ class Evaluation:
 
     def __init__(self, rows: MeasurementRows, model: MeasurementModel) -> None:
         self._rows, self._whitener = rows, model.whitener
-        # With a single group, the filters include whitening, which then costs no time per item.
-        # With several groups, it follows after the means are joined.
+        # With a single group, the filters include patterns and whitening, which then cost no time
+        # per item. With several groups, these follow after the means are joined.
         self._is_folded = rows.n_groups == 1
-        # Each pattern, [N_B, J, 1, S F].
-        self._patterns = [np.broadcast_to(pattern, model.radiation.shape[:2]).reshape(
-            len(model.radiation), rows.n_groups, 1, -1) for _, pattern in rows.patterns]
+        self._patterns = rows.patterns if self._is_folded else PLAIN
         self._filters = [
-            [self._filter(rows.means(band, radiation) * pattern[band], band)
-             for pattern in self._patterns] for band, radiation in enumerate(model.radiation)]
+            [self._filter(rows.means(band, radiation), band, pattern)
+             for _, pattern in self._patterns]
+            for band, radiation in enumerate(model.radiation)]
         self._weights = [[np.zeros_like(one) for one in filters] for filters in self._filters]
         self._last = [np.empty(0)] * len(self._whitener)
         # Sums over weighted whitened means times whitened means.
         self._products = np.zeros_like(self._whitener)
 
-    def _filter(self, means: np.ndarray, band: int) -> np.ndarray:
+    def _filter(self, means: np.ndarray, band: int, pattern: np.ndarray | None) -> np.ndarray:
+        if pattern is not None:
+            means = means * pattern[band]
         return np.matmul(means, self._whitener[band].T) if self._is_folded else means
 
     def whitened(self, block: slice, band: int) -> np.ndarray:
@@ -131,7 +133,7 @@ class Evaluation:
         rows = self._rows.in_block(block, band)
         n_groups, n, n_rows, rank = rows.shape
         means = np.empty((n, n_rows, n_groups, self._filters[band][0].shape[2]), rows.dtype)
-        for (part, _), filters in zip(self._rows.patterns, self._filters[band], strict=True):
+        for (part, _), filters in zip(self._patterns, self._filters[band], strict=True):
             chosen = means[:, part]
             product = np.matmul(rows[:, :, part].reshape(n_groups, -1, rank),
                                 filters.astype(rows.dtype, copy=False))
@@ -139,6 +141,9 @@ class Evaluation:
                 product.reshape(n_groups, *chosen.shape[:2], -1), 0, 2)
         whitened = means.reshape(n, n_rows, -1)
         if not self._is_folded:
+            for part, pattern in self._rows.patterns:
+                if pattern is not None:
+                    whitened[:, part] *= pattern[band]
             whitened = self._last[band] = np.matmul(whitened, self._whitener[band].T)
         return whitened
 
@@ -151,12 +156,15 @@ class Evaluation:
             flat, last = (one.reshape(-1, one.shape[2]) for one in (weighted, self._last[band]))
             self._products[band] += flat.T @ np.conj(last)
             weighted = np.matmul(weighted, np.conj(self._whitener[band]))
+            for part, pattern in self._rows.patterns:
+                if pattern is not None:
+                    weighted[:, part] *= np.conj(pattern[band])
         rows = self._rows.in_block(block, band)
         n_groups, n, n_rows, rank = rows.shape
         # Accumulate the conjugate, so that the coefficients need not be copied.
         grouped = np.conj(weighted, dtype=rows.dtype, casting='same_kind').reshape(
             n, n_rows, n_groups, -1)
-        for (part, _), weights in zip(self._rows.patterns, self._weights[band], strict=True):
+        for (part, _), weights in zip(self._patterns, self._weights[band], strict=True):
             chosen = rows[:, :, part].reshape(n_groups, -1, rank)
             weights += np.matmul(
                 np.swapaxes(chosen, 1, 2),
@@ -170,13 +178,15 @@ class Evaluation:
         """
         whitener, products = self._whitener[band], self._products[band]
         total = np.zeros(())
-        for pattern, filters, gathered in zip(
+        for (_, pattern), filters, gathered in zip(
                 self._patterns, self._filters[band], self._weights[band], strict=True):
             weights = np.conj(gathered)
             if self._is_folded:
                 products = products + weights[0].T @ np.conj(filters[0])
                 weights = np.matmul(weights, np.conj(whitener))
-            total = total + weights * np.conj(pattern[band])
+            if pattern is not None:
+                weights = weights * np.conj(pattern[band])
+            total = total + weights
         return self._rows.sums(band, total), np.conj(whitener.T) @ products @ whitener
 
 
