@@ -4,22 +4,19 @@ The average Cramer-Rao bound is one example. `by_radiation` is the gradient
 d/dRe(T_i) + i d/dIm(T_i) of an objective, complex128 [N_B, N_SB F, N_E].
 """
 
-from collections.abc import Callable, Iterator, Sequence
+import dataclasses
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import (
-    inverse_information,
-    without_nuisance,
-)
+from rhs_isac_ros.bounds.fisher import inverse_information, without_nuisance
 from rhs_isac_ros.bounds.rows import (
     PLAIN,
     Evaluation,
     Pattern,
     RowSource,
     Tick,
-    blocks,
     no_tick,
     rows_within,
 )
@@ -91,32 +88,28 @@ class Average:
     tolerance
         Relative error of the rows (see `CompressedRows`); 0 selects exact rows. Raises ValueError
         if a positive tolerance is too small.
-    patterns
-        Factors of the means of the rows.
     combination
         Rows of the form, if they differ from the rows of the source.
-    tick
-        Called repeatedly while the rows are computed; it can end the computation with an
-        exception.
     """
 
     #: An estimate of the surface that is treated as exact; None for the scenario's elements.
     surface: SurfaceEstimate | None = None
 
     @one_blas_thread
-    def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
-                 loss: Loss, tolerance: float, patterns: Sequence[Pattern] = PLAIN,
-                 combination: Combination | None = None, tick: Tick = no_tick) -> None:
-        self.scenario, self._loss = scenario, loss
-        self._n_rows, self._combination = n_rows, combination
-        self.rows = rows_within(
-            scenario, source, n_items, n_rows, tolerance, patterns, tick)
+    def __init__(self, source: RowSource, loss: Loss, tolerance: float,
+                 combination: Combination | None = None) -> None:
+        self.scenario, self._loss, self._combination = source.scenario, loss, combination
+        self.rows = rows_within(source, tolerance)
 
     @one_blas_thread
     def value(self, codebook: Beamforming) -> float:
         """Compute the average without its gradients."""
-        total = sum(float(losses.sum()) for losses, _ in self._losses(codebook))
-        return total / self.rows.n_items
+        return float(np.mean(self.losses(codebook)))
+
+    def losses(self, codebook: Beamforming) -> np.ndarray:
+        """Compute the loss of each item, float64 [n]."""
+        evaluation = Evaluation(self.rows, self._model(codebook))
+        return np.concatenate([losses for _, _, losses, _ in self._blocks(evaluation)])
 
     @one_blas_thread
     def __call__(self, codebook: Beamforming) -> Gradient:
@@ -124,37 +117,35 @@ class Average:
         model = self._model(codebook)
         evaluation = Evaluation(self.rows, model)
         bands = range(self.scenario.n_bands)
-        total = 0.0
-        for block in blocks(self.rows.n_items, self._n_rows, self.rows.width):
-            whitened = self._whitened(evaluation, block)
-            losses, weights = self._loss(block, _sum_of_forms(whitened))
-            total += float(losses.sum())
+        every = []
+        for block, whitened, losses, weights in self._blocks(evaluation):
+            every.append(losses)
             for band in bands:
                 weighted = _weighted(weights, whitened[band])
                 if self._combination:
-                    weighted = self._combination.backward(band, weighted, self._n_rows)
+                    weighted = self._combination.backward(band, weighted, self.rows.n_rows)
                 evaluation.accumulate(block, band, weighted)
         mean_terms, covariance_terms = map(
             np.stack, zip(*map(evaluation.sums, bands), strict=True))
         gradients = quadratic_gradients(
-            model, codebook, mean_terms, covariance_terms, self.rows.n_items, self.surface)
-        return Gradient(total / self.rows.n_items, *gradients)
-
-    def _losses(self, codebook: Beamforming) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        evaluation = Evaluation(self.rows, self._model(codebook))
-        for block in blocks(self.rows.n_items, self._n_rows, self.rows.width):
-            yield self._loss(block, _sum_of_forms(self._whitened(evaluation, block)))
+            model, codebook, mean_terms, covariance_terms, self.rows.n_items)
+        return Gradient(float(np.mean(np.concatenate(every))), *gradients)
 
     def _model(self, codebook: Beamforming) -> MeasurementModel:
-        exact = self.surface.without_errors() if self.surface else None
+        exact = self.surface and dataclasses.replace(
+            self.surface, factor=self.surface.factor[:, :0])
         return MeasurementModel(self.scenario, codebook, exact)
 
-    def _whitened(self, evaluation: Evaluation, block: slice) -> list[np.ndarray]:
-        """Return the whitened means of the form's rows, [n, G, N_SB F], for each band."""
-        whitened = [evaluation.whitened(block, i) for i in range(self.scenario.n_bands)]
-        if self._combination is None:
-            return whitened
-        return [self._combination.forward(band, rows) for band, rows in enumerate(whitened)]
+    def _blocks(self, evaluation: Evaluation
+                ) -> Iterator[tuple[slice, list[np.ndarray], np.ndarray, np.ndarray]]:
+        """Yield blocks, their whitened means [n, G, N_SB F] by band, and results of the loss."""
+        for block in self.rows.blocks():
+            whitened = [evaluation.whitened(block, i) for i in range(self.scenario.n_bands)]
+            if self._combination:
+                whitened = [self._combination.forward(band, rows)
+                            for band, rows in enumerate(whitened)]
+            forms = np.sum([quadratic_form(means) for means in whitened], axis=0, dtype=float)
+            yield block, whitened, *self._loss(block, forms)
 
 
 def average_crlb(
@@ -171,8 +162,9 @@ def average_crlb(
 class AverageCrlb(Average):
     """Average bound at fixed positions, float64 [N, 3] [m], for evaluation with many codebooks.
 
-    Nuisance parameters, errors of the elements and `region_prior` are treated as in `crlb`;
-    `tolerance` and `tick` are passed to `Average`.
+    Nuisance parameters, errors of the elements and `region_prior` are treated as in `crlb`.
+    `tolerance` is that of `Average`. `tick` is called repeatedly while the rows are computed; an
+    exception ends the computation.
     """
 
     def __init__(self, scenario: Scenario, positions: np.ndarray, tolerance: float = 0.0, *,
@@ -188,22 +180,22 @@ class AverageCrlb(Average):
             return np.concatenate([derivative, *[gain[:, None]] * len(patterns)], axis=1)
 
         super().__init__(
-            scenario, source, len(self.positions), 3 + len(patterns), self._bounds, tolerance,
-            patterns or PLAIN, combination, tick)
+            RowSource(scenario, source, len(self.positions), 3 + len(patterns), patterns or PLAIN,
+                      tick), self._bounds, tolerance, combination)
 
     def _bounds(self, _: slice, joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the bounds [n] and their negative derivatives with respect to the forms."""
-        information, regression = without_nuisance(joint)
-        inverse = inverse_information(information + self._prior)
+        marginal = without_nuisance(joint)
+        inverse = inverse_information(marginal.information + self._prior)
         values = np.trace(inverse, axis1=1, axis2=2)
         # If the signals do not determine the position, the value is infinite and the slope zero.
         finite = np.where(np.isfinite(values)[:, None, None], inverse, 0.0)
         slopes = np.matmul(finite, finite)
-        if not regression.shape[1]:
+        if joint.shape[1] == 3:
             return values, slopes
         # W = [I; regression] minimises the Schur complement W^T J W, and is therefore held fixed.
         identity = np.broadcast_to(np.eye(3), (len(joint), 3, 3))
-        whole = np.concatenate([identity, regression], axis=1)
+        whole = np.concatenate([identity, marginal.regression], axis=1)
         return values, whole @ slopes @ np.swapaxes(whole, 1, 2)
 
 
@@ -226,11 +218,6 @@ def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
     return patterns, Combination(np.array(index), scale)
 
 
-def _sum_of_forms(whitened: list[np.ndarray]) -> np.ndarray:
-    """Return the sum of the quadratic forms of the bands, [n, G, G]."""
-    return np.sum([quadratic_form(means) for means in whitened], axis=0, dtype=float)
-
-
 def _weighted(weights: np.ndarray, whitened: np.ndarray) -> np.ndarray:
     """Multiply weights [n, G, G] by rows [n, G, R], in the precision of the rows."""
     parts = whitened.view(whitened.real.dtype)
@@ -242,12 +229,11 @@ def _weighted(weights: np.ndarray, whitened: np.ndarray) -> np.ndarray:
 
 def quadratic_gradients(
         model: MeasurementModel, codebook: Beamforming, mean_terms: np.ndarray,
-        covariance_terms: np.ndarray, n_items: int, surface: SurfaceEstimate | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+        covariance_terms: np.ndarray, n_items: int) -> tuple[np.ndarray, np.ndarray]:
     """Compute the gradients of an average, as in `Gradient`, from the sums over n items.
 
     The sums are those of `Evaluation.sums` for all bands, complex128 [N_B, N_SB F, N_E] and
-    [N_B, N_SB F, N_SB F]. An estimate of the surface is treated as exact.
+    [N_B, N_SB F, N_SB F].
     """
     scenario = model.scenario
     correlation = np.conj(measurement_correlation(scenario))
@@ -260,13 +246,8 @@ def quadratic_gradients(
             correlation * (covariance_terms @ to_survey @ measured.excess),
             declared.scatter(measured.radiation))
     by_radiation = 4 * (through_covariance - mean_terms) / n_items
-    terms: list[tuple[np.ndarray | float, np.ndarray | float, np.ndarray]]
-    if surface:
-        by_radiation = np.conj(surface.band_gains)[:, None, None] * by_radiation
-        terms = [(surface.offsets, surface.gains, by_radiation)]
-    else:
-        share = scenario.failed_element_share
-        terms = [(share / 2, 1 - share, by_radiation)]
+    slope, offset, band_gains = model.elements.response
+    terms = [(offset, slope, np.reshape(np.conj(band_gains), (-1, 1, 1)) * by_radiation)]
     if not model.elements.is_exact:
         radiation = error_radiation(scenario, codebook)
         terms += [

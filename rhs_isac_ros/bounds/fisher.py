@@ -3,7 +3,7 @@
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.gaussian import marginalise, quadratic_form
+from rhs_isac_ros.model.gaussian import Marginal, marginalise, quadratic_form
 from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
@@ -33,23 +33,16 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
 def crlb_of(model: MeasurementModel, positions: np.ndarray, *,
             region_prior: bool = False) -> np.ndarray:
     """Compute `crlb` for a model; all calls share its whitener."""
-    information, _ = without_nuisance(joint_information_of(model, positions))
+    information = without_nuisance(joint_information_of(model, positions)).information
     if region_prior:
         information = information + region_information(model.scenario)
     return np.trace(inverse_information(information), axis1=1, axis2=2)
 
 
-def without_nuisance(joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the information about the position if the nuisance parameters are unknown.
-
-    `joint` is the result of `joint_information_of`, float64 [N, 3 + Q, 3 + Q]. Returns float64
-    [N, 3, 3] [1/m^2], and how the parameters change with the position, [N, Q, 3].
-    """
-    if joint.shape[1] == 3:
-        return joint, np.empty((len(joint), 0, 3))
+def without_nuisance(joint: np.ndarray) -> Marginal:
+    """Integrate the result of `joint_information_of` over the nuisance parameters."""
     prior = np.diag(np.repeat([0.0, 1.0], [3, joint.shape[1] - 3]))
-    marginal = marginalise(joint + prior, np.zeros(joint.shape[:2]))
-    return marginal.information, marginal.regression
+    return marginalise(joint + prior, np.zeros(joint.shape[:2]))
 
 
 def inverse_information(information: np.ndarray) -> np.ndarray:

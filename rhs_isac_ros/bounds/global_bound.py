@@ -22,7 +22,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds.fisher import fisher_information
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import blocks
+from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.geometry import jacobian, polar_bounds, to_polar
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
@@ -180,9 +180,7 @@ class _Lattice:
         (rays,) = np.nonzero(likely)
         values = parts[rays] @ self._basis + self._offset[rays]
         chosen, at = np.nonzero(values > least)
-        values = values[chosen, at].astype(float)
-        weights = np.exp(values - values.max())
-        weights /= weights.sum()
+        weights, _ = mixture_weights(values[chosen, at].astype(float))
         truth = self._sight[ray] * self._ranges[index]
         places = self._sight[rays[chosen]] * self._ranges[at, None]
         offsets = (places - truth) * self._extends

@@ -17,7 +17,7 @@ import numpy as np
 from rhs_isac_ros.bounds.fisher import inverse_information
 from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.arrays import adjoint
-from rhs_isac_ros.model.gaussian import quadratic_form
+from rhs_isac_ros.model.gaussian import energy_limit, quadratic_form, step_to_maximum
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
@@ -30,8 +30,6 @@ _DIFFERENCE_M, _TOLERANCE_M = 1e-4, 1e-7
 _PER_WAVELENGTH = 8
 # Scale of the distance between the maximum of an ambiguity and the ray [m].
 _MAX_OFFSET_M = 0.5
-# Probability with which estimators reject a residual although the model holds.
-_FALSE_ALARM = 1e-9
 # Quantile, in standard deviations, of the residual energy that they should accept: 99 %.
 _QUANTILE = 2.33
 # Conditions for a valid result: largest share of ambiguities in the squared error, smallest
@@ -111,7 +109,7 @@ def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndar
         mean, slopes = model.mean_and_jacobian(places, whitened=True)
         information, gradient = _curvature(slopes), 2 * _projections(slopes, target - mean)
         ridge = 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        step = np.linalg.solve(information + ridge, gradient[..., None])[..., 0]
+        step = step_to_maximum(information + ridge, gradient)
         for _ in range(_HALVINGS):
             # The mean is defined only in front of the surface.
             trial = places + step
@@ -141,8 +139,6 @@ def _bending(model: MeasurementModel, places: np.ndarray, residual: np.ndarray) 
 def _is_valid(model: MeasurementModel, places: np.ndarray, bias: np.ndarray,
               covariance: np.ndarray, residual: np.ndarray, white: np.ndarray) -> np.ndarray:
     """Return whether the local description holds, bool [N]."""
-    from scipy.special import gammainccinv
-
     low, high = model.scenario.roi_bounds_m
     reach = _MIN_BORDER * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     valid = ((places - reach >= low) & (places + reach <= high)).all(axis=1)
@@ -150,7 +146,7 @@ def _is_valid(model: MeasurementModel, places: np.ndarray, bias: np.ndarray,
         np.abs(residual)**2, axis=(1, 2))
     spread = np.sum(np.abs(white)**2) + 2 * np.einsum(
         'nir,irs,nis->n', residual.conj(), white, residual).real
-    limit = gammainccinv(np.prod(model.shape), _FALSE_ALARM)
+    limit = energy_limit(int(np.prod(model.shape)))
     valid &= energy + _QUANTILE * np.sqrt(spread) <= limit
     mean, slopes = model.mean_and_jacobian(places, whitened=True)
     values, vectors = np.linalg.eigh(covariance)
@@ -187,7 +183,7 @@ def _ambiguities(model: MeasurementModel, place: np.ndarray, mean: np.ndarray,
     # The maximum of an ambiguity is beside the ray.
     information = _curvature(slopes) / 2 + np.diag([_MAX_OFFSET_M**-2] * 3)
     gradient = _projections(slopes, mean + residual - means)
-    offset = np.linalg.solve(information, gradient[..., None])[..., 0]
+    offset = step_to_maximum(information, gradient)
     difference = means + np.einsum('na,nair->nir', offset, slopes) - mean
     excess = np.sum(np.abs(difference)**2, axis=(1, 2)) - 2 * np.einsum(
         'nir,ir->n', difference.conj(), residual).real

@@ -11,7 +11,7 @@ import copy
 import numpy as np
 
 from rhs_isac_ros.bounds.average import Average, Combination
-from rhs_isac_ros.bounds.rows import PLAIN, CompressedRows, Tick, no_tick
+from rhs_isac_ros.bounds.rows import CompressedRows, RowSource, Tick, no_tick
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions, los_gain
 from rhs_isac_ros.model.scenario import Scenario
@@ -33,8 +33,8 @@ class PairwiseErrorCost(Average):
     form, the difference h(p) - h(p') replaces the derivative of Eq. (12). If the scenario declares
     unknown phases, the form is minimised over them; other nuisance parameters are not included.
     Pairs have positions, float64 [N, 3] [m], and weights, float64 [N]. `tolerance` and `tick` are
-    passed to `Average`. Raises ValueError if an argument has a wrong shape or is not finite, there
-    are no pairs, or a weight is negative.
+    those of `AverageCrlb`. Raises ValueError if an argument has a wrong shape or is not finite,
+    there are no pairs, or a weight is negative.
     """
 
     def __init__(
@@ -60,13 +60,13 @@ class PairwiseErrorCost(Average):
                     los_gain(scenario, second_positions[block], band)]
 
         if not self._scales.size:
-            super().__init__(
-                scenario, lambda block, band: np.subtract(*gains(block, band))[:, None],
-                n, 1, self._confusion, tolerance, tick=tick)
+            super().__init__(RowSource(
+                scenario, lambda block, band: np.subtract(*gains(block, band))[:, None], n, 1,
+                tick=tick), self._confusion, tolerance)
             return
-        super().__init__(
-            scenario, lambda block, band: np.stack(gains(block, band), axis=1), n, 2,
-            self._confusion, tolerance, PLAIN, _rows_of_bands(scenario.n_bands), tick)
+        super().__init__(RowSource(
+            scenario, lambda block, band: np.stack(gains(block, band), axis=1), n, 2, tick=tick),
+            self._confusion, tolerance, _rows_of_bands(scenario.n_bands))
 
     def sample(
             self, codebook: Beamforming, n: int, rng: np.random.Generator
@@ -83,7 +83,7 @@ class PairwiseErrorCost(Average):
             raise ValueError(f'n: {n}, expected 1 to {total}, the number of pairs')
         if not isinstance(self.rows, CompressedRows):
             raise ValueError('tolerance: 0, expected compressed differences to draw a sample of')
-        costs = np.concatenate([losses for losses, _ in self._losses(codebook)])
+        costs = self.losses(codebook)
         shares = np.full(total, 1 / total)
         if costs.any():
             shares += (1 - _UNIFORM_SHARE) * (costs / costs.sum() - shares)

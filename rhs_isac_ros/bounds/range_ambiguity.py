@@ -10,8 +10,8 @@ import numpy as np
 
 from rhs_isac_ros.bounds.pairwise_error import best_phases
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.model.arrays import blocks
-from rhs_isac_ros.model.gaussian import eliminate
+from rhs_isac_ros.model.arrays import blocks, mixture_weights
+from rhs_isac_ros.model.gaussian import step_to_maximum
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
@@ -90,11 +90,9 @@ def range_confusion_error_of(
         # The real and imaginary parts of the noise have variance 1/2 each.
         noise = rng.normal(scale=np.sqrt(0.5), size=(_DRAWS, difference.shape[1]))
         exponents = 2 * noise @ difference.T - np.sum(difference**2, axis=1) - penalties / 2
-        # The true position has the exponent 0.
-        largest = exponents.max(axis=1, initial=0.0)[:, None]
-        weights = np.exp(exponents - largest)
-        total = np.exp(-largest[:, 0]) + weights.sum(axis=1)
-        error += float(np.mean((weights @ lags[inside] / total)**2))
+        # The true position, with the lag 0, has the exponent 0.
+        weights, _ = mixture_weights(np.pad(exponents, ((0, 0), (0, 1))))
+        error += float(np.mean((weights[:, :-1] @ lags[inside])**2))
     return error / len(positions)
 
 
@@ -119,7 +117,7 @@ def _differences(
     information = np.einsum('nur,nvr->nuv', directions, directions)
     # Phases have a prior; the information of real parts is half the curvature.
     information[:, 3:, 3:] += np.eye(scales.shape[1]) / 2
-    _, displacement = eliminate(information, information[..., :0], by_position)
+    displacement = step_to_maximum(information, by_position)
     return difference - np.einsum('nu,nur->nr', displacement, directions), penalties
 
 

@@ -6,15 +6,15 @@ of the mean signals, as in Eq. (13). Whitened means take most of the time of an 
 """
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.support import streams
 
-# Function of a block of n items and a band; it returns their rows, complex128 [n, G, N_SB, N_E].
-RowSource = Callable[[slice, int], np.ndarray]
 # Function that long computations call repeatedly; it may raise an exception to end them.
 Tick = Callable[[], None]
 # Rows, and the factor of their means in each band and measurement, complex128 [N_B, N_SB F], or
@@ -43,6 +43,30 @@ def no_tick() -> None:
     """Do nothing."""
 
 
+@dataclasses.dataclass(frozen=True)
+class RowSource:
+    """G rows of each of n items, computed in blocks."""
+
+    scenario: Scenario
+    #: Function of a block of n items and a band that returns complex128 [n, G, N_SB, N_E].
+    rows: Callable[[slice, int], np.ndarray]
+    n_items: int
+    n_rows: int  #: Number G of rows of an item.
+    patterns: Sequence[Pattern] = PLAIN
+    tick: Tick = no_tick
+
+    @property
+    def width(self) -> int:
+        """Complex numbers of a row."""
+        return self.scenario.n_subbands * self.scenario.n_elements
+
+    def flat(self, block: slice, band: int) -> np.ndarray:
+        """Return the rows of a block, complex128 [n G, N_SB N_E]."""
+        self.tick()
+        # The memory layout of a single item may not allow a view as real numbers.
+        return np.ascontiguousarray(self.rows(block, band).reshape(-1, self.width))
+
+
 class MeasurementRows:
     """Rows of all items and bands, as coefficients of basis vectors.
 
@@ -50,13 +74,15 @@ class MeasurementRows:
     if the coefficients are the rows themselves, with S = 1 and R = N_E.
     """
 
-    def __init__(self, scenario: Scenario, n_items: int, n_rows: int,
-                 patterns: Sequence[Pattern], n_groups: int) -> None:
-        self.n_items, self.n_rows, self.patterns = n_items, n_rows, patterns
-        self.n_groups, self._n_in_group = n_groups, scenario.n_subbands // n_groups
-        # Complex numbers of an exact row.
-        self.width = scenario.n_subbands * scenario.n_elements
-        self.bases: list[np.ndarray | None] = [None] * scenario.n_bands
+    def __init__(self, source: RowSource, n_groups: int, width: int = 0) -> None:
+        self.n_items, self.n_rows, self.patterns = source.n_items, source.n_rows, source.patterns
+        self.n_groups, self._n_in_group = n_groups, source.scenario.n_subbands // n_groups
+        self._width = width
+        self.bases: list[np.ndarray | None] = [None] * source.scenario.n_bands
+
+    def blocks(self) -> list[slice]:
+        """Split the items into blocks that fit into the cache."""
+        return blocks(self.n_items, self.n_rows, self._width)
 
     def in_block(self, block: slice, band: int) -> np.ndarray:
         """Return the coefficients of a block of n items, complex [J, n, G, R]."""
@@ -164,34 +190,31 @@ class Evaluation:
         return self._rows.sums(band, total), np.conj(whitener.T) @ products @ whitener
 
 
-def rows_within(
-        scenario: Scenario, source: RowSource, n_items: int, n_rows: int, tolerance: float,
-        patterns: Sequence[Pattern] = PLAIN, tick: Tick = no_tick) -> MeasurementRows:
+def rows_within(source: RowSource, tolerance: float) -> MeasurementRows:
     """Return rows within a relative error, compressed as in `CompressedRows`.
 
     If the tolerance is 0, the rows are exact. A small number of rows that would need a large basis
     is stored in single precision instead.
     """
-    of = scenario, source, n_items, n_rows
     if tolerance == 0:
-        return ExactRows(*of, patterns, tick)
-    if n_items * n_rows <= _SKETCHED_ROWS and any(
-            _rank_of_some(*of, tolerance, band) > _MAX_RANK for band in range(scenario.n_bands)):
-        return ExactRows(*of, patterns, tick, np.complex64)
-    return CompressedRows(*of, tolerance, patterns, tick)
+        return ExactRows(source)
+    if source.n_items * source.n_rows <= _SKETCHED_ROWS and any(
+            _rank_of_some(source, tolerance, band) > _MAX_RANK
+            for band in range(source.scenario.n_bands)):
+        return ExactRows(source, np.complex64)
+    return CompressedRows(source, tolerance)
 
 
-def _rank_of_some(scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
-                  tolerance: float, band: int) -> int:
+def _rank_of_some(source: RowSource, tolerance: float, band: int) -> int:
     """Return the rank, within a tolerance, of a sample of the rows and columns."""
-    size, width = 2 * _MAX_RANK, scenario.n_subbands * scenario.n_elements
-    if n_items * n_rows <= size or width <= 3 * size:
+    size, n_rows = 2 * _MAX_RANK, source.n_items * source.n_rows
+    if n_rows <= size or source.width <= 3 * size:
         return 0
-    columns = streams.generator(0, streams.SKETCH, size).permutation(width)[:size]
-    step = max(n_items * n_rows // size, 1)
+    columns = streams.generator(0, streams.SKETCH, size).permutation(source.width)[:size]
+    step = max(n_rows // size, 1)
     some = np.concatenate([
-        source(slice(block.start, block.stop, step), band).reshape(-1, width)[:, columns]
-        for block in blocks(n_items, n_rows, width)])
+        source.flat(slice(block.start, block.stop, step), band)[:, columns]
+        for block in blocks(source.n_items, source.n_rows, source.width)])
     norms = np.linalg.norm(some, axis=1)
     coefficients = some[norms > 0] / norms[norms > 0, None]
     values = np.linalg.eigvalsh(np.conj(coefficients.T) @ coefficients / max(len(some), 1))
@@ -202,13 +225,11 @@ class ExactRows(MeasurementRows):
     """Rows without approximation, kept between evaluations if they fit into memory."""
 
     def __init__(
-            self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
-            patterns: Sequence[Pattern] = PLAIN, tick: Tick = no_tick,
-            kind: type[np.complexfloating] = np.complex128) -> None:
-        super().__init__(scenario, n_items, n_rows, patterns, n_groups=scenario.n_subbands)
-        self._source, self._tick, self._kind = source, tick, kind
-        size = np.dtype(kind).itemsize * n_items * n_rows * scenario.n_bands * self.width
-        self._keeps_all = size <= _CACHE_BYTES
+            self, source: RowSource, kind: type[np.complexfloating] = np.complex128) -> None:
+        super().__init__(source, source.scenario.n_subbands, source.width)
+        self._source, self._kind = source, kind
+        n_numbers = source.n_items * source.n_rows * source.scenario.n_bands * source.width
+        self._keeps_all = np.dtype(kind).itemsize * n_numbers <= _CACHE_BYTES
         # Beyond the limit, only the current block is kept: an evaluation uses its rows twice.
         self._kept: dict[tuple[int, int], np.ndarray] = {}
 
@@ -216,12 +237,12 @@ class ExactRows(MeasurementRows):
         """Return the rows of a block, complex [N_SB, n, G, N_E]."""
         key = block.start, band
         if key not in self._kept:
-            self._tick()
+            self._source.tick()
             if not self._keeps_all and any(start != block.start for start, _ in self._kept):
                 self._kept.clear()
             # With sub-bands first, every matrix product reads contiguous memory.
             self._kept[key] = np.ascontiguousarray(
-                np.moveaxis(self._source(block, band), 2, 0), self._kind)
+                np.moveaxis(self._source.rows(block, band), 2, 0), self._kind)
         return self._kept[key]
 
 
@@ -234,22 +255,16 @@ class CompressedRows(MeasurementRows):
     errors of the rows.
     """
 
-    def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
-                 tolerance: float, patterns: Sequence[Pattern] = PLAIN,
-                 tick: Tick = no_tick) -> None:
-        super().__init__(scenario, n_items, n_rows, patterns, n_groups=1)
-        width, self.width = self.width, 0
+    def __init__(self, source: RowSource, tolerance: float) -> None:
+        super().__init__(source, n_groups=1)
+        scenario = source.scenario
         self.coefficients: list[np.ndarray] = []
         for band in range(scenario.n_bands):
-            def flat_rows(block: slice, band: int = band) -> np.ndarray:
-                # The memory layout of a single item may not allow a view as real numbers.
-                tick()
-                rows = source(block, band)
-                return np.ascontiguousarray(rows.reshape(-1, rows.shape[2] * rows.shape[3]))
-
             # The first sketch has enough columns for Table I, and more for larger surfaces.
             coefficients, basis = _compress(
-                flat_rows, list(blocks(n_items, n_rows, width)), n_items * n_rows, tolerance,
+                functools.partial(source.flat, band=band),
+                blocks(source.n_items, source.n_rows, source.width),
+                source.n_items * source.n_rows, tolerance,
                 max(_MIN_SKETCH, min(scenario.n_elements // 2, _MAX_RANK)))
             self.coefficients.append(coefficients)
             self.bases[band] = basis.reshape(1, scenario.n_subbands, scenario.n_elements, -1)
@@ -278,15 +293,11 @@ class CompressedRows(MeasurementRows):
         return rows.reshape(1, -1, self.n_rows, rows.shape[1])
 
 
-def blocks(n_items: int, n_rows: int = 3, width: int = 0) -> Iterator[slice]:
-    """Split items of `n_rows` rows each, in order, into blocks that fit into the cache.
-
-    Blocks of very wide rows are smaller.
-    """
+def blocks(n_items: int, n_rows: int, width: int) -> list[slice]:
+    """Split items of `n_rows` rows, in order, into blocks that are smaller for very wide rows."""
     size = max(3 // n_rows, 1) * _BLOCK
     size = max(min(size, _BLOCK_NUMBERS // max(n_rows * width, 1)), 1)
-    for start in range(0, n_items, size):
-        yield slice(start, min(start + size, n_items))
+    return [slice(start, min(start + size, n_items)) for start in range(0, n_items, size)]
 
 
 def _compress(rows_of: Callable[[slice], np.ndarray], every: list[slice], n_rows: int,

@@ -21,8 +21,8 @@ from rhs_isac_ros.calibration.mixture import (
 from rhs_isac_ros.model import Beamforming, Scenario, SurfaceEstimate
 from rhs_isac_ros.model.arrays import blocks, check_arrays
 from rhs_isac_ros.model.elements import direct_design, element_radiation, scattered_errors
-from rhs_isac_ros.model.gaussian import eliminate, quadratic_form
-from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, nuisance_of
+from rhs_isac_ros.model.gaussian import quadratic_form, step_to_maximum
+from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, Nuisance, nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.measurement import signal_covariance
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -95,50 +95,32 @@ def estimate_surface(
     return _result(posterior, gains)
 
 
-class Alignment:
-    """Scoring steps that fit nuisance parameters, scaled to standard normal, to pilot signals."""
+def first_values(nuisance: Nuisance, white: np.ndarray, white_mean: np.ndarray) -> np.ndarray:
+    """Return the likeliest values [N, Q] of those that only rotate whole bands, one by one."""
+    values = np.zeros((len(white), len(nuisance)))
+    outputs = np.sum(np.conj(white_mean) * white, axis=2)
+    for q in np.flatnonzero(nuisance.phases.any(axis=0)):
+        turns = nuisance.phases[:, q]
+        output = outputs[:, turns != 0].sum(axis=1)
+        turn, magnitude = turns[turns != 0].mean(), 2 * np.abs(output)
+        values[:, q] = turn * magnitude * np.angle(output) / (turn**2 * magnitude + 1)
+        outputs = outputs * np.exp(-1j * values[:, q, None] * turns)
+    return values
 
-    def __init__(self, scenario: Scenario) -> None:
-        nuisance = nuisance_of(scenario)
-        self.patterns, self._phases = nuisance.scaled_patterns, nuisance.phases
-        self._moves_multipath = nuisance.moves_multipath[:, None, None]
 
-    def aligned(self, signals: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Remove the factors of values [N, Q] from the signals, complex128 [N, N_B, N_SB F]."""
-        return signals * np.exp(-np.tensordot(values, self.patterns, axes=1))
+def better_values(nuisance: Nuisance, values: np.ndarray, signals: np.ndarray, mean: np.ndarray,
+                  whiten: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return values [N, Q] after a scoring step, for signals and their mean [N, N_B, N_SB F]."""
+    aligned = nuisance.divide(signals, values)
+    slopes = whiten(nuisance.derivatives(aligned, mean))
+    residual = whiten(aligned) - whiten(mean)
+    gradient = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), residual).real - values
+    return values + step_to_maximum(_curvature(slopes), gradient)
 
-    def slopes(self, aligned: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Return the derivatives of aligned signals with respect to values, [N, Q, N_B, N_SB F].
 
-        Offsets of carrier and timing are visible because they move the multipath out of the nulls
-        of its covariance. Their derivatives therefore contain the signals instead of the mean.
-        """
-        return self.patterns * np.where(self._moves_multipath, aligned[:, None], mean[:, None])
-
-    def start(self, white: np.ndarray, white_mean: np.ndarray, values: np.ndarray) -> None:
-        """Set the values that only rotate whole bands, one by one, to the likeliest values."""
-        outputs = np.sum(np.conj(white_mean) * white, axis=2)
-        for q in np.flatnonzero(self._phases.any(axis=0)):
-            turns = self._phases[:, q]
-            output = outputs[:, turns != 0].sum(axis=1)
-            turn, magnitude = turns[turns != 0].mean(), 2 * np.abs(output)
-            values[:, q] = turn * magnitude * np.angle(output) / (turn**2 * magnitude + 1)
-            outputs = outputs * np.exp(-1j * values[:, q, None] * turns)
-
-    def step(self, whiten: Callable[[np.ndarray], np.ndarray], signals: np.ndarray,
-             mean: np.ndarray, values: np.ndarray) -> None:
-        """Improve the values by one scoring step, for signals and their mean [N, N_B, N_SB F]."""
-        aligned = self.aligned(signals, values)
-        slopes = whiten(self.slopes(aligned, mean))
-        residual = whiten(aligned) - whiten(mean)
-        gradient = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), residual).real - values
-        curvature = self.curvature(slopes)
-        values += eliminate(curvature, curvature[..., :0], gradient)[1]
-
-    def curvature(self, slopes: np.ndarray) -> np.ndarray:
-        """Return the curvature [N, Q, Q] that results from whitened slopes and the prior."""
-        n, n_values = slopes.shape[:2]
-        return quadratic_form(slopes.reshape(n, n_values, -1)) + np.eye(n_values)
+def _curvature(slopes: np.ndarray) -> np.ndarray:
+    """Return the curvature [N, Q, Q] that results from whitened slopes and the prior."""
+    return quadratic_form(slopes.reshape(*slopes.shape[:2], -1)) + np.eye(slopes.shape[1])
 
 
 def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
@@ -186,9 +168,9 @@ class PilotStatistics:
         self._scenario, self._pilots = scenario, pilots
         self._radiation = [element_radiation(scenario, group.beams) for group in pilots]
         self._size = 2 * scenario.n_elements + scenario.n_bands
-        self._alignment = Alignment(scenario)
-        self._n_values = len(self._alignment.patterns)
-        self._values: list[np.ndarray] = []
+        self._nuisance = nuisance_of(scenario)
+        # Values of each group, block by block.
+        self._values: dict[tuple[int, int], np.ndarray] = {}
 
     def evaluate(self, gains: np.ndarray, mean: np.ndarray, covariance: np.ndarray
                  ) -> tuple[np.ndarray, np.ndarray]:
@@ -200,25 +182,18 @@ class PilotStatistics:
         size = self._size
         normal, product = np.zeros((size, size), complex), np.zeros(size, complex)
         lost, moved = np.zeros((2 * size, 2 * size)), np.zeros(2 * size)
-        is_first = not self._values
-        if is_first:
-            self._values = [np.zeros((len(group.positions), self._n_values))
-                            for group in self._pilots]
-        for group, radiation, of_group in zip(
-                self._pilots, self._radiation, self._values, strict=True):
+        for number, (group, radiation) in enumerate(
+                zip(self._pilots, self._radiation, strict=True)):
             whiteners = self._whiteners(radiation, gains, mean, covariance)
             for block in blocks(len(group.positions), _BLOCK):
                 part = _Block(self._scenario, radiation, whiteners, group.positions[block], mean)
-                signals, values = group.received[block] / gains[:, None], of_group[block]
-                if self._n_values:
-                    if is_first:
-                        self._alignment.start(
-                            part.whiten(signals), part.whiten(part.mean), values)
-                    signals, slopes = self._linearised(part, signals, values)
+                signals = group.received[block] / gains[:, None]
+                if len(self._nuisance):
+                    signals, slopes = self._linearised(part, signals, (number, block.start))
                     of_values = self._integrated(part, signals, slopes)
                     lost, moved = lost + of_values[0], moved + of_values[1]
-                whitened = part.whiten(signals)
-                for columns, white in zip(part.columns, np.swapaxes(whitened, 0, 1), strict=True):
+                whitened = np.swapaxes(part.whiten(signals), 0, 1)
+                for columns, white in zip(part.columns, whitened, strict=True):
                     flat = columns.reshape(-1, size)
                     normal += np.conj(flat.T) @ flat
                     product += np.conj(flat.T) @ white.reshape(-1)
@@ -237,12 +212,16 @@ class PilotStatistics:
         total += excess[:, None, None] * np.eye(total.shape[1])
         return np.linalg.inv(np.linalg.cholesky(total))
 
-    def _linearised(self, part: '_Block', signals: np.ndarray, values: np.ndarray
+    def _linearised(self, part: '_Block', signals: np.ndarray, key: tuple[int, int]
                     ) -> tuple[np.ndarray, np.ndarray]:
         """Improve the values; return signals linear in them, and their whitened slopes."""
-        self._alignment.step(part.whiten, signals, part.mean, values)
-        aligned = self._alignment.aligned(signals, values)
-        slopes = self._alignment.slopes(aligned, part.mean)
+        values = self._values.get(key)
+        if values is None:
+            values = first_values(self._nuisance, part.whiten(signals), part.whiten(part.mean))
+        self._values[key] = values = better_values(
+            self._nuisance, values, signals, part.mean, part.whiten)
+        aligned = self._nuisance.divide(signals, values)
+        slopes = self._nuisance.derivatives(aligned, part.mean)
         return aligned + np.einsum('nq,nqir->nir', values, slopes), part.whiten(slopes)
 
     def _integrated(self, part: '_Block', signals: np.ndarray, slopes: np.ndarray
@@ -252,31 +231,29 @@ class PilotStatistics:
                        for band, columns in enumerate(part.columns))
         coupling = 2 * np.concatenate([coupling.real, -coupling.imag], axis=2)
         of_signals = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), part.whiten(signals)).real
-        regression, _ = eliminate(self._alignment.curvature(slopes), coupling, of_signals)
-        flat = -regression.reshape(-1, regression.shape[2])
+        regression = np.linalg.solve(_curvature(slopes), coupling)
+        flat = regression.reshape(-1, regression.shape[2])
         return coupling.reshape(flat.shape).T @ flat, of_signals.reshape(-1) @ flat
 
 
 class _Block:
     """Linear model of several pilots.
 
-    `columns` are the whitened derivatives of each band's signals, complex128 [N, N_SB F, P], and
+    `columns` are the whitened derivatives of the signals, complex128 [N_B, N, N_SB F, P], and
     `mean` the expected signals, complex128 [N, N_B, N_SB F].
     """
 
     def __init__(self, scenario: Scenario, radiation: np.ndarray, whiteners: np.ndarray,
                  positions: np.ndarray, mean: np.ndarray) -> None:
         self._whiteners = whiteners
-        self.columns: list[np.ndarray] = []
-        self.mean = np.empty((len(positions), *radiation.shape[:2]), complex)
-        n = 2 * scenario.n_elements
+        (n_bands, n_rows, n), n_pilots = radiation.shape, len(positions)
+        self.mean = np.empty((n_pilots, n_bands, n_rows), complex)
+        self.columns = np.zeros((n_bands, n_pilots, n_rows, n + n_bands), complex)
         for band, whitener in enumerate(whiteners):
             design = direct_design(scenario, radiation, band, positions)
             self.mean[:, band] = design @ mean
-            columns = np.zeros((*design.shape[:2], n + scenario.n_bands), complex)
-            columns[..., :n] = np.matmul(whitener, design)
-            columns[..., n + band] = self.mean[:, band] @ whitener.T
-            self.columns.append(columns)
+            self.columns[band, ..., :n] = np.matmul(whitener, design)
+            self.columns[band, ..., n + band] = self.mean[:, band] @ whitener.T
 
     def whiten(self, signals: np.ndarray) -> np.ndarray:
         """Whiten signals [..., N_B, N_SB F]."""

@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.gaussian import step_to_maximum
+
 # Smallest prior deviation of a coefficient; it keeps matrices invertible.
 _MIN_RMS = 1e-6
 # If the less likely state has a smaller probability, it is neglected.
@@ -188,7 +190,7 @@ class _Search:
             self, indices: np.ndarray, curvature: np.ndarray, gradient: np.ndarray) -> np.ndarray:
         """Return the log evidence for two parameters of each element against their absence."""
         precision, mean = self._precision[indices], self._mean[indices]
-        best = np.linalg.solve(curvature, gradient[..., None])[..., 0]
+        best = step_to_maximum(curvature, gradient)
         exponents = np.log(precision) + gradient * best - precision * mean**2
         evidence = exponents.sum(axis=1) - np.linalg.slogdet(curvature)[1]
         return evidence / 2

@@ -23,10 +23,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rhs_isac_ros import __version__
-from rhs_isac_ros.calibration.estimate import Alignment, Pilots
+from rhs_isac_ros.calibration.estimate import Pilots, better_values, first_values
 from rhs_isac_ros.model import Beamforming, MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import adjoint
-from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level, share_of_level
+from rhs_isac_ros.model.gaussian import (
+    BLOCKED_STD_DB,
+    energy_limit,
+    log_evidence_of_level,
+    share_of_level,
+)
 from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.hall import CONDITIONS, FIELDS, MultipathEstimate
 from rhs_isac_ros.model.impairments import nuisance_of
@@ -34,10 +39,9 @@ from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Share of positions that should lie in the region of the local bound, and of residuals that should
-# pass their test, which has this rate of false alarms.
+# pass their test.
 COVERAGE = 0.95
 _PASSING = 0.99
-_FALSE_ALARM = 1e-9
 # Inflation of a survey without positions, and its weight in positions. It is a margin for small
 # surveys, for which the quantiles above are uncertain.
 _INFLATION, _INFLATION_WEIGHT = 1.8, 40
@@ -161,12 +165,11 @@ def _fitted(fields: Scenario, pilots: Pilots, surface: Surface | None) -> _Fit:
 
 def _residuals(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
     """Return signals without the likeliest impairments and without their mean, [N, N_B, R]."""
-    alignment, mean = Alignment(model.scenario), model.mean(pilots.positions)
-    values = np.zeros((len(mean), len(alignment.patterns)))
-    alignment.start(model.whiten(pilots.received), model.whiten(mean), values)
-    for _ in range(_ALIGNMENT_STEPS if values.shape[1] else 0):
-        alignment.step(model.whiten, pilots.received, mean, values)
-    return alignment.aligned(pilots.received, values) - mean
+    nuisance, mean = nuisance_of(model.scenario), model.mean(pilots.positions)
+    values = first_values(nuisance, model.whiten(pilots.received), model.whiten(mean))
+    for _ in range(_ALIGNMENT_STEPS if len(nuisance) else 0):
+        values = better_values(nuisance, values, pilots.received, mean, model.whiten)
+    return nuisance.divide(pilots.received, values) - mean
 
 
 def _most_likely(scenario: Scenario, model: MeasurementModel, sample: np.ndarray, n: int
@@ -274,12 +277,9 @@ def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
 
 def _inflation(distances: np.ndarray, energies: np.ndarray, n_measurements: int) -> float:
     """Return t, including the margin for small surveys."""
-    from scipy.special import gammainccinv
-
     most = max(1.0, float(energies.mean()) / n_measurements,
                float(np.quantile(distances, COVERAGE)) / _radius(),
-               float(np.quantile(energies, _PASSING)
-                     / gammainccinv(n_measurements, _FALSE_ALARM)))
+               float(np.quantile(energies, _PASSING)) / energy_limit(n_measurements))
     weights = np.array([len(energies), _INFLATION_WEIGHT])
     return float(np.exp(weights @ np.log([most, _INFLATION]) / weights.sum()))
 

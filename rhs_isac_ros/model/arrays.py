@@ -19,6 +19,15 @@ def adjoint(matrices: np.ndarray) -> np.ndarray:
     return np.conj(np.swapaxes(matrices, -2, -1))
 
 
+def mixture_weights(log_weights: np.ndarray, axis: int | tuple[int, ...] = -1
+                    ) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights whose sum along the axis is one, and the logarithm of the sum before."""
+    highest = log_weights.max(axis=axis, keepdims=True)
+    weights = np.exp(log_weights - highest)
+    total = weights.sum(axis=axis, keepdims=True)
+    return weights / total, np.squeeze(highest + np.log(total), axis=axis)
+
+
 def blocks(n: int, size: int) -> list[slice]:
     """Split n items into blocks of the given size; the last one may be smaller."""
     return [slice(start, start + size) for start in range(0, n, size)]

@@ -20,6 +20,7 @@ errors have a covariance in closed form.
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 
@@ -42,6 +43,8 @@ _LOG2_NODES = 7
 # Positions evaluated at a time.
 _BLOCK = 32
 
+# Slope and offset of coefficients over the configuration, numbers or [N_E]; gains of the bands.
+Response: TypeAlias = tuple[np.ndarray | float, np.ndarray | float, np.ndarray | float]
 # Function of a band and positions, float64 [N, 3] [m], that returns the errors of the signals on
 # the direct path per unit of R white numbers, complex128 [N, N_SB F, R].
 DirectErrors = Callable[[int, np.ndarray], np.ndarray]
@@ -50,17 +53,34 @@ DirectErrors = Callable[[int, np.ndarray], np.ndarray]
 class SurfaceModel:
     """Knowledge about the elements of a surface: expected coefficients and their errors.
 
-    A subclass defines `applied_beams` and, if there are errors, `is_exact` and `errors`.
+    A subclass defines `response` and, if there are errors, `is_exact` and `errors`.
     """
+
+    @property
+    def response(self) -> Response:
+        """Slope and offset of the expected coefficients over the configuration; band gains."""
+        raise NotImplementedError
 
     @property
     def is_exact(self) -> bool:
         """Whether the coefficients of the elements are known without errors."""
         return True
 
+    def applied(self, analog: np.ndarray) -> np.ndarray:
+        """Return the expected coefficients for configurations [..., N_E].
+
+        Raises ValueError if the surface has another number of elements.
+        """
+        slope, offset, _ = self.response
+        if np.ndim(slope) and np.shape(slope) != analog.shape[-1:]:
+            raise ValueError(f'surface: {np.size(slope)} elements, expected N_E = '
+                             f'{analog.shape[-1]} as in the configurations')
+        return slope * analog + offset
+
     def applied_beams(self, beams: Beamforming) -> AppliedBeams:
-        """Return the beamforming with the expected coefficients of the elements."""
-        raise NotImplementedError
+        """Return the beamforming with expected coefficients, times the gains of the bands."""
+        band_gains = np.reshape(self.response[2], (-1, 1, 1, 1))
+        return AppliedBeams(self.applied(beams.analog), band_gains * beams.digital)
 
     def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
         """Return the multipath covariance [N_B, N_SB F, N_SB F] and the errors of direct paths."""
@@ -104,38 +124,28 @@ class ElementErrors(SurfaceModel):
         """Hash of the errors, 16 hexadecimal digits."""
         return digest(np.asarray(self.gains, '<c16'), np.asarray(self.stuck, '<f8'))
 
-    def applied(self, analog: np.ndarray) -> np.ndarray:
-        """Return the coefficients in effect, complex128, for configurations [..., N_E].
-
-        Raises ValueError if the surface has another number of elements.
-        """
-        if analog.shape[-1:] != self.gains.shape:
-            raise ValueError(f'surface: {len(self.gains)} elements, expected N_E = '
-                             f'{analog.shape[-1]} as in the configurations')
-        return np.where(np.isnan(self.stuck), analog, self.stuck) * self.gains
-
-    def applied_beams(self, beams: Beamforming) -> AppliedBeams:
-        """Return the beamforming with the actual coefficients of the elements."""
-        return AppliedBeams(self.applied(beams.analog), beams.digital)
+    @property
+    def response(self) -> Response:
+        """The actual coefficients."""
+        return self.gains * np.isnan(self.stuck), self.gains * np.nan_to_num(self.stuck), 1.0
 
 
 class DeclaredElements(SurfaceModel):
     """The distribution of the elements that a scenario declares."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self._is_exact = not has_errors(scenario)
-        self._failed_share = scenario.failed_element_share
+        self._scenario = scenario
 
     @property
     def is_exact(self) -> bool:
         """Whether the scenario declares no errors."""
-        return self._is_exact
+        return not has_errors(self._scenario)
 
-    def applied_beams(self, beams: Beamforming) -> AppliedBeams:
-        """Return the beamforming with the coefficients averaged over surfaces."""
-        share = self._failed_share
-        analog = (1 - share) * beams.analog + share / 2 if share else beams.analog
-        return AppliedBeams(analog, beams.digital)
+    @property
+    def response(self) -> Response:
+        """The coefficients averaged over surfaces."""
+        share = self._scenario.failed_element_share
+        return 1 - share, share / 2, 1.0
 
     def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
         """Compute `SurfaceModel.error_covariance` from cached correlations."""
@@ -193,18 +203,10 @@ class SurfaceEstimate(SurfaceModel):
         """Return the standard deviation of each row of `factor`, float64 [2 N_E + N_B]."""
         return np.sqrt(np.sum(np.abs(self.factor)**2, axis=1))
 
-    def without_errors(self) -> 'SurfaceEstimate':
-        """Return the estimate with its means taken as exact."""
-        return dataclasses.replace(self, factor=self.factor[:, :0])
-
-    def applied(self, analog: np.ndarray) -> np.ndarray:
-        """Return the expected coefficients, complex128, for configurations [..., N_E]."""
-        return self.gains * analog + self.offsets
-
-    def applied_beams(self, beams: Beamforming) -> AppliedBeams:
-        """Return the beamforming with expected coefficients, times the gains of the bands."""
-        return AppliedBeams(
-            self.applied(beams.analog), self.band_gains[:, None, None, None] * beams.digital)
+    @property
+    def response(self) -> Response:
+        """The expected coefficients and gains of the bands."""
+        return self.gains, self.offsets, self.band_gains
 
     def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
         """Return the errors; see `SurfaceModel.errors`."""

@@ -4,8 +4,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import mixture_weights
+
 # Standard deviation of the level of multipath without a direct path [dB].
 BLOCKED_STD_DB = 10.0
+# Share of valid signals that each test of the energy of one phase may reject.
+FALSE_ALARM = 1e-9
 
 
 class Marginal(NamedTuple):
@@ -22,6 +26,14 @@ class Marginal(NamedTuple):
     log_volume: np.ndarray
 
 
+def energy_limit(n: int, probability: float = FALSE_ALARM) -> float:
+    """Return the energy that n complex Gaussian numbers of unit variance rarely exceed."""
+    # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
+    from scipy.special import gammainccinv
+
+    return float(gammainccinv(n, probability))
+
+
 def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: float = 0.0
                           ) -> np.ndarray:
     """Average the likelihood of Gaussian numbers over their level, a log-normal power.
@@ -34,9 +46,7 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
     normal = np.linspace(-4, 4, 2 * int(np.ceil(4 * std * np.sqrt(n))) + 61)
     level, prior = np.log(10) / 10 * median_db + std * normal, -normal**2 / 2
     exponents = -energy[:, None] * np.exp(-level) - n * level + prior
-    highest = exponents.max(axis=1)
-    total = np.exp(exponents - highest[:, None]).sum(axis=1)
-    return highest + np.log(total) - np.log(np.exp(prior).sum())
+    return mixture_weights(exponents)[1] - mixture_weights(prior)[1]
 
 
 def share_of_level(n: int, std_db: float) -> float:
@@ -64,18 +74,9 @@ def quadratic_form(whitened: np.ndarray) -> np.ndarray:
     return 2 * form
 
 
-def eliminate(
-        curvature: np.ndarray, coupling: np.ndarray, gradient: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Maximise a quadratic log-likelihood over nuisance parameters.
-
-    Takes the curvature in these parameters, float64 [N, Q, Q], their coupling with n other
-    unknowns, [N, Q, n], and the gradient, [N, Q]. Returns how the maximum moves with the other
-    unknowns, [N, Q, n], and the step to the maximum, [N, Q].
-    """
-    both = np.linalg.solve(
-        curvature, np.concatenate([-coupling, gradient[..., None]], axis=-1))
-    return both[..., :-1], both[..., -1]
+def step_to_maximum(information: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Compute the Gauss-Newton step [..., Q] for information [..., Q, Q] and gradient [..., Q]."""
+    return np.linalg.solve(information, gradient[..., None])[..., 0]
 
 
 def marginalise(information: np.ndarray, gradient: np.ndarray, n: int = 3) -> Marginal:
@@ -83,8 +84,14 @@ def marginalise(information: np.ndarray, gradient: np.ndarray, n: int = 3) -> Ma
 
     Takes information, float64 [N, n + Q, n + Q], and gradient, [N, n + Q], of a log-likelihood.
     """
+    if information.shape[1] == n:
+        n_points = len(gradient)
+        return Marginal(information, gradient, np.zeros((n_points, 0, n)),
+                        np.zeros((n_points, 0)), np.zeros(n_points))
     among, coupling = information[:, n:, n:], information[:, n:, :n]
-    regression, offset = eliminate(among, coupling, gradient[:, n:])
+    both = np.linalg.solve(
+        among, np.concatenate([-coupling, gradient[:, n:, None]], axis=2))
+    regression, offset = both[..., :-1], both[..., -1]
     explained = np.matmul(np.swapaxes(coupling, 1, 2), regression)
     return Marginal(
         information[:, :n, :n] + (explained + np.swapaxes(explained, 1, 2)) / 2,

@@ -15,14 +15,10 @@ from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 _NO_EXTENT = 1e-5
 
 
-def mean_wavelength_m(scenario: Scenario) -> float:
-    """Return lambda_avr [m], the mean wavelength of the bands' centres (Section V)."""
-    return float(np.mean(SPEED_OF_LIGHT_MPS / np.array(scenario.center_frequencies_hz)))
-
-
 def element_interval_m(scenario: Scenario) -> float:
-    """Return the spacing Delta_E [m] of neighbouring elements."""
-    return scenario.element_interval_wavelengths * mean_wavelength_m(scenario)
+    """Return the spacing Delta_E [m] of elements; its unit is lambda_avr (Section V)."""
+    wavelengths_m = SPEED_OF_LIGHT_MPS / np.array(scenario.center_frequencies_hz)
+    return scenario.element_interval_wavelengths * float(np.mean(wavelengths_m))
 
 
 @functools.lru_cache(maxsize=16)

@@ -67,36 +67,52 @@ class Impairment:
         return white @ self.linear(scenario).root.T
 
 
-class Nuisance:
+class Exponents:
+    """Standard normal parameters z with exponents P: signals contain the factor exp(z P)."""
+
+    scaled_patterns: np.ndarray  #: The exponents P, complex128 [Q, N_B, N_SB F].
+    #: Parameters that change the measurements of one band relative to each other, and so move the
+    #: multipath out of the nulls of its covariance, bool [Q].
+    moves_multipath: np.ndarray
+
+    def __len__(self) -> int:
+        """Return the number Q of parameters."""
+        return len(self.scaled_patterns)
+
+    def divide(self, signals: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Remove the factors of values z [..., Q] from signals [..., N_B, N_SB F]."""
+        return signals * np.exp(-np.tensordot(values, self.scaled_patterns, axes=1))
+
+    def derivatives(self, divided: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        """Return the informative derivatives of divided signals [N, ...], [N, Q, N_B, N_SB F].
+
+        Parameters that move the multipath act on the received multipath, so their derivatives
+        contain the signals, and vary from phase to phase. The others contain the mean.
+        """
+        moves = self.moves_multipath[:, None, None]
+        return self.scaled_patterns * np.where(moves, divided[:, None], mean[:, None])
+
+
+class Nuisance(Exponents):
     """The nuisance parameters of all impairments of a scenario.
 
     The parameters are x = L z with standard normal z. Bounds and estimators use z, which is
     dimensionless. `patterns` and `scaled_patterns`, complex128 [Q, N_B, N_SB F], are the exponents
-    per unit of x and of z. `needs_search`, bool [Q], repeats the flag of `Linear`.
-    `moves_multipath`, bool [Q], marks values z that change the measurements of one band relative
-    to each other, and so move the multipath out of the nulls of its covariance. `phases`, float64
-    [N_B, Q], is the phase of each band per unit of z, and 0 for every z that does more than rotate
-    the phases of whole bands.
+    per unit of x and of z. `needs_search`, bool [Q], repeats the flag of `Linear`. `phases`,
+    float64 [N_B, Q], is the phase of each band per unit of z, and 0 for every z that does more
+    than rotate the phases of whole bands.
     """
 
     def __init__(self, scenario: Scenario, parts: Sequence[Linear]) -> None:
-        self.patterns = read_only(np.concatenate([
-            np.zeros((0, *_shape(scenario)), complex), *(part.patterns for part in parts)]))
-        sizes = [len(part.patterns) for part in parts]
-        starts = np.cumsum([0, *sizes])
-        root = np.zeros((starts[-1], starts[-1]))
-        for start, part in zip(starts, parts, strict=False):
-            block = slice(start, start + len(part.root))
-            root[block, block] = part.root
-        self.scaled_patterns = read_only(np.tensordot(root.T, self.patterns, axes=1))
-        self.needs_search = np.repeat([part.needs_search for part in parts], sizes).astype(bool)
+        none = np.zeros((0, *_shape(scenario)), complex)
+        self.patterns = read_only(np.concatenate([none, *(part.patterns for part in parts)]))
+        self.scaled_patterns = read_only(np.concatenate([none, *(
+            np.tensordot(part.root.T, part.patterns, axes=1) for part in parts)]))
+        self.needs_search = np.repeat(
+            [part.needs_search for part in parts], [len(part.root) for part in parts]).astype(bool)
         self.moves_multipath = np.ptp(self.scaled_patterns, axis=2).any(axis=1)
         turns = ~self.moves_multipath & ~self.scaled_patterns.real.any(axis=(1, 2))
         self.phases = read_only(np.where(turns, self.scaled_patterns[:, :, 0].imag.T, 0.0))
-
-    def __len__(self) -> int:
-        """Return the number Q of parameters."""
-        return len(self.patterns)
 
     @property
     def scaled_phases(self) -> np.ndarray:

@@ -235,13 +235,6 @@ def describe_doubts(estimate: object) -> str:
         estimate).items() if value >= _MIN_DOUBT)
 
 
-def shares(log_weights: np.ndarray) -> np.ndarray:
-    """Return the probabilities of hypotheses from the logarithms of their weights, [N, A]."""
-    weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
-    weights /= weights.sum(axis=1, keepdims=True)
-    return weights
-
-
 def rejection(alternative: Alternative, probability: float) -> str:
     """Return a reason if the probability of an alternative alone rules out a fix, or ''."""
     if probability <= alternative.limit:

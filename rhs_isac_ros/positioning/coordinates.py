@@ -78,9 +78,22 @@ def log_sum(values: np.ndarray) -> float:
     return highest + float(np.log(np.sum(np.exp(values - highest))))
 
 
+def moments(weights: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean [..., n] and covariance [..., n, n] of points [..., S, n]; weights add to 1."""
+    mean = np.matmul(weights[..., None, :], points)
+    offsets = points - mean
+    return mean[..., 0, :], np.matmul(np.swapaxes(offsets * weights[..., None], -1, -2), offsets)
+
+
 def symmetric(covariances: np.ndarray) -> np.ndarray:
     """Return matrices [..., n, n] without the asymmetry that rounding causes."""
     return (covariances + np.swapaxes(covariances, -1, -2)) / 2
+
+
+def select(rows: _Rows, chosen: Any) -> _Rows:
+    """Return the rows with the given indices or mask, of a named tuple of arrays."""
+    kind: Any = type(rows)
+    return kind(*(field[chosen] for field in rows))
 
 
 def concatenate(*parts: _Rows) -> _Rows:

@@ -23,11 +23,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.gaussian import FALSE_ALARM, energy_limit
 from rhs_isac_ros.positioning.alternatives import ALTERNATIVES, probabilities_of
 from rhs_isac_ros.positioning.estimate import Estimate
 
-# Share of valid signals that each test of one phase may reject.
-FALSE_ALARM = 1e-9
 # Probabilities that the mean and the variance of the residuals of a correct model cause a warning.
 # For the variance, the approximation is less accurate.
 FALSE_WARNING = 1e-6
@@ -66,15 +65,14 @@ class FitTest:
     """
 
     def __init__(self, n_measurements: int, level: float = 1.0) -> None:
-        # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
-        from scipy.special import gammainccinv, gammaincinv
+        from scipy.special import gammaincinv
 
         self.min_energy = float(gammaincinv(n_measurements, FALSE_ALARM))
         self._level = level
         # If the level of the multipath is unknown, the ratio of the likelihoods with and without a
         # direct path is (energy / residual)**n.
         self._weak_share = FALSE_ALARM**(1 / n_measurements)
-        self.max_residual = float(gammainccinv(n_measurements, FALSE_ALARM))
+        self.max_residual = energy_limit(n_measurements)
 
     def min_energy_test(self, energy: float) -> str:
         """Reject signals weaker than noise; `energy` is relative to the noise."""

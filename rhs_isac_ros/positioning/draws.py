@@ -16,7 +16,15 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, concatenate
+from rhs_isac_ros.model.arrays import mixture_weights
+from rhs_isac_ros.positioning.coordinates import (
+    carrier_wavenumbers,
+    concatenate,
+    moments,
+    select,
+    symmetric,
+)
+from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.grid import Query, TemplateTable, Windows
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution
 
@@ -42,16 +50,6 @@ _SEQUENCE = 1.324717957244746**-np.array([1.0, 2.0])
 _TINY = 1e-12
 
 
-class Draws(NamedTuple):
-    """The posterior of one phase."""
-
-    mean: np.ndarray  # Float64 [3] [m].
-    covariance: np.ndarray  # Float64 [3, 3] [m^2], with the uncertainty of the mean.
-    log_total: float  # Logarithm of the integral of the likelihood over the region [m^3].
-    highest: float  # Log-likelihood at the best position.
-    average: float  # Log-likelihood averaged over the posterior.
-
-
 class _Rays(NamedTuple):
     """Integrals of the likelihood over intervals of range, each in the direction of a draw."""
 
@@ -71,6 +69,7 @@ class DrawnPosterior:
         self._table, resolution = table, Resolution.of(scenario)
         self._wavelength_m, self._bounds = resolution.wavelength_m, resolution.bounds_m
         self._wavenumbers = carrier_wavenumbers(scenario)
+        self._log_region = np.log(resolution.volume_m3)
         grid, points = table.grid, table.grid.points
         # Directions of each cell: lowest (u, v) and extent, float64 [C, 2].
         self._low, high = (np.clip(points[:, 1:] + sign * PHASE_ERROR * resolution.direction,
@@ -81,7 +80,7 @@ class DrawnPosterior:
         volume = points[:, 0]**2 * grid.widths_m[grid.cell] / _boresight(points[:, 1:])
         self._log_volume = np.log(volume) + self._log_area
 
-    def of(self, query: Query, phase: int) -> Draws | None:
+    def of(self, query: Query, phase: int) -> Fit | None:
         """Draw positions for one phase of a query; return None if too few are effective."""
         probability = bounds = self._probabilities(query, phase)
         cells, log_weights, parts, total_share = np.empty(0, int), np.empty(0), [], 0.0
@@ -96,12 +95,9 @@ class DrawnPosterior:
             log_weights = np.append(log_weights, rays.log_mass + log_scale[rays.draw])
             parts.append(rays._replace(draw=rays.draw + len(cells)))
             cells, rays = np.append(cells, drawn), concatenate(*parts)
-            highest = log_weights.max(initial=-np.inf)
-            if np.isneginf(highest):
+            if np.isneginf(log_weights.max(initial=-np.inf)):
                 return None
-            weights = np.exp(log_weights - highest)
-            total = weights.sum()
-            weights /= total
+            weights, log_total = mixture_weights(log_weights)
             by_draw = np.bincount(rays.draw, weights, len(cells))
             variance = np.sum(by_draw**2)
             if variance <= 1 / _N_EFFECTIVE:
@@ -111,13 +107,15 @@ class DrawnPosterior:
         else:
             return None
         places = rays.range_m[:, None] * rays.direction
-        mean = weights @ places
-        offsets, along = places - mean, weights * rays.variance_m2
-        covariance = ((weights[:, None] * offsets).T @ offsets
-                      + (along[:, None] * rays.direction).T @ rays.direction)
-        return Draws(
-            mean, covariance * (1 + variance), float(highest + np.log(total / total_share)),
-            float(rays.highest[weights > 0].max()), float(weights @ rays.average))
+        mean, covariance = moments(weights, places)
+        along = weights * rays.variance_m2
+        covariance += (along[:, None] * rays.direction).T @ rays.direction
+        # Log-likelihoods are relative to no signal.
+        energy, best = float(query.energies[phase]), float(rays.highest[weights > 0].max())
+        return Fit(
+            mean, symmetric(covariance * (1 + variance)),
+            float(log_total) - np.log(total_share) - energy - self._log_region,
+            energy - best, query.signals[0].size + float(weights @ rays.average) - best, 0.0)
 
     def _probabilities(self, query: Query, phase: int) -> np.ndarray:
         """Approximate the share of each cell in the posterior, as if phases were random."""
@@ -135,16 +133,16 @@ class DrawnPosterior:
         directions[:, 1:] = self._low[cells] + places * self._extent[cells]
         directions[:, 0] = _boresight(directions[:, 1:])
         windows = self._table.windows(query, phase, cells, directions[:, 1:])
-        amplitude = np.abs(windows.outputs).sum(axis=0)
+        amplitude = np.abs(windows.outputs).sum(axis=1)
         bound = 2 * amplitude - windows.energy
         best = int(np.argmax(bound))
         limit = bound[best] - np.log1p(4 * np.pi * amplitude[best]) / 2 - _MARGIN
-        windows = windows.select(np.flatnonzero(bound >= limit))
+        windows = select(windows, np.flatnonzero(bound >= limit))
         per_wavelength = max(_MIN_STEPS, np.pi * np.sqrt(2 * amplitude[best]))
         n_steps = int(np.ceil(self._table.window_m / self._wavelength_m * per_wavelength))
         low, high = self._inside(directions)
         rows, n = windows.pair, max(_BLOCK // n_steps, 1)
-        parts = [self._integrate(windows.select(slice(k, k + n)), low, high, n_steps)
+        parts = [self._integrate(select(windows, slice(k, k + n)), low, high, n_steps)
                  for k in range(0, len(rows), n)]
         log_mass, *moments = (np.concatenate(fields) for fields in zip(*parts, strict=True))
         log_mass += (self._log_area[cells] - np.log(directions[:, 0]))[rows]
@@ -158,7 +156,7 @@ class DrawnPosterior:
         phase = np.exp(1j * self._wavenumbers[:, None] * offsets_m)
         rotation = (2 * np.concatenate([phase.real, -phase.imag])).astype(np.float32)
         outputs = windows.outputs
-        value = np.concatenate([outputs.real, outputs.imag]).T @ rotation
+        value = np.hstack([outputs.real, outputs.imag]) @ rotation
         value -= windows.energy[:, None]
         highest = value.max(axis=1)
         value -= highest[:, None]

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable
-from typing import Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -50,6 +50,17 @@ class Estimate:
     def fix(self) -> np.ndarray:
         """Whether there is a position, bool [] or [N]."""
         return np.isfinite(self.mean).all(axis=-1)
+
+
+class Fit(NamedTuple):
+    """The posterior of one phase, on the assumption that the user is inside the region."""
+
+    mean: np.ndarray  # Float64 [3] [m].
+    covariance: np.ndarray  # Float64 [3, 3] [m^2].
+    log_evidence: float  # Logarithm of the likelihood averaged over the region.
+    residual: float  # Energy of the whitened residual at the best position.
+    expected: float  # Expected residual of signals that match the model.
+    gain: complex  # Gain of the signals at the best position [nepers].
 
 
 class Estimator(Protocol):

@@ -10,6 +10,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.gaussian import share_of_level
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.alternatives import (
@@ -18,14 +19,21 @@ from rhs_isac_ros.positioning.alternatives import (
     Blocked,
     Outside,
     rejection,
-    shares,
 )
-from rhs_isac_ros.positioning.coordinates import concatenate, jacobian, symmetric, to_positions
+from rhs_isac_ros.positioning.coordinates import (
+    concatenate,
+    jacobian,
+    moments,
+    select,
+    symmetric,
+    to_positions,
+)
 from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.draws import DrawnPosterior
 from rhs_isac_ros.positioning.estimate import (
     Estimate,
     Estimator,
+    Fit,
     Located,
     checked_received,
     estimate_each,
@@ -60,18 +68,6 @@ _BLOCK = 128
 _N_INFORMATIVE = 512
 # Total probability of the alternatives above which residuals are not compared with the scenario.
 _DOUBT_LIMIT = 0.05
-
-
-class _Fit(NamedTuple):
-    """Result for one phase on the assumption that the user is inside the region."""
-
-    mean: np.ndarray  # Float64 [3] [m].
-    covariance: np.ndarray  # Float64 [3, 3] [m^2].
-    log_evidence: float  # Logarithm of the likelihood averaged over the region.
-    residual: float  # Energy of the whitened residual at the best position.
-    expected: float  # Expected residual of signals that match the model.
-    gain: complex  # Gain of the signals at the best position [nepers].
-    modes: Modes | None = None  # None if positions were drawn instead.
 
 
 class SearchEstimator(abc.ABC):
@@ -127,7 +123,6 @@ class SearchEstimator(abc.ABC):
         # Twice an energy has two degrees of freedom for each complex measurement, less one for
         # each fitted parameter.
         n_fitted = _N_COORDINATES + len(prior)
-        self._n_measurements = n_measurements
         self._mean_residual = max(n_measurements - n_fitted / 2, 0.5)
         # Points that represent a standard Gaussian, float64 [128, 3].
         self.normal = self._grid.normal
@@ -160,7 +155,7 @@ class SearchEstimator(abc.ABC):
         signals = self._likelihood.signals(batch)
         blocks = map_blocks(
             lambda start: self._locate_block(
-                signals.take(slice(start, start + _BLOCK)), draws=True),
+                select(signals, slice(start, start + _BLOCK)), draws=True),
             range(0, len(batch), _BLOCK))
         return (located for located, _ in itertools.chain.from_iterable(blocks))
 
@@ -173,28 +168,25 @@ class SearchEstimator(abc.ABC):
             ((*_no_fix(), reason), None) for reason in reasons]
         (usable,) = np.nonzero([not reason for reason in reasons])
         if len(usable):
-            signals = signals.take(usable)
+            signals = select(signals, usable)
             aligned = self._alignment.values_of_each(signals.received)
             fits = self._search(signals, aligned, draws)
-            for row, *phase in zip(usable.tolist(), fits, self._likelihood.whitened(
+            for row, (fit, modes), *phase in zip(usable.tolist(), fits, self._likelihood.whitened(
                     aligned, signals), aligned, strict=True):
-                results[row] = self._judge(*phase)
+                located = self._judge(fit, *phase)
+                results[row] = located, None if located[2] else modes
         return results
 
-    def _search(self, signals: Signals, aligned: np.ndarray, draws: bool) -> list[_Fit]:
-        """Find the posterior of each phase, by draws if it has too many modes."""
-        likelihood, fits = self._likelihood, dict[int, _Fit]()
+    def _search(self, signals: Signals, aligned: np.ndarray, draws: bool
+                ) -> list[tuple[Fit, Modes | None]]:
+        """Find the posterior of each phase and its modes, or by draws if it has too many modes."""
+        likelihood, fits = self._likelihood, dict[int, tuple[Fit, Modes | None]]()
         extra = self._failures.search_margin if self._failures else 0.0
 
         def draw(query: Query, row: int) -> bool:
             found = self._drawn.of(query, row) if self._drawn else None
             if found is not None:
-                energy, phase = float(query.energies[row]), query.first + row
-                fits[phase] = _Fit(
-                    found.mean, symmetric(found.covariance),
-                    found.log_total - energy - np.log(likelihood.resolution.volume_m3),
-                    energy - found.highest, self._n_measurements + found.average - found.highest,
-                    0.0)
+                fits[query.first + row] = found, None
             return found is not None
 
         modes = find_modes(
@@ -204,8 +196,9 @@ class SearchEstimator(abc.ABC):
             fits.update(zip(rows, self._fit(modes, signals, rows), strict=True))
         return [fits[phase] for phase in range(len(aligned))]
 
-    def _fit(self, modes: Modes, signals: Signals, rows: list[int]) -> Iterator[_Fit]:
-        """Yield the posterior of each phase in `rows`, in ascending order, from its modes."""
+    def _fit(self, modes: Modes, signals: Signals, rows: list[int]
+             ) -> Iterator[tuple[Fit, Modes]]:
+        """Yield posterior and modes of each phase in `rows`, in ascending order."""
         likelihood = self._likelihood
         conditionals: dict[int, Sequence[Conditional]] = dict.fromkeys(
             rows, [self._dispersed or likelihood])
@@ -215,14 +208,14 @@ class SearchEstimator(abc.ABC):
             parts = []
             for phase in rows:
                 one, conditionals[phase] = self._failures.refine(
-                    modes.of_phase(phase), signals.repeated(phase))
+                    modes.of_phase(phase), select(signals, [phase]))
                 # Each part counts its phases from 0.
                 parts.append(one._replace(phases=np.full(len(one.phases), phase)))
             modes = concatenate(*parts)
         if likelihood.nuisance.is_coarse:
             drawn = concatenate(*(
                 draw_broad_samples(likelihood, conditionals[phase], self._phases,
-                                   signals.repeated(phase), modes.of_phase(phase), self._normal)
+                                   select(signals, [phase]), modes.of_phase(phase), self._normal)
                 for phase in rows))
         else:
             drawn = draw_samples(modes, self._normal, self._bounds)
@@ -237,31 +230,29 @@ class SearchEstimator(abc.ABC):
         for row, (start, end) in enumerate(zip(samples.starts.tolist(), ends, strict=True)):
             best = start + int(np.argmax(value[start:end]))
             residual = float(modes.residual[best])
-            yield _Fit(means[row], covariances[row], float(log_evidence[row]), residual,
-                       expected[row] + residual, modes.values[best] @ likelihood.nuisance.gain,
-                       modes.select(slice(start, end)))
+            yield Fit(means[row], covariances[row], float(log_evidence[row]), residual,
+                      expected[row] + residual, modes.values[best] @ likelihood.nuisance.gain
+                      ), select(modes, slice(start, end))
 
-    def _judge(self, fit: _Fit, whitened: np.ndarray, aligned: np.ndarray
-               ) -> tuple[Located, Modes | None]:
-        """Return the position of one phase or the reason for its absence, and the modes."""
+    def _judge(self, fit: Fit, whitened: np.ndarray, aligned: np.ndarray) -> Located:
+        """Return the position of one phase or the reason for its absence."""
         log_weights = np.array([fit.log_evidence, *(
             one.log_odds + one.log_evidence_of(
                 whitened, aligned, fit.residual, self._likelihood.nuisance)
             for one in self._alternatives)])
-        probabilities = shares(log_weights[None])[0]
+        probabilities, _ = mixture_weights(log_weights)
         reason = self._reason(whitened * np.exp(-fit.gain), fit.residual, log_weights)
-        moments = _no_fix() if reason else (fit.mean, self._covariance(fit))
-            # Without a fix, only a residual that nothing explains is evidence against the
-            # scenario.
+        mean, covariance = _no_fix() if reason else (fit.mean, self._covariance(fit))
+        # Without a fix, only a residual that nothing explains is evidence against the scenario.
         counts = (reason == self._test.residual_test(fit.residual) if reason
                   else probabilities[0] >= 1 - _DOUBT_LIMIT)
         by_name = {one.name: float(share) for one, share in zip(
             self._alternatives, probabilities[1:], strict=True)}
         outside, blocked = (by_name.get(kind.name, np.nan) for kind in ALTERNATIVES)
-        return ((*moments, reason, fit.residual, fit.expected if counts else np.nan,
-                 outside, blocked), None if reason else fit.modes)
+        expected = fit.expected if counts else np.nan
+        return mean, covariance, reason, fit.residual, expected, outside, blocked
 
-    def _covariance(self, fit: _Fit) -> np.ndarray:
+    def _covariance(self, fit: Fit) -> np.ndarray:
         """Return the covariance, scaled to the level of the multipath that the residual shows."""
         relative = max(fit.residual, 1e-9) / (self._level * max(fit.expected, 0.5))
         # The covariance of a position never exceeds the prior's.
@@ -276,8 +267,8 @@ class SearchEstimator(abc.ABC):
             float(np.sum(np.abs(whitened)**2)), residual)
         for index in np.argsort(-log_weights[1:]).tolist():
             one = self._alternatives[index]
-            share = float(shares(log_weights[None, [0, 1 + index]])[0, 1])
-            reason = rejection(one, share)
+            (_, share), _ = mixture_weights(log_weights[[0, 1 + index]])
+            reason = rejection(one, float(share))
             if reason and (not unexplained or one.explain(whitened, self._test.max_residual)):
                 return reason
         return unexplained
@@ -334,16 +325,12 @@ def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> Weighted
     modes = estimator.posterior(received.reshape(len(received), -1)).modes
     if modes is None:
         return None
-    samples = draw_samples(modes, estimator.normal, Resolution.of(estimator.scenario).bounds_m)
-    weights = np.exp(samples.log_weights - samples.log_weights.max())
-    shares = weights.sum(axis=1)
+    samples = WeightedSamples.of(draw_samples(
+        modes, estimator.normal, Resolution.of(estimator.scenario).bounds_m), modes)
+    shares = samples.weights.sum(axis=1)
     order = np.argsort(-shares)[:np.count_nonzero(shares)]
-    shares, places = shares[order], samples.positions[order]
-    weights = weights[order] / shares[:, None]
-    means = np.einsum('ms,msa->ma', weights, places)
-    offsets = places - means[:, None]
-    covariances = np.einsum('ms,msa,msb->mab', weights, offsets, offsets)
-    return WeightedModes(shares / shares.sum(), means, covariances)
+    weights = samples.weights[order] / shares[order, None]
+    return WeightedModes(shares[order], *moments(weights, samples.positions[order]))
 
 
 def surface_of(estimator: Estimator) -> Surface | None:

@@ -15,17 +15,18 @@ likelihood of a set uses their covariance at each point.
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
+from rhs_isac_ros.model.gaussian import energy_limit
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import onboard_matrix
-from rhs_isac_ros.positioning.coordinates import concatenate, jacobian, to_positions
+from rhs_isac_ros.positioning.coordinates import concatenate, jacobian, select, to_positions
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.lattice import Means
 from rhs_isac_ros.positioning.likelihood import (
@@ -86,24 +87,13 @@ class FailedElements:
     search_margin = 10.0
 
     def __init__(self, likelihood: Likelihood, grid: TemplateTable) -> None:
-        # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
-        from scipy.special import gammainccinv
-
         self._likelihood, self._grid = likelihood, grid
         self._model = FailureModel(likelihood)
-        self._usual_residual = float(gammainccinv(np.prod(likelihood.model.shape), _UNUSUAL))
-
-    def refine(self, modes: Modes, signals: Signals) -> tuple[Modes, list['FailedSet']]:
-        """Return the modes of one phase for all probable sets, and the likelihoods of these sets.
-
-        Takes the modes found without sets, and the signals of the phase, N = 1.
-        """
-        return self._converge(self._search(modes, signals), signals)
 
     def _search(self, modes: Modes, signals: Signals) -> 'FailureSearch':
         """Search for probable sets of failed elements, at the modes and elsewhere."""
         order = np.argsort(-modes.roi_log_likelihood)
-        search = FailureSearch(self._model, signals, _MARGIN, self._usual_residual)
+        search = FailureSearch(self._model, signals)
         keys = search.add(modes.roi_points[order], modes.values[order])
         if search.explains(keys):
             search.grow(keys[:_N_USUAL])
@@ -119,9 +109,12 @@ class FailedElements:
         search.try_neighbours(search.best)
         return search
 
-    def _converge(self, search: 'FailureSearch', signals: Signals
-                  ) -> tuple[Modes, list['FailedSet']]:
-        """Take exact Gauss-Newton steps from the most probable sets and positions."""
+    def refine(self, modes: Modes, signals: Signals) -> tuple[Modes, list['FailedSet']]:
+        """Return modes of one phase for all probable sets, and the likelihoods of the sets.
+
+        Takes the modes found without sets, and the signals of the phase, N = 1.
+        """
+        search = self._search(modes, signals)
         values, best = search.values, max(search.values.values())
         keys = sorted((key for key in values if values[key] >= best - _MARGIN),
                       key=lambda key: -values[key])[:_MAX_HYPOTHESES]
@@ -138,7 +131,7 @@ class FailedElements:
                                 _FIRST_MARGIN, number))
         modes = concatenate(*parts)
         order = np.argsort(-modes.roi_log_likelihood)[:_MAX_HYPOTHESES]
-        return modes.select(order), conditionals
+        return select(modes, order), conditionals
 
 
 class Surface(NamedTuple):
@@ -148,13 +141,6 @@ class Surface(NamedTuple):
     # Covariance of the signals, given the amplitudes in the direct path, [N_B, N_SB F, N_SB F].
     covariance: np.ndarray
 
-    def whitening(self, prior: NuisancePrior) -> 'Whitening':
-        """Return the inverse Cholesky factor of the covariance."""
-        roots = np.linalg.cholesky(self.covariance)
-        whitener = np.linalg.inv(roots)
-        return Whitening(whitener[:, None], log_determinant(roots).sum(keepdims=True),
-                         prior.information_of(roots, whitener))
-
 
 class Whitening(NamedTuple):
     """Factors of the covariance matrices of H sets of failed elements."""
@@ -162,6 +148,15 @@ class Whitening(NamedTuple):
     whitener: np.ndarray  # Inverse Cholesky factors, complex128 [N_B, H, N_SB F, N_SB F].
     log_volume: np.ndarray  # Logarithms of the determinants, float64 [H].
     information: np.ndarray  # One covariance's information about the parameters, float64 [Q, Q].
+
+    @classmethod
+    def of(cls, covariance: np.ndarray, prior: NuisancePrior, parent: 'Whitening | None' = None
+           ) -> 'Whitening':
+        """Factorise covariances [N_B, H, N_SB F, N_SB F]; the information may be the parent's."""
+        roots = np.linalg.cholesky(covariance)
+        whitener = np.linalg.inv(roots)
+        return cls(whitener, log_determinant(roots).sum(axis=0), parent.information if parent
+                   else prior.information_of(roots[:, 0], whitener[:, 0]))
 
 
 @dataclasses.dataclass(eq=False)
@@ -198,39 +193,36 @@ class FailedSet:
     Its value includes the prior of the set, and is relative to the value of `Likelihood`.
     """
 
-    def __init__(self, likelihood: Likelihood, failed: Failed, surface: Surface,
-                 whitening: Whitening, amplitudes: np.ndarray, log_prior: float,
-                 excess_at: Callable[[np.ndarray], np.ndarray] | None) -> None:
-        self._likelihood, scenario = likelihood, likelihood.scenario
-        self._covariance, self._excess_at = surface.covariance, excess_at
-        self._failed = list(failed)
-        stuck = np.full(scenario.n_elements, np.nan)
+    def __init__(self, model: 'FailureModel', failed: Failed) -> None:
+        self._model, self._failed = model, list(failed)
+        self._covariance = model.surface(failed).covariance
+        self._whitening = model.whitening(failed)
+        stuck = np.full(model.scenario.n_elements, np.nan)
         stuck[self._failed] = 0.5
         self._means = Means(MeasurementModel(
-            scenario, likelihood.codebook, ElementErrors(np.ones(len(stuck)), stuck)))
-        self._whitener, self._information = whitening.whitener[:, 0], whitening.information
-        self._log_volume = whitening.log_volume
-        self._offset = log_prior + likelihood.log_volume
-        self._amplitudes = amplitudes[self._failed]
+            model.scenario, model.likelihood.codebook, ElementErrors(np.ones(len(stuck)), stuck)))
+        self._offset = model.log_prior(failed) + model.likelihood.log_volume
+        self._amplitudes = model.amplitudes[self._failed]
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate points; see `Conditional.local`."""
-        prior, positions = self._likelihood.nuisance, to_positions(points)
-        mean, slopes = self._means(points)
+        scenario, prior = self._model.scenario, self._model.likelihood.nuisance
+        positions, (mean, slopes) = to_positions(points), self._means(points)
         gains = np.stack([
-            np.repeat(los_gain(self._likelihood.scenario, positions, band)[:, :, self._failed],
-                      self._likelihood.scenario.n_frames, axis=1)
-            for band in range(mean.shape[1])])
+            np.repeat(los_gain(scenario, positions, band)[:, :, self._failed],
+                      scenario.n_frames, axis=1) for band in range(scenario.n_bands)])
         amplitudes = np.moveaxis(gains, (0, 1, 2, 3), (2, 0, 3, 1)) * self._amplitudes
         columns = prior.columns(values, signals.received, mean, slopes, amplitudes)
-        if self._excess_at is None:
-            white = np.einsum('irs,mcis->mcir', self._whitener, columns, optimize=True)
-            white, log_volume = white.reshape(*columns.shape[:2], -1), self._log_volume
+        if self._model.is_exact:
+            white = np.einsum(
+                'irs,mcis->mcir', self._whitening.whitener[:, 0], columns, optimize=True)
+            white, log_volume = white.reshape(*columns.shape[:2], -1), self._whitening.log_volume
         else:
-            roots = np.linalg.cholesky(self._covariance + self._excess_at(positions))
-            white, log_volume = whiten_each(roots, columns), log_determinant(roots).sum(axis=1)
-        local = assemble(prior, values, white, information_of_covariance=self._information,
-                         n_linear=len(self._failed))
+            roots = np.linalg.cholesky(self._covariance + self._model.excess_at(positions))
+            white, log_volume = whiten_each(roots, columns)
+        local = assemble(
+            prior, values, white, information_of_covariance=self._whitening.information,
+            n_linear=len(self._failed))
         return local._replace(value=local.value + self._offset - log_volume)
 
 
@@ -240,12 +232,13 @@ class FailureModel:
     def __init__(self, likelihood: Likelihood) -> None:
         scenario, codebook = likelihood.scenario, likelihood.codebook
         self.likelihood, self.scenario = likelihood, scenario
+        self.usual_residual = energy_limit(int(np.prod(likelihood.model.shape)), _UNUSUAL)
         intact = dataclasses.replace(scenario, failed_element_share=0.0)
         self._model = MeasurementModel(intact, codebook).prepare(jacobian=True)
         # Weights of the elements' direct paths, [N_E, N_B, N_SB F]: their change by a failure, and
         # the weight per standard deviation of a failed element's amplitude.
         weights = np.matmul(codebook.digital, onboard_matrix(scenario))
-        self._shift, self._amplitudes = (
+        self._shift, self.amplitudes = (
             np.ascontiguousarray(np.moveaxis(one.reshape(self._model.radiation.shape), 2, 0))
             for one in ((0.5 - codebook.analog[:, None]) * weights, weights / np.sqrt(12)))
         self._spatial = multipath_covariance(scenario)
@@ -258,16 +251,19 @@ class FailureModel:
         share = scenario.failed_element_share
         self._log_odds = float(np.log(share / (1 - share)))
         self._log_intact = scenario.n_elements * float(np.log1p(-share))
+        self.is_exact = self._model.elements.is_exact
         # The same set is often probable in successive phases.
         cache = functools.lru_cache(maxsize=_MAX_SURFACES)
         self.surface = cache(self._surface)
-        self._whitening = cache(lambda failed: self.surface(failed).whitening(likelihood.nuisance))
-        excess_at = None if self._model.elements.is_exact else self._excess_at
-        self.failed_set = cache(lambda failed: FailedSet(
-            likelihood, failed, self.surface(failed), self._whitening(failed), self._amplitudes,
-            len(failed) * self._log_odds + self._log_intact, excess_at))
+        self.whitening = cache(lambda failed: Whitening.of(
+            self.surface(failed).covariance[:, None], likelihood.nuisance))
+        self.failed_set = cache(lambda failed: FailedSet(self, failed))
 
-    def _excess_at(self, positions: np.ndarray) -> np.ndarray:
+    def log_prior(self, failed: Failed) -> float:
+        """Return the logarithm of the probability of a set of failed elements."""
+        return len(failed) * self._log_odds + self._log_intact
+
+    def excess_at(self, positions: np.ndarray) -> np.ndarray:
         """Return the covariance of element errors at positions, less its average."""
         return self._model.covariance_at(positions) - self._intact.covariance
 
@@ -297,9 +293,9 @@ class FailureModel:
             gains.append(np.repeat(both, self.scenario.n_frames, axis=1))
         elements = np.moveaxis(np.stack(gains), (0, 1, 2, 3), (2, 1, 3, 0))
         changes = elements * self._shift[:, None]
-        fixed = prior.patterns * ~prior.moves_multipath[:, None, None]
+        fixed = prior.scaled_patterns * ~prior.moves_multipath[:, None, None]
         changes = np.concatenate([-changes[:, :1], changes[:, 1:], fixed * changes[:, :1]], axis=1)
-        return changes, elements[:, 0] * self._amplitudes
+        return changes, elements[:, 0] * self.amplitudes
 
     def weigh(self, failed: Failed, sites: Sequence[Site]) -> tuple[np.ndarray, np.ndarray]:
         """Return the log-probability of a set at sites, and its deviance, after a step, [P] each.
@@ -308,7 +304,7 @@ class FailureModel:
         energy of the residual plus the cost of the parameters, because an unknown gain can lower
         any energy.
         """
-        whitening = self._whitening(failed)
+        whitening = self.whitening(failed)
         columns = np.stack([np.concatenate(site.columns_of(failed)) for site in sites])
         value = self._predicted(np.stack([site.values for site in sites]), columns, whitening,
                                 len(failed))
@@ -344,17 +340,15 @@ class FailureModel:
             surface = self.surface(failed)
             covariance = surface.covariance[:, None] + np.swapaxes(self._growth(surface), 0, 1)
             covariance += remainder * self._error[:, None]
-            roots = np.linalg.cholesky(covariance)
             # Only extensions of the intact surface serve all phases; each takes a few megabytes.
             self._extensions = {key: kept for key, kept in self._extensions.items() if not key[0]}
-            self._extensions[failed, remainder] = Whitening(
-                np.linalg.inv(roots), log_determinant(roots).sum(axis=0),
-                self._whitening(failed).information)
+            self._extensions[failed, remainder] = Whitening.of(
+                covariance, self.likelihood.nuisance, self.whitening(failed))
         return self._extensions[failed, remainder]
 
     def _growth(self, surface: Surface, elements: slice = slice(None)) -> np.ndarray:
         """Return the change of a surface's covariance if an element fails, [N_E, N_B, S, S]."""
-        shift, spread = self._shift[elements], self._amplitudes[elements]
+        shift, spread = self._shift[elements], self.amplitudes[elements]
         power = np.diagonal(self._spatial, axis1=1, axis2=2).real.T[elements, :, None]
         cross = np.moveaxis(surface.scattered[..., elements], 2, 0) + power / 2 * shift
         # A product of two vectors plus its conjugate transpose, and a product of the amplitudes.
@@ -374,10 +368,8 @@ class FailureSearch:
     continues while no hypothesis has a deviance below the usual residual.
     """
 
-    def __init__(self, model: FailureModel, signals: Signals, margin: float,
-                 usual_residual: float) -> None:
-        self._model, self._signals, self._margin = model, signals, margin
-        self._usual_residual = usual_residual
+    def __init__(self, model: FailureModel, signals: Signals) -> None:
+        self._model, self._signals = model, signals
         self.sites: list[Site] = []
         # Logarithm of prior times likelihood of each hypothesis.
         self.values: dict[Key, float] = {}
@@ -390,7 +382,7 @@ class FailureSearch:
 
     def explains(self, keys: list[Key]) -> bool:
         """Return whether the deviance of a hypothesis is no higher than usual."""
-        return any(self._deviances[key] <= self._usual_residual for key in keys)
+        return any(self._deviances[key] <= self._model.usual_residual for key in keys)
 
     def add(self, points: np.ndarray, values: np.ndarray, failed: Failed = ()) -> list[Key]:
         """Add a site at each point [P, 3] with parameters [P, Q]; return keys, the best first."""
@@ -411,7 +403,7 @@ class FailureSearch:
                 # All elements have failed.
                 break
             exact = self._weigh(ranked[:_N_EXACT])
-            limit = max(self.values[key] for key in found) - self._margin
+            limit = max(self.values[key] for key in found) - _MARGIN
             if self.values[exact[0]] < limit and self.explains(found):
                 break
             found += exact

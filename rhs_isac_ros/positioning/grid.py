@@ -24,6 +24,7 @@ from rhs_isac_ros.positioning.coordinates import (
     is_inside,
     likelihood_loss,
     offset_to_roi,
+    select,
     to_positions,
 )
 from rhs_isac_ros.positioning.lattice import (
@@ -244,7 +245,7 @@ class TemplateTable:
             drawn = [row for row in np.flatnonzero(many).tolist() if draw(query, row)]
             if drawn:
                 likely[drawn] = False
-                peaks = peaks.select(~np.isin(peaks.phases, drawn))
+                peaks = select(peaks, ~np.isin(peaks.phases, drawn))
         rows, others = np.nonzero(likely)
         if len(rows):
             peaks = concatenate(peaks, self._peaks_of(rows, others, query))
@@ -252,9 +253,9 @@ class TemplateTable:
         order = order[np.lexsort((-peaks.value[order], peaks.phases[order]))]
         phases = peaks.phases[order]
         place = np.arange(len(order)) - np.searchsorted(phases, phases)
-        peaks = peaks.select(order[place < _MAX_PEAKS])
+        peaks = select(peaks, order[place < _MAX_PEAKS])
         radii = self._resolution.separation(query.prior.is_coarse)
-        return peaks.select(separate(peaks.phases, self._points(peaks), radii))
+        return select(peaks, separate(peaks.phases, self._points(peaks), radii))
 
     def _points(self, peaks: '_Peaks') -> np.ndarray:
         """Return the points (r [m], u, v) of peaks, float64 [P, 3]."""
@@ -276,7 +277,8 @@ class TemplateTable:
             amplitude *= 2
             amplitude -= self.energy
             return amplitude
-        bounds = [query.over_gain(one, energy)[0]
+        n_rows = query.signals[0].size
+        bounds = [query.prior.over_gain(one, energy, n_rows)[0]
                   for one, energy in zip(amplitude, query.energies.tolist(), strict=True)]
         return np.stack(bounds) - self.energy
 
@@ -305,7 +307,8 @@ class TemplateTable:
                     itertools.pairwise(ends), query.energies.tolist(), strict=True):
                 if last > first:
                     part = np.s_[:, first:last]
-                    likelihood[part], gain[part] = query.over_gain(likelihood[part] / 2, of_phase)
+                    likelihood[part], gain[part] = prior.over_gain(
+                        likelihood[part] / 2, of_phase, query.signals[0].size)
         likelihood -= energy
         is_peak = np.full(likelihood.shape, prior.is_coarse)
         if not prior.is_coarse:
@@ -355,7 +358,7 @@ class TemplateTable:
         energy = (self.energy[cells] + np.sum(slope[:, 1:] * offset, axis=1)
                   + likelihood_loss(offset, curvature))
         pair, window = self._windows_of(cells)
-        outputs = np.einsum('wis,isw->iw', by_subband[pair], self._window_turns[:, :, window])
+        outputs = np.einsum('wis,isw->wi', by_subband[pair], self._window_turns[:, :, window])
         range_m = self._window_ranges_m[window]
         along = (slope[:, 0] + 2 * self.energy[cells] / cell_m)[pair]
         energy = (cell_m[pair] / range_m)**2 * (energy[pair] + along * (range_m - cell_m[pair]))
@@ -436,10 +439,6 @@ class Query(NamedTuple):
     prior: NuisancePrior
     margin: float
 
-    def over_gain(self, amplitude: np.ndarray, energy: float) -> tuple[np.ndarray, np.ndarray]:
-        """Maximise over the gain; see `NuisancePrior.over_gain`."""
-        return self.prior.over_gain(amplitude, energy, self.signals[0].size)
-
 
 class Windows(NamedTuple):
     """W windows of range, in which only the phases of the carriers change."""
@@ -447,13 +446,8 @@ class Windows(NamedTuple):
     pair: np.ndarray  # Index of the window's pair, int [W], ascending.
     range_m: np.ndarray  # Centre, float64 [W] [m].
     width_m: np.ndarray  # Float64 [W] [m].
-    outputs: np.ndarray  # Matched-filter outputs of the bands at the centre, complex64 [N_B, W].
+    outputs: np.ndarray  # Matched-filter outputs of the bands at the centre, complex64 [W, N_B].
     energy: np.ndarray  # Energy of the whitened mean, float32 [W].
-
-    def select(self, chosen: np.ndarray | slice) -> 'Windows':
-        """Return the windows with the given indices."""
-        return Windows(self.pair[chosen], self.range_m[chosen], self.width_m[chosen],
-                       self.outputs[:, chosen], self.energy[chosen])
 
 
 class _Peaks(NamedTuple):
@@ -465,9 +459,6 @@ class _Peaks(NamedTuple):
     value: np.ndarray  # Log-likelihood, float32 [P].
     gain: np.ndarray  # Most likely gain [nepers], float64 [P].
     outputs: np.ndarray  # Matched-filter outputs of the bands, complex64 [P, N_B].
-
-    def select(self, chosen: np.ndarray) -> '_Peaks':
-        return _Peaks(*(field[chosen] for field in self))
 
 
 def first_of_each(phases: np.ndarray) -> np.ndarray:

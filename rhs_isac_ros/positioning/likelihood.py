@@ -18,8 +18,9 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.gaussian import eliminate, marginalise, quadratic_form
-from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, nuisance_of
+from rhs_isac_ros.model.arrays import mixture_weights
+from rhs_isac_ros.model.gaussian import marginalise, quadratic_form, step_to_maximum
+from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, Exponents, nuisance_of
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.coordinates import to_positions
 from rhs_isac_ros.positioning.lattice import Means, Resolution, whiten
@@ -54,14 +55,6 @@ class Signals(NamedTuple):
     received: np.ndarray
     whitened: np.ndarray
 
-    def take(self, rows: np.ndarray | slice) -> 'Signals':
-        """Return the signals of some phases, which may be repeated."""
-        return Signals(self.received[rows], self.whitened[rows])
-
-    def repeated(self, phase: int, n: int = 1) -> 'Signals':
-        """Return the signals of a phase n times."""
-        return self.take(np.full(n, phase))
-
 
 class Local(NamedTuple):
     """The log-likelihood of M points (r [m], u, v) with nuisance parameters, and its derivatives.
@@ -80,11 +73,11 @@ class Conditional(Protocol):
     """The likelihood given one state of the surface."""
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate points [M, 3] with parameters [M, Q], each for its own signals, N = M."""
+        """Evaluate points [M, 3] with parameters [M, Q] for the signals of M phases or of one."""
         ...
 
 
-class NuisancePrior:
+class NuisancePrior(Exponents):
     """Prior and effect of the nuisance parameters, in units in which they are standard normal.
 
     A uniform phase has no prior, and its unit is `_UNIFORM_EQUIVALENT`. If the phases of the bands
@@ -118,9 +111,9 @@ class NuisancePrior:
         # Per unit: exponents of the signals, complex128 [Q, N_B, N_SB F]; phase of each band
         # [rad], float64 [N_B, Q]; precision of the prior; gain of all signals [nepers]; and change
         # of the logarithm of the signals' volume, float64 [Q].
-        self.patterns, self.phases = patterns * scale[:, None, None], phases * scale
+        self.scaled_patterns, self.phases = patterns * scale[:, None, None], phases * scale
         self.precision = np.where(uniform, 0.0, 1.0)
-        self.gain = self.patterns.real.mean(axis=(1, 2))
+        self.gain = self.scaled_patterns.real.mean(axis=(1, 2))
         # Standard deviations of the gain of all signals [nepers], 0 if it is negligible, and of
         # the phase of each band, infinite if it is uniform, float64 [N_B].
         gain_std = np.linalg.norm(self.gain)
@@ -128,21 +121,13 @@ class NuisancePrior:
         self.gain_std = float(gain_std) if gain_std > _MIN_GAIN_STD else 0.0
         self.phase_std_rad = np.where(
             self.is_coarse | (phase_std > UNIFORM_STD_RAD), np.inf, phase_std)
-        self.volume = 2 * self.patterns.real.sum(axis=(1, 2))
+        self.volume = 2 * self.scaled_patterns.real.sum(axis=(1, 2))
         self.needs_search = np.append(nuisance.needs_search[keeps], np.zeros(n_added, bool))
         self.moves_multipath = np.append(nuisance.moves_multipath[keeps], np.zeros(n_added, bool))
         self._operators = self._multiplying(model.root, model.whitener)
         self.information = self.information_of(model.root, model.whitener)
         # Curvature in (r, u, v) that is added to every log-likelihood, float64 [3].
         self.floor = Resolution.of(model.scenario).curvature_floor
-
-    def __len__(self) -> int:
-        """Return the number Q of parameters."""
-        return len(self.patterns)
-
-    def divide(self, received: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Remove the factors of parameters [..., Q] from signals [..., N_B, N_SB F]."""
-        return received * np.exp(-np.tensordot(values, self.patterns, axes=1))
 
     def information_of(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
         """Compute the Fisher information of a covariance, tr(L^-1 dL L^-1 dL'), float64 [Q, Q]."""
@@ -153,7 +138,7 @@ class NuisancePrior:
 
     def _multiplying(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
         """Compute W P W^-1, which multiplies whitened signals, [Q, N_B, N_SB F, N_SB F]."""
-        return np.matmul(whitener * self.patterns[:, :, None], root)
+        return np.matmul(whitener * self.scaled_patterns[:, :, None], root)
 
     def columns(self, values: np.ndarray, received: np.ndarray, mean: np.ndarray,
                 slopes: np.ndarray, *linear: np.ndarray) -> np.ndarray:
@@ -164,21 +149,14 @@ class NuisancePrior:
         of the received signals to the parameters.
         """
         divided = self.divide(received, values)
-        # A parameter that moves the multipath acts on the received multipath, so the information
-        # about it varies from phase to phase.
-        sources = np.where(self.moves_multipath[:, None, None], divided[:, None], mean[:, None])
         return np.concatenate([
-            (divided - mean)[:, None], slopes, self.patterns * sources, *linear,
-            self.patterns * divided[:, None]], axis=1)
+            (divided - mean)[:, None], slopes, self.derivatives(divided, mean), *linear,
+            self.scaled_patterns * divided[:, None]], axis=1)
 
     def slopes(self, whitened: np.ndarray) -> np.ndarray:
         """Compute W P W^-1 times whitened signals [M, N_B, N_SB F], [M, Q, N_B N_SB F]."""
         slopes = np.einsum('qimn,kin->kqim', self._operators, whitened, optimize=True)
         return slopes.reshape(*slopes.shape[:2], -1)
-
-    def band_angles(self, values: np.ndarray) -> np.ndarray:
-        """Return the phases of the bands for parameters [M, Q], float64 [M, N_B] [rad]."""
-        return values @ self.phases.T
 
     def log_prior(self, values: np.ndarray) -> np.ndarray:
         """Return the logarithm of the prior times the change of volume, float64 [M]."""
@@ -257,19 +235,12 @@ class Likelihood:
         """Evaluate points; see `Conditional.local`."""
         n, white = len(points), whiten(self.model, *self._means(points))
         mean, whitened = white[:, 0], self.whitened(values, signals)
-        residual, derivative = (whitened - mean).reshape(n, -1), white[:, 1:].reshape(n, 3, -1)
+        columns = [(whitened - mean).reshape(n, 1, -1), white[:, 1:].reshape(n, 3, -1)]
         if len(self.nuisance):
             observed = self.nuisance.slopes(whitened)
             moves = self.nuisance.moves_multipath[:, None]
-            expected = np.where(moves, observed, self.nuisance.slopes(mean))
-            return assemble(self.nuisance, values, np.concatenate(
-                [residual[:, None], derivative, expected, observed], axis=1))
-        # The same as `assemble`, but without its copies.
-        parts = residual.view(float)
-        gradient = 2 * np.matmul(derivative.view(float), parts[..., None])[..., 0]
-        energy = np.sum(parts**2, axis=1)
-        information = quadratic_form(derivative) + np.diag(self.nuisance.floor)
-        return Local(-energy, gradient, information, energy)
+            columns += [np.where(moves, observed, self.nuisance.slopes(mean)), observed]
+        return assemble(self.nuisance, values, np.concatenate(columns, axis=1))
 
     def settle(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Replace uniform phases of all bands, in parameters [M, Q], by the most likely ones."""
@@ -297,21 +268,23 @@ def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
     standard normal parameters in which the mean is linear; they are integrated out.
     """
     n, end = 3 + len(prior), 4 + len(prior) + n_linear
-    expected, observed = white[:, 1:end], white[:, end:]
+    expected, observed = np.ascontiguousarray(white[:, 1:end]), white[:, end:]
     # Re(a^H b) is the inner product of real and imaginary parts.
     parts = np.ascontiguousarray(white[:, 0]).view(float)
     information = quadratic_form(expected)
     information += np.diag(np.concatenate([prior.floor, prior.precision, np.ones(n_linear)]))
-    # Derivatives of parameters that move the multipath already include this information.
-    still = ~prior.moves_multipath
-    information[:, 3:n, 3:n] += np.outer(still, still) * (
-        prior.information if information_of_covariance is None else information_of_covariance)
     if observed.shape[1]:
         expected = np.concatenate([expected[:, :3], observed, expected[:, n:]], axis=1)
-    gradient = 2 * np.matmul(np.ascontiguousarray(expected).view(float), parts[..., None])[..., 0]
-    gradient[:, 3:n] -= prior.precision * values + prior.volume
+    gradient = 2 * np.matmul(expected.view(float), parts[..., None])[..., 0]
     energy = np.sum(parts**2, axis=1)
-    value = prior.log_prior(values) - energy
+    value = -energy
+    if len(prior):
+        # Derivatives of parameters that move the multipath already include this information.
+        still = ~prior.moves_multipath
+        information[:, 3:n, 3:n] += np.outer(still, still) * (
+            prior.information if information_of_covariance is None else information_of_covariance)
+        gradient[:, 3:n] -= prior.precision * values + prior.volume
+        value = prior.log_prior(values) - energy
     if not n_linear:
         return Local(value, gradient, information, energy)
     marginal = marginalise(information, gradient, n)
@@ -325,10 +298,14 @@ def log_determinant(roots: np.ndarray) -> np.ndarray:
     return 2 * np.log(np.diagonal(roots, axis1=-2, axis2=-1).real).sum(axis=-1)
 
 
-def whiten_each(roots: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Whiten columns [M, C, N_B, N_SB F] by Cholesky factors of each point, [M, C, N_B N_SB F]."""
+def whiten_each(roots: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whiten columns [M, C, N_B, N_SB F] by Cholesky factors of each point, [M, C, N_B N_SB F].
+
+    Also return the logarithms of the determinants, float64 [M].
+    """
     white = np.linalg.solve(roots, np.moveaxis(columns, 1, 3))
-    return np.moveaxis(white, 3, 1).reshape(*columns.shape[:2], -1)
+    return (np.moveaxis(white, 3, 1).reshape(*columns.shape[:2], -1),
+            log_determinant(roots).sum(axis=1))
 
 
 class DispersedLikelihood:
@@ -377,10 +354,9 @@ class DispersedLikelihood:
         columns = prior.columns(values, signals.received, *self._means(points))
         for roots, offset, information in zip(
                 self._roots_at(points), self._offsets, self._information, strict=True):
-            local = assemble(prior, values, whiten_each(roots, columns),
-                             information_of_covariance=information)
-            volume = log_determinant(roots).sum(axis=1)
-            states.append(local._replace(value=local.value + offset - volume))
+            white, log_volume = whiten_each(roots, columns)
+            local = assemble(prior, values, white, information_of_covariance=information)
+            states.append(local._replace(value=local.value + offset - log_volume))
         return _average_of(states)
 
     def _roots_at(self, points: np.ndarray) -> list[np.ndarray]:
@@ -401,13 +377,10 @@ class DispersedLikelihood:
 def _average_of(states: list[Local]) -> Local:
     """Average likelihoods; the residual is that of the most probable state."""
     value = np.stack([one.value for one in states])
-    highest = value.max(axis=0)
-    weights = np.exp(value - highest)
-    total = weights.sum(axis=0)
-    weights /= total
+    weights, log_total = mixture_weights(value, axis=0)
     residual = np.stack([one.residual for one in states])
     return Local(
-        highest + np.log(total),
+        log_total,
         np.einsum('km,kmp->mp', weights, np.stack([one.gradient for one in states])),
         np.einsum('km,kmpq->mpq', weights, np.stack([one.information for one in states])),
         np.take_along_axis(residual, value.argmax(axis=0)[None], axis=0)[0])
@@ -466,7 +439,7 @@ class Alignment:
         for _ in range(_N_REFINEMENTS):
             divided = prior.divide(received, values)
             residual = self._whitened(divided[None]).reshape(-1)
-            slopes = self._whitened(prior.patterns[moves] * divided)
+            slopes = self._whitened(prior.scaled_patterns[moves] * divided)
             slopes = slopes.reshape(len(slopes), -1)
             # With an unknown gain, the energy is normalised.
             scale = residual.size / np.sum(np.abs(residual)**2) if prior.gain_std else 1.0
@@ -474,7 +447,7 @@ class Alignment:
             curvature += np.diag(prior.precision[moves])
             gradient = 2 * scale * (slopes.conj() @ residual).real
             gradient -= prior.precision[moves] * values[moves]
-            values[moves] += eliminate(curvature, curvature[:, :0], gradient)[1]
+            values[moves] += step_to_maximum(curvature, gradient)
         return values
 
     def _best_on_grid(self, received: np.ndarray) -> np.ndarray:

@@ -53,14 +53,9 @@ def stack_parts(signals: np.ndarray) -> np.ndarray:
     return np.hstack([flat.real, flat.imag])
 
 
-def magnitudes(signals: np.ndarray) -> np.ndarray:
-    """Flatten complex signals [N, N_B, N_SB F] to their magnitudes, float64 [N, N_B N_SB F]."""
-    return np.abs(signals.reshape(len(signals), -1))
-
-
 # Inputs of a network as functions of the received signals. The paper does not specify them.
 INPUTS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
-    'parts': stack_parts, 'magnitudes': magnitudes}
+    'parts': stack_parts, 'magnitudes': lambda signals: np.abs(signals.reshape(len(signals), -1))}
 
 
 class ModelError(ValueError):

@@ -12,12 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD
 from rhs_isac_ros.positioning.coordinates import (
     carrier_wavenumbers,
     is_inside,
     jacobian,
     likelihood_loss,
+    select,
     to_polar,
     to_positions,
 )
@@ -145,16 +147,14 @@ def draw_broad_samples(
         points = to_polar(positions[chosen])
         values = np.repeat(modes.values, inside.sum(axis=1) * rows, axis=0)
         evidence, values = marginal_at(
-            conditionals[state], likelihood, points, values,
-            signals.repeated(0, len(points)))
+            conditionals[state], likelihood, points, values, signals)
         evidence += (np.log(np.linalg.det(jacobian(points))) - 1.5 * np.log(2 * np.pi)
-                     - _log_proposal(points, modes.select(rows)))
+                     - _log_proposal(points, select(modes, rows)))
         if phases.is_informative:
             likely = evidence >= evidence.max() - _LIKELY_MARGIN
-            outputs = likelihood.outputs(points[likely], values[likely], signals.repeated(
-                0, int(np.count_nonzero(likely))))
-            turned = likelihood.nuisance.band_angles(values[likely])
-            log_factors, offsets_m = phases.factors(outputs.T * np.exp(1j * turned.T))
+            outputs = likelihood.outputs(points[likely], values[likely], signals)
+            turns = np.exp(1j * (likelihood.nuisance.phases @ values[likely].T))
+            log_factors, offsets_m = phases.factors(outputs.T * turns)
             evidence[likely] += log_factors
             points[likely, 0] += offsets_m
             positions[chosen] = to_positions(points)
@@ -216,10 +216,8 @@ class BandPhases:
             std = self._broadened(np.abs(output))[:, None, None]
             log_factor += _log_density(np.angle(output)[:, None, None] + turns, std)
         log_factor += self._log_weights - np.log(len(ranges_m))
-        highest = log_factor.max(axis=(1, 2))
-        weights = np.exp(log_factor - highest[:, None, None]).sum(axis=2)
-        total = weights.sum(axis=1)
-        return highest + np.log(total), weights @ ranges_m / total
+        weights, log_total = mixture_weights(log_factor, axis=(1, 2))
+        return log_total, weights.sum(axis=2) @ ranges_m
 
     def _broadened(self, magnitude: np.ndarray) -> np.ndarray:
         """Return the standard deviation of the phase of outputs of these magnitudes."""

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.gaussian import Marginal, marginalise
-from rhs_isac_ros.positioning.coordinates import likelihood_loss, offset_to_roi
+from rhs_isac_ros.model.gaussian import Marginal, marginalise, step_to_maximum
+from rhs_isac_ros.positioning.coordinates import likelihood_loss, offset_to_roi, select
 from rhs_isac_ros.positioning.grid import (
     Query,
     Starts,
@@ -61,10 +61,6 @@ class Modes(NamedTuple):
         """Return the most likely points inside the region, to start another search from them."""
         return Starts(self.phases, self.roi_points, self.values)
 
-    def select(self, chosen: np.ndarray | slice) -> 'Modes':
-        """Return the modes with the given indices or mask."""
-        return Modes(*(field[chosen] for field in self))
-
     def replace(self, rows: np.ndarray, others: 'Modes') -> None:
         """Overwrite the modes in `rows`."""
         for field, new in zip(self, others, strict=True):
@@ -72,7 +68,7 @@ class Modes(NamedTuple):
 
     def of_phase(self, phase: int) -> 'Modes':
         """Return the modes of one phase."""
-        return self.select(slice(*np.searchsorted(self.phases, (phase, phase + 1))))
+        return select(self, slice(*np.searchsorted(self.phases, (phase, phase + 1))))
 
 
 def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
@@ -101,17 +97,18 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     the best of their phase, by more than the margin, are dropped.
     """
     def step(starts: Starts, moves: bool = True) -> tuple[Modes, np.ndarray]:
-        return _step(conditional, likelihood, starts, signals.take(starts.phases), state, moves)
+        return _step(conditional, likelihood, starts, select(signals, starts.phases), state,
+                     moves)
 
     modes, gain = step(starts)
     for number in range(n_steps):
         chosen = _prune(likelihood, modes, gain, margin)
-        modes, gain = modes.select(chosen), gain[chosen]
-            # At the border of the region, small gains may alternate forever.
+        modes, gain = select(modes, chosen), gain[chosen]
+        # At the border of the region, small gains may alternate forever.
         (moving,) = np.nonzero(gain > (_MIN_GAIN if number < _N_USUAL_STEPS else 1.0))
         if not len(moving) or number == n_steps - 1:
             break
-        moved, gain[moving] = step(modes.select(moving).starts())
+        moved, gain[moving] = step(select(modes, moving).starts())
         modes.replace(moving, moved)
     # Before convergence, the predicted likelihood may be arbitrarily wrong.
     (moving,) = np.nonzero((gain > _MIN_GAIN) | (len(likelihood.nuisance) > 0))
@@ -119,7 +116,7 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
         again = Starts(modes.phases[moving], modes.points[moving], modes.values[moving])
         modes.replace(moving, step(again, moves=False)[0])
         gain[moving] = 0.0
-        modes = modes.select(_prune(likelihood, modes, gain, margin))
+        modes = select(modes, _prune(likelihood, modes, gain, margin))
     return modes
 
 
@@ -167,14 +164,11 @@ def predict(local: Local, likelihood: Likelihood) -> np.ndarray:
 
 def _newton(local: Local, likelihood: Likelihood) -> tuple[Marginal, np.ndarray, np.ndarray]:
     """Return the marginal, the limited step of all unknowns [M, 3 + Q], and its rise [M]."""
-    n, n_values = len(local.value), len(likelihood.nuisance)
-    marginal = (marginalise(local.information, local.gradient) if n_values
-                else Marginal(local.information, local.gradient, np.zeros((n, 0, 3)),
-                              np.zeros((n, 0)), np.zeros(n)))
-    step = np.linalg.solve(marginal.information, marginal.gradient[..., None])[..., 0]
+    marginal = marginalise(local.information, local.gradient)
     limits = likelihood.resolution.step_limits(likelihood.nuisance.is_coarse)
-    whole = np.clip(step, -limits, limits)
-    if n_values:
+    whole = np.clip(
+        step_to_maximum(marginal.information, marginal.gradient), -limits, limits)
+    if len(likelihood.nuisance):
         whole = np.hstack([whole, marginal.offset + np.einsum(
             'mqp,mp->mq', marginal.regression, whole)])
     rise = np.sum(local.gradient * whole, axis=1) - likelihood_loss(whole, local.information)

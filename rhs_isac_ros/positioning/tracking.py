@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.gaussian import step_to_maximum
 from rhs_isac_ros.model.multipath import time_correlation
 from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT
 from rhs_isac_ros.positioning.coordinates import (
@@ -20,6 +21,8 @@ from rhs_isac_ros.positioning.coordinates import (
     is_inside,
     jacobian,
     log_sum,
+    moments,
+    select,
     symmetric,
     to_polar,
     to_positions,
@@ -76,19 +79,9 @@ class Mixture(NamedTuple):
     means: np.ndarray  # (r [m], u, v) and its rate [1/s], float64 [C, 6].
     covariances: np.ndarray  # Float64 [C, 6, 6].
 
-    def select(self, chosen: np.ndarray) -> 'Mixture':
-        """Return the components with the given indices or mask."""
-        return Mixture(*(field[chosen] for field in self))
-
     def normalised(self) -> 'Mixture':
         """Return the mixture with weights whose sum is one."""
         return self.weighted(-log_sum(self.log_weights))
-
-    def positions(self, normal: np.ndarray) -> np.ndarray:
-        """Map points that represent a standard Gaussian, [S, 3], to positions, [C, S, 3] [m]."""
-        factors = np.linalg.cholesky(self.covariances[:, :3, :3])
-        points = self.means[:, None, :3] + np.matmul(normal, np.swapaxes(factors, 1, 2))
-        return to_positions(points)
 
     def weighted(self, log_factor: float | np.ndarray) -> 'Mixture':
         """Return the mixture with its weights multiplied by a factor."""
@@ -98,21 +91,17 @@ class Mixture(NamedTuple):
         """Return mean, float64 [3] [m/s], and covariance, float64 [3, 3], of the velocity."""
         weights = np.exp(self.log_weights - log_sum(self.log_weights))
         by_rate = jacobian(self.means[:, :3])
-        means = np.matmul(by_rate, self.means[:, 3:, None])[..., 0]
-        mean = weights @ means
-        offsets = means - mean
         within = np.matmul(np.matmul(by_rate, self.covariances[:, 3:, 3:]),
                            np.swapaxes(by_rate, 1, 2))
-        covariance = np.tensordot(weights, within, axes=1)
-        covariance += (weights[:, None] * offsets).T @ offsets
-        return mean, symmetric(covariance)
+        mean, between = moments(weights, np.matmul(by_rate, self.means[:, 3:, None])[..., 0])
+        return mean, symmetric(np.tensordot(weights, within, axes=1) + between)
 
 
 def reduce(mixture: Mixture, max_components: int) -> Mixture:
     """Merge components that are close to a heavier one, and discard those of little weight."""
     order = np.argsort(-mixture.log_weights)
     order = order[mixture.log_weights[order] >= mixture.log_weights[order[0]] - _WEIGHT_MARGIN]
-    mixture = mixture.select(order)
+    mixture = select(mixture, order)
     means = mixture.means
     precisions = np.linalg.inv(mixture.covariances)
     free = np.ones(len(means), bool)
@@ -131,7 +120,7 @@ def reduce(mixture: Mixture, max_components: int) -> Mixture:
 
 def _merge(mixture: Mixture, group: np.ndarray, n_groups: int) -> Mixture:
     """Merge the components of each group, preserving mean and covariance; discard group -1."""
-    mixture = mixture.select(group >= 0)
+    mixture = select(mixture, group >= 0)
     group = group[group >= 0]
     member = np.equal.outer(np.arange(n_groups), group)
     weights = np.exp(mixture.log_weights - mixture.log_weights.max())
@@ -189,7 +178,8 @@ class Motion:
         log_no_turn = -elapsed_s / self.turn_s
         turn = -np.expm1(log_no_turn)
         straight = self._straight(mixture, elapsed_s).weighted(log_no_turn)
-        mixture = mixture.select(mixture.log_weights >= mixture.log_weights.max() - _TURN_MARGIN)
+        heavy = mixture.log_weights >= mixture.log_weights.max() - _TURN_MARGIN
+        mixture = select(mixture, heavy)
         return concatenate(
             straight,
             *(self._turned(mixture.weighted(np.log(turn * (end - begin))),
@@ -198,36 +188,21 @@ class Motion:
 
     def _straight(self, mixture: Mixture, elapsed_s: float) -> Mixture:
         decay = np.exp(-elapsed_s / self.memory_s)
-        reach_s = self.memory_s * (1 - decay)
-        points, velocity = _moved(mixture, reach_s)
-        rates = decay * np.linalg.solve(jacobian(points), velocity[..., None])[..., 0]
-        means = np.concatenate([points, rates], axis=1)
-        transition = np.eye(6)
-        transition[:3, 3:] += reach_s * np.eye(3)
-        transition[3:, 3:] *= decay
-        return Mixture(
-            mixture.log_weights, means,
-            transition @ mixture.covariances @ transition.T
-            + np.kron(self._noise(elapsed_s, decay), np.ones((3, 3)))
-            * np.tile(_isotropic(points), (2, 2)))
+        return _moved(
+            mixture, self.memory_s * (1 - decay), decay, self._noise(elapsed_s, decay))
 
     def _turned(self, mixture: Mixture, begin_s: float, end_s: float, elapsed_s: float) -> Mixture:
         """Return the mixture of users who have turned once, at a random time in an interval."""
         mean_s, variance_s2 = (begin_s + end_s) / 2, (end_s - begin_s)**2 / 12
         rest_s = elapsed_s - mean_s
-        points, _ = _moved(mixture, mean_s)
-        means = np.concatenate([points, np.zeros_like(points)], axis=1)
-        transition = np.hstack([np.eye(3), mean_s * np.eye(3)])
+        noise = self.velocity_variance * np.array([
+            [rest_s**2 + variance_s2, rest_s], [rest_s, 1.0]])
+        moved = _moved(mixture, mean_s, 0.0, noise)
+        # The velocity before the turn acts for a random time.
         rates, within = mixture.means[:, 3:], mixture.covariances[:, 3:, 3:]
-        turned = self.velocity_variance * _isotropic(points)
-        covariances = np.empty_like(mixture.covariances)
-        covariances[:, :3, :3] = (
-            transition @ mixture.covariances @ transition.T
-            + variance_s2 * (within + rates[:, :, None] * rates[:, None])
-            + (rest_s**2 + variance_s2) * turned)
-        covariances[:, :3, 3:] = covariances[:, 3:, :3] = rest_s * turned
-        covariances[:, 3:, 3:] = turned
-        return Mixture(mixture.log_weights, means, covariances)
+        moved.covariances[:, :3, :3] += variance_s2 * (
+            within + rates[:, :, None] * rates[:, None])
+        return moved
 
     def _noise(self, elapsed_s: float, decay: float) -> np.ndarray:
         """Return the covariance of position and velocity along an axis, float64 [2, 2]."""
@@ -240,14 +215,20 @@ class Motion:
             [memory_s * (1 - decay)**2, 1 - decay**2]])
 
 
-def _moved(mixture: Mixture, time_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Move points (r, u, v) in a straight line; return them and velocities, float64 [C, 3]."""
+def _moved(mixture: Mixture, reach_s: float, decay: float, noise: np.ndarray) -> Mixture:
+    """Move straight, decay the velocities, and add the noise [2, 2] of position and velocity."""
     points = mixture.means[:, :3]
-    velocities = np.matmul(jacobian(points), mixture.means[:, 3:, None])[..., 0]
-    positions = to_positions(points) + time_s * velocities
+    velocities = np.matmul(jacobian(points), mixture.means[:, 3:, None])
+    positions = to_positions(points) + reach_s * velocities[..., 0]
     # No user is behind the surface.
     positions[:, 0] = np.maximum(positions[:, 0], 1e-3)
-    return to_polar(positions), velocities
+    points = to_polar(positions)
+    rates = decay * np.linalg.solve(jacobian(points), velocities)[..., 0]
+    transition = np.kron([[1.0, reach_s], [0.0, decay]], np.eye(3))
+    return Mixture(
+        mixture.log_weights, np.concatenate([points, rates], axis=1),
+        transition @ mixture.covariances @ transition.T
+        + np.kron(noise, np.ones((3, 3))) * np.tile(_isotropic(points), (2, 2)))
 
 
 def _isotropic(points: np.ndarray) -> np.ndarray:
@@ -362,24 +343,22 @@ class Tracker:
     def _inside(self, mixture: Mixture) -> tuple[Mixture, np.ndarray, np.ndarray]:
         """Return the components that reach the region, and their mean and covariance inside."""
         heavy = mixture.log_weights >= _MIN_LOG_WEIGHT
-        mixture, light = mixture.select(heavy), mixture.select(~heavy)
-        positions = mixture.positions(self.estimator.normal)
+        mixture, light = select(mixture, heavy), select(mixture, ~heavy)
+        factors = np.linalg.cholesky(mixture.covariances[:, :3, :3])
+        positions = to_positions(mixture.means[:, None, :3] + np.matmul(
+            self.estimator.normal, np.swapaxes(factors, 1, 2)))
         bounds_m = Resolution.of(self.estimator.scenario).bounds_m
         inside = is_inside(positions, bounds_m)
         reaches = inside.mean(axis=1) >= _MIN_INSIDE
         if reaches.any():
-            mixture, positions = mixture.select(reaches), positions[reaches]
+            mixture, positions = select(mixture, reaches), positions[reaches]
             inside = inside[reaches]
         else:
             inside[...] = True
             positions = np.clip(positions, *bounds_m)
         weights = np.exp(mixture.log_weights)[:, None] * inside
-        flat, points = (weights / weights.sum()).ravel(), positions.reshape(-1, 3)
-        mean = flat @ points
-        offsets = points - mean
-        covariance = (flat[:, None] * offsets).T @ offsets
-        mixture = concatenate(mixture, light).normalised()
-        return mixture, mean, symmetric(covariance)
+        mean, covariance = moments((weights / weights.sum()).ravel(), positions.reshape(-1, 3))
+        return concatenate(mixture, light).normalised(), mean, symmetric(covariance)
 
 
 def _described(estimate: Estimate, mixture: Mixture, n_phases: int) -> TrackEstimate:
@@ -422,15 +401,16 @@ def update(
     order = np.argsort(-flat)[:_MAX_PAIRS]
     order = order[flat[order] >= flat[order[0]] - _PAIR_MARGIN]
     mode, component = np.unravel_index(order, log_weights.shape)
-    updated = _shifted(predicted.select(component)._replace(log_weights=flat[order]),
+    updated = _shifted(select(predicted, component)._replace(log_weights=flat[order]),
                        precision[mode, component], offsets[mode, component])
     if likelihood is not None:
         # The pairs are in the order of their weights.
         head = np.arange(min(_N_EXACT, len(order)))
         exact = _exact_update(
-            predicted.select(component[head]), updated.means[head, :3], share, likelihood, signals)
-        exact = exact.select(_is_first(exact, component[head]))
-        updated = concatenate(exact, updated.select(np.arange(len(head), len(order))))
+            select(predicted, component[head]), updated.means[head, :3], share, likelihood,
+            signals)
+        exact = select(exact, _is_first(exact, component[head]))
+        updated = concatenate(exact, select(updated, slice(len(head), None)))
     best = int(np.argmax(modes.roi_log_likelihood))
     floor, _ = _evidence(np.zeros(3), predicted.covariances[:, :3, :3], spread[best])
     floor += share * (modes.roi_log_likelihood[best] + _FLOOR)
@@ -442,8 +422,8 @@ def _exact_update(
         signals: Signals) -> Mixture:
     """Update each component with the likelihood expanded at a point (r, u, v), [C, 3]."""
     value, gradient, curvature, _ = likelihood.local(
-        points, np.zeros((len(points), 0)), signals.repeated(0, len(points)))
-    step = np.linalg.solve(curvature, gradient[..., None])[..., 0]
+        points, np.zeros((len(points), 0)), signals)
+    step = step_to_maximum(curvature, gradient)
     offsets = points + step - predicted.means[:, :3]
     log_weights, precision = _evidence(
         offsets, predicted.covariances[:, :3, :3], np.linalg.inv(curvature) / share)

@@ -198,7 +198,7 @@ def test_nothing_declared_gives_the_plain_bound(case):
     model = MeasurementModel(case.scenario, case.codebook)
     joint = fisher.joint_information_of(model, positions)
     np.testing.assert_allclose(
-        fisher.without_nuisance(joint)[0], case.vectors['fim'], rtol=1e-8,
+        fisher.without_nuisance(joint).information, case.vectors['fim'], rtol=1e-8,
         atol=1e-9 * np.abs(case.vectors['fim']).max())
     # An impairment too small to matter, through the code of nuisance parameters.
     tiny = dataclasses.replace(case.scenario, band_phase_std_rad=1e-9, user_gain_std_db=1e-9)
@@ -246,10 +246,11 @@ def test_the_region_is_an_upper_limit(small):
 
 def test_equation_12_is_that_of_the_position_alone(table1):
     declared = dataclasses.replace(table1.scenario, **DECLARED)
-    np.testing.assert_array_equal(
+    # Some processors round the last digit of matrix products by their sizes.
+    np.testing.assert_allclose(
         *(fisher_information(MeasurementModel(scenario, table1.codebook),
                              table1.vectors['positions'])
-          for scenario in (declared, table1.scenario)))
+          for scenario in (declared, table1.scenario)), rtol=1e-12)
 
 
 def test_a_flat_region_determines_the_coordinate(table1):

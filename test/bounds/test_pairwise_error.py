@@ -239,7 +239,7 @@ def test_the_mean_over_samples_is_the_cost_of_all_pairs(many, codebook, random_b
 
 def test_a_sample_is_closer_to_the_cost_than_a_uniform_choice(many, codebook, scenario):
     rng = np.random.default_rng(1)
-    costs = np.concatenate([losses for losses, _ in many._losses(codebook)])
+    costs = many.losses(codebook)
     uniform = [rng.choice(costs, 40, replace=False).mean() for _ in range(200)]
     sampled = [many.sample(codebook, 40, rng).value(codebook) for _ in range(200)]
     assert np.std(sampled) < 0.1 * np.std(uniform)

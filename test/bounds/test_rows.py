@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import AverageCrlb, rows
-from rhs_isac_ros.bounds.rows import CompressedRows, Evaluation, ExactRows, rows_within
+from rhs_isac_ros.bounds.rows import CompressedRows, Evaluation, ExactRows, RowSource, rows_within
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
@@ -52,8 +52,8 @@ def source_of(items):
 
 
 def make(scenario, items, tolerance=0.0):
-    arguments = scenario, source_of(items), len(items), items.shape[1]
-    return CompressedRows(*arguments, tolerance) if tolerance else ExactRows(*arguments)
+    source = RowSource(scenario, source_of(items), len(items), items.shape[1])
+    return CompressedRows(source, tolerance) if tolerance else ExactRows(source)
 
 
 def evaluate(some_rows, model, n_rows, seed=2):
@@ -61,7 +61,7 @@ def evaluate(some_rows, model, n_rows, seed=2):
     evaluation, rng = Evaluation(some_rows, model), np.random.default_rng(seed)
     bands = range(len(model.radiation))
     whitened = [[] for _ in bands]
-    for block in rows.blocks(some_rows.n_items):
+    for block in rows.blocks(some_rows.n_items, 3, 0):
         weights = rng.normal(size=(block.stop - block.start, n_rows, n_rows))
         for band in bands:
             whitened[band].append(evaluation.whitened(block, band).copy())
@@ -98,7 +98,7 @@ def recovered(some_rows, scenario):
     evaluation = Evaluation(some_rows, SimpleNamespace(
         radiation=np.stack([elements] * scenario.n_bands),
         whitener=np.stack([np.eye(size, dtype=complex)] * scenario.n_bands)))
-    blocks = list(rows.blocks(some_rows.n_items))
+    blocks = rows.blocks(some_rows.n_items, 3, 0)
     bands = [np.concatenate([evaluation.whitened(block, i) for block in blocks])
              for i in range(scenario.n_bands)]
     whole = np.stack(bands, axis=2)
@@ -263,7 +263,8 @@ def test_zero_rows_alone_give_zeros(wide, model, n_items):
     np.nan])
 def test_a_tolerance_out_of_range_is_an_error(wide, items, tolerance):
     with pytest.raises(ValueError, match='^tolerance: .*, expected 1e-07 to 1, or 0 '):
-        CompressedRows(wide, source_of(items), len(items), items.shape[1], tolerance)
+        CompressedRows(
+            RowSource(wide, source_of(items), len(items), items.shape[1]), tolerance)
 
 
 @pytest.mark.parametrize('tolerance', [0, 1e-5], ids=['exact', 'compressed'])
@@ -282,7 +283,7 @@ def test_concurrent_evaluations_are_independent(
     expected = evaluate(some_rows, model, items.shape[1])
     first, second = Evaluation(some_rows, model), Evaluation(some_rows, other_model)
     rng = np.random.default_rng(2)
-    for block in rows.blocks(some_rows.n_items):
+    for block in rows.blocks(some_rows.n_items, 3, 0):
         weights = rng.normal(size=(block.stop - block.start, *[items.shape[1]] * 2))
         for band in range(2):
             part = first.whitened(block, band).copy()
@@ -299,7 +300,7 @@ def test_results_do_not_depend_on_the_blocks(wide, items, model, monkeypatch, si
     expected = plain_evaluation(wide, items, model)
     monkeypatch.setattr(rows, '_BLOCK', size)
     for some_rows, tolerance in ((make(wide, items), 1e-12), (make(wide, items, 1e-6), 1e-5)):
-        blocks = [range(N_ITEMS)[block] for block in rows.blocks(some_rows.n_items)]
+        blocks = [range(N_ITEMS)[block] for block in rows.blocks(some_rows.n_items, 3, 0)]
         assert [n for block in blocks for n in block] == list(range(N_ITEMS))
         lengths = [len(block) for block in blocks]
         assert lengths[:-1] == [size] * (len(lengths) - 1)
@@ -321,7 +322,7 @@ def test_exact_rows_are_kept_only_within_the_memory_limit(
     monkeypatch.setattr(rows, '_CACHE_BYTES', items.nbytes + spare)
     monkeypatch.setattr(rows, '_BLOCK', 25)
     source = RecordingSource(items)
-    some_rows = ExactRows(wide, source, N_ITEMS, items.shape[1])
+    some_rows = ExactRows(RowSource(wide, source, N_ITEMS, items.shape[1]))
     every = {(start, stop, band) for start, stop in ((0, 25), (25, 50), (50, 60))
              for band in range(2)}
     expected = plain_evaluation(wide, items, model)
@@ -358,9 +359,9 @@ def test_few_rows_that_need_a_large_basis_are_kept_in_single_precision(rank):
     rng = np.random.default_rng(6)
     items = (complex_array(rng, 400, rank) @ complex_array(rng, rank, 2 * 40 * 36)).reshape(
         400, 1, 2, 40, 36)
-    found = rows_within(scenario, source_of(items), 400, 1, 1e-5)
+    found = rows_within(RowSource(scenario, source_of(items), 400, 1), 1e-5)
     assert isinstance(found, CompressedRows if rank == 20 else ExactRows)
-    exact = rows_within(scenario, source_of(items), 400, 1, 0.0)
+    exact = rows_within(RowSource(scenario, source_of(items), 400, 1), 0.0)
     assert isinstance(exact, ExactRows)
     beams = SimpleNamespace(
         radiation=complex_array(rng, 2, 80, 36),

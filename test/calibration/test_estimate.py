@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.calibration import Pilots, SurfacePrior, estimate_surface, prior_of
-from rhs_isac_ros.calibration.estimate import Alignment
+from rhs_isac_ros.calibration.estimate import first_values
 from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario
 from rhs_isac_ros.model.elements import DeclaredElements, SurfaceEstimate
+from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.positioning import make_estimator
 
 NUISANCE = [
@@ -83,11 +84,10 @@ def test_an_alignment_starts_at_the_phases_of_the_bands(scenario, beams):
     declared = dataclasses.replace(scenario, band_phase_std_rad=6.2832)
     model, phases = MeasurementModel(declared, beams), np.array([0.9, -2.0])
     mean = model.mean(declared.sample_positions(5, np.random.default_rng(0)))
-    signals, values = mean * np.exp(1j * phases)[:, None], np.zeros((5, 2))
-    alignment = Alignment(declared)
-    alignment.start(model.whiten(signals), model.whiten(mean), values)
+    signals, nuisance = mean * np.exp(1j * phases)[:, None], nuisance_of(declared)
+    values = first_values(nuisance, model.whiten(signals), model.whiten(mean))
     np.testing.assert_allclose(
-        alignment.aligned(signals, values), mean, rtol=0, atol=1e-2 * np.abs(mean).max())
+        nuisance.divide(signals, values), mean, rtol=0, atol=1e-2 * np.abs(mean).max())
 
 
 def test_several_codebooks_reveal_more_of_the_elements(scenario, damaged, send, random_beams):

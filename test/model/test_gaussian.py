@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.model.gaussian import eliminate, marginalise, quadratic_form
+from rhs_isac_ros.model.gaussian import marginalise, quadratic_form, step_to_maximum
 
 N = 6
 
@@ -94,8 +94,7 @@ def test_without_parameters_nothing_changes():
     np.testing.assert_array_equal(marginal.log_volume, 0)
 
 
-def test_without_other_unknowns_only_the_step_remains():
-    curvature, gradient = np.array([[[2.0, 1.0], [1.0, 3.0]]]), np.array([[4.0, 5.0]])
-    regression, step = eliminate(curvature, curvature[..., :0], gradient)
-    assert regression.shape == (1, 2, 0)
-    np.testing.assert_allclose(curvature[0] @ step[0], gradient[0])
+def test_a_step_leads_to_the_maximum():
+    information, gradient = np.array([[[2.0, 1.0], [1.0, 3.0]]]), np.array([[4.0, 5.0]])
+    step = step_to_maximum(information, gradient)
+    np.testing.assert_allclose(information[0] @ step[0], gradient[0])

@@ -41,7 +41,8 @@ def test_positions_and_frequencies_match_the_definition(scenario, plain):
 
 def test_mean_wavelength_is_that_of_the_bands_not_of_the_mean_frequency():
     scenario = Scenario(center_frequencies_hz=(1e9, 3e9))
-    assert g.mean_wavelength_m(scenario) == pytest.approx((0.299792458 + 0.299792458 / 3) / 2)
+    assert g.element_interval_m(scenario) == pytest.approx(
+        scenario.element_interval_wavelengths * (0.299792458 + 0.299792458 / 3) / 2)
 
 
 def test_given_feed_positions_are_used():

@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import chi2, gamma
 
 from rhs_isac_ros.model import Scenario, simulate_received
+from rhs_isac_ros.model.gaussian import FALSE_ALARM
 from rhs_isac_ros.positioning import Estimate, make_estimator, simulate_pairs
 from rhs_isac_ros.positioning.alternatives import (
     OUTSIDE_LIMIT,
@@ -17,7 +18,6 @@ from rhs_isac_ros.positioning.alternatives import (
     rejection,
 )
 from rhs_isac_ros.positioning.diagnosis import (
-    FALSE_ALARM,
     LEVEL,
     MIN_FIXES,
     MIN_RETURN,

@@ -11,7 +11,12 @@ from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.positioning import failures, make_estimator
 from rhs_isac_ros.positioning.coordinates import jacobian, to_polar, to_positions
-from rhs_isac_ros.positioning.failures import FailureModel, FailureSearch, can_enumerate
+from rhs_isac_ros.positioning.failures import (
+    FailureModel,
+    FailureSearch,
+    Whitening,
+    can_enumerate,
+)
 from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
 
 SCENARIO = Scenario(
@@ -23,8 +28,6 @@ AMBIGUOUS = dataclasses.replace(SCENARIO, center_frequencies_hz=(2.5e9, 3.1e9))
 POSITION = np.array([4.2, 0.3, -0.1])
 POINT = to_polar(POSITION)
 NO_VALUES = np.zeros(0)
-# Signals of the 64 measurements of two bands rarely leave a larger residual.
-USUAL_RESIDUAL = 85.0
 
 
 @pytest.fixture(scope='module')
@@ -187,8 +190,8 @@ def test_the_remainder_adds_to_the_covariance(weighing, codebook, monkeypatch):
         failed = tuple(sorted((5, element)))
         surface = model.surface(failed)
         larger = surface._replace(covariance=surface.covariance + remainder)
-        whitening = larger.whitening(model.likelihood.nuisance)
-        monkeypatch.setattr(model, '_whitening', lambda _, whitening=whitening: whitening)
+        whitening = Whitening.of(larger.covariance[:, None], model.likelihood.nuisance)
+        monkeypatch.setattr(model, 'whitening', lambda _, whitening=whitening: whitening)
         (expected,), _ = model.weigh(failed, [site])
         assert values[element] == pytest.approx(expected, **tolerance(model))
 
@@ -233,7 +236,7 @@ def sample_with(model, failed, seed):
 
 
 def search_at_the_truth(model, received):
-    search = FailureSearch(model, model.likelihood.signals(received), 9.0, USUAL_RESIDUAL)
+    search = FailureSearch(model, model.likelihood.signals(received))
     return search, search.add(POINT[None], NO_VALUES[None])
 
 

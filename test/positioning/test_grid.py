@@ -110,7 +110,7 @@ def test_windows_have_the_outputs_and_energies_of_their_centres(
     means = model.whiten(model.mean(to_positions(np.column_stack([windows.range_m, directions]))))
     energy = np.sum(np.abs(means)**2, axis=(1, 2))
     np.testing.assert_allclose(windows.energy, energy, rtol=0.01)
-    outputs = np.einsum('wir,ir->iw', means.conj(), y[0])
+    outputs = np.einsum('wir,ir->wi', means.conj(), y[0])
     np.testing.assert_allclose(
         windows.outputs, outputs, atol=0.02 * np.abs(outputs).max())
 

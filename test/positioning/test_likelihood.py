@@ -10,7 +10,7 @@ from scipy.stats import binom
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.positioning.coordinates import to_polar, to_positions
+from rhs_isac_ros.positioning.coordinates import select, to_polar, to_positions
 from rhs_isac_ros.positioning.grid import tabulate
 from rhs_isac_ros.positioning.likelihood import (
     Alignment,
@@ -45,7 +45,7 @@ def without_values(n):
 
 def repeated(signals, n):
     """Return the signals of one phase for n points."""
-    return signals.take(np.zeros(n, int))
+    return select(signals, np.zeros(n, int))
 
 
 def test_signals_are_whitened_with_the_covariance_of_the_vectors(case, likelihood):

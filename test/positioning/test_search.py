@@ -11,6 +11,7 @@ from rhs_isac_ros.positioning import simulate_pairs
 from rhs_isac_ros.positioning.coordinates import (
     jacobian,
     likelihood_loss,
+    select,
     to_polar,
     to_positions,
 )
@@ -99,9 +100,9 @@ def test_modes_are_separate(setting):
 def test_the_modes_of_a_phase_do_not_depend_on_other_phases(setting):
     likelihood, grid, signals, _, modes = setting
     for phase in (0, 7, 29):
-        alone = find_modes(likelihood, grid, signals.take([phase]), np.zeros((1, 0)))
+        alone = find_modes(likelihood, grid, select(signals, [phase]), np.zeros((1, 0)))
         # Rounding decides about modes at the margin.
-        both = [one.select(one.roi_log_likelihood > one.roi_log_likelihood.max() - 5)
+        both = [select(one, one.roi_log_likelihood > one.roi_log_likelihood.max() - 5)
                 for one in (alone, modes.of_phase(phase))]
         for found, expected in zip(both[0][1:], both[1][1:], strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
@@ -109,7 +110,7 @@ def test_the_modes_of_a_phase_do_not_depend_on_other_phases(setting):
 
 def test_the_curvature_is_the_information_in_polar_coordinates(setting):
     likelihood, grid, signals, _, _ = setting
-    modes = find_modes(likelihood, grid, signals.take([0]), np.zeros((1, 0)))
+    modes = find_modes(likelihood, grid, select(signals, [0]), np.zeros((1, 0)))
     by_point = jacobian(modes.points)
     information = fisher_information(likelihood.model, to_positions(modes.points))
     expected = np.swapaxes(by_point, 1, 2) @ information @ by_point
@@ -146,7 +147,7 @@ def test_the_likelihood_of_a_mode_is_the_average_over_the_parameter(codebook, ch
     values = modes.values[0] + step * np.arange(-1500, 1501)[:, None]
     points = np.repeat(modes.points[:1], len(values), axis=0)
     log_likelihood = likelihood.local(
-        points, values, signals.take(np.zeros(len(values), int))).value
+        points, values, select(signals, np.zeros(len(values), int))).value
     highest = log_likelihood.max()
     average = highest + np.log(np.sum(np.exp(log_likelihood - highest)) * step)
     # The factors 2 pi of the integral and of the prior cancel.
@@ -170,7 +171,7 @@ def test_the_weights_of_modes_are_likelihoods_and_no_predictions(codebook):
     signals = likelihood.signals(received)
     modes = find_modes(
         likelihood, grid, signals, alignment.values_of_each(received))
-    local = likelihood.local(modes.points, modes.values, signals.take(modes.phases))
+    local = likelihood.local(modes.points, modes.values, select(signals, modes.phases))
     # Outside of the region, the residual is that of the nearest point inside.
     beyond = likelihood_loss(modes.roi_offset, modes.curvature)
     np.testing.assert_allclose(modes.residual - beyond, local.residual, rtol=1e-9)

@@ -14,6 +14,7 @@ from rhs_isac_ros.positioning.coordinates import (
     concatenate,
     jacobian,
     log_sum,
+    select,
     to_polar,
     to_positions,
 )
@@ -41,7 +42,7 @@ def cartesian(mixture):
 
 def continued(motion, mixture, elapsed_s):
     """Return the components of users that have not turned."""
-    return motion.predict(mixture, elapsed_s).select(slice(len(mixture.means)))
+    return select(motion.predict(mixture, elapsed_s), slice(len(mixture.means)))
 
 
 def test_a_mixture_starts_at_rest_with_the_assumed_speed():
@@ -107,7 +108,7 @@ def test_components_after_a_turn_have_the_moments_of_its_random_moment():
     rng = np.random.default_rng(1)
     for index, bounds in ((2, (0.0, 0.2)), (4, (0.2, 0.4))):
         position, velocity, (found, *_) = cartesian(
-            motion.predict(mixture, elapsed_s).select(slice(index, None)))
+            select(motion.predict(mixture, elapsed_s), slice(index, None)))
         start = rng.multivariate_normal([*PLACE[0], *before], covariance, n)
         turn_s = rng.uniform(*bounds, (n, 1))
         after = np.sqrt(motion.velocity_variance) * rng.standard_normal((n, 3))

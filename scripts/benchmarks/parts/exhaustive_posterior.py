@@ -14,7 +14,7 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import ElementErrors
-from rhs_isac_ros.positioning.coordinates import to_polar
+from rhs_isac_ros.positioning.coordinates import select, to_polar
 from rhs_isac_ros.positioning.estimate import Estimate, checked_received
 from rhs_isac_ros.positioning.estimators import BayesEstimator
 from rhs_isac_ros.positioning.failures import FailedElements, FailureSearch, can_enumerate
@@ -143,21 +143,21 @@ class _Posterior:
         conditional: Conditional = self._dispersed or likelihood
         prior, value = likelihood.nuisance, np.empty(len(points))
         values = np.repeat(self._aligned[phase][None], len(points), axis=0)
-        outputs = likelihood.outputs(points, values, self._signals.repeated(phase, len(points)))
+        outputs = likelihood.outputs(points, values, select(self._signals, [phase]))
         values += prior.start(outputs.T, np.zeros(len(points))) if len(prior) else 0.0
         for start in range(0, len(points), _BLOCK):
             block = slice(start, start + _BLOCK)
             value[block], values[block] = marginal_at(
                 conditional, likelihood, points[block], values[block],
-                self._signals.repeated(phase, len(points[block])))
+                select(self._signals, [phase]))
         if not len(prior):
             return value
         (near,) = np.nonzero(value >= value.max() - _MARGIN)
         value[near] = self._integrated(conditional, points[near], values[near], phase)
         if self._phases.is_informative:
-            signals = self._signals.repeated(phase, len(points))
+            signals = select(self._signals, [phase])
             outputs = likelihood.outputs(points, values, signals)
-            turned = outputs * np.exp(1j * prior.band_angles(values))
+            turned = outputs * np.exp(1j * values @ prior.phases.T)
             value += self._phases.factors(turned.T, averages=False)[0]
         return value
 
@@ -169,7 +169,7 @@ class _Posterior:
 
         n_values = values.shape[1]
         normal = ndtri(qmc.Sobol(n_values, seed=0).random(_N_VALUES))
-        signals = self._signals.repeated(phase, len(points))
+        signals = select(self._signals, [phase])
         among = conditional.local(points, values, signals).information[:, 3:, 3:]
         roots = np.linalg.cholesky(among)
         value = np.empty((len(points), _N_VALUES))
