@@ -59,9 +59,10 @@ def check(message: 'Message', sizes: Mapping[str, int]) -> None:
     """
     own = message.own_sizes(sizes)
     sizes = {**sizes, **own} if own else sizes
-    for name, problem_of in _checks(type(message)):
+    kind: type = type(message)
+    for name, problem_of in _checks(kind):
         if problem := problem_of(getattr(message, name), sizes):
-            raise MessageError(f'{type(message).__name__}.{name}: {problem}')
+            raise MessageError(f'{kind.__name__}.{name}: {problem}')
 
 
 @functools.cache
