@@ -22,7 +22,13 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import EXCHANGE, BackgroundWorker, UserTopics, create_publisher
+from rhs_isac_ros.ros.endpoints import (
+    EXCHANGE,
+    BackgroundWorker,
+    UserTopics,
+    create_publisher,
+    publish_if_read,
+)
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.parameters import calibrated_surface
 from rhs_isac_ros.ros.role_node import RoleNode
@@ -127,10 +133,8 @@ class PositionerNode(RoleNode[Positioner]):
     def _publish_track(self, track: events.PublishTrack) -> None:
         if self.stands_by:
             return
-        odometry = convert.odometry(
-            track.user, track.estimate, convert.stamp_of(track, self), self._frame)
-        for publisher in self._user_odometry.publishers(track.user):
-            publisher.publish(odometry)
+        publish_if_read(self._user_odometry.publishers(track.user), lambda: convert.odometry(
+            track.user, track.estimate, convert.stamp_of(track, self), self._frame))
 
     def _on_estimator(self, event: events.EstimatorBuilt) -> None:
         self.dispatch(event)
@@ -141,9 +145,9 @@ class PositionerNode(RoleNode[Positioner]):
         """Publish a message, and the poses of an estimate; return whether this succeeded."""
         is_published = super().publish(message)
         if is_published and isinstance(message, m.PositionEstimate):
-            pose = convert.pose(message, convert.stamp_of(message, self), self._frame)
-            for publisher in (self._pose, *self._user_poses.publishers(message.user)):
-                publisher.publish(pose)
+            publishers = self._pose, *self._user_poses.publishers(message.user)
+            publish_if_read(publishers, lambda: convert.pose(
+                message, convert.stamp_of(message, self), self._frame))
         return is_published
 
 

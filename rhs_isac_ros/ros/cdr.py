@@ -218,7 +218,10 @@ class Codec:
                 values[name] = decode(items[first] if encode is None else items[first:last])
             except ValueError as error:
                 raise MessageError(f'{self._kind.__name__}.{name}: {error}') from None
-        return self._kind(**values)
+        # Unlike the constructor, this does not store each field of a frozen dataclass separately.
+        message = object.__new__(self._kind)
+        vars(message).update(values)
+        return message
 
     def _items(self, data: bytes) -> list[Any]:
         items: list[Any] = []

@@ -10,7 +10,13 @@ from std_msgs.msg import Header
 
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import topics
-from rhs_isac_ros.ros.endpoints import EXCHANGE, create_publisher, steady_timer, subscribe
+from rhs_isac_ros.ros.endpoints import (
+    EXCHANGE,
+    create_publisher,
+    publish_if_read,
+    steady_timer,
+    subscribe,
+)
 
 _PERIOD_S = 1.0
 
@@ -49,6 +55,8 @@ def publish_reports(node: Node, report: Callable[[], Report]) -> None:
     publisher = create_publisher(node, DiagnosticArray, topics.DIAGNOSTICS, EXCHANGE)
 
     def publish() -> None:
-        stamp = node.get_clock().now().to_msg()
-        publisher.publish(to_ros(report(), node.get_fully_qualified_name(), stamp))
+        # Each report contains the faults since the previous one, even if nobody reads it.
+        found = report()
+        publish_if_read((publisher,), lambda: to_ros(
+            found, node.get_fully_qualified_name(), node.get_clock().now().to_msg()))
     steady_timer(node, _PERIOD_S, publish)
