@@ -385,9 +385,11 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def _handle(self, event: events.Event, now_s: float) -> None:
         start_s = time.perf_counter()
         actions = self.role.handle(event, now_s)
-        self._statistics.record(event, actions, time.perf_counter() - start_s)
+        handling_s = time.perf_counter() - start_s
         for action in actions:
             self._perform(action)
+        # Last, because other nodes wait for the messages.
+        self._statistics.record(event, actions, handling_s)
 
     def _perform(self, action: events.Action) -> None:
         match action:
