@@ -9,14 +9,7 @@ from rclpy.node import Node
 from std_msgs.msg import Header
 
 from rhs_isac_ros.monitoring.role_statistics import Report
-from rhs_isac_ros.ros import topics
-from rhs_isac_ros.ros.endpoints import (
-    EXCHANGE,
-    create_publisher,
-    publish_if_read,
-    steady_timer,
-    subscribe,
-)
+from rhs_isac_ros.ros import endpoints, topics
 
 _PERIOD_S = 1.0
 
@@ -47,16 +40,17 @@ def subscribe_reports(node: Node, on_report: Callable[[str, Report], None]) -> N
     def receive(message: DiagnosticArray) -> None:
         for name, report in from_ros(message, namespace):
             on_report(name, report)
-    subscribe(node, DiagnosticArray, topics.DIAGNOSTICS, receive, EXCHANGE)
+    endpoints.subscribe(node, DiagnosticArray, topics.DIAGNOSTICS, receive, endpoints.EXCHANGE)
 
 
 def publish_reports(node: Node, report: Callable[[], Report]) -> None:
     """Publish the report of a node once a second."""
-    publisher = create_publisher(node, DiagnosticArray, topics.DIAGNOSTICS, EXCHANGE)
+    publisher = endpoints.create_publisher(
+        node, DiagnosticArray, topics.DIAGNOSTICS, endpoints.EXCHANGE)
 
     def publish() -> None:
         # Each report contains the faults since the previous one, even if nobody reads it.
         found = report()
-        publish_if_read((publisher,), lambda: to_ros(
+        endpoints.publish_if_read((publisher,), lambda: to_ros(
             found, node.get_fully_qualified_name(), node.get_clock().now().to_msg()))
-    steady_timer(node, _PERIOD_S, publish)
+    endpoints.steady_timer(node, _PERIOD_S, publish)
