@@ -9,12 +9,9 @@ import importlib.util
 import os
 import signal
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
-# Time of `time.monotonic` at which the program began, before anything slow was imported [s].
-STARTED_S = time.monotonic()
 # Environment variable with the process id of a parent that its children must not outlive.
 PARENT_ID = 'RHS_ISAC_ROS_PARENT_ID'
 _PR_SET_PDEATHSIG = 1

@@ -22,8 +22,6 @@ class CycleTimes:
     cycle_id: int
     user: int = 0  # 0 before the grant
     began_s: float = math.nan  # last beacon before the grant
-    # First message of each later phase.
-    phase_s: dict[m.Phase, float] = dataclasses.field(default_factory=dict)
     ended_s: float = math.nan  # outcome
     # The latest state, with the times that the base station measured.
     state: m.ProtocolState | None = None
@@ -92,7 +90,7 @@ class CycleRecord(CycleTimes):
                 or self.estimate is None or self.capacity is None):
             return None
         return CompleteCycle(
-            self.cycle_id, self.user, self.began_s, self.phase_s, self.ended_s, self.state,
+            self.cycle_id, self.user, self.began_s, self.ended_s, self.state,
             truth=truth, signals=self.signals, estimate=self.estimate, capacity=self.capacity)
 
 
@@ -143,8 +141,6 @@ class CycleLog:
                     if not record.outcome:
                         self.ended.append(record)
                     record.outcome, record.ended_s = message.outcome, now_s
-                else:
-                    record.phase_s[message.phase] = now_s
         if cycle := record.completed():
             self.complete.append(cycle)
         if cycle or record.outcome not in ('', 'served'):

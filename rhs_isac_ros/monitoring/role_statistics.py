@@ -48,24 +48,23 @@ class RoleStatistics:
         self._durations_s: dict[str, collections.deque[float]] = collections.defaultdict(
             lambda: collections.deque(maxlen=_MAX_DURATIONS))
 
-    def count_received(self, kind: type[m.Message]) -> None:
-        """Count a received message, even if it is dropped later."""
-        self._messages['received'][kind.__name__] += 1
-
     def record(self, event: Event, actions: Sequence[Action], handling_s: float) -> None:
         """Record an event, the actions that it caused, and the time taken [s]."""
-        if isinstance(event, CodebookOffered):
+        if isinstance(event, m.Message):
+            self._messages['received'][type(event).__name__] += 1
+        elif isinstance(event, CodebookOffered):
             self._codebook_id = event.codebook.id
         self._durations_s['handling_ms'].append(handling_s)
         for action in actions:
-            if isinstance(action, Send):
-                self._messages['sent'][type(action.message).__name__] += 1
-            match action:
-                case Send(m.PositionEstimate() as estimate):
-                    self._durations_s['estimate_ms'].append(estimate.latency_s)
-                case Send(m.ProtocolState(outcome='served') as state):
-                    self._served += 1
-                    self._durations_s['cycle_ms'].append(state.elapsed_s)
+            if not isinstance(action, Send):
+                continue
+            message = action.message
+            self._messages['sent'][type(message).__name__] += 1
+            if isinstance(message, m.PositionEstimate):
+                self._durations_s['estimate_ms'].append(message.latency_s)
+            elif isinstance(message, m.ProtocolState) and message.outcome == 'served':
+                self._served += 1
+                self._durations_s['cycle_ms'].append(message.elapsed_s)
 
     def report(
             self, phase: str, counters: Mapping[str, int], blocked: bool = False,

@@ -21,8 +21,7 @@ from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PositionerSettings
-from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import EXCHANGE, BackgroundWorker, UserTopics, create_publisher
+from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.parameters import calibrated_surface
 from rhs_isac_ros.ros.role_node import RoleNode
@@ -41,14 +40,15 @@ class PositionerNode(RoleNode[Positioner]):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('positioner', **node_options)
         settings = self.make_settings(self.values)
-        self._worker, self._table = BackgroundWorker(self), ''
+        self._worker, self._table = endpoints.BackgroundWorker(self), ''
         self.endings.callback(self._worker.close)
         self._frame = Frame.of(self, self.values)
-        self._pose = create_publisher(
-            self, PoseWithCovarianceStamped, topics.POSITION, EXCHANGE, overridable=True)
+        self._pose = endpoints.create_publisher(
+            self, PoseWithCovarianceStamped, topics.POSITION, endpoints.EXCHANGE, overridable=True)
         limit = self.values.user_topics
-        self._user_poses = UserTopics(self, {topics.POSE: PoseWithCovarianceStamped}, limit)
-        self._user_odometry = UserTopics(self, {topics.ODOMETRY: Odometry}, limit)
+        self._user_poses = endpoints.UserTopics(
+            self, {topics.POSE: PoseWithCovarianceStamped}, limit)
+        self._user_odometry = endpoints.UserTopics(self, {topics.ODOMETRY: Odometry}, limit)
         self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
 
     def make_settings(self, values: types.SimpleNamespace) -> PositionerSettings:
@@ -127,10 +127,9 @@ class PositionerNode(RoleNode[Positioner]):
     def _publish_track(self, track: events.PublishTrack) -> None:
         if self.stands_by:
             return
-        odometry = convert.odometry(
-            track.user, track.estimate, convert.stamp_of(track, self), self._frame)
-        for publisher in self._user_odometry.publishers(track.user):
-            publisher.publish(odometry)
+        publishers = self._user_odometry.publishers(track.user)
+        endpoints.publish_if_read(publishers, lambda: convert.odometry(
+            track.user, track.estimate, convert.stamp_of(track, self), self._frame))
 
     def _on_estimator(self, event: events.EstimatorBuilt) -> None:
         self.dispatch(event)
@@ -141,9 +140,9 @@ class PositionerNode(RoleNode[Positioner]):
         """Publish a message, and the poses of an estimate; return whether this succeeded."""
         is_published = super().publish(message)
         if is_published and isinstance(message, m.PositionEstimate):
-            pose = convert.pose(message, convert.stamp_of(message, self), self._frame)
-            for publisher in (self._pose, *self._user_poses.publishers(message.user)):
-                publisher.publish(pose)
+            publishers = self._pose, *self._user_poses.publishers(message.user)
+            endpoints.publish_if_read(publishers, lambda: convert.pose(
+                message, convert.stamp_of(message, self), self._frame))
         return is_published
 
 

@@ -229,10 +229,10 @@ class UserNode(RoleNode[User]):
         truths = role.ground_truths(now_s)
         self.publish(truths if len(role.users) > 1 else next(truths.each()))
         for truth in truths.each():
-            for publisher in self._true_odometry.publishers(truth.user):
-                if publisher.get_subscription_count():
-                    publisher.publish(convert.true_odometry(
-                        truth.user, truth.position, truth.velocity, stamp, self._frame))
+            endpoints.publish_if_read(
+                self._true_odometry.publishers(truth.user), functools.partial(
+                    convert.true_odometry, truth.user, truth.position, truth.velocity, stamp,
+                    self._frame))
 
     def _watch_robot(self, robot: RobotMobility) -> None:
         self.set_lacking(robot.lack)

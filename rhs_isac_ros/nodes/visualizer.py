@@ -1,6 +1,7 @@
 """The executable ``visualizer``: publishes what RViz and Foxglove show of a network."""
 
 import copy
+import functools
 import itertools
 import time
 from collections.abc import Iterable
@@ -200,17 +201,17 @@ class VisualizerNode(Node):
         stamp = self.get_clock().now().to_msg()
         for state in self._scene.users.values():
             self._show_paths(state, stamp)
-        if self._publisher.get_subscription_count():
-            self._show_markers(stamp)
+        endpoints.publish_if_read((self._publisher,), lambda: self._markers(stamp))
 
     def _show_paths(self, user: UserState, stamp: Time) -> None:
         paths = user.estimated_path, user.true_path
         # Without publishers, the zip is empty.
         for publisher, places in zip(self._paths.publishers(user.user), paths, strict=False):
-            if places and publisher.get_subscription_count():
-                publisher.publish(path(places, stamp, self._frame))
+            if places:
+                endpoints.publish_if_read(
+                    (publisher,), functools.partial(path, places, stamp, self._frame))
 
-    def _show_markers(self, stamp: Time) -> None:
+    def _markers(self, stamp: Time) -> MarkerArray:
         state = self._scene
         bodies: dict[tuple[str, int], shapes.Points | shapes.Ellipsoids | shapes.Boxes
                      | shapes.Lines] = {
@@ -231,7 +232,7 @@ class VisualizerNode(Node):
         shown = {(marker.ns, marker.id) for marker in array}
         array += [deletion(*key, stamp) for key in sorted(self._shown - shown)]
         self._shown = shown
-        self._publisher.publish(MarkerArray(markers=array))
+        return MarkerArray(markers=array)
 
     def _beam_marker(self, message: m.Beam, stamp: Time) -> Marker:
         if self._drawn is None or self._drawn[0] is not message:

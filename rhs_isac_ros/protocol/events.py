@@ -200,7 +200,9 @@ class Outcome(enum.Enum):
     NO_BEACON = 'no_beacon', Kind.IDLE
 
 
+_KINDS = {outcome.value: outcome.kind for outcome in Outcome}
+
+
 def kind_of(counter: str) -> Kind:
     """Return the kind of a counter; counters without an `Outcome` count dropped messages."""
-    kinds = {outcome.value: outcome.kind for outcome in Outcome}
-    return kinds.get(counter, Kind.DROPPED)
+    return _KINDS.get(counter, Kind.DROPPED)

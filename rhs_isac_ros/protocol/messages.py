@@ -5,7 +5,7 @@ import datetime
 import enum
 import functools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
@@ -60,48 +60,62 @@ def check(message: 'Message', sizes: Mapping[str, int]) -> None:
     own = message.own_sizes(sizes)
     sizes = {**sizes, **own} if own else sizes
     kind: type = type(message)
-    for name, meta in _fields(kind):
-        value = getattr(message, name)
-        problem = ''
-        if 'dims' in meta:
-            problem = _array_problem(value, meta, sizes)
-        elif 'index_of' in meta and not 0 <= value < sizes[meta['index_of']]:
-            end = sizes[meta['index_of']]
-            problem = f'{value}, expected 0 to {end - 1} ({meta["index_of"]} = {end})'
-        elif isinstance(value, float) and not math.isfinite(value) and 'nan_allowed' not in meta:
-            problem = f'{value}, expected a finite number'
-        elif 'equals' in meta and value != sizes[meta['equals']]:
-            problem = f'{value}, expected {meta["equals"]} = {sizes[meta["equals"]]}'
-        elif 'declared' in meta:
-            declared = meta['declared']
-            if not declared.low <= value <= declared.high:
-                problem = f'{value}, expected {declared.range}'
-        if problem:
+    for name, problem_of in _checks(kind):
+        if problem := problem_of(getattr(message, name), sizes):
             raise MessageError(f'{kind.__name__}.{name}: {problem}')
 
 
 @functools.cache
-def _fields(kind: type) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-    """Return the name and the declaration of each restricted field."""
-    return tuple((field.name, field.metadata) for field in dataclasses.fields(kind)
-                 if field.metadata or field.type is float)
+def _checks(kind: type) -> tuple[tuple[str, Callable[[Any, Mapping[str, int]], str]], ...]:
+    """Return the name of each restricted field, and the function that describes its problem."""
+    return tuple((field.name, functools.partial(_check_of(field.metadata), field.metadata))
+                 for field in dataclasses.fields(kind) if field.metadata or field.type is float)
 
 
-def _array_problem(value: np.ndarray, meta: Mapping[str, Any], sizes: Mapping[str, int]) -> str:
-    dims = meta['dims']
+def _check_of(meta: Mapping[str, Any]) -> Callable[..., str]:
+    if 'dims' in meta:
+        return _array_problem
+    if 'index_of' in meta:
+        return _index_problem
+    return _size_problem if 'equals' in meta else _number_problem
+
+
+def _index_problem(meta: Mapping[str, Any], value: int, sizes: Mapping[str, int]) -> str:
+    symbol = meta['index_of']
+    end = sizes[symbol]
+    return '' if 0 <= value < end else f'{value}, expected 0 to {end - 1} ({symbol} = {end})'
+
+
+def _size_problem(meta: Mapping[str, Any], value: int, sizes: Mapping[str, int]) -> str:
+    symbol = meta['equals']
+    return '' if value == sizes[symbol] else f'{value}, expected {symbol} = {sizes[symbol]}'
+
+
+def _number_problem(meta: Mapping[str, Any], value: float, sizes: Mapping[str, int]) -> str:
+    if not math.isfinite(value) and 'nan_allowed' not in meta:
+        return f'{value}, expected a finite number'
+    declared = meta.get('declared')
+    if declared and not declared.low <= value <= declared.high:
+        return f'{value}, expected {declared.range}'
+    return ''
+
+
+def _array_problem(
+        meta: Mapping[str, Any], value: np.ndarray, sizes: Mapping[str, int]) -> str:
+    dims, declared = meta['dims'], meta['declared']
     expected = [sizes[d] if d in sizes else int(d) for d in dims]
     if list(value.shape) != expected:
         described = ', '.join(d if d.isdigit() else f'{d} = {e}'
-                           for d, e in zip(dims, expected, strict=True))
+                              for d, e in zip(dims, expected, strict=True))
         return f'shape {list(value.shape)}, expected [{described}]'
+    has_range = declared.high < math.inf and value.size
+    # Comparisons with NaN are false, so most arrays with a range need no other check.
+    if has_range and declared.low <= value.min() and value.max() <= declared.high:
+        return ''
     finite = np.isfinite(value)
     if not finite.all() and not (meta['nan_allowed'] and (finite | np.isnan(value)).all()):
         return 'not finite, expected finite numbers'
-    declared = meta['declared']
-    if declared.range and value.size and (
-            value.min() < declared.low or value.max() > declared.high):
-        return f'{value.min():g} to {value.max():g}, expected {declared.range}'
-    return ''
+    return (f'{value.min():g} to {value.max():g}, expected {declared.range}' if has_range else '')
 
 
 _LAST_USER = 2**32 - 1

@@ -1,9 +1,8 @@
 """Selection of the node that serves, if several nodes have the same role."""
 
 import dataclasses
+import json
 import math
-from collections.abc import Mapping
-from typing import Any
 
 from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.messages import started
@@ -31,7 +30,7 @@ class Presence:
     scenario_id: str
     role: str
     node: str  # fully qualified name
-    scenario: Mapping[str, Any]  # as `Scenario.fields` returns it
+    scenario: str  # the result of `Scenario.fields`, in JSON
 
     def __str__(self) -> str:
         """Return the name and the start of the node, for log messages."""
@@ -73,11 +72,12 @@ class Presences:
     def update(self, now_s: float) -> list[LogMessage]:
         """Forget the conflicts with nodes that have gone, and choose the node that serves."""
         self._now_s = now_s
-        ended = sorted(self._scenarios.keys() - {other.scenario_id for other in self._present()})
+        present = self._present()
+        ended = sorted(self._scenarios.keys() - {other.scenario_id for other in present})
         for scenario_id in ended:
             del self._scenarios[scenario_id]
         return [*(LogMessage(f'no node with scenario {scenario_id} is left')
-                  for scenario_id in ended), *self._choose()]
+                  for scenario_id in ended), *self._choose(present)]
 
     def silent(self) -> set[str]:
         """Return the names of the nodes that have announced themselves and fallen silent."""
@@ -115,10 +115,10 @@ class Presences:
     def _describe(self) -> str:
         return f'{"stands by for" if self.stands_by else "serves instead of"} {self._rival}'
 
-    def _choose(self) -> list[LogMessage]:
+    def _choose(self, present: list[Presence]) -> list[LogMessage]:
         """Find the newest other node of the role; log a change of the node that serves."""
         own, before = self.own, self._rival if self.stands_by else None
-        rivals = [other for other in self._present()
+        rivals = [other for other in present
                   if other.role == own.role and not self._is_stranger(other)]
         self._rival = max(rivals, key=lambda other: other.sender, default=None)
         rival = self._rival
@@ -134,12 +134,22 @@ class Presences:
     def _report_scenario(self, other: Presence) -> list[LogMessage]:
         if other.scenario_id in self._scenarios:
             return []
-        own, theirs = self.own.scenario, other.scenario
-        differences = [f'{name} {theirs.get(name)} instead of {own.get(name)}'
-                       for name in {**own, **theirs} if theirs.get(name) != own.get(name)]
         text = (f'{other.node} uses another scenario, {other.scenario_id}, with '
-                f'{"; ".join(differences)[:_MAX_LENGTH] or "unknown differences"}; '
+                f'{_differences(self.own.scenario, other.scenario) or "unknown differences"}; '
                 'its messages are dropped')
         self._scenarios.put(other.scenario_id, text)
         self._n_logged += 1
         return [LogMessage(text, warning=True)] if self._n_logged <= _MAX_LOGGED else []
+
+
+def _differences(own_text: str, other_text: str) -> str:
+    """Describe the fields in which two scenarios in JSON differ; '' if this is unknown."""
+    # Anything may be published on the topic. Unlike YAML, JSON has no references, with which a
+    # short text can describe an enormous value; an escaped surrogate would be refused by a log.
+    try:
+        own, other = json.loads(own_text), json.loads(other_text)
+        return '; '.join(
+            f'{name} {json.dumps(other.get(name))} instead of {json.dumps(value)}'
+            for name, value in own.items() if other.get(name) != value)[:_MAX_LENGTH]
+    except (ValueError, AttributeError, RecursionError):
+        return ''

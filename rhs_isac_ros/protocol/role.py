@@ -79,48 +79,43 @@ Value = TypeVar('Value')
 
 
 class NewestDict(dict[Key, Value]):
-    """A dictionary whose `put` discards all but the newest `max_size` entries.
-
-    The limit does not apply to the entry with the key `pinned`, which is never discarded.
-    """
+    """A dictionary whose `put` discards all but the newest `max_size` entries."""
 
     def __init__(self, max_size: int) -> None:
         super().__init__()
         self.max_size = max_size
-        self.pinned: Key | None = None
 
     def put(self, key: Key, value: Value) -> int:
         """Store an entry as the newest, and return the number of entries that were discarded."""
         self.pop(key, None)
         self[key] = value
-        # `islice` stops at the last entry to discard: most calls discard none.
-        n_surplus = len(self) - (self.pinned in self) - self.max_size
-        surplus = list(itertools.islice(
-            (known for known in self if known != self.pinned), max(n_surplus, 0)))
-        for known in surplus:
-            del self[known]
-        return len(surplus)
+        n_surplus = max(len(self) - self.max_size, 0)
+        for oldest in list(itertools.islice(self, n_surplus)):
+            del self[oldest]
+        return n_surplus
 
 
-# Number of codebooks that are kept in addition to the one in use.
-_MAX_OFFERED = 3
+# Number of codebooks that are kept, including the one in use.
+_MAX_CODEBOOKS = 4
 
 
 class CodebookCache(NewestDict[str, Value]):
-    """Items by codebook id; the item that was taken last is in use, and never discarded."""
+    """Items by codebook id; the item that was taken last is `in_use`, and never discarded."""
 
     def __init__(self) -> None:
-        super().__init__(_MAX_OFFERED)
+        super().__init__(_MAX_CODEBOOKS)
+        self.in_use = ''  # id of the codebook; empty at first
 
-    @property
-    def in_use(self) -> str:
-        """Id of the codebook in use; empty at first."""
-        return self.pinned or ''
+    def put(self, codebook_id: str, item: Value) -> int:
+        """Store an item as the newest, and discard the oldest one that is not in use."""
+        if self.in_use:
+            super().put(self.in_use, self[self.in_use])
+        return super().put(codebook_id, item)
 
     def take(self, codebook_id: str) -> Value:
         """Return the item of a known codebook, and mark it as in use."""
         item = self[codebook_id]
-        self.pinned = codebook_id
+        self.in_use = codebook_id
         return item
 
 

@@ -7,7 +7,6 @@ common data representation (CDR), version 1, little endian.
 
 import dataclasses
 import enum
-import json
 import math
 import struct
 from collections.abc import Callable, Sequence
@@ -63,19 +62,6 @@ def _numbers(n: int) -> Type:
     return Type(('d',) * n, lambda values: values.ravel().tolist(), np.array)
 
 
-def _decode_mapping(items: Sequence[str]) -> dict[str, Any]:
-    # Unlike YAML, JSON has no references, with which a short text can describe an enormous value.
-    try:
-        mapping = json.loads(items[0])
-        # It can escape surrogates, which neither a log nor a message can contain.
-        json.dumps(mapping, ensure_ascii=False).encode()
-    except RecursionError as error:
-        raise ValueError(str(error)) from None
-    if not isinstance(mapping, dict):
-        raise ValueError('expected a mapping in JSON')
-    return mapping
-
-
 # Types that are one item on the wire.
 SCALARS = {'uint8': 'B', 'uint32': 'I', 'uint64': 'Q', 'double': 'd', 'string': 's'}
 # The other types.
@@ -91,8 +77,6 @@ TYPES = {
         ('*I', '*d'), lambda values: (
             np.array(values.shape, '<u4'), np.asarray(values, '<f8').ravel()), _decode_real),
     'rhs_isac_msgs/ComplexArray': Type(('*I', '*d', '*d'), _encode_complex, _decode_complex),
-    # A string field in ROS, but a mapping in the dataclass.
-    'mapping': Type(('s',), lambda mapping: (json.dumps(dict(mapping)),), _decode_mapping),
 }
 
 
@@ -149,8 +133,6 @@ class Codec:
             if name == 'header':
                 continue
             first = len(wire)
-            if text == 'string' and own[name] is not str:
-                text = 'mapping'
             if text in TYPES:
                 one = TYPES[text]
                 wire += one.wire
@@ -236,7 +218,10 @@ class Codec:
                 values[name] = decode(items[first] if encode is None else items[first:last])
             except ValueError as error:
                 raise MessageError(f'{self._kind.__name__}.{name}: {error}') from None
-        return self._kind(**values)
+        # Unlike the constructor, this does not store each field of a frozen dataclass separately.
+        message = object.__new__(self._kind)
+        vars(message).update(values)
+        return message
 
     def _items(self, data: bytes) -> list[Any]:
         items: list[Any] = []

@@ -9,8 +9,7 @@ from rclpy.node import Node
 from std_msgs.msg import Header
 
 from rhs_isac_ros.monitoring.role_statistics import Report
-from rhs_isac_ros.ros import topics
-from rhs_isac_ros.ros.endpoints import EXCHANGE, create_publisher, steady_timer, subscribe
+from rhs_isac_ros.ros import endpoints, topics
 
 _PERIOD_S = 1.0
 
@@ -41,14 +40,17 @@ def subscribe_reports(node: Node, on_report: Callable[[str, Report], None]) -> N
     def receive(message: DiagnosticArray) -> None:
         for name, report in from_ros(message, namespace):
             on_report(name, report)
-    subscribe(node, DiagnosticArray, topics.DIAGNOSTICS, receive, EXCHANGE)
+    endpoints.subscribe(node, DiagnosticArray, topics.DIAGNOSTICS, receive, endpoints.EXCHANGE)
 
 
 def publish_reports(node: Node, report: Callable[[], Report]) -> None:
     """Publish the report of a node once a second."""
-    publisher = create_publisher(node, DiagnosticArray, topics.DIAGNOSTICS, EXCHANGE)
+    publisher = endpoints.create_publisher(
+        node, DiagnosticArray, topics.DIAGNOSTICS, endpoints.EXCHANGE)
 
     def publish() -> None:
-        stamp = node.get_clock().now().to_msg()
-        publisher.publish(to_ros(report(), node.get_fully_qualified_name(), stamp))
-    steady_timer(node, _PERIOD_S, publish)
+        # Each report contains the faults since the previous one, even if nobody reads it.
+        found = report()
+        endpoints.publish_if_read((publisher,), lambda: to_ros(
+            found, node.get_fully_qualified_name(), node.get_clock().now().to_msg()))
+    endpoints.steady_timer(node, _PERIOD_S, publish)

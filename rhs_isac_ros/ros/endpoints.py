@@ -146,6 +146,17 @@ def create_publisher(
     return publisher or _NoPublisher(node.resolve_topic_name(name))
 
 
+def publish_if_read(publishers: Iterable[Publisher], make: Callable[[], Any]) -> None:
+    """Publish the message that `make` returns on the topics with subscribers, if any.
+
+    Topics for observers often have none, and the creation of a message takes longer than the rest.
+    """
+    if read := [one for one in publishers if one.get_subscription_count()]:
+        message = make()
+        for publisher in read:
+            publisher.publish(message)
+
+
 def subscribe(
         node: Node, kind: type, name: str, callback: Callable[[Any], None], profile: QoSProfile,
         raw: bool = False, overridable: bool = False) -> None:
@@ -164,7 +175,6 @@ def subscribe_messages(
         on_message: Callable[[m.Message], None],
         on_error: Callable[[m.MessageError], None] | None = None, scenario_id: str = '', *,
         on_foreign: Callable[[m.Message], None] = lambda message: None,
-        on_arrival: Callable[[type[m.Message]], None] = lambda kind: None,
         exchange: QoSProfile = EXCHANGE) -> None:
     """Subscribe to messages of the protocol; malformed messages are dropped.
 
@@ -176,8 +186,6 @@ def subscribe_messages(
         Called with the reason why a message was dropped; by default, the node logs it.
     scenario_id, on_foreign
         If `scenario_id` is given, messages of other scenarios are passed to `on_foreign`.
-    on_arrival
-        Called with the class of each message before decoding.
     exchange
         Quality of service of messages that are not latched.
     """
@@ -185,7 +193,6 @@ def subscribe_messages(
         node.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
 
     def receive(kind: type[m.Message], serialized: bytes) -> None:
-        on_arrival(kind)
         try:
             message = convert.from_bytes(kind, serialized)
             if scenario_id and message.scenario_id not in ('', scenario_id):

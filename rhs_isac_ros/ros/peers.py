@@ -1,6 +1,7 @@
 """Presence of the nodes, from the topics of the ROS graph and their announcements."""
 
 import itertools
+import json
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -81,7 +82,8 @@ class Peers:
         # Endpoints that were logged; those that are created again are not logged again.
         self._logged: set[tuple[str, str]] = set()
         self._presences = Presences(Presence(
-            instance, scenario.id, role, node.get_fully_qualified_name(), scenario.fields()))
+            instance, scenario.id, role, node.get_fully_qualified_name(),
+            json.dumps(scenario.fields())))
         # Time of the last poll or announcement, and total of the times without [s].
         self._last_s, self._missed_s = time.monotonic(), 0.0
         # Nodes that the last poll found silent.

@@ -50,11 +50,9 @@ class CodebookClient:
         name = f'{topics.OPTIMIZER_NODE}/get_parameters'
         self._client = endpoints.create_or_refuse(
             node, f'client of {name}', lambda: node.create_client(GetParameters, name))
-        # Serial numbers of the latest announcement, and of the announcements at the latest request
-        # and response: a response to a request before the latest announcement is stale.
-        self._announced, self._requested, self._fetched = 0, 0, 0
-        self._announced_s = math.inf
-        self._announcement: Codebook | None = None
+        # The latest announcement until it is in use; its time; whether it has led to a request.
+        self._announced: Codebook | None = None
+        self._announced_s, self._is_requested = math.inf, False
         # Why the latest codebook was rejected.
         self._problem = ''
         self.codebook_id = ''
@@ -72,8 +70,7 @@ class CodebookClient:
         if message.codebook_id != codebook.id or not self._fits(message, codebook):
             return
         # Even if the id is unchanged, a response with a withdrawn codebook may be in transit.
-        self._announcement = codebook
-        self._announced += 1
+        self._announced, self._is_requested = codebook, False
         self._announced_s = time.monotonic()
         self._timer.reset()
         self._request()
@@ -93,27 +90,24 @@ class CodebookClient:
         return not self._problem
 
     def _request(self) -> None:
-        if self._fetched == self._announced:
+        if self._announced is None:
             self._timer.cancel()
-            return
-        if time.monotonic() - self._announced_s > _RESPONSE_TIMEOUT_S:
-            self._use(())
-        elif (self._client is not None and self._requested != self._announced
-                and self._client.service_is_ready()):
-            self._requested = self._announced
+        elif time.monotonic() - self._announced_s > _RESPONSE_TIMEOUT_S:
+            self._use(self._announced, ())
+        elif self._client and not self._is_requested and self._client.service_is_ready():
+            self._is_requested = True
             future = self._client.call_async(GetParameters.Request(names=_NAMES))
             future.add_done_callback(functools.partial(self._on_response, self._announced))
 
-    def _on_response(self, serial: int, future: Any) -> None:
+    def _on_response(self, announced: Codebook, future: Any) -> None:
         values = future.result().values if future.exception() is None else ()
-        if serial == self._announced:
-            self._use(values)
+        # A response to a request before the latest announcement is stale.
+        if announced is self._announced:
+            self._use(announced, values)
 
-    def _use(self, values: Sequence[ParameterValue]) -> None:
+    def _use(self, codebook: Codebook, values: Sequence[ParameterValue]) -> None:
         """Use the codebook in a response if it was announced, otherwise the announced one."""
-        self._fetched = self._announced
-        assert self._announcement
-        codebook = self._announcement
+        self._announced = None
         # An invalid or incomplete response is not the announced codebook.
         with contextlib.suppress(CodebookError, ValueError):
             fetched = Codebook.from_parameters(
@@ -250,7 +244,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._receiving.update(kinds)
         endpoints.subscribe_messages(
             self, kinds, self._sizes, self._on_message, self._on_malformed, self.scenario.id,
-            on_foreign=self._on_foreign, on_arrival=self._statistics.count_received)
+            on_foreign=self._on_foreign)
 
     def report(self) -> Report:
         """Return the diagnostics of the role, with the faults since the last report."""
@@ -385,9 +379,11 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def _handle(self, event: events.Event, now_s: float) -> None:
         start_s = time.perf_counter()
         actions = self.role.handle(event, now_s)
-        self._statistics.record(event, actions, time.perf_counter() - start_s)
+        handling_s = time.perf_counter() - start_s
         for action in actions:
             self._perform(action)
+        # Last, because other nodes wait for the messages.
+        self._statistics.record(event, actions, handling_s)
 
     def _perform(self, action: events.Action) -> None:
         match action:

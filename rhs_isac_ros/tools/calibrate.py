@@ -17,11 +17,9 @@ from rclpy.node import Node
 from rhs_isac_ros.calibration import (
     CalibrationError,
     Pilots,
-    SurfacePrior,
     SurveyWarning,
     calibrate,
     load_surface,
-    prior_of,
     report,
     survey,
     survey_report,
@@ -38,7 +36,6 @@ from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
     integer,
-    nonnegative_float,
     output_file,
     positive_float,
     positive_int,
@@ -128,7 +125,7 @@ def _calibrate(options: argparse.Namespace, arguments: list[str]) -> int:
         if options.multipath:
             _survey(scenario, pilots, options)
             return 0
-        calibration = calibrate(scenario, pilots, _prior(scenario, options))
+        calibration = calibrate(scenario, pilots)
         print(report(calibration, scenario), flush=True)
         for text, surface in (('before', None), ('after', calibration.surface)):
             print(f'position error of the pilots {text}: {_error(scenario, pilots, surface)}')
@@ -199,13 +196,6 @@ def _survey(scenario: Scenario, pilots: Sequence[Pilots], options: argparse.Name
           f'"multipath: {options.output.name}" in a scenario file beside it')
 
 
-def _prior(scenario: Scenario, options: argparse.Namespace) -> SurfacePrior:
-    names = ('element_error_rms', 'failed_element_share', 'band_gain_rms')
-    given = {name: getattr(options, name) for name in names}
-    return dataclasses.replace(
-        prior_of(scenario), **{name: value for name, value in given.items() if value is not None})
-
-
 def _error(scenario: Scenario, pilots: Sequence[Pilots], surface: SurfaceEstimate | None) -> str:
     """Return the root mean square error and the number of missing fixes as text."""
     distances = np.empty(0)
@@ -243,13 +233,6 @@ def _parser() -> argparse.ArgumentParser:
         help=f'pilots to collect from a running network (default: {_CYCLES})')
     add('--timeout', type=positive_float, default=_TIMEOUT_S, metavar='S',
         help=f'maximum time to collect them (default: {_TIMEOUT_S:g} s)')
-    prior = parser.add_argument_group(
-        'prior', 'What is known of the surface before; by default what the scenario declares.')
-    for name, text in (
-            ('--element-error-rms', 'RMS of the relative errors of the elements'),
-            ('--failed-element-share', 'probability that an element has failed'),
-            ('--band-gain-rms', "RMS of the relative errors of the bands' gains (default: 1)")):
-        prior.add_argument(name, type=nonnegative_float, metavar='X', help=text)
     return parser
 
 

@@ -179,9 +179,7 @@ def recorded(
     names: dict[type, str] = {**topics.NAMES, Codebook: topics.CODEBOOK}
     by_topic = {f'{prefix}{names[kind]}': kind for kind in kinds if kind is not Report}
     if Report in kinds:
-        # Before version 1.0, the topic was in the namespace.
-        reports = topics.DIAGNOSTICS, f'{prefix}{topics.DIAGNOSTICS.lstrip("/")}'
-        by_topic.update(dict.fromkeys(reports, Report))
+        by_topic[topics.DIAGNOSTICS] = Report
     for topic, content, time_s in read(path, by_topic):
         kind = by_topic[topic]
         with translated((m.MessageError, CodebookError), RecordingError, f'{path}: {topic}'):

@@ -17,7 +17,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.utilities import try_shutdown
 
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
-from rhs_isac_ros.executables import STARTED_S, print_error
+from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog, CycleRecord
 from rhs_isac_ros.protocol.messages import Phase
@@ -44,15 +44,12 @@ from rhs_isac_ros.tools.pictures import compose_cycles, prepare_drawing
 
 # Maximum time between two complete cycles [s].
 _CYCLE_TIMEOUT_S = 60.0
-# Period of checks until all nodes are discovered, and afterwards [s].
-_DISCOVERY_PERIOD_S, _PERIOD_S = 0.02, 0.5
+# Period of checks [s].
+_PERIOD_S = 0.5
 _PHASES = (Phase.BEACONING, Phase.POSITIONING, Phase.ESTIMATING, Phase.TRANSMITTING)
 _HEADS = ('cycle', 'user', 'true position [m]', 'estimate [m]', 'error\n[m]', '√CRLB\n[m]',
           'beacon\n[ms]', 'sound\n[ms]', 'locate\n[ms]', 'data\n[ms]', 'capacity\n[Mbit/s]',
           'loss\n[%]')
-_STAT_FILE = Path('/proc/self/stat')
-# Index of the start time among the fields after the name of the program.
-_START_FIELD = 19
 
 
 def add_network_options(parser: argparse.ArgumentParser) -> None:
@@ -105,21 +102,15 @@ def start_network(
 
 def watch(
         observer: CycleObserver, processes: Processes, cycles: int,
-        on_progress: Callable[[int, int], None],
-        on_discovered: Callable[[], None] | None = None) -> str:
+        on_progress: Callable[[int, int], None]) -> str:
     """Spin an observer until it has received a number of complete cycles.
 
-    `on_progress` is called with the current and the final number whenever the current one changes,
-    and `on_discovered` when the observer has discovered all nodes. Returns the error that ended
-    the wait, or ''.
+    `on_progress` is called with the current and the final number whenever the current one changes.
+    Returns the error that ended the wait, or ''.
     """
     seen, changed_s = -1, time.monotonic()
     while seen < cycles:
-        rclpy.spin_once(
-            observer, timeout_sec=_DISCOVERY_PERIOD_S if on_discovered else _PERIOD_S)
-        if on_discovered and set(processes.names) <= set(observer.get_node_names()):
-            on_discovered()
-            on_discovered = None
+        rclpy.spin_once(observer, timeout_sec=_PERIOD_S)
         complete = len(observer.log.complete)
         if complete != seen:
             seen, changed_s = complete, time.monotonic()
@@ -167,31 +158,6 @@ def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) ->
           for record in given_up)])
 
 
-def process_age_s() -> float | None:
-    """Return the time since this process started [s], or None if it is not available.
-
-    This includes the time of a script that ended with ``exec``.
-    """
-    try:
-        # The name of the program, in parentheses, may contain spaces.
-        fields = _STAT_FILE.read_text(encoding='utf-8').rpartition(')')[2].split()
-        started_s = int(fields[_START_FIELD]) / os.sysconf('SC_CLK_TCK')
-        return max(time.clock_gettime(time.CLOCK_BOOTTIME) - started_s, 0.0)
-    except (OSError, ValueError, IndexError, AttributeError):
-        return None
-
-
-def parts_text(begin_s: float, parts: Sequence[tuple[str, float]]) -> str:
-    """Return a line with the total and the parts, such as ``time: 2.1 s (first 0.40, ...)``.
-
-    The first part began at `begin_s`; `parts` contains the name and the end [s] of each part.
-    """
-    times_s = [begin_s, *(end_s for _, end_s in parts)]
-    texts = [f'{name} {end_s - start_s:.2f}' for (name, end_s), start_s in zip(
-        parts, times_s, strict=False)]
-    return f'time: {times_s[-1] - begin_s:.2f} s ({", ".join(texts)})'
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demonstration, and return its exit code.
 
@@ -221,10 +187,6 @@ def _run(
         options: argparse.Namespace) -> int:
     """Run the network until the cycles are complete, report them, and return the exit code."""
     log, code = CycleLog(), 0
-    now_s, age_s = time.monotonic(), process_age_s()
-    parts = [('imports', now_s)]
-    if age_s is not None:
-        parts.insert(0, ('environment', STARTED_S))
     together = options.users > min(MAX_USER_NODES, max_user_processes())
     if together:
         print(f'the {options.users} users share one process', file=sys.stderr)
@@ -241,7 +203,7 @@ def _run(
                         # The parameter does not admit 0.
                         track_speed_mps=None if options.prior == REGION else max(
                             scenario.max_user_speed_mps, 0.01))
-                    problem = _observe(log, processes, recorder, options.cycles, parts)
+                    problem = _observe(log, processes, recorder, options.cycles)
             finally:
                 # A signal may arrive before the observer exists.
                 if recorder is not None:
@@ -249,36 +211,20 @@ def _run(
             processes.interrupt()
             with contextlib.suppress(KeyboardInterrupt):
                 code = _report(log, scenario, options, problem)
-    if log.complete:
-        parts.append(('end', time.monotonic()))
-        print(parts_text(STARTED_S if age_s is None else now_s - age_s, parts))
     return code
 
 
 def _observe(
-        log: CycleLog, processes: Processes, recorder: Recorder | None, cycles: int,
-        parts: list[tuple[str, float]]) -> str:
+        log: CycleLog, processes: Processes, recorder: Recorder | None, cycles: int) -> str:
     """Observe a number of cycles, and return the error that ended the observation, or ''."""
     rclpy.init(args=startup.prepare(['demo']))
     with startup.one_line():
         observer = CycleObserver(recorder, log=log, **startup.WITHOUT_SERVICES)
     # Use the time in which the network starts.
     prepare_drawing()
-    discovered_s: list[float] = []
     try:
-        return watch(observer, processes, cycles, _show_progress,
-                     lambda: discovered_s.append(time.monotonic()))
+        return watch(observer, processes, cycles, _show_progress)
     finally:
-        if log.complete:
-            # The first cycles may end before this process has discovered all nodes, or while it
-            # prepares to draw. Their messages contain the time at which they were sent.
-            first, last = log.complete[0].state, log.complete[-1].state
-            assert first and last
-            begin_s = (log.complete[-1].ended_s - (last.stamp_ns - first.stamp_ns) / 1e9
-                       - first.elapsed_s)
-            parts += [('start and discovery of the nodes', min([*discovered_s, begin_s])),
-                      ('codebook and tables', begin_s),
-                      ('cycles', log.complete[-1].ended_s)]
         observer.destroy_node()  # type: ignore[no-untyped-call]
         try_shutdown()
 

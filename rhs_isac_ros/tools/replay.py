@@ -279,8 +279,7 @@ def errors_m(
             estimate = estimator.estimate(signals.reshape(len(signals), -1))
         else:
             estimate = tracks.locate(
-                cycle.signals, estimator, track_speed_mps,
-                cycle.phase_s.get(m.Phase.ESTIMATING, cycle.ended_s))
+                cycle.signals, estimator, track_speed_mps, cycle.signals.time_s(cycle.ended_s))
         errors.append(np.linalg.norm(estimate.mean - cycle.truth.position)
                       if estimate.fix else np.nan)
     return np.array(errors)

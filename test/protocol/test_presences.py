@@ -7,7 +7,7 @@ import pytest
 from rhs_isac_ros.protocol.presences import SILENCE_S, Presence, Presences
 
 NOW_NS = 1_700_000_000 * 10**9
-OWN = Presence(NOW_NS - 5 * 10**9, 'sc1', 'bs', '/bs', {'n_frames': 4, 'n_feeds': 3})
+OWN = Presence(NOW_NS - 5 * 10**9, 'sc1', 'bs', '/bs', '{"n_frames": 4, "n_feeds": 3}')
 
 
 def other(age_s=0, **changes):
@@ -104,7 +104,7 @@ def test_other_roles_and_impossible_instances_are_ignored(presences, changes):
 
 def test_another_scenario_is_named_once_and_never_supersedes(presences):
     stranger = other(scenario_id='sc2', node='/channel', role='channel',
-                     scenario={'n_frames': 6, 'n_feeds': 3})
+                     scenario='{"n_frames": 6, "n_feeds": 3}')
     (message,) = presences.add(stranger, NOW_NS, 0.0)
     assert message.warning
     assert message.text == ('/channel uses another scenario, sc2, with n_frames 6 instead of 4; '
@@ -115,6 +115,17 @@ def test_another_scenario_is_named_once_and_never_supersedes(presences):
     assert not presences.stands_by
     assert texts(presences.update(SILENCE_S)) == ['no node with scenario sc2 is left']
     assert presences.conflicts() == {}
+
+
+@pytest.mark.parametrize(('scenario', 'differences'), [
+    (r'{"n_frames": "\ud800", "other": 1}',
+     r'n_frames "\ud800" instead of 4; n_feeds null instead of 3'),
+    *((invalid, 'unknown differences') for invalid in (
+        '', '[', '3', 'a: b: c', '[' * 100_000, '{"n_frames": 4, "n_feeds": 3}'))])
+def test_any_text_describes_another_scenario(presences, scenario, differences):
+    (message,) = presences.add(other(scenario_id='sc2', scenario=scenario), NOW_NS, 0.0)
+    assert f'another scenario, sc2, with {differences}; its' in message.text
+    assert message.text.encode().isascii()
 
 
 def test_forged_announcements_fill_neither_the_memory_nor_the_log(presences):

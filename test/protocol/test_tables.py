@@ -231,7 +231,7 @@ def snapshot(thing):
             return str(thing.bit_generator.state)
         case dict():
             return [(snapshot(key), snapshot(value)) for key, value in thing.items()] + [
-                getattr(thing, 'pinned', None)]
+                getattr(thing, 'in_use', None)]
         case list() | tuple():
             return [snapshot(item) for item in thing]
         case set():

@@ -22,6 +22,25 @@ ESTIMATE = m.PositionEstimate(
     covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01)
 
 
+def test_a_message_is_created_once_for_all_topics_with_subscribers(bench, probe):
+    publishers = [endpoints.create_publisher(probe, Point, name, endpoints.EXCHANGE)
+                  for name in ('one', 'two', 'unread')]
+    made, received = [], []
+
+    def make():
+        made.append(Point(x=1.0))
+        return made[-1]
+    endpoints.publish_if_read(publishers, make)
+    assert not made
+    for publisher in publishers[:2]:
+        endpoints.subscribe(probe, Point, publisher.topic_name, received.append,
+                            endpoints.EXCHANGE)
+        bench.until(publisher.get_subscription_count, 'the subscription')
+    endpoints.publish_if_read(publishers, make)
+    bench.until(lambda: len(received) == 2, 'the messages')
+    assert received == 2 * made
+
+
 @pytest.fixture
 def refused(monkeypatch):
     """Names of the topics and services that were refused: all but those of every rclpy node."""

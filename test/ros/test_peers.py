@@ -412,19 +412,6 @@ def test_the_own_standstill_is_no_silence_of_others(bench, add_channel, monkeypa
     assert not older.stands_by
 
 
-@pytest.mark.parametrize('scenario', ['[', '3', 'a: b: c', r'{"a": "\ud800"}'])
-def test_invalid_announcements_are_ignored(bench, probe, add_channel, scenario):
-    node = add_channel()
-    publisher = probe.create_publisher(ros.Presence, topics.PRESENCE, LATCHED)
-    bench.until(publisher.get_subscription_count, 'the subscription')
-    publisher.publish(ros.Presence(
-        sender=new_instance(), role='channel', node='/rogue', scenario=scenario))
-    publisher.publish(ros.Presence(
-        sender=node.instance - 1, role='channel', node='/rogue', scenario='{}'))
-    bench.until(lambda: node._peers.conflicts(), 'the valid announcement')
-    assert not node.report().values['conflict.role'].startswith('stands by')
-
-
 def test_the_newer_of_two_optimizers_is_followed_until_it_has_gone(bench, bench_files, small):
     def add(name):
         return bench.add(OptimizerNode, parameter_overrides=[
