@@ -251,8 +251,7 @@ class SearchEstimator(abc.ABC):
         probabilities = shares(log_weights[None])[0]
         reason = self._reason(whitened * np.exp(-fit.gain), fit.residual, log_weights)
         moments = _no_fix() if reason else (fit.mean, self._covariance(fit))
-            # Without a fix, only a residual that nothing explains is evidence against the
-            # scenario.
+        # Without a fix, only a residual that nothing explains is evidence against the scenario.
         counts = (reason == self._test.residual_test(fit.residual) if reason
                   else probabilities[0] >= 1 - _DOUBT_LIMIT)
         by_name = {one.name: float(share) for one, share in zip(
