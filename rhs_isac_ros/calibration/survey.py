@@ -255,8 +255,9 @@ def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
               in_sight: np.ndarray, total: np.ndarray, weight: float) -> np.ndarray:
     """Mark the positions that probably have a direct path, given the others, bool [N].
 
-    Otherwise, signals are multipath of an unknown level. `total`, complex128 [N_B, R, R], is the
-    sum over the positions that are `in_sight` and the prior, which has this weight.
+    Otherwise, signals are multipath of an unknown level. With a direct path, the level of the
+    multipath spreads as among the positions that are `in_sight`. `total`, complex128 [N_B, R, R],
+    is the sum over these positions and the prior, and has this weight.
     """
     whitener = np.linalg.inv(np.linalg.cholesky(total))
     with_path = np.einsum('irs,nis->nir', whitener, residuals)
@@ -268,9 +269,12 @@ def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     energy = others * np.sum(share / (1 - share * counts), axis=1)
     energy_without = others * np.sum(
         np.sum(np.abs(without)**2, axis=2) + counts * cross / (1 - share * counts), axis=1)
-    blocked = log_evidence_of_level(energy_without, int(np.prod(model.shape)), BLOCKED_STD_DB)
+    n_measurements = int(np.prod(model.shape))
+    blocked = log_evidence_of_level(energy_without, n_measurements, BLOCKED_STD_DB)
+    sight = log_evidence_of_level(
+        energy, n_measurements, _level_std_db(energy[in_sight], n_measurements))
     prior = min(model.scenario.blocked_probability or _BLOCKED_PROBABILITY, _MAX_BLOCKED)
-    log_odds = np.log(1 / prior - 1) - energy - blocked
+    log_odds = np.log(1 / prior - 1) + sight - blocked
     result = log_odds > 0
     return result if result.any() else np.ones(len(result), bool)
 

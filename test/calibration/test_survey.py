@@ -111,6 +111,17 @@ def test_positions_behind_obstacles_are_left_out(beams):
 
 
 @pytest.mark.slow
+def test_users_in_sight_with_strong_multipath_take_part(beams):
+    """The level of the multipath has a standard deviation of 3 dB among users."""
+    positions, received = send(HALL, beams, 60)
+    mean = MeasurementModel(HALL, beams).mean(positions)
+    levels_db = 3 * np.random.default_rng(2).normal(size=(60, 1, 1))
+    estimate = survey(DECLARED, beams, positions, mean + (received - mean) * 10**(levels_db / 20))
+    assert estimate.about['blocked'] == 0
+    assert estimate.about['level_std_db'] > 2
+
+
+@pytest.mark.slow
 def test_impairments_are_estimated_with_the_multipath(beams):
     impaired = {'user_gain_std_db': 3.0, 'phase_std_rad': 6.2832, 'timing_std_s': 5e-9}
     declared, hall = (dataclasses.replace(one, **impaired) for one in (DECLARED, HALL))
