@@ -32,6 +32,8 @@ _SEPARATOR = '=' * 80
 _SCENARIO = 'scenario'
 # Maximum size of a record, and of the records of a chunk [bytes].
 _MAX_BYTES = 2**26
+# Maximum number of characters of a scenario.
+_MAX_SCENARIO = 2**20
 _BUILT_IN = re.compile(r'(bool|byte|char|float\d+|u?int\d+|w?string)\b')
 
 
@@ -218,8 +220,8 @@ def read_scenario(path: str | Path) -> Scenario | None:
             try:
                 text = record.metadata['yaml']
                 # With references, a short text can describe an enormous value.
-                if '&' in text:
-                    raise TypeError('it contains references')
+                if '&' in text or len(text) > _MAX_SCENARIO:
+                    raise TypeError('it contains references, or is too long')
                 return Scenario(**yaml.safe_load(text))
             # The file may come from another version or another program.
             except (KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
