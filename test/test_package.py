@@ -26,10 +26,11 @@ KEYS = {
     'tqdm': 'python3-tqdm', 'yaml': 'python3-yaml',
 }
 # Libraries without a key, by the name of the import: their requirement in an extra of setup.py.
+# mcap requires lz4 and zstandard.
 PIP_ONLY = {
-    'distributed': 'distributed', 'jax': None, 'mcap': 'mcap', 'mcap_ros2': 'mcap-ros2-support',
-    'pymoo': 'pymoo', 'rerun': 'rerun-sdk==0.22.1', 'rosbags': 'rosbags', 'sionna': None,
-    'stonesoup': None,
+    'distributed': 'distributed', 'jax': None, 'lz4': 'mcap', 'mcap': 'mcap',
+    'mcap_ros2': 'mcap-ros2-support', 'pymoo': 'pymoo', 'rerun': 'rerun-sdk==0.22.1',
+    'rosbags': 'rosbags', 'sionna': None, 'stonesoup': None, 'zstandard': 'mcap',
 }
 # Modules of the repository.
 OWN = {

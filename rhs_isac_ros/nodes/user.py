@@ -110,14 +110,19 @@ def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> Robo
             "mobility: 'tf', expected 'odometry' or a built-in mobility, because tf2_ros is not "
             'installed; it comes with a ROS 2 installation, but not as a wheel') from None
     mobility = RobotMobility(node, frame, f'transform from {frame.name} to {child}', timeout_s)
-    buffer = tf2_ros.Buffer(node=node)
-    listener = endpoints.create_or_refuse(
-        node, f'subscription to {topics.TF}', lambda: tf2_ros.TransformListener(buffer, node))
+
+    def listen() -> tuple[Any, Any]:
+        # The buffer offers a service.
+        buffer = tf2_ros.Buffer(node=node)
+        return buffer, tf2_ros.TransformListener(buffer, node)
+    source = endpoints.create_or_refuse(node, f'subscription to {topics.TF}', listen)
     last: list[tuple[int, np.ndarray]] = []
 
     def look() -> None:
-        # This reference keeps the listener alive.
-        if not listener or not buffer.can_transform(frame.name, child, Time()):
+        if not source:
+            return
+        buffer, _ = source  # The reference keeps the listener alive.
+        if not buffer.can_transform(frame.name, child, Time()):
             return
         found = buffer.lookup_transform(frame.name, child, Time())
         stamp_ns = Time.from_msg(found.header.stamp).nanoseconds

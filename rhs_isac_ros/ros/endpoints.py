@@ -264,13 +264,18 @@ class BackgroundWorker:
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=node.get_name())
 
     def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
-        """Queue a job; its result, or its exception, reaches the thread that spins the node."""
+        """Queue a job; its result, or its exception, reaches the thread that spins the node.
+
+        If the thread cannot start, the job is refused.
+        """
         def hand_over(future: Future[_Result]) -> None:
             self._done.append((future, on_result))
             executor = self._node.executor
             if self._is_open and executor is not None:
                 executor.create_task(self._wake)
-        self._pool.submit(job).add_done_callback(hand_over)
+        if future := create_or_refuse(
+                self._node, 'thread of jobs', lambda: self._pool.submit(job)):
+            future.add_done_callback(hand_over)
 
     def close(self) -> None:
         """Wait for the running job, cancel the others and discard all results."""

@@ -5,6 +5,7 @@ can read. The library mcap is optional.
 """
 
 import contextlib
+import dataclasses
 import re
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -29,6 +30,10 @@ from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 # Separator between the message definitions of a schema, as in ROS 1 and 2.
 _SEPARATOR = '=' * 80
 _SCENARIO = 'scenario'
+# Maximum size of a record, and of the records of a chunk [bytes].
+_MAX_BYTES = 2**26
+# Maximum number of characters of a scenario.
+_MAX_SCENARIO = 2**20
 _BUILT_IN = re.compile(r'(bool|byte|char|float\d+|u?int\d+|w?string)\b')
 
 
@@ -168,14 +173,27 @@ def read(
     cannot be read, or the fields of a recorded and an installed message differ.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
+    schemas: dict[int, Any] = {}
+    channels: dict[int, Any] = {}
     checked: set[int] = set()
-    with _opened(path) as reader:
-        for found, channel, message in reader.iter_messages(topics=names):
-            if found is not None and found.name in kinds:
+    for record in _records(path):
+        match type(record).__name__:
+            case 'Schema':
+                schemas[record.id] = record
+            case 'Channel':
+                channels[record.id] = record
+            case 'Message':
+                channel = channels.get(record.channel_id)
+                if channel is None:
+                    raise RecordingError(f'{path}: a message without a topic')
+                found = schemas.get(channel.schema_id)
+                if (found is None or found.name not in kinds
+                        or names is not None and channel.topic not in names):
+                    continue
                 if found.id not in checked:
                     _check_schema(path, found, kinds[found.name])
                     checked.add(found.id)
-                yield channel.topic, message.data, 1e-9 * message.log_time
+                yield channel.topic, record.data, 1e-9 * record.log_time
 
 
 def _check_schema(path: str | Path, found: Any, kind: type) -> None:
@@ -197,34 +215,61 @@ def read_scenario(path: str | Path) -> Scenario | None:
 
     Raises RecordingError if the file cannot be read, ScenarioError if the scenario is invalid.
     """
-    with _opened(path) as reader:
-        for metadata in reader.iter_metadata():
-            if metadata.name == _SCENARIO:
-                try:
-                    text = metadata.metadata['yaml']
-                    # With references, a short text can describe an enormous value.
-                    if '&' in text:
-                        raise TypeError('it contains references')
-                    return Scenario(**yaml.safe_load(text))
-                # The file may come from another version or another program.
-                except (KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
-                    raise RecordingError(f'{path}: invalid scenario: {error}') from None
+    for record in _records(path):
+        if type(record).__name__ == 'Metadata' and record.name == _SCENARIO:
+            try:
+                text = record.metadata['yaml']
+                # With references, a short text can describe an enormous value.
+                if '&' in text or len(text) > _MAX_SCENARIO:
+                    raise TypeError('it contains references, or is too long')
+                return Scenario(**yaml.safe_load(text))
+            # The file may come from another version or another program.
+            except (KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
+                raise RecordingError(f'{path}: invalid scenario: {error}') from None
     return None
 
 
-@contextlib.contextmanager
-def _opened(path: str | Path) -> Iterator[Any]:
+def _records(path: str | Path) -> Iterator[Any]:
+    """Yield the records of a file and of its chunks, in the order of the file.
+
+    The readers of mcap would decompress a chunk to any size. Raises RecordingError if the file
+    cannot be read.
+    """
     with translated(MissingLibraryError, RecordingError), optional_import(
             'reading a recording', extra='recording'):
-        from mcap.exceptions import McapError
-        from mcap.reader import make_reader
+        from mcap.records import Chunk
+        from mcap.stream_reader import StreamReader, breakup_chunk
     try:
         with Path(path).open('rb') as stream:
-            yield make_reader(stream)
+            for record in StreamReader(stream, emit_chunks=True, validate_crcs=True,
+                                       record_size_limit=_MAX_BYTES).records:
+                if isinstance(record, Chunk):
+                    yield from breakup_chunk(_decompressed(record), validate_crc=True)
+                else:
+                    yield record
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
-    except McapError as error:
+    # For a damaged file, mcap and its libraries raise many kinds of exceptions.
+    except Exception as error:
         raise RecordingError(f'{path}: not a complete recording: {error!r}') from None
+
+
+def _decompressed(chunk: Any) -> Any:
+    """Return a chunk without compression; raise ValueError if it is too large."""
+    import lz4.frame
+    import zstandard
+
+    size = chunk.uncompressed_size
+    if size > _MAX_BYTES:
+        raise ValueError(f'a chunk of {size} bytes, expected at most {_MAX_BYTES}')
+    match chunk.compression:
+        case 'zstd':
+            data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size)
+        case 'lz4':
+            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size)
+        case _:
+            data = chunk.data
+    return dataclasses.replace(chunk, compression='', data=data)
 
 
 class CycleObserver(Node):

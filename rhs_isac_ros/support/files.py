@@ -13,8 +13,9 @@ from typing import Any, BinaryIO
 import numpy as np
 import yaml
 
-# Maximum size of a YAML file, or of the arrays of an archive [bytes].
-_MAX_BYTES = 2**28
+# Maximum size of the arrays of an archive, and of a YAML file, which takes up to 240 times as much
+# memory [bytes].
+_MAX_BYTES, _MAX_YAML_BYTES = 2**28, 2**24
 # Maximum depth of the lists and mappings of a YAML file.
 _MAX_YAML_DEPTH = 16
 # The loader in C reads a codebook ten times as fast; some builds of PyYAML lack it.
@@ -73,9 +74,9 @@ def read_yaml(path: str | Path) -> Any:
     """
     try:
         with open(path, 'rb') as stream:
-            data = stream.read(_MAX_BYTES + 1)
-        if len(data) > _MAX_BYTES:
-            raise ValueError(f'more than {_MAX_BYTES} bytes')
+            data = stream.read(_MAX_YAML_BYTES + 1)
+        if len(data) > _MAX_YAML_BYTES:
+            raise ValueError(f'more than {_MAX_YAML_BYTES} bytes')
         text, depth = data.decode(), 0
         # The C loader ends the process if the nesting is deep.
         for event in yaml.parse(text, _LOADER):

@@ -1,19 +1,21 @@
 """The action ``locate``, called by a client, during the messages of a cycle."""
 
 import types
+from unittest import mock
 
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Time
 from rclpy.action.client import ActionClient
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from rhs_isac_msgs.action import Locate
 from rhs_isac_ros.nodes import bs
 from rhs_isac_ros.nodes.bs import LocateServer
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros import convert, endpoints
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.topics import LOCATE
 
@@ -126,6 +128,17 @@ def test_signals_without_a_position_abort_the_goal(bench, action):
 def test_a_goal_ends_after_its_timeout(bench, action):
     assert finish(bench, action.send(1, 0.05), GoalStatus.STATUS_ABORTED).reason == (
         'no position within 0.05 s')
+
+
+def test_a_goal_whose_timer_was_refused_succeeds(bench, action, monkeypatch):
+    monkeypatch.setattr(Node, 'create_timer', mock.Mock(
+        side_effect=rclpy_implementation.RCLError('no memory, at a.cpp:1')))
+    goal = action.send(1)
+    action.server.observe(state(1, m.Phase.POSITIONING))
+    action.server.observe(estimate(1))
+    assert finish(bench, goal, GoalStatus.STATUS_SUCCEEDED).cycle_id == 7
+    assert 'timer of 60 s was refused: no memory' in endpoints.refusals(
+        action.server._node).values()
 
 
 def test_the_number_of_goals_and_of_timers_is_limited(bench, action, monkeypatch):

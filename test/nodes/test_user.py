@@ -1,5 +1,6 @@
 import sys
 import types
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -91,11 +92,12 @@ def test_odometry_is_read_in_the_frame_of_the_robot(bench):
     np.testing.assert_allclose(mobility.state(0.0)[1], [0.0, 2.0, 0.0], atol=1e-12)
 
 
-def test_transforms_that_were_refused_are_lacking(bench, monkeypatch):
-    def refuse(*_):
+@pytest.mark.parametrize('refused', ['Buffer', 'TransformListener'])
+def test_transforms_that_were_refused_are_lacking(bench, monkeypatch, refused):
+    def refuse(*_, **__):
         raise rclpy_implementation.RCLError('rt/tf topic not found in allow rule')
-    monkeypatch.setitem(sys.modules, 'tf2_ros', types.SimpleNamespace(
-        Buffer=lambda node: None, TransformListener=refuse))
+    monkeypatch.setitem(sys.modules, 'tf2_ros', types.SimpleNamespace(**{
+        'Buffer': Buffer, 'TransformListener': mock.Mock(), refused: refuse}))
     node = bench.add(Node_, 'robot_user')
     mobility = follow_frame(node, Frame(), 'base_link', 1.0)
     bench.until(lambda: [*node.timers], 'the timer')

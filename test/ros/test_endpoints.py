@@ -2,6 +2,7 @@
 
 import importlib
 import threading
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -221,6 +222,14 @@ def test_jobs_run_one_after_the_other(each_bench, background):
     each_bench.until(lambda: len(order) == 10)
     assert [n for kind, n in order if kind == 'begin'] == list(range(5))
     assert [n for kind, n in order if kind == 'end'] == list(range(5))
+
+
+def test_a_node_whose_jobs_have_no_thread_reports_that(each_bench, background, monkeypatch):
+    monkeypatch.setattr(threading.Thread, 'start', mock.Mock(side_effect=RuntimeError('no more')))
+    for _ in range(2):
+        background.run(lambda: 1, lambda result: None)
+    node = background._node
+    assert endpoints.refusals(node) == {'thread of jobs': 'thread of jobs was refused: no more'}
 
 
 def test_an_exception_of_a_job_is_raised_where_the_node_spins(each_bench, background):

@@ -157,6 +157,58 @@ def test_the_error_names_an_incomplete_recording(recording):
         list(read(path))
 
 
+def test_changed_bytes_cause_no_other_error(recording):
+    path, _ = recording
+    content, rng, errors = path.read_bytes(), np.random.default_rng(1), 0
+    for _ in range(200):
+        changed = bytearray(content)
+        for place in rng.integers(len(content), size=2):
+            changed[place] = rng.integers(256)
+        path.write_bytes(changed)
+        for act in (lambda: list(read(path)), lambda: read_scenario(path)):
+            try:
+                act()
+            except RecordingError as error:
+                assert str(error).startswith(f'{path}: ')
+                errors += 1
+    assert errors > 50
+
+
+@pytest.mark.parametrize('compression', ['ZSTD', 'LZ4', 'NONE'])
+@pytest.mark.parametrize(('declared', 'reason'), [
+    (None, 'a chunk of 100[0-9]{4} bytes, expected at most 500000'),
+    (1000, 'CRCValidationError')])
+def test_a_chunk_is_not_expanded_beyond_the_limit(
+        tmp_path, monkeypatch, compression, declared, reason):
+    from mcap import records, writer
+    monkeypatch.setattr('rhs_isac_ros.ros.recording._MAX_BYTES', 500_000)
+    write = records.Chunk.write
+
+    def lie(chunk, builder):
+        chunk.uncompressed_size = declared or chunk.uncompressed_size
+        write(chunk, builder)
+    monkeypatch.setattr(records.Chunk, 'write', lie)
+    path = tmp_path / 'bomb.mcap'
+    bomb = writer.Writer(str(path), compression=getattr(writer.CompressionType, compression))
+    bomb.start()
+    bomb.add_message(bomb.register_channel('/ack', 'cdr', 0), 0, bytes(1_000_000), 0)
+    bomb.finish()
+    if compression == 'NONE':
+        reason = 'RecordLengthLimitExceeded'
+    with pytest.raises(RecordingError, match=f'bomb.mcap: not a complete recording: .*{reason}'):
+        list(read(path))
+
+
+def test_a_message_without_a_topic_is_an_error(tmp_path):
+    from mcap.writer import Writer
+    writer = Writer(str(tmp_path / 'a.mcap'))
+    writer.start()
+    writer.add_message(7, 0, b'', 0)
+    writer.finish()
+    with pytest.raises(RecordingError, match='a.mcap: a message without a topic'):
+        list(read(tmp_path / 'a.mcap'))
+
+
 def test_a_scenario_of_another_version_is_an_error(tmp_path):
     class Other:
         def changes(self):
@@ -169,6 +221,7 @@ def test_a_scenario_of_another_version_is_an_error(tmp_path):
 
 @pytest.mark.parametrize(('text', 'reason'), [
     ('n_frames: [&a [1, 1], &b [*a, *a]]', 'it contains references'),
+    (f'n_frames: [{2**19 * "1,"}]', 'it contains references, or is too long'),
     (10_000 * '[', 'maximum recursion depth exceeded')])
 def test_a_scenario_that_would_occupy_the_process_is_an_error(
         tmp_path, monkeypatch, text, reason):
@@ -196,7 +249,7 @@ def test_the_error_names_a_missing_folder(tmp_path):
 
 
 def test_the_error_names_the_missing_library(tmp_path, monkeypatch):
-    for name in ('mcap.writer', 'mcap.reader'):
+    for name in ('mcap.writer', 'mcap.stream_reader'):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(RecordingError, match=r'^recording needs mcap.*rhs_isac_ros\[recording\]'):
         Recorder(tmp_path / 'run.mcap', Scenario())

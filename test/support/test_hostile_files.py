@@ -50,7 +50,7 @@ def test_yaml(tmp_path, content, text):
 
 
 def test_a_file_without_end(monkeypatch):
-    monkeypatch.setattr('rhs_isac_ros.support.files._MAX_BYTES', 1000)
+    monkeypatch.setattr('rhs_isac_ros.support.files._MAX_YAML_BYTES', 1000)
     with pytest.raises(ValueError, match='/dev/zero: cannot be read: more than 1000 bytes'):
         read_yaml('/dev/zero')
 
