@@ -48,11 +48,13 @@ class RoleStatistics:
         self._durations_s: dict[str, collections.deque[float]] = collections.defaultdict(
             lambda: collections.deque(maxlen=_MAX_DURATIONS))
 
+    def count_received(self, kind: type[m.Message]) -> None:
+        """Count a received message, even if it is dropped later."""
+        self._messages['received'][kind.__name__] += 1
+
     def record(self, event: Event, actions: Sequence[Action], handling_s: float) -> None:
         """Record an event, the actions that it caused, and the time taken [s]."""
-        if isinstance(event, m.Message):
-            self._messages['received'][type(event).__name__] += 1
-        elif isinstance(event, CodebookOffered):
+        if isinstance(event, CodebookOffered):
             self._codebook_id = event.codebook.id
         self._durations_s['handling_ms'].append(handling_s)
         for action in actions:

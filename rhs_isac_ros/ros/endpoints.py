@@ -175,6 +175,7 @@ def subscribe_messages(
         on_message: Callable[[m.Message], None],
         on_error: Callable[[m.MessageError], None] | None = None, scenario_id: str = '', *,
         on_foreign: Callable[[m.Message], None] = lambda message: None,
+        on_arrival: Callable[[type[m.Message]], None] = lambda kind: None,
         exchange: QoSProfile = EXCHANGE) -> None:
     """Subscribe to messages of the protocol; malformed messages are dropped.
 
@@ -186,6 +187,8 @@ def subscribe_messages(
         Called with the reason why a message was dropped; by default, the node logs it.
     scenario_id, on_foreign
         If `scenario_id` is given, messages of other scenarios are passed to `on_foreign`.
+    on_arrival
+        Called with the class of each message before decoding.
     exchange
         Quality of service of messages that are not latched.
     """
@@ -193,6 +196,7 @@ def subscribe_messages(
         node.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
 
     def receive(kind: type[m.Message], serialized: bytes) -> None:
+        on_arrival(kind)
         try:
             message = convert.from_bytes(kind, serialized)
             if scenario_id and message.scenario_id not in ('', scenario_id):
