@@ -95,7 +95,7 @@ def estimate_surface(
     return _result(posterior, gains)
 
 
-def first_values(nuisance: Nuisance, white: np.ndarray, white_mean: np.ndarray) -> np.ndarray:
+def initial_values(nuisance: Nuisance, white: np.ndarray, white_mean: np.ndarray) -> np.ndarray:
     """Return the likeliest values [N, Q] of those that only rotate whole bands, one by one."""
     values = np.zeros((len(white), len(nuisance)))
     outputs = np.sum(np.conj(white_mean) * white, axis=2)
@@ -108,8 +108,8 @@ def first_values(nuisance: Nuisance, white: np.ndarray, white_mean: np.ndarray) 
     return values
 
 
-def better_values(nuisance: Nuisance, values: np.ndarray, signals: np.ndarray, mean: np.ndarray,
-                  whiten: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def refined_values(nuisance: Nuisance, values: np.ndarray, signals: np.ndarray, mean: np.ndarray,
+                   whiten: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Return values [N, Q] after a scoring step, for signals and their mean [N, N_B, N_SB F]."""
     aligned = nuisance.divide(signals, values)
     slopes = whiten(nuisance.derivatives(aligned, mean))
@@ -217,8 +217,8 @@ class PilotStatistics:
         """Improve the values; return signals linear in them, and their whitened slopes."""
         values = self._values.get(key)
         if values is None:
-            values = first_values(self._nuisance, part.whiten(signals), part.whiten(part.mean))
-        self._values[key] = values = better_values(
+            values = initial_values(self._nuisance, part.whiten(signals), part.whiten(part.mean))
+        self._values[key] = values = refined_values(
             self._nuisance, values, signals, part.mean, part.whiten)
         aligned = self._nuisance.divide(signals, values)
         slopes = self._nuisance.derivatives(aligned, part.mean)

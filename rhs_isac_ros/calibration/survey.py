@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rhs_isac_ros import __version__
-from rhs_isac_ros.calibration.estimate import Pilots, better_values, first_values
+from rhs_isac_ros.calibration.estimate import Pilots, initial_values, refined_values
 from rhs_isac_ros.model import Beamforming, MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.gaussian import (
@@ -166,9 +166,9 @@ def _fitted(fields: Scenario, pilots: Pilots, surface: Surface | None) -> _Fit:
 def _residuals(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
     """Return signals without the likeliest impairments and without their mean, [N, N_B, R]."""
     nuisance, mean = nuisance_of(model.scenario), model.mean(pilots.positions)
-    values = first_values(nuisance, model.whiten(pilots.received), model.whiten(mean))
+    values = initial_values(nuisance, model.whiten(pilots.received), model.whiten(mean))
     for _ in range(_ALIGNMENT_STEPS if len(nuisance) else 0):
-        values = better_values(nuisance, values, pilots.received, mean, model.whiten)
+        values = refined_values(nuisance, values, pilots.received, mean, model.whiten)
     return nuisance.divide(pilots.received, values) - mean
 
 

@@ -128,7 +128,7 @@ class PositionerNode(RoleNode[Positioner]):
         if self.stands_by:
             return
         publishers = self._user_odometry.publishers(track.user)
-        endpoints.publish_if_read(publishers, lambda: convert.odometry(
+        endpoints.publish_if_subscribed(publishers, lambda: convert.odometry(
             track.user, track.estimate, convert.stamp_of(track, self), self._frame))
 
     def _on_estimator(self, event: events.EstimatorBuilt) -> None:
@@ -141,7 +141,7 @@ class PositionerNode(RoleNode[Positioner]):
         is_published = super().publish(message)
         if is_published and isinstance(message, m.PositionEstimate):
             publishers = self._pose, *self._user_poses.publishers(message.user)
-            endpoints.publish_if_read(publishers, lambda: convert.pose(
+            endpoints.publish_if_subscribed(publishers, lambda: convert.pose(
                 message, convert.stamp_of(message, self), self._frame))
         return is_published
 

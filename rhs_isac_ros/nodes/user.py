@@ -234,7 +234,7 @@ class UserNode(RoleNode[User]):
         truths = role.ground_truths(now_s)
         self.publish(truths if len(role.users) > 1 else next(truths.each()))
         for truth in truths.each():
-            endpoints.publish_if_read(
+            endpoints.publish_if_subscribed(
                 self._true_odometry.publishers(truth.user), functools.partial(
                     convert.true_odometry, truth.user, truth.position, truth.velocity, stamp,
                     self._frame))

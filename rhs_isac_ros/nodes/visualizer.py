@@ -201,14 +201,14 @@ class VisualizerNode(Node):
         stamp = self.get_clock().now().to_msg()
         for state in self._scene.users.values():
             self._show_paths(state, stamp)
-        endpoints.publish_if_read((self._publisher,), lambda: self._markers(stamp))
+        endpoints.publish_if_subscribed((self._publisher,), lambda: self._markers(stamp))
 
     def _show_paths(self, user: UserState, stamp: Time) -> None:
         paths = user.estimated_path, user.true_path
         # Without publishers, the zip is empty.
         for publisher, places in zip(self._paths.publishers(user.user), paths, strict=False):
             if places:
-                endpoints.publish_if_read(
+                endpoints.publish_if_subscribed(
                     (publisher,), functools.partial(path, places, stamp, self._frame))
 
     def _markers(self, stamp: Time) -> MarkerArray:

@@ -230,9 +230,9 @@ class SearchEstimator(abc.ABC):
         for row, (start, end) in enumerate(zip(samples.starts.tolist(), ends, strict=True)):
             best = start + int(np.argmax(value[start:end]))
             residual = float(modes.residual[best])
-            yield Fit(means[row], covariances[row], float(log_evidence[row]), residual,
-                      expected[row] + residual, modes.values[best] @ likelihood.nuisance.gain
-                      ), select(modes, slice(start, end))
+            fit = Fit(means[row], covariances[row], float(log_evidence[row]), residual,
+                      expected[row] + residual, modes.values[best] @ likelihood.nuisance.gain)
+            yield fit, select(modes, slice(start, end))
 
     def _judge(self, fit: Fit, whitened: np.ndarray, aligned: np.ndarray) -> Located:
         """Return the position of one phase or the reason for its absence."""

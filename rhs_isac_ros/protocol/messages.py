@@ -108,7 +108,7 @@ def _array_problem(
         described = ', '.join(d if d.isdigit() else f'{d} = {e}'
                               for d, e in zip(dims, expected, strict=True))
         return f'shape {list(value.shape)}, expected [{described}]'
-    has_range = declared.high < math.inf and value.size
+    has_range = value.size and (declared.low > -math.inf or declared.high < math.inf)
     # Comparisons with NaN are false, so most arrays with a range need no other check.
     if has_range and declared.low <= value.min() and value.max() <= declared.high:
         return ''

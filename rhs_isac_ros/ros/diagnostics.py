@@ -51,6 +51,6 @@ def publish_reports(node: Node, report: Callable[[], Report]) -> None:
     def publish() -> None:
         # Each report contains the faults since the previous one, even if nobody reads it.
         found = report()
-        endpoints.publish_if_read((publisher,), lambda: to_ros(
+        endpoints.publish_if_subscribed((publisher,), lambda: to_ros(
             found, node.get_fully_qualified_name(), node.get_clock().now().to_msg()))
     endpoints.steady_timer(node, _PERIOD_S, publish)

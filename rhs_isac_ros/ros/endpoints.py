@@ -146,14 +146,14 @@ def create_publisher(
     return publisher or _NoPublisher(node.resolve_topic_name(name))
 
 
-def publish_if_read(publishers: Iterable[Publisher], make: Callable[[], Any]) -> None:
+def publish_if_subscribed(publishers: Iterable[Publisher], make: Callable[[], Any]) -> None:
     """Publish the message that `make` returns on the topics with subscribers, if any.
 
     Topics for observers often have none, and the creation of a message takes longer than the rest.
     """
-    if read := [one for one in publishers if one.get_subscription_count()]:
+    if subscribed := [one for one in publishers if one.get_subscription_count()]:
         message = make()
-        for publisher in read:
+        for publisher in subscribed:
             publisher.publish(message)
 
 

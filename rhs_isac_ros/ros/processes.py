@@ -162,8 +162,7 @@ class Processes:
         """Start an executable with ROS parameters.
 
         By default, the node has the name of the executable, and the process has the name of the
-        node.
-        Processes of nodes with the same name need different names.
+        node. Processes of nodes with the same name need different names.
         """
         program = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros' / executable
         command = [str(program), '--ros-args']

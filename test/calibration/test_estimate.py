@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.calibration import Pilots, SurfacePrior, estimate_surface, prior_of
-from rhs_isac_ros.calibration.estimate import first_values
+from rhs_isac_ros.calibration.estimate import initial_values
 from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario
 from rhs_isac_ros.model.elements import DeclaredElements, SurfaceEstimate
 from rhs_isac_ros.model.impairments import nuisance_of
@@ -85,7 +85,7 @@ def test_an_alignment_starts_at_the_phases_of_the_bands(scenario, beams):
     model, phases = MeasurementModel(declared, beams), np.array([0.9, -2.0])
     mean = model.mean(declared.sample_positions(5, np.random.default_rng(0)))
     signals, nuisance = mean * np.exp(1j * phases)[:, None], nuisance_of(declared)
-    values = first_values(nuisance, model.whiten(signals), model.whiten(mean))
+    values = initial_values(nuisance, model.whiten(signals), model.whiten(mean))
     np.testing.assert_allclose(
         nuisance.divide(signals, values), mean, rtol=0, atol=1e-2 * np.abs(mean).max())
 

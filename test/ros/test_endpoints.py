@@ -31,13 +31,13 @@ def test_a_message_is_created_once_for_all_topics_with_subscribers(bench, probe)
     def make():
         made.append(Point(x=1.0))
         return made[-1]
-    endpoints.publish_if_read(publishers, make)
+    endpoints.publish_if_subscribed(publishers, make)
     assert not made
     for publisher in publishers[:2]:
         endpoints.subscribe(probe, Point, publisher.topic_name, received.append,
                             endpoints.EXCHANGE)
         bench.until(publisher.get_subscription_count, 'the subscription')
-    endpoints.publish_if_read(publishers, make)
+    endpoints.publish_if_subscribed(publishers, make)
     bench.until(lambda: len(received) == 2, 'the messages')
     assert received == 2 * made
 
