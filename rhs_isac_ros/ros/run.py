@@ -186,10 +186,9 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         # which takes tens of milliseconds at any time during a cycle.
         gc.collect()
         gc.freeze()
-        while not signals and not done():
-            # This call returns after each message, and raises an exception after a shutdown. Other
-            # ways of spinning do not return until the queue is empty, so that a busy node would
-            # miss signals.
+        while ok() and not signals and not done():
+            # This call returns after each message. Other ways of spinning do not return until the
+            # queue is empty, so that a busy node would miss signals.
             executor.spin_once(timeout_sec=_POLL_S)
     except ExternalShutdownException:
         pass

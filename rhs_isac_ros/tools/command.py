@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import itertools
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -17,6 +18,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import try_shutdown
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
@@ -201,7 +203,11 @@ class Session(contextlib.AbstractContextManager['Session']):
 
     def __init__(self, arguments: Sequence[str] = ('',)) -> None:
         startup.use_discovery_profile()
-        rclpy.init(args=startup.prepare(arguments))
+        # The handlers of rclpy would invalidate the context while the executor uses it.
+        rclpy.init(args=startup.prepare(arguments),
+                   signal_handler_options=SignalHandlerOptions.NO)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.default_int_handler)
         with startup.one_line():
             self.node = Node(f'_rhs_isac_cli_{os.getpid()}', **startup.WITHOUT_SERVICES)
         self._executor = SingleThreadedExecutor()
