@@ -1,10 +1,12 @@
 """A small scenario that is fast to optimise, and problems with a known minimum."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 
+from rhs_isac_ros.codebook.optimize import _Report
 from rhs_isac_ros.codebook.problem import Search
 from rhs_isac_ros.model import Scenario
 
@@ -56,6 +58,14 @@ class Flat(Quadratic):
 
     def value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
         return self.value(variables), np.zeros(20)
+
+
+@pytest.fixture(scope='package', autouse=True)
+def no_ticks():
+    """Report only steps: on a busy machine, the set-up can take longer than a tick."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_Report, '_TICK_S', math.inf)
+        yield
 
 
 @pytest.fixture(scope='session')
