@@ -54,10 +54,10 @@ class Frame:
     @classmethod
     def of(cls, node: Node, values: types.SimpleNamespace) -> 'Frame':
         """Return the frame of ``frame_id`` and ``surface_pose``, or raise ParameterError."""
-        pose = values.surface_pose or [0.0] * 6
+        pose = values.surface_pose
         if len(pose) != 6:
             raise ParameterError(f'surface_pose: {len(pose)} numbers, expected six, x, y, z [m], '
-                                 'roll, pitch, yaw [rad], or none')
+                                 'roll, pitch, yaw [rad]')
         if not values.frame_id or values.frame_id.startswith('/'):
             raise ParameterError(f'frame_id: {values.frame_id!r}, expected the name of a frame '
                                  'without a slash at its beginning')

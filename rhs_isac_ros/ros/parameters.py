@@ -5,6 +5,7 @@ the parameters that are settings of a role.
 """
 
 import contextlib
+import copy
 import dataclasses
 import difflib
 import functools
@@ -98,8 +99,8 @@ _FRAME = (
         'frame_id', topics.MAP_FRAME, 'Frame of poses, odometry, paths and transforms; messages '
         'of the protocol are in the frame of the surface.'),
     _parameter(
-        'surface_pose', [], 'Pose of the surface in frame_id: x, y, z in metres, roll, pitch, '
-        'yaw in radians; empty: at the origin, with the same axes.', low=-1e6, high=1e6),
+        'surface_pose', [0.0] * 6, 'Pose of the surface in frame_id: x, y, z in metres, roll, '
+        'pitch, yaw in radians.', low=-1e6, high=1e6),
 )
 
 # Parameters of roles that are not settings.
@@ -221,22 +222,29 @@ def _declare_one(node: Node, parameter: Parameter) -> Any:
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         description=parameter.text + unit, additional_constraints=parameter.expected,
-        read_only=not parameter.dynamic)
+        read_only=not parameter.dynamic and default != [])
     if parameter.kind is int:
         descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     elif parameter.kind is float:
         descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
     # ROS cannot infer the element type of an empty list.
-    is_list = parameter.kind is list
-    typed = RosParameter.Type.DOUBLE_ARRAY if is_list else default
+    typed = RosParameter.Type.DOUBLE_ARRAY if default == [] else default
     try:
         value: Any = node.declare_parameter(parameter.name, typed, descriptor).value
     except (InvalidParameterTypeException, InvalidParameterValueException) as error:
         raise ParameterError(
             f'{parameter.name}: {error}; expected {parameter.expected}') from None
     if value is None:
+        # A node with a parameter without value answers no request for several parameters, such as
+        # that of `ros2 param dump`.
         value = default
-    value = list(value) if is_list else value
+        node.set_parameters([RosParameter(parameter.name, typed, default)])
+    if default == []:
+        # rclpy keeps the descriptor itself.
+        final = copy.copy(descriptor)
+        final.read_only = not parameter.dynamic
+        node.set_descriptor(parameter.name, final)
+    value = list(value) if parameter.kind is list else value
     parameter.check(value)
     return value
 

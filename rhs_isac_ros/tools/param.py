@@ -78,7 +78,7 @@ def dump(session: Session, options: argparse.Namespace) -> None:
     node = _find(session, options)
     names = _names(session, node)
     types = _call(session, node, lambda client: client.get_parameter_types(names)).types
-    # A node answers a request for several values with none if one of them is not set.
+    # A node of rclpy answers a request for several values with none if one of them is not set.
     names = [name for name, kind in zip(names, types, strict=True)
              if kind != ParameterType.PARAMETER_NOT_SET]
     tree: dict[str, Any] = {}

@@ -171,8 +171,8 @@ def test_the_file_to_copy_contains_known_parameters_at_their_defaults():
         owner = section.removeprefix('/**').lstrip('/').partition('_')[0] or 'positioner'
         declared = {parameter.name: parameter.default for parameter in NODES[owner]}
         for name, value in content['ros__parameters'].items():
-            # The users of the file move, and a list without elements has no type.
-            assert value == declared[name] or name in ('mobility', 'surface_pose')
+            # The users of the file move.
+            assert value == declared[name] or name == 'mobility'
 
 
 def test_a_foreign_entry_of_a_file_is_ignored_with_a_warning(files, never_spins, capfd):

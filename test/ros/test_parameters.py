@@ -77,6 +77,16 @@ def test_the_defaults_apply_with_their_types(make, executable):
 
 
 @pytest.mark.parametrize('executable', NODES)
+def test_every_parameter_has_a_value(make, executable):
+    """Otherwise, `ros2 param dump` prints no parameter of the node."""
+    node = make()
+    declare(node, executable)
+    names = [p.name for p in NODES[executable]]
+    # rclpy raises ParameterUninitializedException for a parameter without value.
+    assert [p.name for p in node.get_parameters(names)] == names
+
+
+@pytest.mark.parametrize('executable', NODES)
 def test_descriptors_match_the_declarations(make, executable):
     node = make()
     declare(node, executable)
@@ -150,8 +160,7 @@ def test_a_parameter_that_is_not_dynamic_is_read_only(make, executable, paramete
     result, = node.set_parameters([Parameter(parameter.name, value=valid)])
     assert not result.successful
     assert 'read-only' in result.reason
-    unset = Parameter(parameter.name, value=[])
-    assert node.get_parameter_or(parameter.name, unset).value == parameter.default
+    assert node.get_parameter(parameter.name).value == parameter.default
 
 
 @pytest.mark.parametrize(('executable', 'settings', 'fixed'), [

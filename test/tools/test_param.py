@@ -31,9 +31,8 @@ def test_dump_is_a_parameter_file(output_of):
     codebook = content['/optimizer']['ros__parameters']['codebook']
     assert codebook['shape'] == [2, 4, 3, 2, 36]
     assert len(codebook['analog']) == 216
-    # A list without a value is left out.
-    values = yaml.safe_load(output_of(main, 'dump', 'bs'))['/bs']['ros__parameters']
-    assert values['policy'] == 'round_robin' and 'surface_pose' not in values
+    values = yaml.safe_load(output_of(main, 'dump', 'user_1'))['/user_1']['ros__parameters']
+    assert values['user_id'] == 1 and values['position_m'] == []
 
 
 def test_set_changes_the_parameter_or_prints_the_reason(output_of, call):
