@@ -83,9 +83,10 @@ def crash(
     Raises
     ------
     ChaosError
-        If the network does not serve its users before.
+        If the network does not serve its users before, or a node keeps reporting a fault.
     """
     wait_for_service(observer)
+    _wait_for_reports(observer)
     n_violations = len(observer.invariants.violations)
     log_lengths = {name: len(processes.log(name)) for name in processes.names}
     kill_delay_s = _kill_in(observer, processes, node, phase)
@@ -105,6 +106,19 @@ def crash(
         node=node, phase=phase.name.lower(), kill_delay_s=kill_delay_s, recovery_s=recovery_s,
         others_running=not processes.ended(), logged=logged, diagnosed=diagnosed,
         violations=tuple(observer.invariants.violations[n_violations:]))
+
+
+def _wait_for_reports(observer: NetworkObserver) -> None:
+    """Wait until no node reports a fault.
+
+    The network serves without the optimizer. A node that has not found the restarted one yet would
+    log nothing if it were killed again.
+    """
+    def faulty() -> list[str]:
+        return [f'{name}: {report.summary}'
+                for name, report in observer.reports.items() if report.fault]
+    if not observer.spin_until(lambda: not faulty(), TIMEOUT_S):
+        raise ChaosError(f'faults are still reported after {TIMEOUT_S:g} s: {faulty()}')
 
 
 def _kill_in(
