@@ -32,8 +32,11 @@ STEPS = 30
 NO_PYMOO = importlib.util.find_spec('pymoo') is None
 # Methods that search, each with few steps.
 FEW_STEPS = {'alternating': 24, 'direct': 12, 'genetic': 2, 'lbfgs': 10}
-SEARCHING = [pytest.param(name, marks=pytest.mark.skipif(
-    name == 'genetic' and NO_PYMOO, reason='needs pymoo')) for name in FEW_STEPS]
+SEARCHING = [
+    'alternating', 'direct', 'lbfgs',
+    # Many evaluations. Ubuntu has no package of pymoo.
+    pytest.param('genetic', marks=[
+        pytest.mark.skipif(NO_PYMOO, reason='needs pymoo'), pytest.mark.slow])]
 # The objective's rows are not exact, see ROW_TOLERANCE.
 ABOUT = 1e-3
 
