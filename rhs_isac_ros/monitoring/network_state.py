@@ -79,7 +79,7 @@ class Overview:
                 self.codebook_id = message.codebook_id
         self._log.add(message, now_s)
         for cycle in self._log.complete:
-            if cycle.user in self.users or len(self.users) < MAX_USERS:
+            if cycle.user in self.users:
                 self.users[cycle.user] = cycle
         self._log.clear()
 

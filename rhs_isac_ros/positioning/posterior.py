@@ -202,14 +202,13 @@ class BandPhases:
         self._wavenumbers = wavenumbers
         self._common, self._log_weights = _common_phase(np.sqrt(shared))
 
-    def factors(self, outputs: np.ndarray, *, averages: bool = True
-                ) -> tuple[np.ndarray, np.ndarray]:
-        """Multiply the factors at P positions; if `averages`, average over a wavelength of range.
+    def factors(self, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Multiply the factors at P positions, and average over a wavelength of range.
 
         `outputs`, [N_B, P], come from the matched filters. Returns the logarithm of the result,
         and the mean offset in range [m], [P].
         """
-        ranges_m = self._ranges_m if averages else np.zeros(1)
+        ranges_m = self._ranges_m
         all_turns = self._wavenumbers[:, None, None] * ranges_m[:, None] + self._common
         log_factor = np.zeros((outputs.shape[1], *all_turns.shape[1:]))
         for output, turns in zip(outputs, all_turns, strict=True):

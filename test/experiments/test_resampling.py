@@ -41,6 +41,12 @@ def test_comparisons_of_the_same_cases_are_paired():
     assert own.reduction_from(baseline) == pytest.approx((40, 40, 40), abs=1e-3)
 
 
+def test_the_interval_of_many_cases_is_that_of_their_standard_error():
+    results = np.random.default_rng(0).normal(10, 1, size=(1, 4000))
+    value, low, high = replicate(results, 0)[0].interval()
+    assert (value, high - low) == pytest.approx((results.mean(), 2 * 1.96 / 4000**0.5), rel=0.05)
+
+
 @pytest.mark.parametrize('members', [2, 5])
 def test_intervals_of_few_members_have_their_nominal_coverage(members):
     rng, inside, variances = np.random.default_rng(0), 0, []

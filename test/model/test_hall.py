@@ -126,7 +126,7 @@ BAD = [
     ('n', lambda x: x[:10], r'shape \(10, 2\), expected \(20, 2\)'),
     ('f0', lambda x: 0.0, 'expected a positive frequency'),
     ('f0', lambda x: 28e9, 'at most 1.5 times'),
-    ('users', lambda x: x * [-1, 1, 1], 'in front of the surface'),
+    ('users', lambda x: np.abs(x) * [-1, 1, 1], 'x = -.* in front of the surface'),
     ('src', lambda x: x + [0.5, 0, 0], 'from the user for a direct path'),
     ('a', lambda x: 100 * x, 'times that of free space'),
     ('gains', lambda x: np.ones((20, 2, 64), complex), '64 elements, expected 100'),
