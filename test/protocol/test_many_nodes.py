@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.user_registry import INVITED
 
 pytestmark = pytest.mark.usefixtures('plain_beams')
 
-N_USERS = 2 * INVITED
+# Twice as many as a beacon invites.
+N_USERS = 16
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.protocol.user_registry import (
-    INVITED,
     LAST_NUMBER,
     POLICIES,
     SILENT_S,
@@ -14,6 +13,9 @@ from rhs_isac_ros.protocol.user_registry import (
 )
 
 pytestmark = pytest.mark.usefixtures('plain_beams')
+
+# Number of users that a beacon invites, and of seniors.
+INVITED = 8
 
 
 @pytest.fixture
