@@ -30,9 +30,10 @@ def test_the_example_is_served_without_repetitions(processes, make_watch):
             user.terminate()
     assert user.returncode == 0
     assert not watch.given_up
-    for end in watch.served[:5]:
-        # A request is repeated after a quarter of a second.
-        assert len(watch.of_cycle(m.PilotRequest, end.cycle_id)) == 1
+    # A request is repeated after a quarter of a second. The watch may find the publisher of the
+    # requests after the first cycles.
+    requests = [len(watch.of_cycle(m.PilotRequest, end.cycle_id)) for end in watch.served[:5]]
+    assert max(requests) == 1
 
 
 def _incomplete(node, space):
