@@ -83,10 +83,10 @@ def crash(
     Raises
     ------
     ChaosError
-        If the network does not serve its users before, or a node keeps reporting a fault.
+        If the network does not serve its users before, or a node keeps reporting this node.
     """
     wait_for_service(observer)
-    _wait_for_reports(observer)
+    _wait_until_found(observer, node)
     n_violations = len(observer.invariants.violations)
     log_lengths = {name: len(processes.log(name)) for name in processes.names}
     kill_delay_s = _kill_in(observer, processes, node, phase)
@@ -108,17 +108,17 @@ def crash(
         violations=tuple(observer.invariants.violations[n_violations:]))
 
 
-def _wait_for_reports(observer: NetworkObserver) -> None:
-    """Wait until no node reports a fault.
+def _wait_until_found(observer: NetworkObserver, node: str) -> None:
+    """Wait until no fault that a node reports names the given one.
 
     The network serves without the optimizer. A node that has not found the restarted one yet would
     log nothing if it were killed again.
     """
-    def faulty() -> list[str]:
-        return [f'{name}: {report.summary}'
-                for name, report in observer.reports.items() if report.fault]
-    if not observer.spin_until(lambda: not faulty(), TIMEOUT_S):
-        raise ChaosError(f'faults are still reported after {TIMEOUT_S:g} s: {faulty()}')
+    def faults() -> list[str]:
+        return [f'{name}: {report.summary}' for name, report in observer.reports.items()
+                if report.fault and node in report.summary]
+    if not observer.spin_until(lambda: not faults(), TIMEOUT_S):
+        raise ChaosError(f'{node} is still reported after {TIMEOUT_S:g} s: {faults()}')
 
 
 def _kill_in(
