@@ -208,15 +208,14 @@ class BandPhases:
         `outputs`, [N_B, P], come from the matched filters. Returns the logarithm of the result,
         and the mean offset in range [m], [P].
         """
-        ranges_m = self._ranges_m
-        all_turns = self._wavenumbers[:, None, None] * ranges_m[:, None] + self._common
+        all_turns = self._wavenumbers[:, None, None] * self._ranges_m[:, None] + self._common
         log_factor = np.zeros((outputs.shape[1], *all_turns.shape[1:]))
         for output, turns in zip(outputs, all_turns, strict=True):
             std = self._broadened(np.abs(output))[:, None, None]
             log_factor += _log_density(np.angle(output)[:, None, None] + turns, std)
-        log_factor += self._log_weights - np.log(len(ranges_m))
+        log_factor += self._log_weights - np.log(len(self._ranges_m))
         weights, log_total = mixture_weights(log_factor, axis=(1, 2))
-        return log_total, weights.sum(axis=2) @ ranges_m
+        return log_total, weights.sum(axis=2) @ self._ranges_m
 
     def _broadened(self, magnitude: np.ndarray) -> np.ndarray:
         """Return the standard deviation of the phase of outputs of these magnitudes."""

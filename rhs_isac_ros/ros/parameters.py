@@ -219,16 +219,17 @@ def hint(name: str) -> str:
 
 def _declare_one(node: Node, parameter: Parameter) -> Any:
     default, low, high = parameter.default, parameter.low, parameter.high
+    is_empty = default == []
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         description=parameter.text + unit, additional_constraints=parameter.expected,
-        read_only=not parameter.dynamic and default != [])
+        read_only=not (parameter.dynamic or is_empty))
     if parameter.kind is int:
         descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     elif parameter.kind is float:
         descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
     # ROS cannot infer the element type of an empty list.
-    typed = RosParameter.Type.DOUBLE_ARRAY if default == [] else default
+    typed = RosParameter.Type.DOUBLE_ARRAY if is_empty else default
     try:
         value: Any = node.declare_parameter(parameter.name, typed, descriptor).value
     except (InvalidParameterTypeException, InvalidParameterValueException) as error:
@@ -239,8 +240,8 @@ def _declare_one(node: Node, parameter: Parameter) -> Any:
         # that of `ros2 param dump`.
         value = default
         node.set_parameters([RosParameter(parameter.name, typed, default)])
-    if default == []:
-        # rclpy keeps the descriptor itself.
+    if is_empty:
+        # A copy, since rclpy keeps the descriptor itself, which must allow the change above.
         final = copy.copy(descriptor)
         final.read_only = not parameter.dynamic
         node.set_descriptor(parameter.name, final)

@@ -1,6 +1,12 @@
 """``scripts/param`` on a network in another process."""
 
+import threading
+
+import rclpy
 import yaml
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from rhs_isac_ros.tools.param import main
 
@@ -33,6 +39,26 @@ def test_dump_is_a_parameter_file(output_of):
     assert len(codebook['analog']) == 216
     values = yaml.safe_load(output_of(main, 'dump', 'user_1'))['/user_1']['ros__parameters']
     assert values['user_id'] == 1 and values['position_m'] == []
+
+
+def test_parameters_without_a_value_are_left_out(output_of):
+    """Those of this package have values, but not those of every node."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node, executor = Node('foreign', context=context), SingleThreadedExecutor(context=context)
+    node.declare_parameter('gain', Parameter.Type.DOUBLE)
+    node.declare_parameter('count', 3)
+    executor.add_node(node)
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    try:
+        values = yaml.safe_load(output_of(main, 'dump', 'foreign'))['/foreign']['ros__parameters']
+    finally:
+        executor.shutdown()
+        thread.join()
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+    assert values['count'] == 3 and 'gain' not in values
 
 
 def test_set_changes_the_parameter_or_prints_the_reason(output_of, call):
