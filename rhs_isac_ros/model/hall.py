@@ -180,7 +180,7 @@ class PathChannel(ArrayFile):
         Users are the transmitters, and the only receiver is at the surface's centre, with axes
         like the scenario's. Both have one isotropic antenna. All reflections are specular, and
         the frequency of the scene is `f0` [Hz]. Paths from behind the surface are removed. Raises
-        ArchiveError if there are several receivers or antennas, or the result is not possible.
+        ArchiveError if there are several receivers or antennas, or the result is not valid.
         """
         a = np.array(paths.a[0]) + 1j * np.array(paths.a[1])
         if a.ndim != 5 or (*a.shape[:2], a.shape[3]) != (1, 1, 1):
