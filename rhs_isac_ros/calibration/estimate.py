@@ -96,10 +96,7 @@ def estimate_surface(
 
 
 def initial_values(nuisance: Nuisance, white: np.ndarray, white_mean: np.ndarray) -> np.ndarray:
-    """Return initial values [N, Q], from whitened signals and whitened means [N, N_B, N_SB F].
-
-    Values that only rotate whole bands are estimated, one after another; all others are 0.
-    """
+    """Estimate, one by one, the values [N, Q] that only rotate whole bands; others are 0."""
     values = np.zeros((len(white), len(nuisance)))
     outputs = np.sum(np.conj(white_mean) * white, axis=2)
     for q in np.flatnonzero(nuisance.phases.any(axis=0)):
