@@ -70,10 +70,10 @@ class MultipathEstimate(ArrayFile):
     radiation: np.ndarray  #: T_i of the survey, complex128 [N_B, N_SB F, N_E].
     excess: np.ndarray  #: M_i, complex128 [N_B, N_SB F, N_SB F] [1/W].
     conditions: dict[str, Any]  #: Fields of the survey's scenario that the covariance depends on.
-    #: Record of the survey: ``positions``, the number of positions; ``prior_weight`` nu;
-    #: ``inflation`` t; ``level_std_db``, the standard deviation of the power among users [dB];
-    #: ``coverage``, the expected share of positions in the 95 % region, with its interval;
-    #: ``warnings``; ``codebook``, its id; ``version``.
+    #: Record of the survey: numbers of ``positions`` with a direct path and of ``blocked`` ones;
+    #: ``prior_weight`` nu; ``inflation`` t; ``level_std_db``, the standard deviation of the power
+    #: among users [dB]; ``coverage``, the expected share of positions in the 95 % region, with its
+    #: interval; ``warnings``; ``codebook``, its id; ``version``.
     about: dict[str, Any] = dataclasses.field(default_factory=dict)
     origin: str = ''
 
