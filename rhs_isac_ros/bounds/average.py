@@ -69,7 +69,7 @@ class Combination(NamedTuple):
         return whitened[:, self.sources] * self.scale[band, :, None]
 
     def backward(self, band: int, weighted: np.ndarray, n_rows: int) -> np.ndarray:
-        """Convert gradients in the rows, [n, G, R], to gradients in the source rows, [n, S, R]."""
+        """Convert gradients by the rows, [n, G, R], to gradients by the source rows, [n, S, R]."""
         gathered = np.zeros((len(weighted), n_rows, weighted.shape[2]), complex)
         for row, (source, scale) in enumerate(zip(self.sources, self.scale[band], strict=True)):
             gathered[:, source] += np.conj(scale) * weighted[:, row]
@@ -152,8 +152,8 @@ def average_crlb(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> Gradient:
     """Compute the average bound, Eq. (17), with its gradients by Propositions 2 and 3.
 
-    `positions` are at least one position of the user, float64 [N, 3] [m]. The value and its
-    derivative with respect to C are in m^2, the derivative with respect to S in m^2/sqrt(W).
+    Takes positions of the user, float64 [N, 3] [m]. The value and its derivative with respect to C
+    are in m^2; the derivative with respect to S is in m^2/sqrt(W).
     Raises ValueError if `positions` is not a finite [N, 3] array, or contains no position.
     """
     return AverageCrlb(scenario, positions)(codebook)
@@ -193,7 +193,7 @@ class AverageCrlb(Average):
         slopes = np.matmul(finite, finite)
         if joint.shape[1] == 3:
             return values, slopes
-        # W = [I; regression] minimises the Schur complement W^T J W, and is therefore held fixed.
+        # W = [I; regression] minimises the Schur complement W^T J W, so it is treated as constant.
         identity = np.broadcast_to(np.eye(3), (len(joint), 3, 3))
         whole = np.concatenate([identity, marginal.regression], axis=1)
         return values, whole @ slopes @ np.swapaxes(whole, 1, 2)
@@ -270,7 +270,7 @@ def _by_error(scenario: Scenario, radiation: np.ndarray, covariance_terms: np.nd
 def _through_term(
         scenario: Scenario, codebook: Beamforming, constant: np.ndarray | float,
         slope: np.ndarray | float, by_radiation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gradients through (constant + slope C) * (S B), each factor a number or [N_E]."""
+    """Return gradients through (constant + slope C) * (S B); constant and slope may be [N_E]."""
     beams = AppliedBeams(np.conj(constant + slope * codebook.analog), codebook.digital)
     return (gradient_analog(scenario, codebook, np.conj(slope) * by_radiation),
             gradient_digital(scenario, beams, by_radiation))

@@ -38,7 +38,7 @@ _MAX_POINTS = 2_000_000
 # Number of phases that share an offset of the lattice, and number evaluated at a time.
 _PER_OFFSET = 512
 _BLOCK = 16
-# Points further below the true one in log-likelihood have no effect.
+# Points whose log-likelihood is lower than the true point's by more than this have no effect.
 _MARGIN = 20.0
 # Nodes of the interpolation over the range, in addition to those for the phase of the sub-bands,
 # and number of ranges at which the likelihood of a ray is bounded.
@@ -104,7 +104,7 @@ class _Lattice:
         thickness: np.ndarray | float = 1.0
         for axis, (least, most) in enumerate(scenario.roi_bounds_m.T):
             coordinate, cell = sight[:, axis, None] * ranges, steps[axis] * (ranges if axis else 1)
-            # A region thinner than a cell of the lattice has the thickness of a cell.
+            # A region thinner than a cell of the lattice is given the thickness of a cell.
             excess = np.maximum(cell - (most - least), 0) / 2
             inside &= (coordinate >= least - excess) & (coordinate <= most + excess)
             if np.any(excess):
@@ -198,7 +198,7 @@ def _weights(nodes: np.ndarray, angles: np.ndarray, points: np.ndarray) -> np.nd
 
 
 def _steps(model: MeasurementModel, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-    """Return the lattice steps in (r [m], u, v), from local deviations, and their coarseness."""
+    """Return lattice steps in (r [m], u, v) from local standard deviations, and the coarseness."""
     positions = model.scenario.sample_positions(256, rng)
     slopes = jacobian(to_polar(positions))
     information = fisher_information(model, positions)

@@ -30,7 +30,7 @@ _DIFFERENCE_M, _TOLERANCE_M = 1e-4, 1e-7
 _PER_WAVELENGTH = 8
 # Scale of the distance between the maximum of an ambiguity and the ray [m].
 _MAX_OFFSET_M = 0.5
-# Quantile, in standard deviations, of the residual energy that they should accept: 99 %.
+# Quantile, in standard deviations, of the residual energy that estimators should accept: 99 %.
 _QUANTILE = 2.33
 # Conditions for a valid result: largest share of ambiguities in the squared error, smallest
 # distance from the border of the region in standard deviations, and largest relative error of the
@@ -42,10 +42,10 @@ class Misspecified(NamedTuple):
     """Errors of the maximum-likelihood estimator of an assumed model under a true one."""
 
     bias: np.ndarray  #: Pseudo-true position minus true position, float64 [N, 3] [m].
-    covariance: np.ndarray  #: Of the errors about the pseudo-true position, [N, 3, 3] [m^2].
+    covariance: np.ndarray  #: Covariance about the pseudo-true position, [N, 3, 3] [m^2].
     #: Whether the result describes the estimator, bool [N]: ambiguities of the range are
-    #: improbable, the mean is linear over the errors, the border of the region is far away, and
-    #: estimators accept the residual of the signals.
+    #: improbable, the mean is almost linear within the errors, the border of the region is far
+    #: away, and estimators accept the residual of the signals.
     valid: np.ndarray
 
     @property

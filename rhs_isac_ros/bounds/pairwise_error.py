@@ -73,10 +73,10 @@ class PairwiseErrorCost(Average):
     ) -> 'PairwiseErrorCost':
         """Draw n of the pairs, with a probability that grows with their cost.
 
-        For this codebook, the cost of the sample is an unbiased estimate of the whole cost; for
-        similar codebooks, it is close, because the few most similar pairs contribute most of it.
-        Evaluations are in single precision. Raises ValueError if n is not from 1 to the number of
-        pairs, or if the differences are exact.
+        For this codebook, the cost of the sample is an unbiased estimate of the cost of all pairs.
+        For similar codebooks, the estimate is close, because a few very similar pairs contribute
+        most of the cost. Evaluations are in single precision. Raises ValueError if n is not from 1
+        to the number of pairs, or if the rows are not compressed.
         """
         total = len(self._costs)
         if not 1 <= n <= total:
@@ -100,7 +100,7 @@ class PairwiseErrorCost(Average):
         return sample
 
     def _confusion(self, block: slice, forms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the cost times Q(sqrt(q / 2)) [n], and minus its slope over 2 q, [n, 1, 1]."""
+        """Return costs times Q(sqrt(q / 2)) [n], and negative slopes in the forms [n, G, G]."""
         from scipy.special import ndtr
 
         squares, slopes = self._squares(forms)

@@ -16,11 +16,11 @@ from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 
-# Grid points of the lag per shortest wavelength.
+# Number of grid points of the lag per shortest wavelength.
 _LAGS_PER_WAVELENGTH = 24
-# Draws of the noise at each position.
+# Number of draws of the noise at each position.
 _DRAWS = 16
-# Band plans evaluated at a time.
+# Number of band plans evaluated at a time.
 _BLOCK = 128
 
 
@@ -127,14 +127,14 @@ def _lags(highest_hz: float, max_lag_m: float) -> np.ndarray:
 
 
 def _is_minimum(mismatch: np.ndarray) -> np.ndarray:
-    """Return the local minima of rows, except at their ends, bool [P, L]."""
+    """Mark the local minima of each row, except at the ends of the row, bool [P, L]."""
     inside = mismatch[:, 1:-1]
     is_minimum = (inside <= mismatch[:, :-2]) & (inside < mismatch[:, 2:])
     return np.pad(is_minimum, ((0, 0), (1, 1)))
 
 
 def _refined(mismatch: np.ndarray, plan: np.ndarray, lag: np.ndarray) -> np.ndarray:
-    """Return the minima of parabolas through minima and their neighbours, at least 0, [n]."""
+    """Return minima [n], refined by parabolas through their neighbours and at least 0."""
     before, at, after = (mismatch[plan, lag + step] for step in (-1, 0, 1))
     lowest = at - (after - before)**2 / (8 * (before - 2 * at + after))
     return np.maximum(lowest, 0.0)

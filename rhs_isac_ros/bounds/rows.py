@@ -2,7 +2,7 @@
 
 A row is a linear function of the line-of-sight gains of one band, such as their derivative with
 respect to a coordinate, or their difference between two positions. Its mean is the same function
-of the mean signals, as in Eq. (13). Whitened means take most of the time of an objective.
+of the mean signals, as in Eq. (13). Most of the time of an objective goes into whitened means.
 """
 
 import copy
@@ -21,13 +21,13 @@ Tick = Callable[[], None]
 # None for 1. Together, the slices cover all rows.
 Pattern = tuple[slice, np.ndarray | None]
 PLAIN: Sequence[Pattern] = ((slice(None), None),)
-# Number of items of three rows in a block, whose arrays fit into the cache.
+# Number of items in a block, if each has three rows. The arrays of a block fit into the cache.
 _BLOCK = 128
 # Largest number of complex numbers in a block of exact rows.
 _BLOCK_NUMBERS = 1 << 21
-# Memory for exact rows that are kept between evaluations.
+# Memory for exact rows that are kept between evaluations [bytes].
 _CACHE_BYTES = 1 << 30
-# Largest useful rank. With more vectors, products take as long as with rows of a few positions.
+# Largest useful rank. With more basis vectors, a small number of exact rows is as fast.
 _MAX_RANK = 192
 # Minimum number of columns of the first sketch. Each further sketch has twice as many.
 _MIN_SKETCH = 128
@@ -57,7 +57,7 @@ class RowSource:
 
     @property
     def width(self) -> int:
-        """Complex numbers of a row."""
+        """Number of complex numbers in a row."""
         return self.scenario.n_subbands * self.scenario.n_elements
 
     def flat(self, block: slice, band: int) -> np.ndarray:
@@ -97,7 +97,7 @@ class MeasurementRows:
             np.swapaxes(means.reshape(self.n_groups, -1, means.shape[-1]), 1, 2))
 
     def sums(self, band: int, weights: np.ndarray) -> np.ndarray:
-        """Return the sums of weights [J, R, S F] and basis vectors, complex128 [N_SB F, N_E]."""
+        """Sum the basis vectors with weights [J, R, S F]; return complex128 [N_SB F, N_E]."""
         frames = np.swapaxes(weights, 1, 2).reshape(
             self.n_groups, self._n_in_group, -1, weights.shape[1])
         basis = self.bases[band]
@@ -111,7 +111,7 @@ class Evaluation:
     def __init__(self, rows: MeasurementRows, model: MeasurementModel) -> None:
         self._rows, self._whitener = rows, model.whitener
         # With a single group, the filters include patterns and whitening, which then cost no time
-        # per item. With several groups, these follow after the means are joined.
+        # per item. With several groups, both are applied after the means are joined.
         self._is_folded = rows.n_groups == 1
         self._patterns = rows.patterns if self._is_folded else PLAIN
         self._filters = [
@@ -306,7 +306,7 @@ def _compress(rows_of: Callable[[slice], np.ndarray], every: list[slice], n_rows
     if not MIN_TOLERANCE <= tolerance < 1:
         raise ValueError(
             f'tolerance: {tolerance:g}, expected {MIN_TOLERANCE:g} to 1, or 0 for exact rows')
-    # The basis is found from some of many rows, and accepted if its error for all rows is small.
+    # The basis is found from some rows if there are many, and kept if its error for all is small.
     used = every[::max(n_rows // _SKETCHED_ROWS, 1)]
     while True:
         wanted = tolerance if len(used) == len(every) else _SKETCH_MARGIN * tolerance
@@ -348,7 +348,7 @@ def _leading(relative: np.ndarray, tolerance: float) -> tuple[np.ndarray, float]
 
 
 def _missing(relative: np.ndarray) -> float:
-    """Return the mean square of the part of unit-length rows that is outside of the basis."""
+    """Return the mean square of the part of unit-length rows outside the span of the basis."""
     lengths = np.linalg.norm(relative, axis=1)
     return max(1.0 - float(np.sum(lengths**2)) / max(len(lengths), 1), 0.0)
 

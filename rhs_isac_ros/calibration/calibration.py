@@ -16,7 +16,7 @@ from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
 
 _FORMAT = 1
-# Types of the arrays in a file, and names of their standard deviations, which inform readers.
+# Arrays in a file with their types, and standard deviations, which are only for human readers.
 _ARRAYS = {'gains': complex, 'offsets': complex, 'band_gains': complex, 'factor': complex,
            'failed_probability': float}
 _DEVIATIONS = ('gains_std', 'offsets_std', 'band_gains_std')
@@ -113,7 +113,7 @@ def calibrate(scenario: Scenario, pilots: Sequence[Pilots],
 
 
 def _without_hall(scenario: Scenario) -> Scenario:
-    """Return a scenario without channels and multipath, which do not change a surface."""
+    """Return a scenario without channel and multipath files, which do not affect a surface."""
     return dataclasses.replace(scenario, multipath=None, channel=None)
 
 

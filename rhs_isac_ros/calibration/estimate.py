@@ -31,11 +31,11 @@ from rhs_isac_ros.support.threads import one_blas_thread
 DEFAULT_ERROR_RMS = 0.05
 DEFAULT_FAILED_SHARE = 0.01
 _MAX_ROUNDS = 30
-# The estimation has converged if no parameter moves by more than this share of its deviation.
+# The estimation has converged if no parameter moves by more than this, in standard deviations.
 TOLERANCE = 0.02
 # Share of the largest variance below which a direction of the covariance is dropped.
 _MIN_VARIANCE = 1e-12
-# Pilots evaluated at a time.
+# Number of pilots evaluated at a time.
 _BLOCK = 64
 
 
@@ -71,8 +71,8 @@ def estimate_surface(
     """Estimate a surface from pilots of one or several codebooks.
 
     The default prior is the result of `prior_of`; without pilots, it is also the estimate.
-    `progress` is called after each round with its number and the largest change of a parameter, in
-    standard deviations.
+    `progress` is called after each round with the number of the round and the largest change of a
+    parameter, in standard deviations.
     """
     prior = prior or prior_of(scenario)
     statistics = PilotStatistics(scenario, pilots)
@@ -96,7 +96,7 @@ def estimate_surface(
 
 
 def initial_values(nuisance: Nuisance, white: np.ndarray, white_mean: np.ndarray) -> np.ndarray:
-    """Return the likeliest values [N, Q] of those that only rotate whole bands, one by one."""
+    """Estimate, one by one, the values [N, Q] that only rotate whole bands; others are 0."""
     values = np.zeros((len(white), len(nuisance)))
     outputs = np.sum(np.conj(white_mean) * white, axis=2)
     for q in np.flatnonzero(nuisance.phases.any(axis=0)):
@@ -124,9 +124,9 @@ def _curvature(slopes: np.ndarray) -> np.ndarray:
 
 
 def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
-    """Return the RMS of the real and imaginary parts of the bands' relative errors, [2, N_B]."""
-    # Pilots cannot distinguish a random gain or phase of the user from those of the bands. The
-    # gains or phases of as many bands are therefore fixed.
+    """Return the prior RMS of real and imaginary parts of the bands' gain errors, [2, N_B]."""
+    # Pilots cannot distinguish random gains and uniform phases of the signals from gains and
+    # phases of the bands. For each of them, the gain or phase of one band is therefore fixed.
     rms = np.full((2, scenario.n_bands), prior.band_gain_rms / np.sqrt(2))
     nuisance = nuisance_of(scenario)
     phases = nuisance.phases
@@ -139,7 +139,7 @@ def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
 
 
 def _change(before: Posterior, after: Posterior, n_bands: int) -> float:
-    """Return the largest change of a parameter; band parameters are already changes."""
+    """Return the largest change in standard deviations; band parameters are already changes."""
     moved = np.abs(after.complex_mean() - before.complex_mean())
     moved[-n_bands:] = np.abs(after.complex_mean()[-n_bands:])
     std = np.sqrt(np.maximum(np.diagonal(after.complex_covariance()).real, 1e-300))
@@ -157,11 +157,11 @@ def _result(posterior: Posterior, band_gains: np.ndarray) -> SurfaceEstimate:
 
 
 class PilotStatistics:
-    """Information in pilots about the parameters, given the covariance of their noise.
+    """Information in pilots about the parameters, given the covariance of the noise.
 
     The P = 2 N_E + N_B parameters are gains and offsets of the elements, and relative errors of
     the bands' gains. Declared nuisance parameters have different values for each pilot. Each round
-    improves these values by a scoring step and integrates over what remains unknown.
+    improves these values by a scoring step and integrates over the remaining uncertainty.
     """
 
     def __init__(self, scenario: Scenario, pilots: Sequence[Pilots]) -> None:
@@ -169,15 +169,15 @@ class PilotStatistics:
         self._radiation = [element_radiation(scenario, group.beams) for group in pilots]
         self._size = 2 * scenario.n_elements + scenario.n_bands
         self._nuisance = nuisance_of(scenario)
-        # Values of each group, block by block.
+        # Nuisance values by number of the group and first pilot of the block.
         self._values: dict[tuple[int, int], np.ndarray] = {}
 
     def evaluate(self, gains: np.ndarray, mean: np.ndarray, covariance: np.ndarray
                  ) -> tuple[np.ndarray, np.ndarray]:
         """Compute the information [2 P, 2 P] and shift [2 P], for real and then imaginary parts.
 
-        The model is linear about the band gains `gains`, complex128 [N_B]. `mean` and `covariance`
-        describe gains and offsets of the elements, [2 N_E] and [2 N_E, 2 N_E].
+        The model is linearised about the band gains `gains`, complex128 [N_B]. `mean` and
+        `covariance` describe gains and offsets of the elements, [2 N_E] and [2 N_E, 2 N_E].
         """
         size = self._size
         normal, product = np.zeros((size, size), complex), np.zeros(size, complex)
@@ -214,7 +214,7 @@ class PilotStatistics:
 
     def _linearised(self, part: '_Block', signals: np.ndarray, key: tuple[int, int]
                     ) -> tuple[np.ndarray, np.ndarray]:
-        """Improve the values; return signals linear in them, and their whitened slopes."""
+        """Improve nuisance values of a block; return linearised signals and whitened slopes."""
         values = self._values.get(key)
         if values is None:
             values = initial_values(self._nuisance, part.whiten(signals), part.whiten(part.mean))
@@ -226,7 +226,7 @@ class PilotStatistics:
 
     def _integrated(self, part: '_Block', signals: np.ndarray, slopes: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the information [2 P, 2 P] and shift [2 P] lost because values are unknown."""
+        """Return the information [2 P, 2 P] and shift [2 P] lost to unknown nuisance values."""
         coupling = sum(np.einsum('nqr,nrp->nqp', np.conj(slopes[:, :, band]), columns)
                        for band, columns in enumerate(part.columns))
         coupling = 2 * np.concatenate([coupling.real, -coupling.imag], axis=2)

@@ -1,9 +1,9 @@
 """The posterior of elements that work or have failed, from a Gaussian likelihood.
 
 A working element has a gain and no offset, a failed one an offset and no gain. Given the states of
-all elements, the posterior is Gaussian. The search changes the state of one element at a time, as
-long as this increases the evidence. The final posterior averages over both states of each element,
-given the states of the others. Without data, it is the prior.
+all elements, the posterior is Gaussian. The search changes the state of one element at a time
+until no change increases the evidence. The final posterior averages over both states of each
+element, given the states of all other elements. Without data, the posterior is the prior.
 """
 
 import dataclasses
@@ -13,9 +13,9 @@ import numpy as np
 
 from rhs_isac_ros.model.gaussian import step_to_maximum
 
-# Smallest prior deviation of a coefficient; it keeps matrices invertible.
+# Smallest prior standard deviation of a coefficient; it keeps matrices invertible.
 _MIN_RMS = 1e-6
-# If the less likely state has a smaller probability, it is neglected.
+# Probability below which the less likely state of an element is neglected.
 _MIN_PROBABILITY = 1e-7
 
 
@@ -46,7 +46,7 @@ class Posterior(NamedTuple):
     # For the P = 2 N_E + N_B gains, offsets and band gains: float64 [2 P] and [2 P, 2 P].
     mean: np.ndarray
     covariance: np.ndarray
-    # The most likely states, bool [N_E], and probabilities, float64 [N_E].
+    # The most likely states, bool [N_E], and probabilities of failure, float64 [N_E].
     failed: np.ndarray
     failed_probability: np.ndarray
 
@@ -68,7 +68,7 @@ def without_data(prior: SurfacePrior, band_rms: np.ndarray, n_elements: int) -> 
     size = 2 * (2 + n_bands)
     one = surface_posterior(np.zeros((size, size)), np.zeros(size), prior, band_rms,
                             np.zeros(1, bool))
-    # Each element equals this one and is independent of the others.
+    # All elements have the distribution of this one, and they are independent.
     like = np.repeat(np.arange(size), [n, n, *[1] * n_bands] * 2)
     owner = np.tile([*range(n), *range(n), *[n] * n_bands], 2)
     covariance = one.covariance[np.ix_(like, like)] * (owner[:, None] == owner)
@@ -149,7 +149,7 @@ class _Search:
         return mean, covariance
 
     def climb(self, failed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Flip states as long as the evidence grows; also return the log odds of each flip."""
+        """Flip states while the evidence grows; return them and the log odds of further flips."""
         log_odds = self._log_odds(failed)
         for _ in range(4 * self._n_elements):
             best = int(np.argmax(log_odds))
@@ -160,7 +160,7 @@ class _Search:
         return failed, log_odds
 
     def _log_odds(self, failed: np.ndarray) -> np.ndarray:
-        """Return the log odds of each element's other state, given the others' states, [N_E]."""
+        """Return log odds [N_E] of each element's other state, given the states of the rest."""
         active, inactive = self._indices(failed), self._indices(~failed)
         mean, covariance = self._solve(active)
         # Real and imaginary part of each element [N_E, 2].
@@ -169,8 +169,8 @@ class _Search:
         # Information about each element in its state, with all other elements eliminated ...
         curvature = np.linalg.inv(covariance[pairs])
         gradient = np.einsum('mxy,my->mx', curvature, mean[own])
-        # ... and in its other state. Conditional on the element itself, it is smaller by the part
-        # that the element explains.
+        # ... and in its other state. The elimination of all parameters in `active` includes the
+        # element itself, so the part that the element explains is added back.
         coupling = self._information[np.ix_(active, inactive)]
         product = covariance @ coupling
         explained, columns = product[pairs], coupling[:, own]

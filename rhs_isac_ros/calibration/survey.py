@@ -5,11 +5,11 @@ nu, whose mean L_0 is the covariance that three fields declare, the posterior me
 
     L = t (nu L_0 + N S) / (nu + N).
 
-Fields and nu maximise the evidence. L is therefore close to the declared covariance for few
-positions, and to the sample covariance for many. If the multipath consists of a few strong paths,
-it is not Gaussian, and with t = 1 positioning errors would exceed the bound. Each position is
-therefore left out in turn, and t is chosen so that 95 % of these positions lie in the 95 % region
-of the local bound, and 99 % pass the test of the residual.
+The fields and nu maximise the evidence. L is close to the declared covariance for few positions,
+and to the sample covariance for many. If the multipath consists of a few strong paths, it is not
+Gaussian, and with t = 1 positioning errors would exceed the bound. Each position is therefore left
+out in turn, and t is chosen so that 95 % of the positions lie in the 95 % region of the local
+bound, and 99 % pass the test of the residual.
 
 Positions are excluded if their signals are more probable as multipath of an unknown level, without
 a direct path.
@@ -225,7 +225,7 @@ def _log_evidence(declared: np.ndarray, sample: np.ndarray, n: int, weight: floa
 
 def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndarray,
               total: np.ndarray, n_others: float) -> tuple[np.ndarray, np.ndarray]:
-    """Evaluate each position under the covariance ``(total - e e^H) / n_others`` of the others.
+    """Evaluate each position under the covariance of all others, ``(total - e e^H) / n_others``.
 
     `total` is complex128 [N_B, R, R]; the residuals e are complex128 [N, N_B, R]. An error is a
     scoring step from the true position, with unknown nuisance parameters. Returns the squared
@@ -237,7 +237,7 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     slopes = np.concatenate([by_position, nuisance * mean[:, None]], axis=1)
     white = np.einsum('irs,nis->nir', whitener, residuals)
     columns = np.einsum('irs,nais->nair', whitener, slopes)
-    # total - e e^H is a change of rank one, so its inverse is known; the share of e is below 1.
+    # total - e e^H is a rank-one update, so its inverse is known; e^H total^-1 e is below 1.
     own = 1 / (1 - np.sum(np.abs(white)**2, axis=2))
     products = np.einsum('nair,nir->nai', columns.conj(), white)
     information = np.einsum('nair,nbir->nab', columns.conj(), columns) + np.einsum(
@@ -253,16 +253,16 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
 
 def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndarray,
               in_sight: np.ndarray, total: np.ndarray, weight: float) -> np.ndarray:
-    """Mark the positions that probably have a direct path, given the others, bool [N].
+    """Mark positions that probably have a direct path, given all other positions, bool [N].
 
-    Otherwise, signals are multipath of an unknown level. With a direct path, the level of the
-    multipath spreads as among the positions that are `in_sight`. `total`, complex128 [N_B, R, R],
-    is the sum over these positions and the prior, and has this weight.
+    Without a direct path, signals are multipath of an unknown level. With one, the level of the
+    multipath varies as among the positions that are `in_sight`. `total`, complex128 [N_B, R, R],
+    is the sum over these positions and the prior, and has the given `weight`.
     """
     whitener = np.linalg.inv(np.linalg.cholesky(total))
     with_path = np.einsum('irs,nis->nir', whitener, residuals)
     without = with_path + np.einsum('irs,nis->nir', whitener, model.mean(positions))
-    # A position must not explain itself: its term in the total is a change of rank one.
+    # A position must not explain itself: its own rank-one term is removed from the total.
     share, counts = np.sum(np.abs(with_path)**2, axis=2), in_sight[:, None]
     cross = np.abs(np.sum(with_path.conj() * without, axis=2))**2
     others = weight - in_sight
@@ -291,7 +291,7 @@ def _inflation(distances: np.ndarray, energies: np.ndarray, n_measurements: int)
 def _level_std_db(energies: np.ndarray, n_measurements: int) -> float:
     """Return the standard deviation of the power of the residuals among users [dB]."""
     n = len(energies)
-    # Even energies of Gaussian residuals with equal power vary.
+    # Energies of Gaussian residuals vary even if the residuals have equal power.
     excess = max(float(np.var(np.log(energies))) - 1 / n_measurements, 0.0)
     usual = (np.log(10) / 10 * _LEVEL_STD_DB)**2
     variance = (n * excess + _INFLATION_WEIGHT * usual) / (n + _INFLATION_WEIGHT)

@@ -52,7 +52,7 @@ from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.pictures import write_picture
 from rhs_isac_ros.support.progress import progress_bar
 
-# Positions for the average bound of the result, drawn independently of the samples.
+# Number of positions, independent of the samples, for the average bound of the result.
 HELD_OUT_POSITIONS = 2000
 # With more positions, the samples would fill the memory.
 _MAX_POSITIONS = 10**5
@@ -87,10 +87,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="calibration file of the surface; the scenario's surface if omitted")
     add('--method', choices=sorted(METHODS), default='lbfgs', help='optimiser')
     add('--objective', choices=sorted(OBJECTIVES),
-        help='the average bound; the ambiguity between distant positions, which a local bound '
-             'ignores; error, the same with weights close to the squared error; or the bound with '
-             'unknown phases of the bands and the region as prior. crlb if omitted, or error with '
-             '--spectrum')
+        help='crlb: the average bound; ambiguity: the confusion of distant positions, which a '
+             'local bound ignores; error: the same with weights close to the squared error; '
+             'nuisance: the bound with unknown phases of the bands and the region as prior; crlb '
+             'if omitted, or error with --spectrum')
     add('--sampling', choices=sorted(SAMPLINGS), default='sobol',
         help='how the region of interest is sampled')
     add('--positions', type=integer(1, _MAX_POSITIONS), default=DEFAULT_POSITIONS,
@@ -112,9 +112,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add('--raster', type=positive_float, default=DEFAULT_RASTER_HZ,
         help='spacing of possible centre frequencies [Hz]')
     add('--min-gap', type=positive_float,
-        help='smallest distance of centre frequencies [Hz]; the width of a band if omitted')
+        help='smallest distance between centre frequencies [Hz]; the width of a band if omitted')
     add('--plan', type=output_file, default='bandplan.yaml',
-        help='file to write the scenario with the chosen bands to')
+        help='file to write, with the scenario of the chosen bands')
     add('--quiet', action='store_true', help='show no progress')
 
 
@@ -196,7 +196,7 @@ def _choose_bands(
                   file=sys.stderr)
 
     def write_and_search(scenario: Scenario) -> OptimizeResult:
-        # An unfinished codebook belongs to this plan.
+        # If the search does not finish, its codebook belongs to the plan in this file.
         _save_plan(options.plan, scenario)
         return search(scenario)
 

@@ -49,7 +49,7 @@ def screen(
     """Return plans with low errors, ascending float64 [P, N_B] [Hz], and the errors [P].
 
     If there are at most `max_exhaustive` plans, all are returned. Otherwise, coordinate searches
-    from several starts move one frequency at a time to its best place on the raster, and their
+    from several starts move one frequency at a time to the best one of the raster, and their
     results are returned.
     """
     if math.comb(len(frequencies_hz), n_bands) > max_exhaustive:
@@ -103,8 +103,8 @@ def first_fit(frequencies_hz: np.ndarray, n_bands: int, gap_hz: float) -> np.nda
 
 DEFAULT_RASTER_HZ = 10e6
 # Energies of a codebook relative to a random one. The screening proposes plans for each: with more
-# energy, wider plans are better. From 8, proposed plans would confuse directions more often, which
-# the screening does not consider.
+# energy, wider plans are better. At 8 and above, the plans would confuse directions more often,
+# which the screening does not consider.
 _ENERGY_LEVELS = (2.0, 3.0, 4.0)
 # Number of plans with a codebook, and positions and steps of their optimisations.
 _CANDIDATES = 6
@@ -124,7 +124,7 @@ _MIN_DIFFERENCE = 4
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
-    """A band plan that was compared with others, with its ascending centre frequencies."""
+    """A band plan, with ascending centre frequencies, and its errors in the comparison."""
 
     frequencies_hz: tuple[float, ...]
     screening_m2: float  #: Squared error from confusing ranges, by the range ambiguity function.
@@ -153,8 +153,8 @@ def best_of(
 
     The candidates are in ascending order of their errors. The first one is chosen unless the error
     of another is clearly lower; candidates with much larger errors are skipped. If a `search` for
-    a codebook is interrupted, the best plan so far is returned. `report` is called with each plan
-    that has a codebook, and its error.
+    a codebook is interrupted, the best plan so far is returned. `report` is called with each
+    optimised candidate, which has its new error.
     """
     best: BandPlan | None = None
     for candidate in candidates[:_FINALISTS]:
@@ -180,11 +180,11 @@ def choose_bands(
         report: Callable[[Candidate], None] | None = None) -> tuple[Candidate, ...]:
     """Choose centre frequencies with which users can be located accurately.
 
-    `spectrum_hz` are intervals of centre frequencies, including their ends, `raster_hz` is the
-    spacing of frequencies from the low end of each interval, and `min_gap_hz` the smallest
-    distance between two frequencies, by default the width of a band. Returns the plans for which
-    codebooks were compared, the best one first; `report` is called with each. Raises ValueError if
-    an argument is out of range, or no plan has the gap.
+    `spectrum_hz` are intervals of centre frequencies, including their ends. `raster_hz` is the
+    spacing of frequencies from the low end of each interval. `min_gap_hz` is the smallest distance
+    between two frequencies, by default the width of a band. Returns the plans for which codebooks
+    were compared, the best one first; `report` is called with each. Raises ValueError if an
+    argument is out of range, or no plan has the gap.
     """
     if n_bands < 1 or scenario.n_bands * scenario.n_frames % n_bands:
         raise ValueError(

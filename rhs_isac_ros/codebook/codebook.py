@@ -1,6 +1,6 @@
-"""The codebook: the beamforming of surface and base station while positioning.
+"""The codebook: the beamforming of surface and base station in a positioning phase.
 
-`Codebook` holds the arrays, their ROS parameters and their files; `Provenance` is their origin.
+`Codebook` reads and writes ROS parameters and files; `Provenance` describes an optimisation.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from rhs_isac_ros.model.surface import on_levels
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import read_yaml, write_whole
 
-# Node with the parameters in a codebook file, in any namespace.
+# Node that receives the parameters in a codebook file, in any namespace.
 PARAMETER_NODE = '/**/optimizer'
 # Relative tolerance of the power constraint.
 _POWER_TOLERANCE = 1e-6
@@ -222,7 +222,7 @@ class Provenance:
     scenario: dict[str, Any]  #: Fields that differ from Table I.
     version: str = __version__
     calibration: str = ''  #: Id of the calibration, if any.
-    steps: int = 0  #: Total, including the runs that were resumed; as for `evaluations`.
+    steps: int = 0  #: Total, including the runs that were resumed, as is `evaluations`.
     evaluations: int = 0
     value_m2: float = math.nan  #: The objective.
     reason: str = ''
@@ -292,7 +292,7 @@ def to_parameter(text: str) -> str:
 
 
 def from_parameter(text: str) -> str:
-    """Return the text behind a string from `to_parameter`.
+    """Return the original text of a string from `to_parameter`.
 
     Mappings written by versions up to 0.1.0 are converted to the text of `encode`.
     """

@@ -1,7 +1,7 @@
 """Optimisation methods: each minimises a `Search` and returns the reason for stopping.
 
 The default is L-BFGS-B. It uses samples of the pairs if there are many, and ends with exchanges of
-amplitudes if the elements have a few levels. The alternating, direct and genetic methods are
+amplitudes if the elements have discrete levels. The alternating, direct and genetic methods are
 described in the paper and its references.
 """
 
@@ -63,7 +63,7 @@ FEWEST_PAIRS = 4096
 # Pairs and steps of each round; the last round is repeated. The first steps change the codebook,
 # and with it the important pairs, the most. Later steps need a more accurate objective.
 _ROUNDS = (2048, 200), (4096, 600)
-# Number of corrections: an evaluation takes little longer than the products with them.
+# Number of corrections. With more, products with them would take longer than an evaluation.
 _SAMPLED_MEMORY = 100
 # Scale of the combining vectors, to which the objective is more sensitive than to configurations.
 _DIGITAL_SCALE = 0.3
@@ -137,8 +137,8 @@ def minimize_levels(search: Search) -> str:
     The first of three phases treats amplitudes as continuous. The second adds the penalty
     sin^2(pi (L - 1) c), which is zero at the L levels, with growing weight: amplitudes move to the
     levels while all other variables adapt. The third exchanges single amplitudes for neighbouring
-    levels, in the order of the gradient, as long as this lowers the objective. L-BFGS-B minimises
-    over continuous variables.
+    levels, in the order of the gradient, while this lowers the objective. L-BFGS-B minimises over
+    continuous variables.
     """
     share = _PENALISED / len(_WEIGHTS)
     variables, left = search.start, search.max_steps
@@ -168,7 +168,7 @@ def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int)
 
 
 def _exchange(search: Search, variables: np.ndarray, max_steps: int) -> str:
-    """Exchange single amplitudes as long as this lowers the objective; return why it stops."""
+    """Exchange single amplitudes while this lowers the objective; return why the search stops."""
     levels = _top_level(search)
     variables = np.array(variables)
     variables[:search.n_analog] = np.rint(variables[:search.n_analog] * levels) / levels
@@ -196,7 +196,7 @@ def _sweep(search: Search, variables: np.ndarray, max_exchanges: int
     value, gradient = search.value_and_gradient(variables)
     by_analog = gradient[:search.n_analog]
     target = variables[:search.n_analog] - np.sign(by_analog) / levels
-        # There is no level outside of [0, 1].
+    # There is no level outside of [0, 1].
     allowed = np.flatnonzero((target > -0.5 / levels) & (target < 1 + 0.5 / levels))
     exchanged = failures = 0
     for entry in allowed[np.argsort(-np.abs(by_analog[allowed]))]:
@@ -237,11 +237,11 @@ _MIN_STEP = 1e-9
 
 def minimize_interior_point(
         search: Search, start: np.ndarray, free: np.ndarray, max_steps: int) -> np.ndarray:
-    """Minimise over the free variables: barrier, trust region, conjugate gradients, BFGS Hessian.
+    """Minimise over the free variables with SciPy's `trust-constr` and a BFGS Hessian.
 
-    SciPy's `trust-constr` is the algorithm of Byrd, Hribar and Nocedal that the paper cites.
-    `start`, float64 [n], contains all variables; `free`, bool [n], marks those to change. Returns
-    the best point evaluated, including `start`, float64 [n].
+    This is the interior-point algorithm of Byrd, Hribar and Nocedal that the paper cites, with a
+    trust region and conjugate gradients. `start`, float64 [n], contains all variables; `free`,
+    bool [n], marks those to change. Returns the best point evaluated, including `start`.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import BFGS, Bounds, minimize
@@ -323,7 +323,7 @@ _POPULATION = 200
 
 
 def minimize_genetic(search: Search) -> str:
-    """Minimise with pymoo's genetic algorithm, one step a generation.
+    """Minimise with pymoo's genetic algorithm; each step is a generation.
 
     Only the direction of a combining vector matters, so its unscaled parts are searched within
     [-1, 1]. The first generation contains the start. Raises MissingLibraryError without pymoo.

@@ -87,9 +87,9 @@ OBJECTIVES: Mapping[str, Callable[..., Average]] = {
 
 
 def sobol(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw scrambled Sobol points, which are more evenly spread, float64 [n, 3] [m].
+    """Draw scrambled Sobol points, float64 [n, 3] [m].
 
-    They are most even if `n` is a power of two.
+    They are more evenly spread than independent points, and most evenly if `n` is a power of two.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.stats import qmc
@@ -174,7 +174,7 @@ def confusable_volumes(
 
 def _displaced(scenario: Scenario, positions: np.ndarray, lags: np.ndarray,
                rng: np.random.Generator, scales: tuple[float, float]) -> np.ndarray:
-    """Move positions by range lags of random sign and randomly across the line of sight."""
+    """Move positions by range lags of random sign, and at random across the line of sight."""
     n, (low, high) = len(positions), scenario.roi_bounds_m
     free = high > low
     ranges = np.linalg.norm(positions, axis=1, keepdims=True)
@@ -185,7 +185,7 @@ def _displaced(scenario: Scenario, positions: np.ndarray, lags: np.ndarray,
     transverse -= sight * np.sum(transverse * sight, axis=1, keepdims=True)
     lags = lags * rng.choice([-1, 1], size=n)
     moved = positions + free * transverse
-    # Coordinates without extent remain unchanged, and the others determine the range.
+    # Coordinates without extent remain unchanged; the other ones are scaled to fit the range.
     wanted = ranges[:, 0] + lags
     within = np.sqrt(np.maximum(wanted**2 - np.sum(moved[:, ~free]**2, axis=1), 0))
     within = np.copysign(within, wanted) / np.linalg.norm(moved[:, free], axis=1)

@@ -37,8 +37,8 @@ INTERRUPTED = 'interrupted'
 class Method(NamedTuple):
     """An optimisation method with its default limit on update steps.
 
-    `minimize` takes a `Search` and returns the reason for stopping. A method whose result is its
-    start has None instead.
+    `minimize` takes a `Search` and returns the reason for stopping. It is None if the result of
+    the method is its start.
     """
 
     minimize: Callable[[Search], str] | None
@@ -59,7 +59,7 @@ METHODS: Mapping[str, Method] = {
 class OptimizeResult:
     """Result of an optimisation."""
 
-    codebook: Codebook  #: The best evaluated; `average_crlb_m2` is for the sampled positions.
+    codebook: Codebook  #: The best one found; `average_crlb_m2` is for the sampled positions.
     history: tuple[Progress, ...]  #: Progress after each step; step 0 is the start.
     reason: str  #: The reason for stopping.
 
@@ -74,9 +74,9 @@ def optimize(
         keep: Callable[[OptimizeResult], None] | None = None) -> OptimizeResult:
     """Find a codebook that minimises an objective.
 
-    If the scenario has ``amplitude_levels``, configurations are optimised over these levels, by
-    `minimize_levels` for the method ``lbfgs`` and by ``genetic``. After a KeyboardInterrupt, the
-    best codebook so far is returned. Raises ValueError if a name is unknown, a number or the
+    If the scenario has ``amplitude_levels``, the methods ``lbfgs``, by `minimize_levels`, and
+    ``genetic`` optimise configurations over these levels. After a KeyboardInterrupt, the best
+    codebook so far is returned. Raises ValueError if a name is unknown, a number or the
     positions are out of range, `resume` was made with other arguments, the calibration belongs to
     another scenario, or the signals do not determine the positions; MissingLibraryError if the
     method needs a library that is not installed; and CodebookError if `start` does not fit the
@@ -110,7 +110,7 @@ def optimize(
     max_evaluations
         Maximum number of evaluations of the objective; by default unlimited.
     progress
-        Called after each step, and once a second while the objective is set up, then with an
+        Called after each step and, during the set-up of the objective, once a second with an
         infinite value. An exception ends the optimisation; KeyboardInterrupt during the set-up
         returns the start.
     keep

@@ -58,8 +58,8 @@ def beam_powers(
         scenario: Scenario, codebook: Codebook, band: int) -> tuple[np.ndarray, np.ndarray]:
     """Return azimuths, float64 [n] [rad], and the received powers, float64 [F, n] [W].
 
-    The user is at the height and distance of the centre of the region of interest, and receives
-    the middle sub-band of the band.
+    The user is at the height and horizontal distance of the centre of the region of interest. The
+    powers are those of the middle sub-band.
     """
     azimuths = np.linspace(-np.pi / 2, np.pi / 2, _N_AZIMUTHS)
     x, y, z = scenario.roi_center_m

@@ -72,7 +72,7 @@ class Problem:
         """Return the objective [m^2] of `unpack` and its gradient, shaped like `variables`."""
         _, raw, norm = self._split(variables)
         value, by_analog, by_digital = self.objective(self.unpack(variables, relaxed=relaxed))
-        # The norm removes the component along raw.
+        # Scaling to a fixed norm removes the component of the gradient along `raw`.
         radial = np.sum((np.conj(raw) * by_digital).real, axis=(1, 3), keepdims=True)
         by_raw = np.sqrt(self.scenario.max_power_w) / norm * (by_digital - raw * radial / norm**2)
         return value, np.concatenate(
@@ -102,7 +102,7 @@ class BudgetSpent(Exception):
 
 
 class Search:
-    """The objective that a method minimises; counts evaluations and keeps the best point.
+    """The objective that a method minimises, with a count of evaluations and the best point.
 
     Each method defines its own update steps. `done` are the steps and evaluations of the search
     that is resumed, which count towards the limits. `start`, float64 [n], is the first point;
@@ -127,7 +127,7 @@ class Search:
     def begin(self) -> float:
         """Evaluate the start [m^2] and record it as the first entry of the history.
 
-        If an earlier search has evaluated the same point, it does not count again.
+        When a search is resumed, this evaluation does not count: the earlier search has made it.
         """
         if self._evaluations:
             self._evaluations -= 1

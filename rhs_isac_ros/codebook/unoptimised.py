@@ -1,6 +1,6 @@
 """Codebooks without optimisation: random ones, and focused beams that scan the region of interest.
 
-Both are benchmarks of the paper, and its optimisation starts from them. The paper does not specify
+Both are benchmarks of the paper, whose optimisation starts from them. The paper does not specify
 the focal points. `SCANS` contains three interpretations, functions that return focal points,
 float64 [F, N_B, 3] [m]. The frames of the first two alternate between points below and above
 mid-height, because beams that are all symmetric in height could not distinguish up from down.
@@ -36,8 +36,8 @@ def directional_codebook(
 
     The configuration follows the holographic principle. The weights of each sub-band are the
     matched filter of the resulting feed signals, with equal power in all sub-bands. `rng` is
-    unused, as the codebook is deterministic. `scan` is one of `SCANS`. Raises ValueError if it is
-    unknown, or a gain pattern of the scenario is zero at a focal point.
+    unused, as the codebook is deterministic. `scan` is one of `SCANS`. Raises ValueError if the
+    scan is unknown, or a gain pattern of the scenario is zero at a focal point.
     """
     if scan not in SCANS:
         raise ValueError(f'scan: {scan!r}, expected one of {sorted(SCANS)}')

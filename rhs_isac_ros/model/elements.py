@@ -8,8 +8,8 @@ coefficient has the mean (1 - p) c + p / 2 and, between two frames, the covarian
     s^2 E[x_q] E[x_q'] + (1 + s^2) (p / 12 + p (1 - p) (1/2 - c_q) (1/2 - c_q')).
 
 This is a sum of at most three terms, each a product of one factor per frame. Elements are
-independent. Signals are treated as circular, although failures also cause a pseudo-covariance: a
-sum over elements whose terms differ in phase.
+independent. Signals are treated as circular. Failures also cause a pseudo-covariance, but its
+terms, one for each element, differ in phase and largely cancel.
 
 An estimated coefficient is ``gain c + offset``: the offset of a working element is 0, as is the
 gain of a failed one. All signals of a band are also multiplied by a gain of its receive chain.
@@ -35,15 +35,15 @@ from rhs_isac_ros.model.multipath import (
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import AppliedBeams, Beamforming, feed_weights
 
-# Nodes along each side of the region of interest. The product of the gains in two sub-bands is
-# smooth, because the carrier cancels.
+# Quadrature nodes along each side of the region of interest. Few are enough, because the carrier
+# cancels in the product of the gains in two sub-bands.
 _ROI_NODES = 8
 # Base-2 logarithm of the number of quasi-random positions over which covariances are averaged.
 _LOG2_NODES = 7
-# Positions evaluated at a time.
+# Number of positions evaluated at a time.
 _BLOCK = 32
 
-# Slope and offset of coefficients over the configuration, numbers or [N_E]; gains of the bands.
+# Slope in the configuration and offset of coefficients, numbers or [N_E]; gains of the bands.
 Response: TypeAlias = tuple[np.ndarray | float, np.ndarray | float, np.ndarray | float]
 # Function of a band and positions, float64 [N, 3] [m], that returns the errors of the signals on
 # the direct path per unit of R white numbers, complex128 [N, N_SB F, R].
@@ -58,7 +58,7 @@ class SurfaceModel:
 
     @property
     def response(self) -> Response:
-        """Slope and offset of the expected coefficients over the configuration; band gains."""
+        """Slope in c and offset of the expected coefficients, and gains of the bands."""
         raise NotImplementedError
 
     @property
@@ -83,7 +83,7 @@ class SurfaceModel:
         return AppliedBeams(self.applied(beams.analog), band_gains * beams.digital)
 
     def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
-        """Return the multipath covariance [N_B, N_SB F, N_SB F] and the errors of direct paths."""
+        """Return the covariance [N_B, N_SB F, N_SB F] of multipath errors, and `DirectErrors`."""
         raise NotImplementedError
 
     def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
@@ -117,7 +117,7 @@ class ElementErrors(SurfaceModel):
     """Errors of the elements of one surface, the same in all bands and frames."""
 
     gains: np.ndarray  #: Factors of the coefficients, complex128 [N_E]; 1 without an error.
-    stuck: np.ndarray  #: Amplitudes of failed elements, float64 [N_E]; NaN if an element works.
+    stuck: np.ndarray  #: Amplitudes of failed elements, float64 [N_E]; NaN for working ones.
 
     @property
     def id(self) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 
 class External(abc.ABC):
-    """A value that a scenario writes as its origin and digest; equal digests mean equal values."""
+    """A scenario value, written as origin and digest; equal digests mean equal values."""
 
     origin: str  #: Path of the file, or name of the plug-in; empty for other values.
     # For error messages: the kind of value, and the values that a scenario accepts.

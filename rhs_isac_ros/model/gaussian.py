@@ -27,7 +27,7 @@ class Marginal(NamedTuple):
 
 
 def energy_limit(n: int, probability: float = FALSE_ALARM) -> float:
-    """Return the energy that n complex Gaussian numbers of unit variance rarely exceed."""
+    """Return the energy that n complex normals of unit variance exceed with `probability`."""
     # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
     from scipy.special import gammainccinv
 

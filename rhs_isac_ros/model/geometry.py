@@ -16,7 +16,7 @@ _NO_EXTENT = 1e-5
 
 
 def element_interval_m(scenario: Scenario) -> float:
-    """Return the spacing Delta_E [m] of elements; its unit is lambda_avr (Section V)."""
+    """Return the spacing Delta_E [m] of the elements, a multiple of lambda_avr (Section V)."""
     wavelengths_m = SPEED_OF_LIGHT_MPS / np.array(scenario.center_frequencies_hz)
     return scenario.element_interval_wavelengths * float(np.mean(wavelengths_m))
 
@@ -98,7 +98,7 @@ def polar_bounds(bounds: np.ndarray) -> np.ndarray:
     limits = np.empty((2, 3))
     limits[:, 0] = np.linalg.norm(nearest), np.linalg.norm(farthest)
     for axis in (1, 2):
-        # A positive cosine is largest where the other coordinates are smallest.
+        # The magnitude of a cosine is largest where the other coordinates are nearest to 0.
         for side, bound in enumerate(bounds[:, axis]):
             outward = bound > 0 if side else bound < 0
             others = np.delete(nearest if outward else farthest, axis)

@@ -70,10 +70,10 @@ class MultipathEstimate(ArrayFile):
     radiation: np.ndarray  #: T_i of the survey, complex128 [N_B, N_SB F, N_E].
     excess: np.ndarray  #: M_i, complex128 [N_B, N_SB F, N_SB F] [1/W].
     conditions: dict[str, Any]  #: Fields of the survey's scenario that the covariance depends on.
-    #: Record of the survey: ``positions``, the number of positions; ``prior_weight`` nu;
-    #: ``inflation`` t; ``level_std_db``, the standard deviation of the power among users [dB];
-    #: ``coverage``, the expected share of positions in the 95 % region, with its interval;
-    #: ``warnings``; ``codebook``, its id; ``version``.
+    #: Record of the survey: numbers of ``positions`` with a direct path and of ``blocked`` ones;
+    #: ``prior_weight`` nu; ``inflation`` t; ``level_std_db``, the standard deviation of the power
+    #: among users [dB]; ``coverage``, the expected share of positions in the 95 % region, with its
+    #: interval; ``warnings``; ``codebook``, its id; ``version``.
     about: dict[str, Any] = dataclasses.field(default_factory=dict)
     origin: str = ''
 
@@ -180,7 +180,7 @@ class PathChannel(ArrayFile):
         Users are the transmitters, and the only receiver is at the surface's centre, with axes
         like the scenario's. Both have one isotropic antenna. All reflections are specular, and
         the frequency of the scene is `f0` [Hz]. Paths from behind the surface are removed. Raises
-        ArchiveError if there are several receivers or antennas, or the result is not possible.
+        ArchiveError if there are several receivers or antennas, or the result is not valid.
         """
         a = np.array(paths.a[0]) + 1j * np.array(paths.a[1])
         if a.ndim != 5 or (*a.shape[:2], a.shape[3]) != (1, 1, 1):

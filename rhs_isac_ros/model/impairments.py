@@ -25,7 +25,7 @@ from rhs_isac_ros.model.geometry import subband_frequencies_hz
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.support import plugins
 
-# Standard deviation from which a wrapped phase is treated as uniform [rad].
+# Standard deviation above which a wrapped phase is treated as uniform [rad].
 UNIFORM_STD_RAD = 2.0
 # Nepers per decibel of an amplitude gain.
 _NEPERS_PER_DB = np.log(10) / 20
@@ -84,10 +84,11 @@ class Exponents:
         return signals * np.exp(-np.tensordot(values, self.scaled_patterns, axes=1))
 
     def derivatives(self, divided: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Return the informative derivatives of divided signals [N, ...], [N, Q, N_B, N_SB F].
+        """Return the derivatives of signals with respect to z, [N, Q, N_B, N_SB F].
 
-        Parameters that move the multipath act on the received multipath, so their derivatives
-        contain the signals, and vary from phase to phase. The others contain the mean.
+        Takes signals after `divide`, and their mean. Parameters that move the multipath act on the
+        received multipath, so their derivatives contain the signals, and differ between
+        positioning phases. The derivatives of other parameters contain the mean.
         """
         moves = self.moves_multipath[:, None, None]
         return self.scaled_patterns * np.where(moves, divided[:, None], mean[:, None])
@@ -193,8 +194,8 @@ def draw_factors(
 ) -> np.ndarray | None:
     """Draw the factors of the signals of n users and cycles, complex128 [n, N_B, N_SB F].
 
-    Users and cycles each have a generator. The values of a built-in impairment do not depend on
-    which others are declared. The result is None if the scenario declares no impairment.
+    `user` and `cycle` generate the values of the respective scope. Values of a built-in impairment
+    do not depend on which others are declared. Returns None if no impairment is declared.
     """
     declared = impairments_of(scenario)
     if not declared:

@@ -42,9 +42,9 @@ def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
                 blocked: np.ndarray | None = None) -> np.ndarray:
     """Compute the gains without random multipath, complex128 [N, N_SB, N_E].
 
-    Without a channel file, these are the gains of `los_gain`. With one, they are sums over the
-    paths of its users nearest to the positions. `blocked`, bool [N], marks users that have no
-    direct path.
+    Without a channel file, these are the gains of `los_gain`. With one, the gain at a position is
+    the sum over the paths of the nearest user in the file. `blocked`, bool [N], marks users that
+    have no direct path.
     """
     channel = scenario.channel
     blocked = np.zeros(len(positions), bool) if blocked is None else blocked
@@ -66,7 +66,7 @@ def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
 
 def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
              weights: np.ndarray) -> np.ndarray:
-    """Sum `los_gain` with weights [n, N_SB, N_E] over the elements of n bands, [n, N, N_SB]."""
+    """Sum `los_gain` in n bands over elements with weights [n, N_SB, N_E]; return [n, N, N_SB]."""
     waves = los_waves(scenario, checked_positions(positions), bands, slopes=False)
     scaled = weights / subband_frequencies_hz(scenario)[list(bands), :, None]
     return np.stack([(gain @ row[..., None])[..., 0].T
@@ -182,7 +182,7 @@ def _amplitude(
 
 
 def _phasors(phases: np.ndarray) -> np.ndarray:
-    """Compute exp(i phase), in a third of the time of `np.exp`, by a table and a Taylor series.
+    """Compute exp(i phase) by a table and a Taylor series, three times as fast as `np.exp`.
 
     The error is below 1e-15, or below the rounding of a large phase.
     """

@@ -37,13 +37,13 @@ from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming, combine, radiation_matrix
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
-# Knowledge of the elements of one surface: their errors, or an estimate of them.
+# Knowledge of the elements of one surface: known errors, or an estimate of the coefficients.
 Surface = ElementErrors | SurfaceEstimate
-# Largest number of positions in a block, and of gains over their elements and sub-bands. Random
-# numbers of `simulate_received` depend on the former.
+# Largest number of positions in a block, and of gains over positions, elements and sub-bands. The
+# random numbers of `simulate_received` depend on the first of these limits.
 _BLOCK, _MAX_GAINS = 256, 1 << 21
-# Size of an array over elements and sub-bands [bytes]. Larger arrays do not fit in the cache, and
-# every call obtains new memory pages for them.
+# Target size of arrays over elements and sub-bands [bytes]. Larger arrays do not fit in the cache,
+# and every call obtains new memory pages for them.
 _ARRAY_BYTES = 3 << 18
 _MIN_BLOCK = 8
 
@@ -142,7 +142,7 @@ def position_blocks(scenario: Scenario, n: int) -> list[slice]:
 class MeasurementModel:
     """Distribution of the received signals for one scenario and beamforming.
 
-    Immutable. Construction computes the radiation matrices only; the factors of the covariance
+    Immutable. Construction computes only the radiation matrices; the factors of the covariance
     and the weights of `mean_and_jacobian` are computed at first use, or by `prepare`.
 
     Methods take positions of the user, float64 [N, 3] [m], and raise ValueError if the shape is
@@ -217,7 +217,7 @@ class MeasurementModel:
 
     def whiten(self, signals: np.ndarray) -> np.ndarray:
         """Transform signals [..., N_B, N_SB F] to unit covariance; the shape stays the same."""
-        # Unlike a matrix product, this rounds a signal equally in batches of all sizes.
+        # Unlike a matrix product, this rounds a signal in the same way in batches of any size.
         return np.einsum('irs,...is->...ir', self.whitener, signals)
 
     def mean(self, positions: np.ndarray) -> np.ndarray:
@@ -248,10 +248,10 @@ class MeasurementModel:
             whitened: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Compute the mean and its derivative, complex128 [N, 3, N_B, N_SB F] [1/m]: Eq. (13).
 
-        The mean equals the result of `mean` up to rounding, and is computed faster. Both results
-        may be `whitened`. Given the derivatives of the positions with respect to Q other
-        coordinates, float64 [N, 3, Q], the derivatives of the mean are with respect to those
-        coordinates.
+        The mean equals the result of `mean` up to rounding, and is computed faster. With
+        `whitened`, both results are whitened. `by_coordinate`, float64 [N, 3, Q], contains
+        derivatives of the positions with respect to Q other coordinates; the derivatives of the
+        mean are then with respect to these coordinates.
         """
         positions, weights = checked_positions(positions), self._weights
         n, (n_bands, n_rows) = len(positions), self.shape
@@ -347,7 +347,7 @@ class ElementSums:
     def terms(self, positions: np.ndarray, slopes: bool = True) -> np.ndarray:
         """Compute the mean and the terms of its derivative, complex128 [N_B, N, 1 + G, N_SB F].
 
-        Row 0 is the mean. The other rows, which `weights` multiply, are omitted without `slopes`.
+        Row 0 is the mean. Other rows, to be multiplied by `weights`, are omitted without `slopes`.
         """
         n, (n_bands, n_subbands, _, n_frames) = len(positions), self._frames.shape
         n_terms = 2 + len(self._axes) + self._has_pattern if slopes else 1

@@ -156,7 +156,7 @@ class RandomWalk(StraightMobility):
 
 
 class Traced:
-    """Path of another mobility, moved to the nearest user of a channel file."""
+    """Path of another mobility, with each position moved to the nearest user of a channel file."""
 
     def __init__(self, mobility: Mobility, channel: PathChannel) -> None:
         self._mobility, self._channel = mobility, channel
@@ -172,9 +172,9 @@ def make_plugin(
         start: Sequence[float] | None = None) -> Mobility:
     """Create a mobility from a plug-in, an entry point of the group `plugins.MOBILITIES`.
 
-    The plug-in is called with the other arguments, like `RandomWalk`. If `start` is None, it
-    chooses the first position. Raises PluginError if there is no such plug-in, or it does not
-    return a mobility.
+    The plug-in is called with the other arguments, like `RandomWalk`. If `start` is None, the
+    plug-in chooses the first position. Raises PluginError if there is no such plug-in, or if it
+    does not return a mobility.
     """
     mobility: Mobility = plugins.make(plugins.MOBILITIES, name, scenario, speed_mps, rng, start)
     if not callable(getattr(mobility, 'state', None)):

@@ -24,7 +24,7 @@ _ANGLE_NODES = 160
 _PANEL_PHASE_RAD = 400.0
 # Number of elements above which products with V_i are computed as convolutions.
 _MAX_MATRIX = 1024
-# Complex numbers processed at a time.
+# Number of complex numbers processed at a time.
 _BLOCK_NUMBERS = 1 << 22
 # Nodes along each side of the region of interest, where 1 / r^2 is smooth.
 _ROI_NODES = 24
@@ -58,7 +58,7 @@ class SpatialCovariance:
     matrix: np.ndarray | None = None  #: V_i [..., N_E, N_E]; None for many elements.
     # Fourier transform over the offsets of the elements; None for few elements.
     spectrum: np.ndarray | None = None
-    # W F and F of the term of low rank (`plus`) if there is no matrix.
+    # W F and F of the low-rank term that `plus` adds, if there is no matrix.
     excess: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
@@ -152,7 +152,7 @@ def _matrix(lattice: np.ndarray, scenario: Scenario) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def _lattice(scenario: Scenario) -> np.ndarray:
-    """Compute V_i by lattice offset, [N_B, 2 rows - 1, 2 columns - 1]; 0 is in the middle."""
+    """Compute V_i by lattice offset, [N_B, 2 rows - 1, 2 columns - 1], with 0 in the middle."""
     is_even = [not angle for angle in scenario.multipath_direction_deg]
     lattice = np.empty((scenario.n_bands, 2 * scenario.n_rows - 1, 2 * scenario.n_columns - 1),
                        complex)
@@ -385,7 +385,7 @@ def _fields(scenario: Scenario) -> Scenario | MultipathEstimate:
 
 def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase: float
                         ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the angles and normalised weights of a Laplacian [n]; positive angles if even."""
+    """Compute angles and normalised weights of a Laplacian [n]; if even, of its positive half."""
     nodes, weights = gauss_legendre(_ANGLE_NODES)
     mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)
     angles, density = [], []

@@ -110,9 +110,9 @@ def on_levels(scenario: Scenario, analog: np.ndarray) -> np.ndarray:
 def matched_configuration(los: np.ndarray, onboard: np.ndarray) -> np.ndarray:
     """Compute a configuration by the holographic principle, float64 [N_E], entries in [0, 1].
 
-    Takes line-of-sight gains, complex128 [N_SB, N_E], and B_j, complex128 [N_SB, K, N_E]. An
-    element radiates strongly if the wave on the board and the path to the user are in phase there.
-    If all gains are 0, all entries are 0.5.
+    Takes line-of-sight gains, complex128 [N_SB, N_E], and B_j, complex128 [N_SB, K, N_E]. The
+    amplitude of an element is high if the phases of its line-of-sight gain and of its propagation
+    on the board cancel. If all gains are 0, all entries are 0.5.
     """
     interference = np.einsum('jm,jkm->m', los, onboard).real
     return (interference / (np.abs(interference).max() or 1.0) + 1) / 2
