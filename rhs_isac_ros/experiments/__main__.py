@@ -46,7 +46,7 @@ from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.pictures import write_picture
 
-# The bootstrap keeps 2000 weights of each position in memory.
+# The bootstrap keeps 2000 weights for each position in memory.
 _MAX_POSITIONS = 10**5
 _MAX_SETTINGS = 10**4
 _Parsed = TypeVar('_Parsed')
@@ -110,10 +110,10 @@ def _add_options(parser: ArgumentParser) -> None:
     add('--steps', type=positive_int, default=300, metavar='N',
         help='maximum number of steps of an optimisation (default: %(default)s)')
     add('--repeats', type=integer(1, 1000), default=1, metavar='N',
-        help='codebooks of each setting with successive seeds, if optimised or random '
+        help='codebooks for each setting, with successive seeds, if optimised or random '
              '(default: %(default)s)')
     add('--positions', type=integer(1, _MAX_POSITIONS), default=2000, metavar='N',
-        help='positions of each setting (default: %(default)s)')
+        help='number of positions in each setting (default: %(default)s)')
     add('--seed', type=seed, default=0, metavar='N',
         help='seed of positions, signals and codebooks (default: %(default)s)')
     add('--picture', type=picture_file, metavar='FILE',
@@ -171,7 +171,7 @@ def _report(axes: Sequence[Axis], points: Sequence[Point]) -> str:
 
 
 class _Along(argparse.Action):
-    """Adds a field to the last axis of ``--vary``."""
+    """The action of ``--with``, which adds a field to the last axis of ``--vary``."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
                  values: Any, option_string: str | None = None) -> None:

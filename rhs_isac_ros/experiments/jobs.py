@@ -38,7 +38,7 @@ class Job:
 
 
 class JobResult(NamedTuple):
-    """The result of a job as JSON in `text`, or its error; and the version that ran the job."""
+    """The result of a job as JSON in `text`, or its error; and the package version that ran it."""
 
     job: Job
     text: str = ''
@@ -47,7 +47,7 @@ class JobResult(NamedTuple):
 
 
 def attempt(function: Callable[..., Mapping[str, Any]], job: Job) -> JobResult:
-    """Run a job in this process; an exception becomes text, because some cannot be pickled."""
+    """Run a job in this process; return errors as text, because some errors cannot be pickled."""
     try:
         return JobResult(job, text=json.dumps(function(**job.arguments)))
     except MissingLibraryError as error:
@@ -89,7 +89,7 @@ def run_locally(
     """Run jobs in single-threaded processes on this machine; yield each result when it is ready.
 
     There are `n_jobs` processes: -1 means one per core; 1 runs all jobs in this process. Closing
-    the generator ends them. Before joblib 1.4, a result waits for all earlier ones.
+    the generator ends the processes. Before joblib 1.4, results are in the order of the jobs.
     """
     with optional_import('running jobs', extra='experiments'):
         import joblib
@@ -114,8 +114,8 @@ def run_locally(
                 # Joblib warns about lost jobs, which are abandoned deliberately here.
                 warnings.simplefilter('ignore', UserWarning)
                 results.close()
-            # If the end of the interpreter stopped a thread of the pool that is releasing a
-            # semaphore, the resource tracker of joblib would report a leak.
+            # If the interpreter ended while a thread of the pool releases a semaphore, the
+            # resource tracker of joblib would report a leak.
             for thread in set(threading.enumerate()) - threads_before:
                 thread.join(_THREAD_TIMEOUT_S)
 
@@ -154,7 +154,7 @@ def _interrupts_ignored() -> Iterator[None]:
     """Ignore SIGINT inside the block, and in processes that are started there.
 
     A terminal sends SIGINT to the whole process group, but only this process may end the workers.
-    A blocked signal would stay pending instead, but joblib unblocks it.
+    Blocking the signal would not work: it would stay pending, and joblib unblocks it.
     """
     # Only the main thread can set handlers, and SIGINT raises KeyboardInterrupt only there.
     if threading.current_thread() is not threading.main_thread():
@@ -175,8 +175,8 @@ def run_jobs(
     `function` takes the arguments of a job and returns a dict that JSON can represent. Each result
     is stored as soon as it is available, in a file in `folder`. After an interruption or an error,
     the same call resumes the experiment. `n_jobs` jobs run in parallel on this machine, by default
-    one per core; `dask` is the address of the scheduler of a Dask cluster to use instead. A
-    terminal shows a progress bar with a label.
+    one per core; `dask` is the address of the scheduler of a Dask cluster to use instead. If
+    stderr is a terminal, it shows a progress bar with the label.
 
     Raises JobError if a job fails or its worker has another version of this package,
     ConnectionError if the cluster does not respond, OSError if a result cannot be read or stored,

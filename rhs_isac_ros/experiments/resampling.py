@@ -1,4 +1,4 @@
-"""Bootstrap intervals over cases and members, and intervals of shares."""
+"""Bootstrap intervals over cases and members, and confidence intervals of shares."""
 
 import functools
 from collections.abc import Sequence

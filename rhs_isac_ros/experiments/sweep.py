@@ -43,17 +43,17 @@ from rhs_isac_ros.support import streams
 # Kinds of codebooks that are made for a scenario.
 OPTIMIZE, DIRECTIONAL, RANDOM = 'optimize', 'directional', 'random'
 KINDS = (OPTIMIZE, DIRECTIONAL, RANDOM)
-# Positions of a job. Another size would change the positions of the global bound.
+# Number of positions in a job. Another size would change the positions of the global bound.
 BLOCK = 250
-# Samples of an optimisation.
+# Number of sample positions in an optimisation.
 _SAMPLES = 64
 # Squared Mahalanobis radius of the 95 % region.
 _RADIUS = float(chdtri(3, 0.05))
 # Above this coarseness of its lattice, a global bound is too loose.
 _MAX_COARSENESS = 3.0
-# Relative deviation of the power without scaling, smaller than the one in `Codebook.check`.
+# Largest relative error of the power without scaling, smaller than that in `Codebook.check`.
 _POWER_TOLERANCE = 1e-9
-# Families of quantities that a job computes. Each of the last three includes those before it.
+# Families of quantities that a job computes. Of the last three, each includes the previous ones.
 CRLB, BOUND, ERROR, CAPACITY, LOSS = 'crlb', 'bound', 'error', 'capacity', 'loss'
 _QUANTITIES = {
     CRLB: ('crlb_m2',), BOUND: ('bound_m2',), ERROR: ('squared_error_m2', 'inside', 'fix'),
@@ -190,13 +190,12 @@ class Sweep:
     base: Scenario  #: Scenario with the values that are not varied.
     settings: Sequence[Setting]  #: Result of `settings_of`.
     measures: Sequence[str]  #: Keys of `MEASURES`.
-    n_positions: int = 2000  #: In each setting; the same for all settings with the same region.
+    n_positions: int = 2000  #: Per setting; settings with the same region have the same positions.
     seed: int = 0  #: Seed of positions, signals and codebooks.
     objective: str = 'ambiguity'  #: Objective of an optimisation.
     steps: int = 300  #: Maximum number of steps of an optimisation.
     #: Fields whose values the optimisation of a codebook takes from the setting; None for all.
-    #: Other fields have their base values, except those on which it depends whether a codebook
-    #: fits.
+    #: Other fields have their base values, except those that decide whether a codebook fits.
     optimize_for: Sequence[str] | None = None
     repeats: int = 1  #: Codebooks in each setting, with successive seeds, if optimised or random.
 
@@ -263,7 +262,7 @@ class Sweep:
 
 def run_sweep(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = None
               ) -> list[Point]:
-    """Return the measures of the results of `run_blocks`, with their intervals, in order."""
+    """Run a sweep by `run_blocks`; return the measures of each setting, with their intervals."""
     return [Point(results.setting, name,
                   measured(MEASURES[name], results.quantities[MEASURES[name].quantity]),
                   tuple(codebook.id for codebook in results.codebooks))

@@ -27,7 +27,7 @@ _WIDE = 8.0
 _LOGARITHMIC = ('m', 'm²')
 # Up to this ratio, a logarithmic axis has labels within decades.
 _FEW_DECADES = 200
-# Horizontal distance of lines relative to the axis, which keeps intervals from overlapping.
+# Horizontal offset between lines, relative to the axis, which keeps intervals from overlapping.
 _SHIFT = 0.01
 # With more values than this, the ticks are not placed at the values.
 _MAX_TICKS = 8
@@ -79,7 +79,7 @@ def draw(axes: Sequence[Axis], points: Sequence[Point],
 
 def draw_panel(panel: Any, first: Axis, others: Sequence[Axis], points: Sequence[Point],
                names: Sequence[str]) -> None:
-    """Draw measures of one unit against the first axis, a line for each value of the others."""
+    """Draw measures of one unit against the first axis, with a line for each value of `others`."""
     values = [entry[0] for entry in first.values]
     numeric = all(isinstance(value, int | float) for value in values)
     places = np.array(values if numeric else range(len(values)), float)
@@ -110,9 +110,10 @@ def draw_panel(panel: Any, first: Axis, others: Sequence[Axis], points: Sequence
 
 def add_legend(place: Any, panels: Sequence[Any], lines: Sequence[Axis],
                joined: Sequence[Sequence[str]] = ()) -> None:
-    """Draw one legend for all panels, which have the same lines, in other axes.
+    """Draw one legend for all panels, which have the same lines, in the separate axes `place`.
 
-    `joined` are the measures of the panels with several measures.
+    `lines` are the axes that the lines distinguish. `joined` lists the measures of each panel with
+    several measures.
     """
     found: dict[str, Any] = {}
     for panel in panels:
@@ -192,7 +193,7 @@ def _lines(others: Sequence[Axis], points: Sequence[Point], names: Sequence[str]
 
 
 def _shifted(panel: Any, places: np.ndarray, shift: float) -> np.ndarray:
-    """Move places on the x axis of a panel by a share of their range."""
+    """Shift x values by a fraction of the range that they span on the axis of a panel."""
     scale = panel.xaxis.get_transform()
     drawn = scale.transform(places)
     return scale.inverted().transform(drawn + shift * np.ptp(drawn))
@@ -215,7 +216,7 @@ def _draw_line(panel: Any, x: np.ndarray, intervals: np.ndarray, line: _Line) ->
 
 
 def _styles(names: Sequence[str]) -> dict[str, Any]:
-    """Return the legend marks for the measures of a panel, keyed by label."""
+    """Return legend handles for the measures of a panel, keyed by label."""
     from matplotlib.lines import Line2D
     handles = {}
     for number, name in enumerate(names):

@@ -16,7 +16,7 @@ from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.scenario import checked
 from rhs_isac_ros.support.threads import one_blas_thread
 
-# Larger than every finite result; its square root and its half are finite.
+# Replaces infinity: larger than every finite result; its square root and its half are finite.
 _INFINITE = 1e300
 
 
@@ -79,7 +79,7 @@ def measured(measure: Measure, results: np.ndarray) -> Interval:
     (replicates,) = replicate(finite, 0, () if measure.quantile is None else [measure.quantile])
     ends = np.array(replicates.interval())
     if measure.quantile is None:
-        # The replicates have single precision, which is less than the digits of the table.
+        # The replicates have single precision, which has fewer digits than the table.
         ends[0] = results.mean()
     ends = np.where(ends > _INFINITE / 2, np.inf, ends)
     if measure.root:
@@ -115,7 +115,7 @@ def names_of(panels: Iterable[Iterable[str]]) -> list[str]:
     return [name for panel in panels for name in panel]
 
 
-# Two further names that can be varied like fields of the scenario.
+# Names that can be varied like fields of the scenario.
 CODEBOOK, ESTIMATOR = 'codebook', 'estimator'
 FIELDS = {field.name: field for field in dataclasses.fields(Scenario)}
 NAMES = (*FIELDS, CODEBOOK, ESTIMATOR)

@@ -23,8 +23,8 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
     """Divide power [W] among channels so that the sum of log(1 + gain * share) is highest.
 
     The gains are relative to noise, float64 [..., N] [1/W]; each row is a separate problem. The
-    shares, float64 [..., N] [W], are not negative and add up to `power_w` in each row. If no gain
-    of a row is positive, its shares are equal.
+    shares, float64 [..., N] [W], are not negative and add up to `power_w` in each row. The shares
+    in a row without a positive gain are equal.
     """
     n = gains.shape[-1]
     if n == 1:
@@ -57,8 +57,8 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
 class BandLink:
     """The link between the surface and a user in one band, or the links in several bands.
 
-    With several bands, all arrays except `fixed` have a leading axis for the band, and
-    configurations are float64 [N_B, n, N_E]. In one band, they have any number of leading axes.
+    For several bands, all arrays except `fixed` have a leading axis for the band, and methods take
+    configurations, float64 [N_B, n, N_E]. For one band, methods take float64 [..., N_E].
     """
 
     onboard: np.ndarray  #: B_j, complex128 [N_SB, K, N_E].
@@ -71,7 +71,7 @@ class BandLink:
     @classmethod
     def to(cls, scenario: Scenario, position: np.ndarray, bands: int | Sequence[int],
            surface: SurfaceEstimate | None = None) -> 'BandLink':
-        """Return the links to a position, float64 [3] [m], in bands, counted from 0.
+        """Return the links to a position, float64 [3] [m], in the given bands, counted from 0.
 
         Coefficients of an estimated surface are included in the propagation on the board. Raises
         ValueError if the position is not a finite [3] array.
@@ -154,8 +154,8 @@ def representative_subbands(
         scenario: Scenario, max_drift_rad: float, max_count: int) -> np.ndarray:
     """Return indices of evenly spread sub-bands, at most `max_count`.
 
-    If this number suffices, the phases of the elements drift apart by at most `max_drift_rad` from
-    one of these sub-bands to the next.
+    Unless `max_count` is too small, the phases of the elements drift apart by at most
+    `max_drift_rad` from one of these sub-bands to the next.
     """
     elements, feeds = element_positions(scenario), feed_positions(scenario)
     on_board = np.linalg.norm(elements - feeds[:, None], axis=-1)

@@ -169,8 +169,8 @@ def beam_pattern(
         scenario: Scenario, beam: Beam, distance_m: float, step_deg: float = 5.0) -> BeamPattern:
     """Compute the near-field pattern of a beam at a distance from the centre of the surface.
 
-    Neighbouring azimuths, and elevations, are at most `step_deg` apart. Raises ValueError if the
-    distance or the step is not positive, or the beam does not fit the scenario.
+    Neighbouring directions differ by at most `step_deg` in azimuth or in elevation. Raises
+    ValueError if the distance or the step is not positive, or the beam does not fit the scenario.
     """
     for name, value in (('distance_m', distance_m), ('step_deg', step_deg)):
         if not value > 0:

@@ -24,7 +24,7 @@ _MAX_SUBBANDS = 16
 _N_STARTS = 256
 _N_DIRECT = 64
 # Number of steps with the strongest modes of the multipath, number of these modes, and number of
-# configurations that are then improved with all modes. Fewer steps would lose the best starts if
+# configurations that are then improved with all modes. Fewer steps would lose the best starts when
 # the multipath is as strong as the line of sight.
 _N_STEPS = 4
 _N_STRONGEST = 4
@@ -63,10 +63,10 @@ def candidate_configurations(
     board, s B, is in phase with a wave in the air, G w. The waves in the air are the line of sight
     and the modes of the multipath, the columns of G. The search improves waves and configuration
     in turn: the best pair of waves for a configuration belongs to the largest singular value of
-    B diag(c) G. It begins with fixed waves on the board, spread over all directions, and with the
-    line of sight alone, for which the best wave on the board is known. The best of these
-    configurations, those for the multipath alone, and the matched filter are then improved with
-    the strongest modes, and the best of them with all modes.
+    B diag(c) G. It begins with fixed waves on the board, spread over all directions, and at first
+    includes only the line of sight, for which the best wave on the board is known. The best of
+    these configurations, those for the multipath alone, and the matched filter are then improved
+    with the strongest modes, and the best results with all modes.
 
     `index` selects the bands of the link from the tables. The configurations of a band are in no
     particular order, and some may be equal.
@@ -129,7 +129,7 @@ def _modes(scenario: Scenario) -> np.ndarray:
 
 
 def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest eigenvalues and their eigenvectors, as `numpy.linalg.eigh` does."""
+    """Return the largest eigenvalues with eigenvectors, in the order of `numpy.linalg.eigh`."""
     from scipy.sparse.linalg import LinearOperator, eigsh
 
     pairs = []
@@ -143,7 +143,7 @@ def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
         start = start.astype(float if spatial.is_real else complex)
         operator = LinearOperator((len(start), len(start)), times, dtype=start.dtype)
         powers, directions = eigsh(operator, _MAX_MODES, v0=start, tol=_MODE_TOLERANCE)
-        # For complex matrices, they are in no particular order.
+        # The eigenvalues of complex matrices are in no particular order.
         order = np.argsort(powers)
         pairs.append((powers[order], directions[:, order]))
     return np.stack([one for one, _ in pairs]), np.stack([other for _, other in pairs])
@@ -188,13 +188,13 @@ class _Waves(NamedTuple):
     analog: np.ndarray
     rate: np.ndarray  # Capacities [nat/symbol], float32 [N_B, n].
     on_board: np.ndarray  # Conjugates of unit waves on the board, complex64 [N_B, n, J, K, 1].
-    # Best waves in the air for them over 1 plus the signal-to-noise ratio, [N_B, n, J, 1, L].
+    # Best waves in the air for `on_board`, divided by 1 plus the SNR, complex64 [N_B, n, J, 1, L].
     in_air: np.ndarray
 
     @classmethod
     def at(cls, paths: np.ndarray, analog: np.ndarray,
            on_board: np.ndarray | None = None) -> '_Waves':
-        """Improve the waves on the board by a power step, or begin with the direct path."""
+        """Compute waves by a power-method step from `on_board` or, by default, the direct path."""
         n_bands, n_elements, *shape = paths.shape
         channels = (analog @ paths.reshape(n_bands, n_elements, -1).view(np.float32)).view(
             np.complex64).reshape(n_bands, -1, *shape)
@@ -212,12 +212,12 @@ class _Waves(NamedTuple):
         return cls(analog, np.log1p(snr).sum(axis=-1), on_board, in_air)
 
     def improved(self, known: np.ndarray, paths: np.ndarray, fixed: np.ndarray) -> '_Waves':
-        """Return the configurations that match these waves over `known` paths, and their waves."""
+        """Match configurations to these waves over paths `known`; compute waves over `paths`."""
         analog = _enabled(self.on_board * self.in_air, known, fixed)
         return _Waves.at(paths, analog, self.on_board)
 
     def best(self, n: int) -> '_Waves':
-        """Return the `n` best configurations of each band; ties count once if possible."""
+        """Return the `n` best configurations of each band, without repetitions if possible."""
         bands = np.arange(len(self.rate))[:, None]
         order = np.argsort(-self.rate, axis=1)
         ranked = self.rate[bands, order]

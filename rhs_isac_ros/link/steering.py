@@ -32,8 +32,8 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     power is convex in the configuration, so it lies above its linear model at any point. The
     vertex of the box [0, 1]^N_E in the direction of the gradient therefore receives more power,
     unless the point is that vertex. The capacity usually, but not always, increases with the
-    power. If the vertex does not increase the capacity, the round moves a single element to an end
-    of its range, the one that increases the capacity most. The capacity never falls below its
+    power. If the vertex does not increase the capacity, the round moves a single element, the one
+    that increases the capacity most, to an end of its range. The capacity never falls below its
     value at the start.
 
     Takes links of several bands, and starts, float64 [N_B, n, N_E], each entry in [0, 1]. Returns
@@ -109,7 +109,7 @@ class _Point(NamedTuple):
         return better, rates[place] - self.rate
 
     def where(self, condition: np.ndarray, other: '_Point') -> '_Point':
-        """Return these points where a condition, bool [N_B, n], holds, and others elsewhere."""
+        """Return these points where a condition, bool [N_B, n], holds, and `other` elsewhere."""
         return _Point(*(np.where(condition.reshape(*condition.shape, *[1] * (new.ndim - 2)),
                                  new, old) for new, old in zip(self, other, strict=True)))
 
@@ -199,7 +199,7 @@ def applied_beam(beam: Beam, surface: SurfaceEstimate | None) -> Beam:
 def choose_beam(
         scenario: Scenario, mean: np.ndarray, covariance: np.ndarray | None = None,
         bands: Sequence[int] | None = None, surface: SurfaceEstimate | None = None) -> Choice:
-    """Steer a beam of each band to the mean position, and choose the one of highest mean capacity.
+    """Steer a beam in each band to the mean position, and choose that of highest mean capacity.
 
     The posterior is Gaussian, with the mean, float64 [3] [m], and the covariance, float64 [3, 3]
     [m^2]; without a covariance, the position is exact. The capacity at the mean position alone

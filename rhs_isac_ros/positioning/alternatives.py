@@ -1,9 +1,9 @@
 """Alternatives to a user in the region with a direct path: a user outside, or a blocked one.
 
-An alternative has prior odds and an evidence: the likelihood averaged over its own unknowns. Its
-probability follows from a comparison with the evidence for the region. If it exceeds a limit,
-there is no fix. The limit of a user outside is high, because the prior odds are even although most
-users are inside, and none of them should lose a fix.
+Each alternative has prior odds and an evidence, the likelihood averaged over its own unknowns. Its
+probability follows from a comparison with the evidence for a user in the region. If the
+probability exceeds a limit, there is no fix. The limit for a user outside is high: the prior odds
+are even although most users are inside, and those users should not lose their fixes.
 """
 
 import math
@@ -23,7 +23,7 @@ from rhs_isac_ros.support.threads import map_blocks
 
 # Probabilities of a user outside, and of a blocked one, above which there is no fix.
 OUTSIDE_LIMIT = 0.99
-# If the user is blocked with a higher probability, no 95 % region can contain the user that often.
+# Above this probability, a 95 % region that assumes a direct path cannot attain its coverage.
 BLOCKED_LIMIT = 0.05
 # Largest plausible level of the multipath of a blocked user, in standard deviations.
 _LEVEL_REACH = 3.0
@@ -31,8 +31,8 @@ _DB_PER_NEPER = 20 / math.log(10)
 _MIN_PROBABILITY = 1e-12
 # Smallest probability of an alternative that is reported.
 _MIN_DOUBT = 0.01
-# Relative to the nearest range of the region: distance outside of it up to which a user may be
-# located at its border, and nearest range on the grid.
+# In units of the nearest range of the region: width of the border around the region that does not
+# count as outside, and nearest range on the grid.
 _BORDER = 0.1
 _NEAREST = 0.3
 # The nearest range is at least this multiple of the radius of the aperture.
@@ -40,9 +40,9 @@ _MIN_APERTURES = 4.0
 # Farthest range in units of the farthest range of the region, and ratio of successive ranges.
 _MAX_RANGE_FACTOR = 3.0
 _RANGE_RATIO = 1.15
-# Phase error of a template at the edge of the aperture at which the next direction takes over. It
-# is larger if there would be more than this number of templates: large apertures distinguish more
-# directions than a comparison of two hypotheses needs.
+# Phase error of a template at the edge of the aperture at which the next direction takes over, and
+# largest number of templates. The error grows where this number would be exceeded: large apertures
+# distinguish more directions than a comparison of two hypotheses needs.
 _DIRECTION_RAD = 0.25
 _MAX_TEMPLATES = 40_000
 # Quadrature over the gain: spacing [nepers], and reach in standard deviations.
@@ -56,7 +56,7 @@ _GRID_ERROR = 0.25
 _BLOCK = 512
 # Largest sine of the angle from boresight on the grid.
 _MAX_SINE = 0.998
-# Directions whose log-likelihood is further below the best at all ranges are ignored.
+# Directions with a log-likelihood below the best by more than this at all ranges are ignored.
 _MARGIN = 30.0
 
 
@@ -65,16 +65,16 @@ class Alternative(Protocol):
 
     name: str  # `Estimate` has the field ``<name>_probability``.
     reason: str  # Why there is no fix.
-    limit: float  # Largest probability with a fix, if there are no other alternatives.
-    log_odds: float  # Logarithm of the prior odds against a user in the region in sight.
+    limit: float  # Largest probability at which there is a fix, without other alternatives.
+    log_odds: float  # Logarithm of the prior odds relative to a user inside and in sight.
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
                         prior: NuisancePrior) -> float:
         """Compute the logarithm of the evidence with the nuisance parameters integrated out.
 
-        `whitened` are the signals of one phase, complex128 [N_B, N_SB F], without the factors of
-        the `aligned` parameters, float64 [Q]: those that follow from the signals alone, and 0 for
-        the others. `residual` is the energy that remains at the best position in the region.
+        `aligned`, float64 [Q], contains the parameters that follow from the signals alone, and 0
+        for the others. `whitened`, complex128 [N_B, N_SB F], are the signals of one phase without
+        the factors of `aligned`. `residual` is the residual energy at the best position inside.
         """
         ...
 
@@ -89,7 +89,7 @@ class Blocked:
     A survey inflates the covariance of the multipath, and the level differs among users in sight.
     The evidence for a user in sight is computed with the inflated covariance, under which weak
     residuals are improbable. The evidence for a blocked user is therefore divided by the factor by
-    which actual levels would change the evidence for a user in sight.
+    which an average over the levels would change the evidence for a user in sight.
     """
 
     name, reason, limit = 'blocked', 'blocked', BLOCKED_LIMIT
@@ -121,12 +121,13 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
                      ) -> dict[str, np.ndarray]:
     """Compute the arrays of `Outside`: templates of the half space in front of the surface.
 
-    A template is a whitened mean times range and carrier. It depends on the direction and, through
-    the curvature of the wavefront and the delays of the sub-bands, slowly on the range. For T
-    template ranges, R ranges and V directions, the arrays are ``outer_filters``, the conjugate
-    templates, complex64 [N_B, T V, N_SB F]; ``outer_energy``, their energy [m^2], float32 [T, V];
-    ``outer_index``, the template of each range, int64 [R]; and ``outer_weights``, the prior
-    probability of ranges and directions, 0 inside the region, float64 [R, V].
+    A template is a whitened mean times the range, without the carrier's phase. It depends on the
+    direction and, through the curvature of the wavefront and the delays of the sub-bands, slowly
+    on the range. For T template ranges, R ranges and V directions, the arrays are
+    ``outer_filters``, the conjugate templates, complex64 [N_B, T V, N_SB F]; ``outer_energy``,
+    their energy [m^2], float32 [T, V]; ``outer_index``, the index of the template range for each
+    range, int64 [R]; and ``outer_weights``, the prior probability of ranges and directions, 0
+    inside the region, float64 [R, V].
     """
     scenario = model.scenario
     ranges, directions = _ranges(scenario), _directions(scenario)
@@ -160,12 +161,12 @@ class Outside:
     Range ambiguities repeat every few wavelengths, so signals from outside often fit some position
     in the region. The prior is uniform in range and solid angle, up to a multiple of the region's
     farthest range. The carrier phases of the bands turn within centimetres of range. The average
-    over them has a closed form: the product over the bands of ``I_0(2 |t_i^H y_i|)``. The rest is
-    smooth, so a coarse grid suffices: the arrays of `tabulate_outside`.
+    over these phases has a closed form: the product over the bands of ``I_0(2 |t_i^H y_i|)``. All
+    other factors are smooth, so the coarse grid of `tabulate_outside` suffices.
     """
 
     name, reason, limit = 'outside', 'position outside of the region', OUTSIDE_LIMIT
-    # The prior odds are even: as many users are outside as inside.
+    # Even prior odds, as if half of the users were outside.
     log_odds = 0.0
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
@@ -194,7 +195,7 @@ class Outside:
     def log_evidence(self, whitened: np.ndarray, scales: Iterable[float] = (1.0,)) -> np.ndarray:
         """Average ``exp(-|s y - t|^2)`` over the prior for each scale s; return the logarithms."""
         filtered, energy = self._filter(whitened), float(np.sum(np.abs(whitened)**2))
-        # At any range, the log-likelihood is at most that of outputs in phase.
+        # At any range, the log-likelihood is highest if the outputs of all bands are in phase.
         bound = (np.sum(filtered, axis=0)**2 / self._node_energy).max(axis=0)
         values = []
         for scale in scales:
@@ -236,7 +237,7 @@ def describe_doubts(estimate: object) -> str:
 
 
 def rejection(alternative: Alternative, probability: float) -> str:
-    """Return a reason if the probability of an alternative alone rules out a fix, or ''."""
+    """Return the reason if an alternative with this probability rules out a fix, or ''."""
     if probability <= alternative.limit:
         return ''
     return (f'{alternative.reason}: probability {probability:.6g}, expected at most '
@@ -290,7 +291,7 @@ def _prior(scenario: Scenario, ranges: np.ndarray, directions: np.ndarray) -> np
 
 
 def _template_ranges(scenario: Scenario, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ranges of the templates [T] [m], and the template of each range of the grid, [R].
+    """Return the template ranges [T] [m], and the index of one for each range of the grid, [R].
 
     The phase error of a template is due to the curvature of the wavefront, proportional to 1 / r,
     and to the delay across the sub-bands, proportional to r.

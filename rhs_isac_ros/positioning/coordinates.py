@@ -43,7 +43,8 @@ def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,
     The offset follows the sphere of the mode's range, because the signals determine the range
     best. The range then changes with the direction to keep the likelihood as high as possible.
     Takes modes (r [m], u, v), float64 [M, 3], the curvature of the log-likelihood there, the
-    bounds of the region, float64 [2, 3], and the distance from the sphere that counts as zero.
+    bounds of the region, float64 [2, 3], and the largest distance from the sphere that counts as
+    zero.
     """
     positions = to_positions(points)
     result = np.zeros_like(points)
@@ -56,8 +57,7 @@ def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,
         offset: np.ndarray = nearest - points
         nearest[:, 0] = points[:, 0]
         positions = to_positions(nearest)
-    # The projections leave a small remainder. If it is large, the sphere does not intersect the
-    # region.
+    # The projections leave a small remainder, or a large one if the sphere misses the region.
     excess = np.sign(offset[:, 0]) * np.maximum(np.abs(offset[:, 0]) - tolerance_m, 0.0)
     coupling = np.einsum('mq,mq->m', curvature[:, 0, 1:], offset[:, 1:]) / curvature[:, 0, 0]
     offset[:, 0] = excess - coupling
@@ -91,7 +91,7 @@ def symmetric(covariances: np.ndarray) -> np.ndarray:
 
 
 def select(rows: _Rows, chosen: Any) -> _Rows:
-    """Return the rows with the given indices or mask, of a named tuple of arrays."""
+    """Select rows of a named tuple of arrays by their indices or by a mask."""
     kind: Any = type(rows)
     return kind(*(field[chosen] for field in rows))
 

@@ -1,4 +1,4 @@
-"""Tests whether the model explains received signals, in one phase and in the latest cycles.
+"""Tests of whether the model explains received signals, in one phase and in the latest cycles.
 
 Whitened signals y from a position with the whitened mean t differ from t by noise of unit
 variance, so ``2 |y - t|^2`` has a chi-square distribution with two degrees of freedom per
@@ -35,12 +35,12 @@ FALSE_SPREAD_WARNING = 1e-7
 # deviation does not cause one warning after another.
 RETURN = 0.9
 SPREAD_RETURN = 0.5
-# Numbers of residuals: in the window, to end a warning, and at least to begin one.
+# Numbers of residuals: in the window, required to end a warning, and required to begin one.
 WINDOW = 400
 MIN_RETURN = 100
 MIN_FIXES = 10
-# Tolerated error of an expectation, and relative excess of the variance, both due to modes that
-# are not Gaussian.
+# Tolerated error of an expectation, and tolerated relative excess of the variance. Modes that are
+# not Gaussian cause both.
 _TOLERANCE = 0.5
 _SPREAD_TOLERANCE = 0.15
 # Deviations are limited to this many standard deviations, so that no single signal causes a
@@ -50,16 +50,16 @@ _MAX_SQUARE = 9.0
 # Subjects with which reasons begin.
 _ENERGY = 'energy of the whitened signals'
 _RESIDUAL = 'residual energy at the best position'
-# Causes of signals without a position.
+# Likely causes of a missing position.
 LEVEL = 'level of the multipath or of the users'
 SPREAD = 'spread of delays, angles or levels'
-# Relative variance of the residuals, in units of the model's, above which a level does not explain
-# them: two standard errors over the window.
+# Relative variance of the residuals, in units of its value in the model, above which a wrong level
+# does not explain them: two standard errors over the window.
 _MAX_DISPERSION = 1.2
 
 
 class FitTest:
-    """Tests of the energy of N_B N_SB F whitened signals; each returns a reason, or ''.
+    """Tests of the energy of N_B N_SB F whitened signals; each returns a reason to reject, or ''.
 
     `level` is the median power of the multipath of users in sight, relative to the model.
     """
@@ -112,8 +112,8 @@ class InnovationTest:
     could then end.
     """
 
-    #: Whether the residuals deviate from the model: True once their mean or variance over the
-    #: window is improbable, until both are probable for the latest `MIN_RETURN`.
+    #: Whether the residuals deviate from the model. It becomes True when their mean or variance
+    #: over the window is improbable, and False when both are probable for the last `MIN_RETURN`.
     drifts: bool
 
     def __init__(self, window: int = WINDOW) -> None:
@@ -163,7 +163,7 @@ class InnovationTest:
 
     @property
     def spread(self) -> float:
-        """Variance of the energy about the expectation, relative to the model's, or NaN."""
+        """Variance of the energy about its expectation, relative to the model; NaN if empty."""
         total = _Residual.total(self._residuals)
         return total.square / len(self._residuals) if self._residuals else np.nan
 
@@ -173,7 +173,7 @@ class _Residual(NamedTuple):
 
     energy: float
     expected: float
-    square: float  # Of the normalised deviation.
+    square: float  # Square of the normalised deviation.
     square_variance: float
 
     @classmethod
@@ -206,9 +206,9 @@ def _spread_probability(total: _Residual, n: int) -> float:
 def diagnose(estimates: Collection[Estimate], deviates: bool) -> dict[str, str]:
     """Return texts for the diagnostics from the estimates of the latest cycles.
 
-    ``probability.<alternative>`` is the share of such users. ``no_fix.share`` and ``no_fix.cause``
-    exist if there are cycles without a fix. `deviates` states whether the residuals deviate from
-    the scenario, in which case the probabilities are wrong.
+    ``probability.<alternative>`` is the mean probability of an alternative. ``no_fix.share`` and
+    ``no_fix.cause`` exist if there are cycles without a fix. `deviates` states whether the
+    residuals deviate from the scenario, in which case the probabilities are wrong.
     """
     values = {}
     probabilities = [probabilities_of(one) for one in estimates]

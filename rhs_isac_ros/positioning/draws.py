@@ -1,7 +1,7 @@
 """The posterior of weak signals: positions drawn all over the grid, instead of modes.
 
-Signals below the noise fit thousands of beams and range steps. The search for all of these modes
-would be slow, and they are not Gaussian. Instead, directions are drawn within cells of the grid,
+Signals below the noise fit positions in thousands of beams and range steps. A search for all modes
+would be slow, and the modes are not Gaussian. Directions are therefore drawn in cells of the grid,
 and the likelihood is integrated along the range. This is importance sampling: cells are drawn with
 probabilities that follow from bounds of their likelihood, and the weight of a draw is its integral
 divided by the probability of its cell. The weights determine the number of effective draws. While
@@ -28,23 +28,23 @@ from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.grid import Query, TemplateTable, Windows
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution
 
-# Draws per round, largest number of rounds, and sufficient number of effective draws; its inverse
-# is the relative increase of the mean squared error.
+# Draws per round, largest number of rounds, and sufficient number of effective draws. The inverse
+# of the last is the relative increase of the mean squared error.
 _N_DRAWS = 500
 _MAX_ROUNDS = 12
 _N_EFFECTIVE = 150.0
 # Share of further draws that follow the bounds instead of the weights.
 _SHARE_OF_BOUNDS = 0.7
-# Power of the likelihood that the bounds imply, so that cells with low bounds are drawn, too.
+# Exponent of the bounds of the likelihood, below 1 so that cells with low bounds are drawn, too.
 _POWER = 0.8
-# Windows of range whose log-likelihood is further below the best average have no effect.
+# Range windows are omitted if their log-likelihood is below the best average by more than this.
 _MARGIN = 12.0
-# Smallest number of range steps per wavelength. A Gaussian peak has one per two deviations.
+# Smallest number of range steps per wavelength; a Gaussian peak gets one per two deviations.
 _MIN_STEPS = 8
 # Number of range steps to evaluate at a time.
 _BLOCK = 1 << 20
-# Multiples of these numbers modulo 1 cover the unit square evenly: powers of the inverse root of
-# x^3 = x + 1.
+# The multiples of this pair, modulo 1, cover the unit square evenly. Its numbers are powers of the
+# inverse of the real root of x^3 = x + 1.
 _SEQUENCE = 1.324717957244746**-np.array([1.0, 2.0])
 # Smaller components of directions are replaced by this value, whose inverse is finite.
 _TINY = 1e-12
@@ -53,7 +53,7 @@ _TINY = 1e-12
 class _Rays(NamedTuple):
     """Integrals of the likelihood over intervals of range, each in the direction of a draw."""
 
-    draw: np.ndarray  # Number of the draw, int [R].
+    draw: np.ndarray  # Index of the draw, int [R].
     direction: np.ndarray  # Unit vector, float64 [R, 3].
     log_mass: np.ndarray  # Logarithm of the integral, float64 [R]; -inf outside of the region.
     range_m: np.ndarray  # Mean range, float64 [R] [m].
@@ -81,7 +81,7 @@ class DrawnPosterior:
         self._log_volume = np.log(volume) + self._log_area
 
     def of(self, query: Query, phase: int) -> Fit | None:
-        """Draw positions for one phase of a query; return None if too few are effective."""
+        """Draw positions for one phase of a query; return None if too few draws are effective."""
         probability = bounds = self._probabilities(query, phase)
         cells, log_weights, parts, total_share = np.empty(0, int), np.empty(0), [], 0.0
         for n_rounds in range(1, _MAX_ROUNDS + 1):
@@ -110,7 +110,7 @@ class DrawnPosterior:
         mean, covariance = moments(weights, places)
         along = weights * rays.variance_m2
         covariance += (along[:, None] * rays.direction).T @ rays.direction
-        # Log-likelihoods are relative to no signal.
+        # Log-likelihoods are relative to that of an absent signal.
         energy, best = float(query.energies[phase]), float(rays.highest[weights > 0].max())
         return Fit(
             mean, symmetric(covariance * (1 + variance)),
@@ -128,7 +128,7 @@ class DrawnPosterior:
         return shares / shares.sum()
 
     def _rays(self, query: Query, phase: int, cells: np.ndarray, places: np.ndarray) -> _Rays:
-        """Integrate along directions, each at a place [K, 2] in the unit square of a cell [K]."""
+        """Integrate along K directions, given by cells [K] and relative places in them, [K, 2]."""
         directions = np.empty((len(cells), 3))
         directions[:, 1:] = self._low[cells] + places * self._extent[cells]
         directions[:, 0] = _boresight(directions[:, 1:])
@@ -150,7 +150,7 @@ class DrawnPosterior:
 
     def _integrate(self, windows: Windows, low: np.ndarray, high: np.ndarray, n_steps: int
                    ) -> tuple[np.ndarray, ...]:
-        """Integrate over windows from `low` to `high` [m]; return the last fields of `_Rays`."""
+        """Integrate over windows from `low` to `high` [m]; return the last five `_Rays` fields."""
         step_m, range_m = self._table.window_m / n_steps, windows.range_m
         offsets_m = ((np.arange(n_steps) - (n_steps - 1) / 2) * step_m).astype(np.float32)
         phase = np.exp(1j * self._wavenumbers[:, None] * offsets_m)

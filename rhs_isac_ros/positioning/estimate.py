@@ -9,8 +9,8 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 
-# Limit far above any received amplitude [sqrt(W)]. After whitening, its square is still finite in
-# single precision.
+# Limit far above any received amplitude [sqrt(W)]. The square of a whitened amplitude is still
+# finite in single precision.
 _MAX_MAGNITUDE = 1e3
 # The fields of an `Estimate` of one phase: mean [3], covariance [3, 3] and reason, optionally
 # followed by the four other fields.
@@ -20,7 +20,7 @@ Located: TypeAlias = (
 
 
 class SignalError(ValueError):
-    """Received signals cannot be used: wrong shape or not finite."""
+    """Received signals cannot be used: wrong shape, not finite, or too large."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Estimate:
 
     mean: np.ndarray  #: Position, float64 [3] or [N, 3] [m]; NaN if there is none.
     covariance: np.ndarray  #: Float64 [3, 3] or [N, 3, 3] [m^2]; NaN without a position.
-    #: Reason why there is no position, empty if there is one; a string, or N of them.
+    #: Reason why there is no position, '' if there is one; a string, or N strings.
     reason: str | tuple[str, ...] = ''
     #: Energy of the whitened residual at the best position, float64 [] or [N]; or NaN.
     residual: float | np.ndarray = np.nan

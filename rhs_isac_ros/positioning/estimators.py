@@ -64,7 +64,7 @@ _N_COORDINATES = 3
 # Number of phases that are located together.
 _BLOCK = 128
 # Samples per mode if the phases of the bands carry information. The density then has several peaks
-# within a mode, and few of the samples have most of the weight.
+# within a mode, and a few of the samples carry most of the weight.
 _N_INFORMATIVE = 512
 # Total probability of the alternatives above which residuals are not compared with the scenario.
 _DOUBT_LIMIT = 0.05
@@ -179,7 +179,7 @@ class SearchEstimator(abc.ABC):
 
     def _search(self, signals: Signals, aligned: np.ndarray, draws: bool
                 ) -> list[tuple[Fit, Modes | None]]:
-        """Find the posterior of each phase and its modes, or by draws if it has too many modes."""
+        """Find the posterior of each phase and its modes; None if draws replace too many modes."""
         likelihood, fits = self._likelihood, dict[int, tuple[Fit, Modes | None]]()
         extra = self._failures.search_margin if self._failures else 0.0
 
@@ -253,7 +253,7 @@ class SearchEstimator(abc.ABC):
         return mean, covariance, reason, fit.residual, expected, outside, blocked
 
     def _covariance(self, fit: Fit) -> np.ndarray:
-        """Return the covariance, scaled to the level of the multipath that the residual shows."""
+        """Return the covariance, scaled to the multipath level that the residual indicates."""
         relative = max(fit.residual, 1e-9) / (self._level * max(fit.expected, 0.5))
         # The covariance of a position never exceeds the prior's.
         largest = max(self._prior_m2 / float(fit.covariance.trace()), 1.0)

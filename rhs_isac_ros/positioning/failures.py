@@ -1,7 +1,7 @@
 """Modes of the posterior as a mixture over sets of failed elements.
 
-`DispersedLikelihood` replaces the mixture by one Gaussian for each number of failures. This
-ignores the information about the set: even a single failure is far above the nulls of the
+`DispersedLikelihood` replaces the mixture by one Gaussian for each number of failures. It ignores
+what the signals reveal about the set, although even a single failure is far above the nulls of the
 multipath. Here, sets with a substantial weight are found by adding elements to the most probable
 sets, one at a time.
 
@@ -43,25 +43,25 @@ from rhs_isac_ros.positioning.search import Modes, ascend, predict
 # Largest expected number of failures for which sets are searched.
 _MAX_EXPECTED = 2.0
 # Probability that the residual of an intact surface exceeds the usual residual, and number of
-# modes from which sets are searched if it does not.
+# modes from which the search for sets starts if the observed residual does not exceed it.
 _UNUSUAL = 0.01
 _N_USUAL = 2
-# Otherwise: number of points of the table besides the modes, their margin, and number of sites.
+# If it does: number of points of the table besides the modes, their margin, and number of sites.
 _MAX_POINTS = 64
 _POINT_MARGIN = 30.0
 _N_SITES = 64
-# Share of further failures assumed to order the sets, and number of sets of one size to extend.
+# Factor of the share of further failures while sets are ordered; number of hypotheses to extend.
 _REMAINDER = 0.3
 _N_EXTENDED = 16
 # Number of sets to try at all sites.
 _N_SETS = 4
-# Hypotheses further below the best in log-probability are dropped, before and after the first
-# exact step; and the largest number that remains.
+# Hypotheses are dropped if their log-probability is below the best by more than these margins,
+# before and during the exact steps. Largest number to keep, and number of exact steps.
 _MARGIN = 9.0
 _FIRST_MARGIN = 27.0
 _MAX_HYPOTHESES = 48
 _N_STEPS = 2
-# Numbers of hypotheses to extend per set and per site, and of extended sets to weigh exactly.
+# Largest numbers of hypotheses to extend per set and per site, and to weigh exactly.
 _MAX_PER_SET = 3
 _MAX_PER_SITE = 4
 _N_EXACT = 16
@@ -70,7 +70,7 @@ _MAX_GROWTH = 6
 # Number of sets whose covariance is kept.
 _MAX_SURFACES = 256
 
-# A set of failed elements, in ascending order; and with the index of a site.
+# A set of failed elements in ascending order, and a hypothesis: a set with the index of a site.
 Failed: TypeAlias = tuple[int, ...]
 Key: TypeAlias = tuple[Failed, int]
 
@@ -147,12 +147,12 @@ class Whitening(NamedTuple):
 
     whitener: np.ndarray  # Inverse Cholesky factors, complex128 [N_B, H, N_SB F, N_SB F].
     log_volume: np.ndarray  # Logarithms of the determinants, float64 [H].
-    information: np.ndarray  # One covariance's information about the parameters, float64 [Q, Q].
+    information: np.ndarray  # Information of one covariance about parameters, float64 [Q, Q].
 
     @classmethod
     def of(cls, covariance: np.ndarray, prior: NuisancePrior, parent: 'Whitening | None' = None
            ) -> 'Whitening':
-        """Factorise covariances [N_B, H, N_SB F, N_SB F]; the information may be the parent's."""
+        """Factorise covariances [N_B, H, N_SB F, N_SB F]; use a parent's information."""
         roots = np.linalg.cholesky(covariance)
         whitener = np.linalg.inv(roots)
         return cls(whitener, log_determinant(roots).sum(axis=0), parent.information if parent
@@ -161,7 +161,7 @@ class Whitening(NamedTuple):
 
 @dataclasses.dataclass(eq=False)
 class Site:
-    """The signals of a phase at a point."""
+    """A point at which the signals of a phase are evaluated."""
 
     model: 'FailureModel'
     point: np.ndarray  # (r [m], u, v), float64 [3].
@@ -172,10 +172,10 @@ class Site:
 
     @functools.cached_property
     def elements(self) -> tuple[np.ndarray, np.ndarray]:
-        """Effect of each element that fails, computed at first use.
+        """Effects of the failure of each element, computed at first use.
 
-        It is the change of the columns, complex128 [N_E, 4 + Q, N_B, N_SB F], and the derivative
-        with respect to the scaled amplitude, complex128 [N_E, N_B, N_SB F].
+        They are the change of the columns, complex128 [N_E, 4 + Q, N_B, N_SB F], and the
+        derivative of the mean with respect to the scaled amplitude, complex128 [N_E, N_B, N_SB F].
         """
         return self.model.elements_at(self.point)
 
@@ -205,7 +205,7 @@ class FailedSet:
         self._amplitudes = model.amplitudes[self._failed]
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate points; see `Conditional.local`."""
+        """Evaluate the log-likelihood at points; see `Conditional.local`."""
         scenario, prior = self._model.scenario, self._model.likelihood.nuisance
         positions, (mean, slopes) = to_positions(points), self._means(points)
         gains = np.stack([
@@ -277,7 +277,7 @@ class FailureModel:
         return Surface(scattered, smaller.covariance + growth)
 
     def sites(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> list[Site]:
-        """Evaluate the signals of a phase, N = 1, at points [P, 3] with parameters [P, Q]."""
+        """Return sites at points [P, 3] with parameters [P, Q], for the signals of one phase."""
         prior = self.likelihood.nuisance
         mean, slopes = self._model.mean_and_jacobian(to_positions(points), jacobian(points))
         columns = prior.columns(values, signals.received, mean, slopes)[:, :4 + len(prior)]
@@ -298,7 +298,7 @@ class FailureModel:
         return changes, elements[:, 0] * self.amplitudes
 
     def weigh(self, failed: Failed, sites: Sequence[Site]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the log-probability of a set at sites, and its deviance, after a step, [P] each.
+        """Return a set's log-probability and deviance, [P] each, after a step at each of P sites.
 
         The log-probability is relative to the prior of an intact surface. The deviance is the
         energy of the residual plus the cost of the parameters, because an unknown gain can lower
@@ -314,8 +314,8 @@ class FailureModel:
         """Compute the log-probability of `weigh` if one more element fails, float64 [N_E].
 
         The other elements are assumed to fail with the declared share times `remainder`, which
-        adds to the covariance. Elements that explain part of the signals then have a higher
-        value than elements that imitate the sum.
+        adds to the covariance. An element that explains part of the signals then has a higher
+        value than one that imitates the sum of several failures.
         """
         extended, (columns, own) = self._extensions_of(failed, remainder), site.columns_of(failed)
         changes, amplitudes = site.elements
@@ -347,7 +347,7 @@ class FailureModel:
         return self._extensions[failed, remainder]
 
     def _growth(self, surface: Surface, elements: slice = slice(None)) -> np.ndarray:
-        """Return the change of a surface's covariance if an element fails, [N_E, N_B, S, S]."""
+        """Return the change of a surface's covariance by each failure, [N_E, N_B, S, S]."""
         shift, spread = self._shift[elements], self.amplitudes[elements]
         power = np.diagonal(self._spatial, axis1=1, axis2=2).real.T[elements, :, None]
         cross = np.moveaxis(surface.scattered[..., elements], 2, 0) + power / 2 * shift
@@ -358,14 +358,14 @@ class FailureModel:
 
 
 class FailureSearch:
-    """Adds failed elements to sets, one at a time, at several sites, for the signals of a phase.
+    """Search for sets of failed elements at several sites, for the signals of one phase.
 
-    Extended sets are ordered by a likelihood that admits a few more failures; see
-    `FailureModel.weigh_extensions`. Otherwise, if two elements have failed, the first one added
-    would often be a third element that imitates the sum of both.
+    Sets grow by one element at a time. Extended sets are ordered by a likelihood that admits a few
+    more failures; see `FailureModel.weigh_extensions`. Otherwise, if two elements have failed, the
+    first one added would often be a third element that imitates the sum of both.
 
-    Growth ends when new sets are less probable than the best by a margin, in log-probability, but
-    continues while no hypothesis has a deviance below the usual residual.
+    Growth ends when all new sets are less probable than the best set by a margin, but not before
+    the deviance of some hypothesis is as low as usual.
     """
 
     def __init__(self, model: FailureModel, signals: Signals) -> None:
@@ -391,7 +391,7 @@ class FailureSearch:
         return self._weigh((failed, index) for index in range(first, len(self.sites)))
 
     def grow(self, parents: list[Key], remainder: float = 0.0) -> None:
-        """Add failures to hypotheses as long as the result is probable.
+        """Add failures to hypotheses until the results are improbable.
 
         `remainder` is the argument of `FailureModel.weigh_extensions`.
         """

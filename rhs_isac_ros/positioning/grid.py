@@ -3,9 +3,9 @@
 A template is a mean signal times the range, without the carriers of its sub-bands: exp(i k_n r) r
 mu_n(p). It changes with the direction at the resolution of the aperture, but with the range only
 through the curvature of the wavefront, so many ranges share one template. The search has three
-levels. Matched filters are evaluated for every template and sub-band. Their outputs are summed in
-range cells, within which delays and amplitudes hardly change. Along fine range steps, which
-resolve the carriers, one output per band then rotates.
+levels. First, matched filters are evaluated for every template and sub-band. Second, their outputs
+are summed over the sub-bands for range cells, within which delays and amplitudes hardly change.
+Third, the sum for each band rotates along fine range steps, which resolve the carriers.
 
 All lengths of the grid follow from the scenario; see `lattice`.
 """
@@ -44,14 +44,14 @@ _N_NORMAL = 128
 _BLOCK = 128
 # Fine range steps per shortest wavelength; at least four are needed to resolve the posterior.
 _STEPS_PER_WAVELENGTH = 8
-# Number of outputs in a block, which limits the number of phases.
+# Number of outputs in a block, which limits the number of phases in it.
 _N_OUTPUTS = 1 << 18
-# Number of cells of a phase that are examined first, to find how likely others must be.
+# Number of cells of a phase that are examined first, to find how likely the other cells must be.
 _N_FIRST = 48
-# Number of further relevant cells above which positions are drawn instead.
+# Number of other relevant cells above which positions are drawn, without a search for modes.
 _MAX_CELLS = 100
 # Largest log-likelihood, relative to no signal, of signals for which positions are drawn. Peaks of
-# stronger signals are so narrow that draws may meet some of them and miss others.
+# stronger signals are so narrow that draws may hit some of them and miss others.
 _MAX_DRAWN = 100.0
 # Largest number of peaks of a phase that are kept, to limit memory and time. Only signals below
 # the noise have more, and the remaining peaks have little weight.
@@ -132,7 +132,7 @@ def standard_normal(n: int) -> np.ndarray:
 class TemplateTable:
     """Fast evaluation of the log-likelihood over the whole region of interest.
 
-    Its argument is the result of `tabulate`; `normal`, `spread` and `energy` are attributes.
+    `arrays` is the result of `tabulate`; `normal`, `spread` and `energy` become attributes.
     """
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
@@ -154,7 +154,7 @@ class TemplateTable:
         self._set_windows(scenario)
 
     def _set_windows(self, scenario: Scenario) -> None:
-        """Divide range cells into windows of equal width, with the same fine steps."""
+        """Divide range cells into windows of similar widths, with the same fine steps."""
         grid, wavelength_m = self.grid, self._resolution.wavelength_m
         counts = np.ceil(grid.widths_m / grid.widths_m.min() - 1e-9).astype(int)
         self._first_window, self._n_windows = np.cumsum(counts) - counts, counts
@@ -173,7 +173,7 @@ class TemplateTable:
         self._fine = np.ascontiguousarray(phase.T.astype(np.complex64))
 
     def _turns(self, ranges_m: np.ndarray) -> np.ndarray:
-        """Return the carriers of conjugate templates at ranges [R], complex128 [N_B, N_SB, R]."""
+        """Return conjugate means over conjugate templates at ranges [R], [N_B, N_SB, R]."""
         return np.exp(1j * self._wavenumbers[..., None] * ranges_m) / ranges_m
 
     def starts(self, whitened: np.ndarray, prior: NuisancePrior, margin: float,
@@ -334,7 +334,7 @@ class TemplateTable:
             np.zeros(len(step)) if gain is None else gain[step, column], at_peak)
 
     def _windows_of(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the windows of pairs [K] of the grid: indices of their pairs and windows, [W]."""
+        """Return the windows of pairs [K]: the index of each window's pair and its own, [W]."""
         ranges = self.grid.cell[cells]
         counts = self._n_windows[ranges]
         pair = np.repeat(np.arange(len(cells)), counts)
@@ -406,7 +406,7 @@ class TemplateTable:
 
     def _loss_outside(self, phases: np.ndarray, points: np.ndarray, cells: np.ndarray,
                       value: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Return the likelihood lost by moves into the region, [P]; inf if a point is unlikely."""
+        """Return the likelihood loss of moves into the region, [P]; inf for unlikely points."""
         inside = is_inside(to_positions(points), self._bounds)
         result = np.where(inside, 0.0, np.inf)
         best = np.full(phases.max(initial=0) + 1, -np.inf)

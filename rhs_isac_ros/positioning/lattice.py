@@ -37,7 +37,7 @@ _SHARED_RAD = 0.05
 # Radii of an ellipsoid around a mode that contains no other mode, in wavelengths and radians.
 _SEPARATION_WAVELENGTHS = 0.37
 _SEPARATION_RAD = 0.57
-# Steps and radii in range cells if the phases of the bands contain no information about the range.
+# Steps and radii in range, in cells, if the phases of the bands contain no information about it.
 _COARSE_CELLS = 0.75
 # Largest value of `Resolution.direction`. It applies to apertures below a few wavelengths, where
 # the gains of elements and of the user also change with the direction.
@@ -58,7 +58,7 @@ class Resolution(NamedTuple):
     wavelength_m: float  # Shortest wavelength of the bands' centres.
     # Changes of (u, v) that turn the phase at the edge of the aperture by one radian, [2].
     direction: np.ndarray
-    curvature_m: float  # Phase [rad] at the vertex of the aperture per change of 1 / r.
+    curvature_m: float  # Phase [rad] at a corner of the aperture per change of 1 / r.
     delay_m: float  # Change of the range that turns the phase at the edge of a band by 1 rad.
     nearest_m: float
     farthest_m: float
@@ -136,8 +136,8 @@ class Grid(NamedTuple):
     widths_m: np.ndarray
     node: np.ndarray  # Template of each pair that belongs to the grid, int [C].
     cell: np.ndarray  # Range cell of each pair, int [C].
-    # Slices of templates, range cells and pairs with the same range of templates. The pairs of a
-    # segment are a subset of all pairs of its range cells and templates.
+    # Slices of templates, range cells and pairs, for each range of the templates. The pairs of a
+    # segment are a subset of all combinations of its templates and range cells.
     segments: list[tuple[slice, slice, slice]]
 
     @property
@@ -211,8 +211,8 @@ class Expansion(NamedTuple):
 
     points: np.ndarray  # (r [m], u, v), float64 [n, 3].
     wavenumbers: np.ndarray  # Of each measurement's carrier, float64 [N_B, N_SB F] [1/m].
-    mean: np.ndarray  # Mean signals over the factor, complex128 [n, N_B, N_SB F].
-    slopes: np.ndarray  # Their derivatives, complex128 [n, 3, N_B, N_SB F].
+    mean: np.ndarray  # Mean signals divided by the factor, complex128 [n, N_B, N_SB F].
+    slopes: np.ndarray  # Derivatives of `mean`, complex128 [n, 3, N_B, N_SB F].
 
     @classmethod
     def of(cls, model: MeasurementModel, points: np.ndarray) -> 'Expansion':
@@ -227,7 +227,7 @@ class Expansion(NamedTuple):
         return cls(points, wavenumbers, mean, slopes)
 
     def at(self, index: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Evaluate points [M, 3], each near the expansion point with the given index, int [M].
+        """Evaluate the mean signals at points [M, 3]; `index`, int [M], selects expansions.
 
         Returns means, complex128 [M, N_B, N_SB F], and derivatives, [M, 3, N_B, N_SB F].
         """
@@ -265,7 +265,7 @@ class Means:
             [resolution.curvature_m, *1 / resolution.direction]) / _SHARED_RAD
 
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Evaluate points (r [m], u, v), [M, 3]; see `Expansion.at`."""
+        """Evaluate the mean signals at points (r [m], u, v), [M, 3]; see `Expansion.at`."""
         cells = points * self._per_cell
         cells[:, 0] = self._per_cell[0] / points[:, 0]
         keys = np.rint(cells).astype(np.int64) @ np.array([1 << 42, 1 << 21, 1])

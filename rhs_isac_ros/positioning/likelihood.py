@@ -7,8 +7,8 @@ volume. With mean mu(p) and covariance Lambda at a position p, the log-likelihoo
 constant, ``-|W (y exp(-z P) - mu(p))|^2 - 2 Re(sum z P) - log det Lambda`` with ``W^H W =
 Lambda^-1``.
 
-A `Conditional` evaluates it for one state of the surface, with its derivatives. Search, posterior
-and tracks use only `Conditional`, whatever the impairments are.
+A `Conditional` evaluates the log-likelihood and its derivatives for one state of the surface.
+Search, posterior and tracks use only `Conditional`, whatever the impairments are.
 """
 
 import dataclasses
@@ -42,10 +42,10 @@ _N_AMPLITUDE = 256
 _GAIN_REACH = 4.5
 # Standard deviation of the gain below which the gain has no effect [nepers].
 _MIN_GAIN_STD = 1e-9
-# Smallest probability of the numbers of failures to average over, and how many at most.
+# Numbers of failures to average over: smallest probability of each, and how many at most.
 _MIN_PROBABILITY = 1e-5
 _MAX_COUNTS = 12
-# Share of an estimate's errors in the whitened energy above which their position is considered.
+# Up to this share of the whitened energy, errors of an estimated surface ignore the position.
 _MIN_ERROR_SHARE = 0.05
 
 
@@ -73,7 +73,7 @@ class Conditional(Protocol):
     """The likelihood given one state of the surface."""
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate points [M, 3] with parameters [M, Q] for the signals of M phases or of one."""
+        """Evaluate points [M, 3] with parameters [M, Q], given the signals of one or M phases."""
         ...
 
 
@@ -142,11 +142,12 @@ class NuisancePrior(Exponents):
 
     def columns(self, values: np.ndarray, received: np.ndarray, mean: np.ndarray,
                 slopes: np.ndarray, *linear: np.ndarray) -> np.ndarray:
-        """Return the residual and its derivatives at M points, complex128 [M, C, N_B, N_SB F].
+        """Return the residual and derivatives at M points, complex128 [M, C, N_B, N_SB F].
 
-        Four groups of derivatives follow the residual: of the mean with respect to the point, of
-        the informative signals to the parameters, of the mean to further `linear` parameters, and
-        of the received signals to the parameters.
+        Four groups follow the residual: derivatives of the mean with respect to the point; the
+        informative derivatives with respect to the parameters; `linear`, derivatives of the mean
+        with respect to further parameters; and derivatives of the divided signals with respect to
+        the parameters.
         """
         divided = self.divide(received, values)
         return np.concatenate([
@@ -169,7 +170,7 @@ class NuisancePrior(Exponents):
         return float(-self.precision @ aligned**2 - np.linalg.slogdet(curvature)[1]) / 2
 
     def amplitude(self, outputs: np.ndarray) -> np.ndarray:
-        """Sum the matched-filter outputs of the bands, [N_B, ...], in their likely phases."""
+        """Sum the bands' matched-filter outputs, [N_B, ...], after their likeliest rotations."""
         if not self.relative_phase_std_rad:
             return _in_phase(outputs.sum(axis=0), float(self.phase_std_rad[0]))
         parts = [_in_phase(output, float(std))
@@ -209,13 +210,13 @@ class NuisancePrior(Exponents):
 
 
 class Likelihood:
-    """The likelihood with one covariance everywhere, averaged over the region and surfaces."""
+    """The likelihood with one covariance, averaged over the region and over surfaces."""
 
     def __init__(self, scenario: Scenario, codebook: Codebook,
                  surface: Surface | None = None) -> None:
         codebook.check(scenario)
         self.scenario, self.codebook, self.surface = scenario, codebook, surface
-        # Estimators are built between cycles; their first estimate should be as fast as any.
+        # Estimators are built between cycles; the first estimate should be as fast as later ones.
         self.model = MeasurementModel(scenario, codebook, surface).prepare(jacobian=True)
         self.nuisance = NuisancePrior(self.model)
         self.resolution, self._means = Resolution.of(scenario), Means(self.model)
@@ -261,10 +262,10 @@ def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
              information_of_covariance: np.ndarray | None = None, n_linear: int = 0) -> Local:
     """Combine whitened columns into the likelihood and its derivatives at parameters [M, Q].
 
-    `white`, complex128 [M, C, n], are the columns of `NuisancePrior.columns`. The last Q may be
-    absent; the gradient then uses derivatives of the mean, and predicts no more than the whole
-    energy. `information_of_covariance`, float64 [Q, Q], is the information of the covariance about
-    the parameters; by default, the average covariance is used. `n_linear` is the number of further
+    `white`, complex128 [M, C, n], are the whitened `NuisancePrior.columns`. Without the last Q,
+    the gradient uses derivatives of the mean, and predicts at most a decrease of the energy to 0.
+    `information_of_covariance`, float64 [Q, Q], is the information of the covariance about the
+    parameters; by default, the average covariance is used. `n_linear` is the number of further
     standard normal parameters in which the mean is linear; they are integrated out.
     """
     n, end = 3 + len(prior), 4 + len(prior) + n_linear

@@ -43,7 +43,7 @@ _FORMAT = 1
 # Arrays of a network with D inputs and H hidden units.
 _SHAPES = {'input_mean': 'D', 'input_scale': 'D', 'w_in': 'DH', 'b_in': 'H', 'w_out': 'H3',
            'b_out': '3', 'center': '3', 'covariance': '33', 'max_energy': ''}
-# Their keys in the file.
+# Keys of these arrays in the file.
 _KEYS = {name: 'loudest' if name == 'max_energy' else name for name in _SHAPES}
 
 
@@ -79,7 +79,7 @@ class Network:
     b_out: np.ndarray  #: Biases of the output, float64 [3] [m].
     center: np.ndarray  #: Centre of the region of interest, float64 [3] [m].
     covariance: np.ndarray  #: Second moments of the validation residuals, float64 [3, 3] [m^2].
-    max_energy: float  #: Largest energy of the whitened mean signal at a training position.
+    max_energy: float  #: Largest energy of a whitened mean signal over the simulated positions.
     #: ``codebook``, the id of the codebook; ``scenario``, the fields that differ from Table I;
     #: ``seed``, ``pairs``, ``epochs``, ``version``; ``validation_mse_m2`` and ``test_mse_m2``.
     about: dict[str, Any]

@@ -2,9 +2,9 @@
 
 A mode is a Gaussian, and its samples inside the region have equal weights, unless the phases of
 the bands are unknown. Then only delays, amplitudes and the curvature of the wavefront determine
-the range. A mode extends over metres, in which the likelihood is not quadratic and the volume
-element changes. The samples then serve as a proposal: each is weighted by the posterior relative
-to the mixture of all Gaussians, so modes may overlap.
+the range. A mode extends over metres, across which the log-likelihood is not quadratic and the
+volume element changes. The samples then serve as a proposal: each is weighted by the posterior
+relative to the mixture of all Gaussians, so modes may overlap.
 """
 
 from collections.abc import Sequence
@@ -31,14 +31,14 @@ from rhs_isac_ros.positioning.search import Modes, marginal_at
 # Factor by which a proposal is wider than its Gaussian, because the tails of the posterior may be
 # heavier.
 _SPREAD = 1.3
-# Samples whose log-weight is further below the best have no effect, whatever their phases.
+# Samples with a log-weight below the best by more than this have no effect, whatever their phases.
 _LIKELY_MARGIN = 20.0
 # Averages over the phases of the bands: spacing of the ranges, in standard deviations of the
 # product of the bands' factors; and number of values of a phase that all bands share, few because
 # the average over the range nearly removes this phase.
 _SPACING = 1.5
 _N_COMMON = 8
-# Standard deviation above which a wrapped phase is uniform; wraps beyond one turn are negligible.
+# Standard deviation above which a wrapped phase is uniform. Below it, wraps by one turn suffice.
 _MAX_STD_RAD = 3.0
 
 
@@ -219,8 +219,8 @@ class BandPhases:
 
     def _broadened(self, magnitude: np.ndarray) -> np.ndarray:
         """Return the standard deviation of the phase of outputs of these magnitudes."""
-        # The phase of the noise has the von Mises density; its first harmonic is that of a
-        # wrapped normal distribution.
+        # Noise gives the phase a von Mises density, which is approximated by the wrapped normal
+        # density with the same first harmonic.
         from scipy.special import i0e, i1e
 
         concentration = 2 * np.maximum(magnitude, 1e-9)

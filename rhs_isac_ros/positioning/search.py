@@ -62,7 +62,7 @@ class Modes(NamedTuple):
         return Starts(self.phases, self.roi_points, self.values)
 
     def replace(self, rows: np.ndarray, others: 'Modes') -> None:
-        """Overwrite the modes in `rows`."""
+        """Overwrite the modes in `rows` with other modes."""
         for field, new in zip(self, others, strict=True):
             field[rows] = new
 
@@ -93,8 +93,8 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
            n_steps: int, margin: float = EXACT_MARGIN, state: int = 0) -> Modes:
     """Take Gauss-Newton steps from points to the modes of the posterior.
 
-    `conditional` is the likelihood for the state of the surface. Modes that are less likely than
-    the best of their phase, by more than the margin, are dropped.
+    `conditional` is the likelihood for the state of the surface with the number `state`. Modes
+    that are less likely than the best of their phase, by more than the margin, are dropped.
     """
     def step(starts: Starts, moves: bool = True) -> tuple[Modes, np.ndarray]:
         return _step(conditional, likelihood, starts, select(signals, starts.phases), state,
@@ -178,7 +178,7 @@ def _newton(local: Local, likelihood: Likelihood) -> tuple[Marginal, np.ndarray,
 def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float) -> np.ndarray:
     """Return indices of the probable, separate modes of each phase, the most likely first."""
     # The likelihood of a mode is a prediction, and may be arbitrarily wrong before convergence.
-    # The best is limited to the highest likelihood before the last step, which is computed.
+    # Before the last step, it is known; the highest known likelihood therefore limits the best.
     value = modes.roi_log_likelihood + np.maximum(gain, 0)
     order = np.lexsort((-modes.roi_log_likelihood, modes.phases))
     phases = modes.phases[order]

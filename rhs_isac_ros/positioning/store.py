@@ -33,9 +33,9 @@ def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = 
     """Load the table of a model from a folder, or compute it and store it there.
 
     The result contains the arrays of `tabulate` and `tabulate_outside`. If they come from a
-    folder, they are read-only and mapped into memory. The table stays in memory without a folder,
-    or with a `RuntimeWarning` if the folder cannot be written. `progress` is called with the
-    completed share.
+    folder, they are read-only and mapped into memory. Without a folder, the table is kept only in
+    memory; if the folder cannot be written, the table is kept there with a `RuntimeWarning`.
+    `progress` is called with the completed share.
     """
     if folder is None:
         return _tabulate(model, progress)

@@ -60,15 +60,15 @@ _SAME_MAXIMUM = 1.0
 # Log-likelihood of a mode that the search has missed, relative to the best mode: the search finds
 # all modes above it.
 _FLOOR = -EXACT_MARGIN
-# Bounds of the intervals between two phases, as shares of the time, in which a turn is
-# distinguished. One interval would make the position after an early turn too unlikely, because the
-# Gaussian has the mean time after a turn.
+# Bounds of the intervals, as shares of the time between two phases, for which turns are modelled
+# separately. A single interval would make the position after an early turn too unlikely, because
+# its Gaussian applies to the mean time of a turn.
 _TURN_INTERVALS = (0.0, 0.5, 1.0)
-# Components further below the heaviest in log-weight do not turn.
+# Components whose log-weight is below the heaviest by more than this do not turn.
 _TURN_MARGIN = 10.0
 # Components whose squared Mahalanobis distance is below this are merged.
 _MERGE_DISTANCE = 1.0
-# Components further below the heaviest in log-weight are discarded.
+# Components whose log-weight is below the heaviest by more than this are discarded.
 _WEIGHT_MARGIN = 18.0
 
 
@@ -76,7 +76,7 @@ class Mixture(NamedTuple):
     """A mixture of C Gaussians."""
 
     log_weights: np.ndarray  # Float64 [C].
-    means: np.ndarray  # (r [m], u, v) and its rate [1/s], float64 [C, 6].
+    means: np.ndarray  # (r [m], u, v) and their rates of change per second, float64 [C, 6].
     covariances: np.ndarray  # Float64 [C, 6, 6].
 
     def normalised(self) -> 'Mixture':
@@ -140,11 +140,11 @@ class Motion:
 
     Between turns, the velocity is an Ornstein-Uhlenbeck process: over times much shorter than
     `memory_s`, it is constant up to noise. At a turn, which may also be a stop or a start, it is
-    redrawn. The numbers of turns in separate times are independent.
+    redrawn. The numbers of turns in disjoint intervals are independent.
     """
 
     speed_mps: float = 1.0  #: Root-mean-square speed.
-    memory_s: float = 5.0  #: Time over which the velocity becomes independent without a turn.
+    memory_s: float = 5.0  #: Correlation time of the velocity between turns.
     turn_s: float = 2.0  #: Mean time between turns.
 
     def __post_init__(self) -> None:
@@ -216,7 +216,7 @@ class Motion:
 
 
 def _moved(mixture: Mixture, reach_s: float, decay: float, noise: np.ndarray) -> Mixture:
-    """Move straight, decay the velocities, and add the noise [2, 2] of position and velocity."""
+    """Move by `reach_s` times the velocities, scale these by `decay`, and add noise [2, 2]."""
     points = mixture.means[:, :3]
     velocities = np.matmul(jacobian(points), mixture.means[:, 3:, None])
     positions = to_positions(points) + reach_s * velocities[..., 0]
@@ -245,7 +245,7 @@ class TrackEstimate(Estimate):
     velocity: np.ndarray = dataclasses.field(default_factory=lambda: np.full(3, np.nan))
     velocity_covariance: np.ndarray = dataclasses.field(
         default_factory=lambda: np.full((3, 3), np.nan))
-    n_phases: int = 0  #: Number of phases behind the estimate; 0 without a position.
+    n_phases: int = 0  #: Number of phases in the estimate; 0 without a position.
     is_predicted: bool = False  #: Whether the position is a prediction for a blocked user.
 
 
@@ -258,7 +258,7 @@ class Tracker:
     prediction. Positions are inside the region of interest.
 
     The attribute `estimator` may be replaced between phases, for example for another codebook. The
-    estimates contain the probabilities of this estimator that the user is outside or blocked.
+    estimates contain this estimator's probabilities that the user is outside or blocked.
     """
 
     def __init__(self, estimator: SearchEstimator, motion: Motion | None = None) -> None:
@@ -312,7 +312,7 @@ class Tracker:
             _described(estimate, mixture, self._n_phases), is_predicted=True)
 
     def _start(self, modes: Modes, share: float = 1.0) -> Mixture:
-        """Return the mixture for a user anywhere in the region, weighted with its likelihood."""
+        """Return the mixture for a user anywhere in the region, weighted with the likelihood."""
         covariances = np.linalg.inv(modes.curvature) / share
         log_mass = (np.log(np.linalg.det(jacobian(modes.roi_points))) + 1.5 * np.log(2 * np.pi)
                     + np.linalg.slogdet(covariances)[1] / 2)
@@ -390,8 +390,8 @@ def update(
 
     Every mode updates every component. Each component also remains without an update, in case the
     search has missed an unlikely mode inside it that is as wide as the best one. `share`, from 0
-    to 1, is the exponent of the likelihood; it is below 1 if part of the multipath was received
-    before. The heaviest pairs are evaluated with `likelihood`, unless it is None.
+    to 1, is the exponent of the likelihood; it is below 1 if the multipath resembles that of the
+    previous phase. The heaviest pairs are evaluated with `likelihood`, unless it is None.
     """
     spread = np.linalg.inv(modes.curvature) / share
     offsets = modes.points[:, None] - predicted.means[:, :3]
@@ -434,8 +434,8 @@ def _exact_update(
 
 def _is_first(updated: Mixture, component: np.ndarray) -> np.ndarray:
     """Mark the components that differ from all earlier ones, bool [C]."""
-    # Modes that have not converged may lead one predicted component, given by its index, to the
-    # same maximum, which must not count twice.
+    # Several modes that have not converged may lead one predicted component, given by its index,
+    # to the same maximum, which must not count twice.
     points = updated.means[:, :3]
     offsets = points[:, None] - points
     precision = np.linalg.inv(updated.covariances[:, :3, :3])
