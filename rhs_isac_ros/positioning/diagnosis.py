@@ -54,7 +54,7 @@ _RESIDUAL = 'residual energy at the best position'
 LEVEL = 'level of the multipath or of the users'
 SPREAD = 'spread of delays, angles or levels'
 # Relative variance of the residuals, in units of its value in the model, above which a wrong level
-# does not explain them: two standard errors over the window.
+# does not explain them: nearly three standard errors over a full window.
 _MAX_DISPERSION = 1.2
 
 
