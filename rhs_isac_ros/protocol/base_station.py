@@ -54,7 +54,7 @@ class Cycle:
     codebook: Codebook | None = None  # the latest one when the latest beacon was sent
     attempt: int = 0  # number of beacons sent before the current one
     user: int = 0     # user that was granted the cycle; 0 before the grant
-    # The granted instance of the user; if unknown, the one that the first signals contain, or 0.
+    # Instance of the user in the grant; if unknown, the one in the first feed signals, or 0.
     user_instance: int = 0
     # Instance of the channel that sent the first signals; 0 if unknown.
     channel: int = 0
@@ -78,7 +78,7 @@ class Cycle:
 
 
 def reply(success: bool, text: str) -> Callable[['BaseStation', Event], None]:
-    """Return a step that answers an operator; `BaseStation.fill` lists the placeholders."""
+    """Return a step that answers an operator with `text`, filled in by `BaseStation.fill`."""
     def reply(role: 'BaseStation', event: Event) -> None:
         role.act(events.Reply(success, role.fill(text)))
 
@@ -117,7 +117,7 @@ class BaseStation(StateMachine):
         self._bands = frozenset(range(scenario.n_bands))
         self._users = UserRegistry(settings.policy, rng)
         self._settings = PendingSettings(settings)
-        # Number of acks by user in the current second. Clearing it each second bounds the memory.
+        # Number of acks by user in the current second; cleared each second, to bound the memory.
         self._acks: collections.Counter[int] = collections.Counter()
         self._second = 0
         self._use(settings)
@@ -126,7 +126,7 @@ class BaseStation(StateMachine):
         # Roles that are missing; None before the first report.
         self._missing: tuple[str, ...] | None = None
         self._cycle = Cycle(first_cycle_id - 1)
-        # Outages that have been logged and have not ended, by reason and user; 0: all users.
+        # Outages that have been logged and have not ended, by reason and user (0 for all users).
         self._outages: NewestDict[tuple[str, int], None] = NewestDict(MAX_USERS)
         # Missing roles and codebook as logged last; empty once a cycle has begun.
         self._logged_lacking: tuple[str, ...] = ()
@@ -252,7 +252,7 @@ class BaseStation(StateMachine):
                 self.log(f'user {user} removed: not in allowed_users {settings.allowed_users!r}')
 
     def _log_not_ready(self, event: Event) -> None:
-        """Log what is missing, unless this was logged or the other roles are not known yet."""
+        """Log the missing roles and codebook, unless they were logged or are not known yet."""
         lacking = self._lacking()
         if self._missing is not None:
             self._serving = False
@@ -261,7 +261,7 @@ class BaseStation(StateMachine):
                 self.log(f'waiting for {", ".join(lacking)}', warning=True)
 
     def fill(self, text: str) -> str:
-        """Fill in ``{cycle}``, an id, and ``{lacking}`` or ``{waiting}``, missing roles."""
+        """Fill in the cycle id (``{cycle}``) and missing roles (``{lacking}``, ``{waiting}``)."""
         lacking = ', '.join(self._lacking())
         return text.format(cycle=self._cycle.cycle_id, lacking=lacking,
                            waiting=f'; waiting for {lacking}' if lacking else '')
@@ -292,8 +292,8 @@ class BaseStation(StateMachine):
         self._beacon()
 
     def _beacon_again(self, event: Timeout) -> None:
-        """Send another beacon of the cycle, which invites more users if there are more."""
-        # If nobody answers a beacon to all users, the network may be at fault: nobody is removed.
+        """Send another beacon in the cycle, which invites more users if there are any."""
+        # If no user answers a beacon to all, the network may be at fault, so no user is removed.
         if not self._users.all_invited:
             self._lose_absent()
         self._cycle.attempt += 1
@@ -430,7 +430,7 @@ class BaseStation(StateMachine):
         self._apply_settings(event)
 
     def _end_cycle(self, outcome: str) -> None:
-        """Report a cycle; a user without a fix has completed its part of it."""
+        """Report the end of a cycle; one without a fix counts as completed by its user."""
         self._users.end_cycle(
             self._cycle.user, self._cycle.began_s[m.Phase.BEACONING], self.now_s,
             completed=outcome in ('served', Outcome.NO_FIX.value))
@@ -446,7 +446,7 @@ class BaseStation(StateMachine):
         self._send(m.ProtocolState, phase=phase, outcome=outcome, began_s=began_s - beacon_s,
                    elapsed_s=float(self.now_s - beacon_s))
 
-    # Conditions that drop a message of a cycle.
+    # Conditions under which a message of a cycle is dropped.
     _OF_CYCLE: Drops = {_wrong_cycle: Outcome.WRONG_CYCLE}
     _OF_USER: Drops = _OF_CYCLE | {_wrong_user: Outcome.WRONG_USER}
     _OF_CODEBOOK: Drops = {_wrong_codebook: Outcome.WRONG_CODEBOOK}
@@ -455,7 +455,7 @@ class BaseStation(StateMachine):
     # For each event, the first matching row applies.
     TABLE = (
         *on(events.CodebookOffered, 'codebook')(
-            # A new codebook takes effect with the next cycle, as do new settings.
+            # A new codebook takes effect with the next cycle, like new settings.
             Row((State.WAITING,), (_store_codebook, _log_not_ready), guard=_not_ready),
             Row((State.WAITING,), (_store_codebook, _begin_cycle), State.BEACONING),
             Row(ANY, (_store_codebook,))),
@@ -515,7 +515,7 @@ class BaseStation(StateMachine):
                 outcome=Outcome.RETRY_POSITION, restart_timeout=True),
             Row((State.ESTIMATING,), (_abandon,), State.RESTING,
                 outcome=Outcome.POSITIONER_SILENT),
-            # Roles repeat their replies to a repeated message: the signals lead to the beam again.
+            # Roles answer a repeated message again, so repeated signals lead to the beam again.
             Row((State.STEERING,), (_resend_signals,), guard=_may_retry,
                 outcome=Outcome.RETRY_BEAM, restart_timeout=True),
             Row((State.STEERING,), (_abandon,), State.RESTING,
@@ -525,7 +525,7 @@ class BaseStation(StateMachine):
                 outcome=Outcome.RETRY_DATA, restart_timeout=True),
             Row((State.TRANSMITTING,), (_abandon,), State.RESTING, outcome=Outcome.DATA_LOST)),
         *on(m.Ack, 'ack', {_not_allowed: Outcome.NOT_ALLOWED, _too_often: Outcome.TOO_OFTEN})(
-            # All acks that pass these two checks count towards the limit of the rate.
+            # All acks that pass these two checks count towards the rate limit.
             Row(ANY, (_count_ack,), guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE),
             # If several nodes have the same number, the first one is served.
             Row(ANY, (_count_ack, _reject_number), guard=_number_taken,

@@ -33,13 +33,13 @@ class Fading:
     """Draws multipath gains, which are correlated over the cycles of a user.
 
     The gains of a cycle are rho h + sqrt(1 - rho^2) w: h are the gains of the user's previous
-    cycle, rho is Eq. (4) for the time between the two, and w is a new draw that depends only on
-    the seed, the user, the cycle and the band. Every cycle has the distribution of Eq. (2) to (4),
-    and consecutive cycles have the correlation of Eq. (4), which is negative for some times. Over
-    several cycles, the correlation is the product of these values and not Eq. (4), for which all
-    earlier cycles would be needed.
+    cycle, rho is the correlation of Eq. (4) for the time between the two cycles, and w is a new
+    draw that depends only on the seed, the user, the cycle and the band. Every cycle has the
+    distribution of Eq. (2) to (4), and consecutive cycles have the correlation of Eq. (4), which
+    is negative for some intervals. Over several cycles, the correlation is the product of these
+    values. To obtain that of Eq. (4), a draw would need the gains of all earlier cycles.
 
-    A channel file replaces the multipath, so the gains are then 0.
+    If the scenario has a channel file, the file replaces the multipath, and the gains are 0.
     """
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
@@ -53,7 +53,7 @@ class Fading:
     def gains(self, user: int, cycle_id: int, now_s: float, *, memory: bool) -> list[np.ndarray]:
         """Return the gains of a cycle for each band, complex128 [N_SB, F, N_E].
 
-        Without `memory`, they are independent of the previous cycle.
+        `now_s` is the time of the cycle [s]. Without `memory`, the gains are a new draw.
         """
         scenario = self._scenario
         shape = scenario.n_subbands, scenario.n_frames, scenario.n_elements
@@ -73,16 +73,16 @@ class Fading:
 
 
 class Air:
-    """The emulated transmission of messages, which loses, duplicates and delays some at random."""
+    """The emulated transmission of messages, with random losses, duplicates and delays."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng, self._serial = rng, itertools.count()
-        # A heap of times of arrival [s], serial numbers as tie-breaks, and messages.
+        # A heap of messages, each after its time of arrival [s] and a serial number to break ties.
         self.in_flight: list[tuple[float, int, m.Message]] = []
 
     def send(self, message: m.Message, impairments: Impairments, now_s: float) -> str:
-        """Send a message at a time [s]; return a counter if it is lost or doubled, or ''."""
-        # Each message takes the same number of draws, so that it does not affect other messages.
+        """Send a message at `now_s` [s]; return the counter of its loss or duplication, or ''."""
+        # The number of draws is the same for each message, so that no outcome shifts later draws.
         loss, duplication, *delays = self._rng.random(4)
         if loss < impairments.loss_probability:
             return 'emulated_loss'
@@ -93,7 +93,7 @@ class Air:
         return 'emulated_double' if is_doubled else ''
 
     def arrived(self, now_s: float) -> list[m.Message]:
-        """Remove and return the messages that have arrived by a time [s]."""
+        """Remove and return the messages that have arrived at or before `now_s` [s], in order."""
         messages = []
         while self.in_flight and self.in_flight[0][0] <= now_s:
             messages.append(heapq.heappop(self.in_flight)[2])
@@ -110,7 +110,7 @@ class _Cycle:
     blocked: np.ndarray
     # Gains of the direct path, or of the paths in a channel file, by band: complex128 [N_SB, N_E].
     los: list[np.ndarray]
-    # Factors of all signals, complex128 [N_B, N_SB, F]; None if all are 1.
+    # Factors that multiply all signals, complex128 [N_B, N_SB, F]; None if all are 1.
     factors: np.ndarray | None
     # Capacity of the applied beam [bit/s]; None until a beam is applied.
     rate_bps: float | None = None
@@ -119,10 +119,10 @@ class _Cycle:
 class Channel(Role):
     """The role of the channel.
 
-    It answers the pilots of a band or a data packet once it has received the true position of the
-    user and the configuration of the surface, in any order. The position applies to the whole
-    cycle, because messages take longer in the network than the signals that they emulate. Changed
-    impairments take effect with the next cycle.
+    It answers pilots once it has received the true position of the user and the configuration of
+    the surface, and data once it has also received the beam, in any order. The position applies to
+    the whole cycle, because messages take longer to cross the network than the signals that they
+    emulate. Changed impairments take effect with the next cycle.
     """
 
     SENDS = (m.FeedSignals, m.Data)
@@ -137,9 +137,9 @@ class Channel(Role):
         self._cycle: _Cycle | None = None
         self._fading = Fading(scenario, seed)
         self._air = Air(streams.generator(seed, streams.AIR))
-        # Cycle, user, instance and position of the cycles begun.
+        # Id, user, instance and position of each cycle that has begun.
         self._begun: NewestDict[tuple[float, ...], None] = NewestDict(REMEMBERED_CYCLES)
-        # Configurations and beams of the current and of future cycles.
+        # Configurations and beams of the current cycle and of future ones.
         self._configurations: NewestDict[tuple[int, m.Mode, int], np.ndarray] = NewestDict(
             _MAX_PENDING)
         self._beams: NewestDict[tuple[int, int], m.Beam] = NewestDict(_MAX_PENDING)
@@ -179,14 +179,14 @@ class Channel(Role):
                     (event.cycle_id, next(self._serial)), event))
         if self._cycle and isinstance(event, m.Message):
             if isinstance(event, m.Beam | m.RhsConfiguration):
-                # Both directions have the same capacity, which is known before data arrive.
+                # Compute the capacity, which is the same in both directions, before data arrive.
                 self._cycle.rate_bps = self._rate_bps(self._cycle)
             self._answer_pending(self._cycle)
         for message in self._air.arrived(self.now_s):
             self.send(message)
 
     def _keep_beam(self, beam: m.Beam) -> None:
-        """Store a beam unless another instance sent one for the cycle."""
+        """Store a beam unless another instance has sent one for the same cycle and user."""
         key = beam.cycle_id, beam.user
         known = self._beams.get(key)
         if known and not m.same_instance(known.sender, beam.sender):
@@ -217,7 +217,7 @@ class Channel(Role):
         self._cycle.rate_bps = self._rate_bps(self._cycle)
 
     def _draw(self, truth: m.GroundTruth, multipath: list[np.ndarray]) -> _Cycle:
-        """Draw the channel of a cycle before the first pilot, while other roles prepare."""
+        """Draw the channel of a cycle in advance, so that answers to pilots are not delayed."""
         scenario, seed, user = self._scenario, self._seed, truth.user
         blocked = draw_blocked(
             self._deviating, 1, streams.generator(seed, streams.BLOCKAGE, user))
@@ -257,7 +257,7 @@ class Channel(Role):
         return dataclasses.replace(event, stage=m.Stage.DELIVERED, bits=bits)
 
     def _applied(self, cycle: _Cycle, mode: m.Mode, band: int) -> np.ndarray | None:
-        """Return the coefficients that the surface applies in each frame, if they are known."""
+        """Return the coefficients that the surface applies in each frame; None if unknown."""
         reported = self._configurations.get((cycle.truth.cycle_id, mode, band))
         if reported is None or self._surface is None:
             return reported

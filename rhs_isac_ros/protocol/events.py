@@ -1,4 +1,4 @@
-"""Events of the roles (except messages), their actions, and the outcomes that they count."""
+"""Events that the roles handle besides messages, their actions, and the outcomes they count."""
 
 import dataclasses
 import enum
@@ -42,7 +42,7 @@ class StoodBy:
 
 @dataclasses.dataclass(frozen=True)
 class Resumed:
-    """The node serves again; the ids below `first_cycle_id` may have been used meanwhile."""
+    """The node serves again; another node may have used the ids below `first_cycle_id`."""
 
     first_cycle_id: int = 0
 
@@ -71,7 +71,7 @@ class LocateRequested:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EstimatorBuilt:
-    """The result of `BuildEstimator` after `elapsed_s`: an estimator, or a `failure`."""
+    """The result of `BuildEstimator`: an estimator, built in `elapsed_s` [s], or a `failure`."""
 
     codebook: Codebook
     estimator: Estimator | None
@@ -137,7 +137,7 @@ Action = Send | LogMessage | Reply | BuildEstimator | RevertSettings | PublishTr
 
 
 class Kind(enum.Enum):
-    """Kind of an outcome; the value is the prefix of its counters in the diagnostics."""
+    """Kind of an outcome; its value is the prefix of the kind's counters in the diagnostics."""
 
     DROPPED = 'dropped'    # a message was ignored
     REPEATED = 'retries'   # a step of a cycle was requested again
@@ -152,7 +152,7 @@ class Outcome(enum.Enum):
     kind: Kind
 
     def __new__(cls, counter: str, kind: Kind) -> 'Outcome':
-        """Create a member whose value is its counter."""
+        """Create a member whose value is the name of its counter."""
         member = object.__new__(cls)
         member._value_ = counter
         member.kind = kind
@@ -204,5 +204,5 @@ _KINDS = {outcome.value: outcome.kind for outcome in Outcome}
 
 
 def kind_of(counter: str) -> Kind:
-    """Return the kind of a counter; counters without an `Outcome` count dropped messages."""
+    """Return the kind of a counter; it is `Kind.DROPPED` for counters without an `Outcome`."""
     return _KINDS.get(counter, Kind.DROPPED)

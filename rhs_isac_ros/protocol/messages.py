@@ -1,4 +1,4 @@
-"""The messages of the protocol as dataclasses; ROS types have the same names and fields."""
+"""The messages of the protocol as dataclasses; the ROS types have the same names and fields."""
 
 import dataclasses
 import datetime
@@ -22,8 +22,8 @@ def array(
         nan_allowed: bool = False) -> Any:
     """Declare an array field, with an inclusive range for the entries of a real array.
 
-    `dims` contains numbers, or symbols of `Scenario.sizes` or `Message.own_sizes`. NaN stands for
-    an unknown value.
+    `dims` lists the dimensions, separated by spaces: numbers, or symbols of `Scenario.sizes` or
+    `Message.own_sizes`. If `nan_allowed` is set, NaN stands for an unknown value.
     """
     return dataclasses.field(
         metadata={'dims': tuple(dims.split()), 'declared': Field(kind, low=low, high=high),
@@ -31,31 +31,31 @@ def array(
 
 
 def index(symbol: str) -> Any:
-    """Declare an index below the size `symbol` of `Scenario.sizes`."""
+    """Declare a field for an index below the size `symbol` in `Scenario.sizes`."""
     return dataclasses.field(metadata={'index_of': symbol})
 
 
 def number(low: float, high: float, default: Any = dataclasses.MISSING) -> Any:
-    """Declare a number with an inclusive range."""
+    """Declare a number field with an inclusive range."""
     return dataclasses.field(
         default=default, metadata={'declared': Field(float, low=low, high=high)})
 
 
 def size(symbol: str) -> Any:
-    """Declare a number that must equal the size `symbol` of `Scenario.sizes`."""
+    """Declare a field that must equal the size `symbol` in `Scenario.sizes`."""
     return dataclasses.field(metadata={'equals': symbol})
 
 
 def optional_float() -> Any:
-    """Declare a number that is NaN if it is unknown."""
+    """Declare a number field in which NaN stands for an unknown value."""
     return dataclasses.field(metadata={'nan_allowed': True})
 
 
 def check(message: 'Message', sizes: Mapping[str, int]) -> None:
     """Check the arrays, indices and numbers of a message against the sizes of `Scenario.sizes`.
 
-    Raises MessageError if a shape differs, an index is too large, or a number is out of range or
-    not finite.
+    Raises MessageError if a shape or a size differs, an index or a number is out of range, or a
+    number is not finite.
     """
     own = message.own_sizes(sizes)
     sizes = {**sizes, **own} if own else sizes
@@ -67,7 +67,7 @@ def check(message: 'Message', sizes: Mapping[str, int]) -> None:
 
 @functools.cache
 def _checks(kind: type) -> tuple[tuple[str, Callable[[Any, Mapping[str, int]], str]], ...]:
-    """Return the name of each restricted field, and the function that describes its problem."""
+    """Return the name of each restricted field, and a function that describes a violation."""
     return tuple((field.name, functools.partial(_check_of(field.metadata), field.metadata))
                  for field in dataclasses.fields(kind) if field.metadata or field.type is float)
 
@@ -161,12 +161,12 @@ class Message:
     """
 
     cycle_id: int
-    #: Instance of the node that sent the message, given by its start in nanoseconds since 1970; 0
-    #: if unknown, as in messages sent by hand.
+    #: Instance of the node that sent the message: the time at which the node started, in
+    #: nanoseconds since 1970; 0 if unknown, as in messages sent by hand.
     sender: int = 0
     scenario_id: str = ''  #: `Scenario.id` of that node; empty if unknown.
     #: Stamp of the header on the clock of the emulated world [ns]. Signals, and messages derived
-    #: from them, carry the time of the measurement. 0: the adapter inserts the present time.
+    #: from them, carry the time of the measurement. If 0, the adapter inserts the current time.
     stamp_ns: int = 0
 
     def time_s(self, now_s: float) -> float:
@@ -174,17 +174,17 @@ class Message:
         return 1e-9 * self.stamp_ns if self.stamp_ns else now_s
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return the sizes that depend on the content, by symbol as in `Scenario.sizes`."""
+        """Return the sizes that depend on the message itself, by symbol as in `Scenario.sizes`."""
         return {}
 
 
 def same_instance(one: int, other: int) -> bool:
-    """Return whether two instances of a node are equal, or one of them is unknown (0)."""
+    """Return whether two instances are equal, or at least one of them is unknown (0)."""
     return one == other or not one or not other
 
 
 def same(one: Message, other: Message) -> bool:
-    """Return whether two messages have the same class and the same fields, except for stamps."""
+    """Return whether two messages have the same class and equal fields, apart from the stamps."""
     return type(one) is type(other) and all(
         np.array_equal(getattr(one, field.name), getattr(other, field.name))
         for field in dataclasses.fields(one) if field.name != 'stamp_ns')
@@ -196,9 +196,9 @@ MessageT = TypeVar('MessageT', bound=Message)
 
 
 def derive(kind: type[MessageT], source: object, **fields: Any) -> MessageT:
-    """Return a message with given fields, and with the cycle, user, band and codebook of a source.
+    """Return a message with the cycle, user, band and codebook of a source, and further fields.
 
-    The source is a message, or an object with attributes of the same names.
+    The source is a message, or an object with attributes of the same names; `fields` override it.
     """
     shared = {name: getattr(source, name) for name in _SHARED
               if name in kind.__dataclass_fields__ and hasattr(source, name)}
@@ -253,7 +253,7 @@ class RhsConfiguration(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class PilotRequest(Message):
-    """Request to a user for the pilots of a range of bands, in order."""
+    """Request to a user for pilots in the bands `band` to `last_band`, in ascending order."""
 
     user: int = number(1, _LAST_USER)
     user_instance: int = 0
@@ -368,7 +368,7 @@ class CapacityStatistics(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class GroundTruth(Message):
-    """True position of a user."""
+    """True position and velocity of a user."""
 
     user: int = number(1, _LAST_USER)
     position: np.ndarray = array('3', low=-1e6, high=1e6)
@@ -377,7 +377,7 @@ class GroundTruth(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class GroundTruths(Message):
-    """True positions of all users of one node."""
+    """True positions and velocities of all users of one node."""
 
     users: np.ndarray = array('USERS', int, low=1, high=_LAST_USER)
     position: np.ndarray = array('USERS 3', low=-1e6, high=1e6)
@@ -388,7 +388,7 @@ class GroundTruths(Message):
         return {'USERS': len(self.users)}
 
     def each(self) -> Iterator[GroundTruth]:
-        """Yield the true position of each user."""
+        """Yield the true position and velocity of each user."""
         for user, position, velocity in zip(
                 self.users.tolist(), self.position, self.velocity, strict=True):
             yield GroundTruth(
@@ -414,6 +414,6 @@ def started(instance: int) -> str:
 
 
 def describe_conflict(user: int, instance: int) -> str:
-    """Return a log message for two nodes with one user number, of which `instance` is served."""
+    """Return a log message about two nodes with the same user number; `instance` is served."""
     return (f'user {user}: two nodes have this number; the first one, {started(instance)}, '
             'is served')

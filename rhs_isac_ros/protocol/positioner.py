@@ -41,12 +41,12 @@ class _Track:
     time_s: float
 
     def is_late(self, received: m.ReceivedSignals) -> bool:
-        """Return whether signals belong to an earlier cycle of the same base station."""
+        """Return whether signals are from the same base station, but not from a later cycle."""
         return received.sender == self.latest.sender and (
             received.cycle_id <= self.latest.cycle_id)
 
     def may_continue(self, received: m.ReceivedSignals, now_s: float) -> bool:
-        """Return whether signals come from the same user, on a clock that was not set back."""
+        """Return whether the user is the same instance, and the clock was not set back."""
         return now_s >= self.time_s - MAX_GAP_S and m.same_instance(
             received.user_instance, self.latest.user_instance)
 
@@ -55,7 +55,7 @@ class Tracks:
     """One track for each user, derived from the signals alone.
 
     A track ends after a gap, when another instance of the user appears, or after thousands of
-    other users have been located. Signals from an earlier cycle do not use or change it.
+    other users have been located. Signals that are not from a later cycle do not use or change it.
     """
 
     def __init__(self) -> None:
@@ -100,7 +100,7 @@ _USER_WINDOW = 100
 
 
 class ResidualWatch:
-    """Compares residuals with the model, for all users together and for each user.
+    """Compares residuals with the model, for all users together and for each user separately.
 
     If only one user deviates, for instance by an unknown gain, the mean over many users hardly
     changes.
@@ -114,7 +114,7 @@ class ResidualWatch:
         self._estimates: collections.deque[Estimate] = collections.deque(maxlen=WINDOW)
 
     def add(self, user: int, codebook_id: str, estimate: Estimate) -> tuple[str, bool]:
-        """Add an estimate; return a text when a warning begins or ends, and whether it begins."""
+        """Add an estimate; return a text if a warning begins or ends, and whether one begins."""
         if codebook_id != self._codebook_id:
             self.clear()
             self._codebook_id = codebook_id
@@ -164,7 +164,7 @@ def _deviation(prefix: str, monitor: InnovationTest) -> str:
 
 
 class _Loss(enum.Enum):
-    """Why the signals of a user yield no position; the value is the log text of the recovery."""
+    """Cause of signals without a position; the value is the log text of the recovery."""
 
     NO_FIX = 'has a position again'
     BLOCKED = 'is in sight again'
@@ -194,8 +194,8 @@ class Positioner(Role):
 
     The codebook id of the received signals selects the estimator. Estimators are built one at a
     time in the background. Meanwhile, existing estimators remain in use, and the latest signals
-    without an estimator wait for it. New settings replace an estimator once the new one is built;
-    if it cannot be built, the old one remains. Tracks of the users, which the prior ``track``
+    without an estimator wait for it. New settings take effect once an estimator is built with
+    them; if this fails, the old estimator remains in use. Tracks, which the prior ``track``
     requires, do not survive a restart. `stopwatch` returns a time [s], to measure latencies.
     """
 
@@ -208,11 +208,11 @@ class Positioner(Role):
         super().__init__()
         self._scenario, self._stopwatch = scenario, stopwatch
         self._settings = PendingSettings(settings or PositionerSettings())
-        # Why the latest change of settings was reverted; empty if it was not.
+        # Reason why the latest change of settings was reverted; empty if it was not.
         self._failure = ''
         self._estimators: CodebookCache[_Built] = CodebookCache()
         self._codebook: Codebook | None = None
-        # The estimator that is being built, and the one to build after it.
+        # The job whose estimator is being built, and the job that comes next.
         self._building: _Job | None = None
         self._next: _Job | None = None
         # Signals that wait for an estimator, and the time of their arrival [s].
@@ -253,7 +253,7 @@ class Positioner(Role):
                 self._receive(event, self.now_s)
 
     def _request(self, job: _Job) -> None:
-        """Request an estimator unless it exists, after the one that is being built."""
+        """Request an estimator unless it exists; if another is being built, it comes next."""
         built = self._estimators.get(job.codebook.id)
         if (built and job.equals(built.job)) or job.equals(self._building):
             self._next = None
@@ -264,7 +264,7 @@ class Positioner(Role):
             self.act(events.BuildEstimator(job.codebook, job.settings))
 
     def _keep(self, job: _Job, estimator: Estimator, elapsed_s: float) -> None:
-        """Store an estimator, unless newer settings replace it and an older one can serve."""
+        """Store an estimator, unless its settings are outdated and another one can serve."""
         codebook = job.codebook
         if job.settings != self._settings.latest and codebook.id in self._estimators:
             return
@@ -351,7 +351,7 @@ class Positioner(Role):
         self._log_change(received, _Loss.NO_FIX, f'no fix of user {received.user}: {reason}')
 
     def _log_change(self, received: m.ReceivedSignals, loss: _Loss | None, text: str) -> None:
-        """Log when the signals of a user cease to yield a position, and when they do again."""
+        """Log when a user's signals stop yielding a position, and when they yield one again."""
         before = self._lost.pop(received.user, None)
         if loss:
             self._lost.put(received.user, loss)
@@ -364,7 +364,7 @@ class Positioner(Role):
 def build_estimator(
         codebook: Codebook, make: Callable[[Codebook], Estimator],
         stopwatch: Callable[[], float]) -> EstimatorBuilt:
-    """Build the estimator that a `BuildEstimator` requests, in any thread."""
+    """Build the estimator that `BuildEstimator` requests; any thread may call this function."""
     begin = stopwatch()
     try:
         estimator = make(codebook)

@@ -8,9 +8,9 @@ from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.role import NewestDict
 
-# Period of the announcements of a node, and the time without one after which it has gone [s].
-# Shorter times would load large networks, and mistake nodes of a busy machine for those that have
-# gone.
+# Period of the announcements of a node, and the silence after which the node counts as gone [s].
+# Shorter times would load large networks, and nodes on a busy machine would count as gone although
+# they are present.
 PERIOD_S, SILENCE_S = 0.4, 1.6
 # Maximum number of other nodes, which bounds the memory.
 _MAX_OTHERS = 64
@@ -18,7 +18,7 @@ _MAX_OTHERS = 64
 _MAX_LOGGED = 16
 # Maximum length of the list of differences in the log.
 _MAX_LENGTH = 500
-# Instances that start later than this after the present are ignored: their clock is wrong [ns].
+# Instances that start further in the future than this are ignored: their clock is wrong [ns].
 _MAX_AHEAD_NS = 3600 * 10**9
 
 
@@ -45,7 +45,7 @@ class Presences:
     of leases: a restarted node serves at once, and an older node resumes when the newer one has
     gone. Nodes with another scenario are reported and otherwise ignored.
 
-    The clock of the arguments `now_s` [s] stops while this node cannot receive announcements.
+    `now_s` [s] is the time on a clock that stops while this node cannot receive announcements.
     """
 
     def __init__(self, own: Presence) -> None:
@@ -53,8 +53,8 @@ class Presences:
         # Latest announcement of each other node, and its time of arrival [s], by instance.
         self._known: NewestDict[int, tuple[Presence, float]] = NewestDict(_MAX_OTHERS)
         self._now_s = -math.inf
-        # The newest other node of the role, and the last older one that was logged: it is not
-        # logged again when it returns after a suspension.
+        # The newest other node of the role, and the instance of the last older node that was
+        # logged, which is not logged again when it returns after a suspension.
         self._rival: Presence | None = None
         self._logged_older = 0
         # Description of the differences from each other scenario, by scenario id.
@@ -62,7 +62,7 @@ class Presences:
         self._n_logged = 0
 
     def add(self, other: Presence, now_ns: int, now_s: float) -> list[LogMessage]:
-        """Process an announcement that arrives at `now_ns` [ns since 1970]."""
+        """Process an announcement received at `now_ns` [ns since 1970]; return log messages."""
         if other.sender in (0, self.own.sender) or other.sender > now_ns + _MAX_AHEAD_NS:
             return []
         self._known.put(other.sender, (other, now_s))
@@ -98,7 +98,7 @@ class Presences:
 
     @property
     def has_conflicts(self) -> bool:
-        """Whether there are nodes of the same role or of another scenario."""
+        """Whether there are other nodes with the same role, or nodes with another scenario."""
         return bool(self._rival or self._scenarios)
 
     @property
@@ -143,9 +143,9 @@ class Presences:
 
 
 def _differences(own_text: str, other_text: str) -> str:
-    """Describe the fields in which two scenarios in JSON differ; '' if this is unknown."""
-    # Anything may be published on the topic. Unlike YAML, JSON has no references, with which a
-    # short text can describe an enormous value; an escaped surrogate would be refused by a log.
+    """Describe the fields in which two scenarios in JSON differ; '' if none can be found."""
+    # Anything may be published on the topic. Unlike YAML, JSON has no references, so a short
+    # text cannot describe an enormous value. `json.dumps` escapes surrogates, which a log refuses.
     try:
         own, other = json.loads(own_text), json.loads(other_text)
         return '; '.join(

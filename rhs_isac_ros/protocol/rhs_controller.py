@@ -116,7 +116,7 @@ class RhsController(StateMachine):
         *on(m.RhsCommand, 'command')(
             Row(ANY, (_log_unknown_codebook,), guard=_unknown_codebook,
                 outcome=Outcome.WRONG_CODEBOOK),
-            # The base station repeats a command whose report may be lost.
+            # The base station repeats a command if its report may have been lost.
             Row(ANY, (_apply_band,), guard=_repeats_command, outcome=Outcome.DUPLICATE),
             Row(ANY, guard=_was_executed, outcome=Outcome.STALE_COMMAND),
             Row(ANY, (_apply_band,), State.POSITIONING)),

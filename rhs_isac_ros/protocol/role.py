@@ -35,7 +35,7 @@ class Role:
         self._actions: list[Action] = []
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Process an event at a time [s] of a monotonic clock, and return the actions in order."""
+        """Process an event at `now_s` [s] on a monotonic clock; return the actions in order."""
         self.now_s, self._actions = now_s, []
         self.react(event)
         return self._actions
@@ -100,14 +100,14 @@ _MAX_CODEBOOKS = 4
 
 
 class CodebookCache(NewestDict[str, Value]):
-    """Items by codebook id; the item that was taken last is `in_use`, and never discarded."""
+    """Items by codebook id; the item that was taken last is in use and is never discarded."""
 
     def __init__(self) -> None:
         super().__init__(_MAX_CODEBOOKS)
-        self.in_use = ''  # id of the codebook; empty at first
+        self.in_use = ''  # id of the codebook whose item is in use; empty at first
 
     def put(self, codebook_id: str, item: Value) -> int:
-        """Store an item as the newest, and discard the oldest one that is not in use."""
+        """Store an item as the newest; if there are too many, discard the oldest not in use."""
         if self.in_use:
             super().put(self.in_use, self[self.in_use])
         return super().put(codebook_id, item)
@@ -122,7 +122,7 @@ class CodebookCache(NewestDict[str, Value]):
 RoleT = TypeVar('RoleT')
 EventT = TypeVar('EventT', contravariant=True)
 
-# As a source: any state. As a target: the current state, which is not entered again.
+# ANY as a source: any state. SAME as a target: the current state, which is not entered again.
 ANY = None
 SAME = None
 
@@ -149,12 +149,12 @@ class Row(Generic[RoleT, EventT]):
 
 
 AnyRow = Row[Any, Any]
-# Conditions under which a message is dropped in every state; the outcome to count, or None.
+# Conditions under which a message is dropped in every state, with the outcome to count, or None.
 Drops = dict[Callable[..., bool], Outcome | None]
 
 
 class on(Generic[EventT]):
-    """Returns the rows for an event, in order: ``on(event, name of the event, drops)(*rows)``."""
+    """Builds the rows for an event, in order: ``on(event, name of the event, drops)(*rows)``."""
 
     def __init__(self, event: type[EventT], name: str, drops: Drops | None = None) -> None:
         self._event, self._name, self._drops = event, name, drops or {}
@@ -208,7 +208,7 @@ class StateMachine(Role):
         return self._deadline_s
 
     def react(self, event: Event) -> None:
-        """Apply the first matching row; raise TypeError for an event that the table lacks."""
+        """Apply the first matching row; raise TypeError for an event that is not in the table."""
         kind = type(event)
         try:
             rows = self._rows[self.state, kind]

@@ -1,7 +1,7 @@
 """Settings of the roles, most of which may change while the network runs.
 
 `setting` declares each field once: the ROS parameter of the same name takes its default, range and
-description from here.
+description from this declaration.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ def setting(
 ) -> Any:
     """Declare a setting and its parameter; only a `dynamic` one may change while the node runs.
 
-    The keywords `declared` are further attributes of `Field`.
+    `text` describes the setting. The keywords `declared` are further attributes of `Field`.
     """
     return dataclasses.field(default=default, metadata={
         'declared': Field(type(default), text, **declared), 'dynamic': dynamic})
@@ -39,7 +39,7 @@ class BaseStationSettings:
         True, 'Whether to add thermal noise; false if the radio adds its own.')
     ack_timeout_s: float = setting(
         0.1, 'Time to wait for acks.', unit='s', low=0.001, high=60.0)
-    # Users have the same timeout and would miss a change.
+    # Not dynamic, because a change would not reach the users, which have the same timeout.
     step_timeout_s: float = setting(
         1.0, 'Time to wait for the next message of a cycle.', unit='s', low=0.01, high=60.0,
         dynamic=False)
@@ -120,7 +120,7 @@ def _of_scenario(name: str) -> Any:
 class Impairments:
     """Impairments of the air interface, and deviations of the signals from their model.
 
-    Only the channel uses the values that replace fields of the scenario.
+    The values that replace fields of the scenario do so in the channel only.
     """
 
     loss_probability: float = setting(
@@ -145,7 +145,7 @@ class Impairments:
     failed_element_share: float = _of_scenario('failed_element_share')
 
     def applied_to(self, scenario: Scenario) -> Scenario:
-        """Return the scenario with the values that are set."""
+        """Return the scenario with its fields replaced by the values that are not negative."""
         known = {field.name for field in dataclasses.fields(Scenario)}
         values = dataclasses.asdict(self)
         return dataclasses.replace(scenario, **{
@@ -156,7 +156,7 @@ SettingsT = TypeVar('SettingsT', bound=Any)
 
 
 class PendingSettings(Generic[SettingsT]):
-    """Keeps the `latest` settings until the role may use them in place of those `in_use`."""
+    """Keeps the `latest` settings until they may replace the settings `in_use`."""
 
     def __init__(self, settings: SettingsT) -> None:
         self.in_use = settings
@@ -169,12 +169,12 @@ class PendingSettings(Generic[SettingsT]):
         return f'settings applied: {described}' if described else ''
 
     def describe(self) -> dict[str, str]:
-        """Return ``parameter.<name>`` for values in use and ``pending.<name>`` for newer ones."""
+        """Return values in use as ``parameter.<name>`` and newer ones as ``pending.<name>``."""
         in_use = {f'parameter.{name}': shown(value) for name, value in vars(self.in_use).items()}
         return in_use | {f'pending.{name}': text for name, text in self._pending().items()}
 
     def _pending(self) -> dict[str, str]:
-        """Return the values that are not in use yet, by name."""
+        """Return the latest values that are not in use yet, by name."""
         in_use = vars(self.in_use)
         return {name: shown(value) for name, value in vars(self.latest).items()
                 if value != in_use[name]}

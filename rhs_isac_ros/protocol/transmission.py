@@ -23,15 +23,15 @@ from rhs_isac_ros.protocol.events import Event, Outcome
 from rhs_isac_ros.protocol.role import REMEMBERED_CYCLES, CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.settings import PendingSettings, TransmissionSettings
 
-# Fields of `Capacity` and of `CapacityStatistics` that have statistics.
+# Fields of `Capacity` whose quartiles are the fields of `CapacityStatistics` with these names.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
-# Number of latest reports in the statistics, which therefore follow a changing network.
+# Number of the latest reports in the statistics, limited in order to follow a changing network.
 _WINDOW = 1000
-# A report is computed when no message of a cycle has arrived for this time [s], so that in a
-# process with other roles it does not delay a cycle.
+# A report is computed once no message of a cycle has arrived for this time [s], so that it does
+# not delay a cycle if other roles run in the same process.
 _IDLE_S = 5e-3
-# Messages, or a true position that has not arrived, postpone a report by this time at most [s];
-# maximum number of postponed reports.
+# Maximum time by which messages, or a true position that has not arrived, postpone a report [s],
+# and maximum number of postponed reports.
 _MAX_DELAY_S = 0.25
 _MAX_WAITING = 8
 
@@ -46,7 +46,7 @@ class _Steered(NamedTuple):
 
 
 class _Waiting(NamedTuple):
-    """A report to compute by `deadline_s` [s], about the beam applied in a cycle."""
+    """A report on the beam applied in a cycle, to be computed by `deadline_s` [s]."""
 
     steered: _Steered
     applied: m.RhsConfiguration
@@ -56,9 +56,9 @@ class _Waiting(NamedTuple):
 class Transmission(Role):
     """The role that steers the beam.
 
-    The true position affects only the reported capacities, never the beam. A report takes as
-    long as a beam, so the role computes it between cycles. `surface_of` returns the surface in a
-    calibration file, or None for an empty name.
+    The true position affects only the reported capacities, never the beam. Computing a report
+    takes as long as computing a beam, so the role does it between cycles. `surface_of` returns the
+    surface in a calibration file, or None for an empty name.
     """
 
     SENDS = (m.Beam, m.Capacity, m.CapacityStatistics)
@@ -71,14 +71,14 @@ class Transmission(Role):
         self._scenario, self._surface_of = scenario, surface_of
         self._settings = PendingSettings(settings or TransmissionSettings())
         self._codebooks: CodebookCache[None] = CodebookCache()
-        # By cycle; `_counted` contains the cycles in the statistics.
+        # Beams by cycle, true positions by cycle, user and instance, and cycles in the statistics.
         self._steered: NewestDict[int, _Steered] = NewestDict(REMEMBERED_CYCLES)
         self._truths: NewestDict[tuple[int, int, int], m.GroundTruth] = NewestDict(
             REMEMBERED_CYCLES + _MAX_WAITING)
         self._counted: NewestDict[int, None] = NewestDict(REMEMBERED_CYCLES)
         self._waiting: collections.deque[_Waiting] = collections.deque()
         self._active_s = -math.inf
-        # Figures of the newest reports, in a ring.
+        # Figures of the newest reports, in a ring buffer.
         self._reported, self._n_reported = np.empty((_WINDOW, len(_FIGURES))), 0
 
     def react(self, event: Event) -> None:
@@ -87,7 +87,7 @@ class Transmission(Role):
             self._active_s = self.now_s
         match event:
             case events.Timeout() if self._waiting:
-                # Messages that arrived during the report are processed before the next one.
+                # Messages that arrived during a report are processed before the next report.
                 self._active_s = self.now_s
                 self._report_next()
             case events.CodebookOffered(codebook):
@@ -125,7 +125,7 @@ class Transmission(Role):
         known = self._steered.get(estimate.cycle_id)
         is_other = known and not m.same_instance(known.estimate.sender, estimate.sender)
         if known and (is_other or m.same(known.estimate, estimate)):
-            # The first estimate of a cycle is final, but each copy is answered.
+            # A copy of the estimate, or one from another positioner, gets the beam already chosen.
             self.count(Outcome.WRONG_INSTANCE if is_other else Outcome.DUPLICATE)
             self.send(known.beam)
             return
@@ -157,7 +157,7 @@ class Transmission(Role):
             self._waiting.append(_Waiting(steered, applied, self.now_s + _MAX_DELAY_S))
 
     def _report_next(self) -> None:
-        """Report on the first beam with a known true position, or else on the first beam."""
+        """Report on the first waiting beam whose true position is known, or else on the first."""
         waiting = next(filter(self._truth_of, self._waiting), self._waiting[0])
         self._waiting.remove(waiting)
         steered, applied, _ = waiting

@@ -11,13 +11,13 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome, PeersChanged, Timeout
 from rhs_isac_ros.protocol.role import ANY, REMEMBERED_CYCLES, NewestDict, Row, StateMachine, on
 
-# Number of consecutive steps in which the user receives nothing: the signals of the last band, the
-# position, the beam and the data.
+# Number of consecutive steps in which a granted user receives nothing: the base station waits for
+# the signals of the last band, the position, the beam and the data.
 _SILENT_STEPS = 4
 
 
 class State(enum.Enum):
-    """States of the users of a node, at most one of which is served at a time."""
+    """States of the users of a node; at most one user is served at a time."""
 
     DISCONNECTED = 'disconnected'  # waits for the base station and the channel
     LISTENING = 'listening'        # waits for a beacon that invites a user
@@ -27,7 +27,7 @@ class State(enum.Enum):
 
 
 class User(StateMachine):
-    """The role of all users of a node, usually one.
+    """The role of the users of a node, usually a single one.
 
     A cycle serves one user, so one state is enough for all of them. The node has an `instance`,
     and ignores grants to other instances.
@@ -35,12 +35,13 @@ class User(StateMachine):
     Parameters
     ----------
     mobilities
-        Mobility of each user, by id from 1.
+        Mobility of each user, by id; ids start at 1.
     step_s, beacon_s
         Time that the base station waits for each step, and time without a beacon after which the
         user logs a warning [s].
     world_s
-        Returns the time for the mobilities [s]; by default the time passed to `handle`.
+        Callable that returns the time for the mobilities [s]; by default, they use the time passed
+        to `handle`.
     """
 
     SENDS = (m.Ack, m.GroundTruth, m.GroundTruths, m.Pilot, m.Data)
@@ -54,15 +55,14 @@ class User(StateMachine):
         super().__init__(State.DISCONNECTED)
         self._step_s, self._beacon_s = step_s, beacon_s
         self.users, self._instance = tuple(sorted(mobilities)), instance
-        # Descriptions of nodes that are served instead because they have the same number, by user.
+        # By user: description of another node with the same number that is served in its place.
         self._conflicts: dict[int, str] = {}
         self._mobilities, self._world_s = mobilities, world_s
         self._crowd = Crowd([mobilities[user] for user in self.users])
         self._cycle_id = 0
         # Cycle and bands of the last pilot request answered.
         self._sounded = (0, 0, 0)
-        # The highest attempt received, by cycle, and the position during a cycle, by cycle and
-        # user.
+        # The highest attempt received, by cycle, and the true position, by cycle and user.
         self._attempts: NewestDict[int, int] = NewestDict(REMEMBERED_CYCLES)
         self._truths: NewestDict[tuple[int, int], m.GroundTruth] = NewestDict(REMEMBERED_CYCLES)
 
@@ -110,7 +110,7 @@ class User(StateMachine):
         return self._other_user(event) and event.cycle_id == self._cycle_id
 
     def _other_instance_granted(self, event: m.Grant) -> bool:
-        """Return whether the acknowledged cycle is granted to another node of the same number."""
+        """Return whether another node with the same number is granted the acknowledged cycle."""
         return self._other_instance(event) and event.cycle_id == self._cycle_id
 
     def _other_instance(self, event: m.Grant | m.PilotRequest) -> bool:

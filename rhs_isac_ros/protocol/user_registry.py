@@ -11,17 +11,17 @@ import numpy as np
 from rhs_isac_ros.protocol import messages as m
 
 POLICIES = ('round_robin', 'first', 'random')
-# Highest number of a user, which bounds the memory for any content of the acks.
+# Highest number of a user, which bounds the memory whatever the acks contain.
 MAX_USERS = 4096
 LAST_NUMBER = 2**32 - 1
 # Number of registered users that the first beacon of a cycle invites, and the factor by which each
-# further beacon increases it. A cycle serves one user, but each ack takes time.
+# further beacon increases it. It is small: a cycle serves one user, and each ack takes time.
 INVITED, _EXTENSION = 8, 8
 # Number of consecutive beacons without an answer after which a user is removed, and of consecutive
 # incomplete cycles after which a senior loses this rank.
 _MAX_MISSED = 3
-# The owner of a number is silent if it has not answered for this time [s], in which other nodes
-# with the number have answered _MAX_MISSED beacons. A beacon invites all of them or none.
+# The owner of a number counts as silent if it has not answered for this time [s] while other nodes
+# with the number have answered _MAX_MISSED beacons. A beacon invites all of these nodes or none.
 SILENT_S = 1.0
 # Time without a rejected ack after which a conflict has ended [s].
 _CONFLICT_S = 5.0
@@ -29,15 +29,15 @@ _CONFLICT_S = 5.0
 
 @dataclasses.dataclass
 class _User:
-    """A registered user, and the node that owns the number, which is the first that answered."""
+    """A registered user, and the owner of its number: the first node that answered with it."""
 
-    # (turn, 1, number) if the user was served in the turn; (turn, 0, number) if the user was
-    # registered after it and has not been served yet.
+    # (turn, 1, number) if the user was last served in this turn; (turn, 0, number) if the user was
+    # registered, or answered too late, after this turn and has not been served since then.
     turn: tuple[int, int, int]
     missed: int = 0  # consecutive beacons without an answer
     instance: int = 0  # instance of the owner; 0 if unknown
     answered_s: float = 0.0  # time of the owner's last ack [s]
-    rejected: int = 0  # number of acks of other instances since then
+    rejected: int = 0  # number of acks from other instances since that ack
 
 
 class UserRegistry:
@@ -46,8 +46,8 @@ class UserRegistry:
     A number belongs to the first node that answers with it, until this node falls silent. The
     policy selects the user served longest ago (``round_robin``), the ``first`` to answer, or one
     at ``random``. The first `INVITED` users that completed a cycle are seniors. When another user
-    does not complete a cycle, the seniors precede all others for as long as this cycle took. User
-    numbers that answer only beacons therefore take at most half of the time.
+    does not complete a cycle, the seniors precede all others for as long as that cycle took. Users
+    that answer beacons but never complete a cycle therefore take at most half of the time.
     """
 
     def __init__(self, policy: str, rng: np.random.Generator) -> None:
@@ -78,8 +78,8 @@ class UserRegistry:
     def invite(self, attempt: int) -> tuple[int, int]:
         """Choose the users to wait for, and return the first and the last number to invite.
 
-        This range contains the user whose turn it is. The ranges of a round cover all numbers, so
-        that new users are invited, too. `attempt` is the number of beacons in this cycle that
+        The range contains the user whose turn it is. Over a round, the ranges cover all numbers,
+        so that new users are invited, too. `attempt` is the number of beacons in this cycle that
         nobody answered; the range grows with it.
         """
         self.answered = {}
@@ -105,7 +105,7 @@ class UserRegistry:
             self._choose(users))
 
     def _preferred(self, users: Iterable[int]) -> list[int]:
-        """Return the given users that precede the others: a requested user, or seniors."""
+        """Return the given users that take precedence: a requested one, else seniors, else all."""
         users = list(users)
         requested = [user for user in self._requested if user in users][:1]
         seniors = [user for user in users if self._seniors_first and user in self._seniors]
@@ -126,20 +126,20 @@ class UserRegistry:
             user.rejected < _MAX_MISSED or now_s < user.answered_s + SILENT_S)
 
     def reject(self, number: int) -> None:
-        """Count an ack of an instance that does not own the number."""
+        """Count an ack from an instance that does not own the number."""
         self._users[number].rejected += 1
 
     def register(self, number: int, instance: int = 0, now_s: float = 0.0) -> str:
         """Register a user that may have answered too late for this cycle.
 
-        An invited user that answers too late loses the turn. Without this rule, a user that is
-        always late would keep the turn forever, and users in other ranges would not be invited.
-        Returns a warning at the first ack of the owner after the rejection of another instance,
-        otherwise ''.
+        With ``round_robin``, an invited user that answers too late loses the turn. Without this
+        rule, a user that is always late would keep the turn forever, and users in other ranges
+        would not be invited. Returns a warning if the owner of the number answers after another
+        instance was rejected and the conflict is new, otherwise ''.
         """
         user = self._users.get(number)
         # A new user takes its turn after all waiting users and before the one served last, so that
-        # leaving and returning does not gain a turn.
+        # no user gains a turn by leaving and returning.
         if user is None:
             user = self._users[number] = _User((self._turn, 0, number), instance=instance)
             bisect.insort(self._numbers, number)

@@ -1,8 +1,8 @@
 """Encoding of the messages of the protocol as bytes, without intermediate ROS messages.
 
 Converting a ROS message calls a Python function for each field and nested message, which takes
-longer than the transport. Publishers and raw subscriptions of rclpy therefore exchange bytes:
-common data representation (CDR), version 1, little endian.
+longer than the transport. Publishers and raw subscriptions of rclpy therefore exchange bytes, in
+the Common Data Representation (CDR), version 1, little endian.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ def _encode_complex(values: np.ndarray) -> tuple[np.ndarray, ...]:
 
 def _decode_real(items: Sequence[np.ndarray]) -> np.ndarray:
     shape, values = items
-    # A copy, because the received numbers are not aligned in memory, which slows computations.
+    # A copy, because the received numbers may be unaligned in memory, which slows computations.
     return values.astype(float).reshape(_shape(values, shape))
 
 
@@ -88,7 +88,7 @@ _SIZES = {'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
 
 
 class _Run(NamedTuple):
-    """Numbers of fixed size, and the type of the string or sequence after them, `tail`.
+    """Numbers of fixed size, followed by a string or a sequence of the type `tail`.
 
     The layout of the numbers depends on their position in the message modulo 8. The `tail` of the
     last run is empty.
@@ -102,7 +102,7 @@ class _Run(NamedTuple):
 class _Field(NamedTuple):
     """A field of a message, and the range of its items on the wire.
 
-    A field of one item has no `encode`; its `decode`, if any, converts an enumeration.
+    A field of a type in `SCALARS` has no `encode`; its `decode`, if any, converts an enumeration.
     """
 
     name: str
@@ -147,7 +147,7 @@ class Codec:
 
     def encode(
             self, message: Any, frame: str, stamp_ns: int, sender: int, scenario_id: str) -> bytes:
-        """Return the bytes of a message; the other arguments replace the message's own values.
+        """Return the bytes of a message, with the given header, sender and scenario id.
 
         Raises MessageError if a string has no UTF-8 encoding.
         """
@@ -205,7 +205,7 @@ class Codec:
                                f'{error}') from None
         values: dict[str, Any] = {}
         if self._keeps_stamp:
-            # Larger numbers could exceed the range of seconds when the stamp is sent on.
+            # A larger number could put the seconds out of range when the stamp is forwarded.
             if items[1] >= _NANOSECONDS:
                 raise MessageError(f'{self._kind.__name__}.header: stamp with {items[1]} ns, '
                                    f'expected less than {_NANOSECONDS}')
@@ -265,7 +265,7 @@ def _runs(wire: Sequence[str]) -> list[_Run]:
 
 
 def _layout(numbers: str, start: int) -> struct.Struct:
-    """Return the layout of numbers that begin at a position, each aligned to its size."""
+    """Return the layout of numbers that begin at `start`, each aligned to its size."""
     text, position = '<', start
     for number in numbers:
         padding = (len(HEADER) - position) % _SIZES[number]

@@ -23,7 +23,7 @@ from rhs_isac_ros.ros.topics import NAMES, RHS_FRAME
 
 # Variance of an unknown angular velocity [rad^2/s^2], the value that ROS drivers use.
 _UNKNOWN_ROTATION_VARIANCE = 1e6
-# The identifier of the encoding; the options after it do not change it.
+# The identifier of the encoding; the option bytes that follow do not affect the encoding.
 _ENCODING = cdr.HEADER[:2]
 
 
@@ -69,7 +69,7 @@ def to_bytes(
         frame: str = RHS_FRAME) -> bytes:
     """Serialize a message (CDR) for a publisher of `ros_type`.
 
-    The `identity`, a sender and the id of a scenario, replaces these two fields of the message.
+    If given, `identity` replaces the fields `sender` and `scenario_id` of the message.
     Raises MessageError if a string has no UTF-8 encoding.
     """
     sender, scenario_id = identity or (message.sender, message.scenario_id)
@@ -80,14 +80,14 @@ def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
     """Convert a serialized message (CDR) from a raw subscription.
 
     Raises MessageError if the bytes are not a message of `ros_type`, an array does not fill its
-    shape, or the value of an enumeration is undefined. Other subscriptions of rclpy silently drop
-    bytes that they cannot deserialize.
+    shape, or the value of an enumeration is undefined. Subscriptions of rclpy that are not raw
+    silently drop bytes that they cannot deserialize.
     """
     if not serialized.startswith(_ENCODING):
         # A machine with another byte order may have sent the message.
         try:
             serialized = serialize_message(deserialize_message(serialized, ros_type(kind)))
-        # rclpy raises a RuntimeError without a public class; a string may be invalid UTF-8.
+        # rclpy raises a RuntimeError of a private class, or a ValueError for invalid UTF-8.
         except (RuntimeError, ValueError) as error:
             raise MessageError(
                 f'{kind.__name__}: invalid CDR data of {len(serialized)} bytes: '
@@ -100,7 +100,7 @@ def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
 
 
 def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
-    """Return the stamp of a message, or the current time of a node if it is unknown."""
+    """Return the stamp of a message, or the current time of a node if the stamp is unknown."""
     if not message.stamp_ns:
         return node.get_clock().now().to_msg()
     return Time(sec=message.stamp_ns // 10**9, nanosec=message.stamp_ns % 10**9)
@@ -122,7 +122,7 @@ def odometry(
         user: int, estimate: TrackEstimate, stamp: Time, frame: Frame) -> Odometry:
     """Return the position and velocity of a track; orientation and angular velocity are unknown.
 
-    The child frame, in which the velocity is given, has the same axes.
+    The child frame, in which the velocity is given, has the same axes as `frame`.
     """
     result = true_odometry(user, estimate.mean, estimate.velocity, stamp, frame)
     result.pose.covariance = _with_rotation(

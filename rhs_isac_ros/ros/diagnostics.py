@@ -15,7 +15,7 @@ _PERIOD_S = 1.0
 
 
 def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
-    """Convert the report of a node to one status, OK or WARN, for its fully qualified `name`."""
+    """Convert the report of a node, with the full name `name`, to one status, OK or WARN."""
     level = DiagnosticStatus.WARN if report.fault else DiagnosticStatus.OK
     values = [KeyValue(key=key, value=value) for key, value in report.values.items()]
     status = DiagnosticStatus(
@@ -25,7 +25,7 @@ def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
 
 
 def from_ros(message: DiagnosticArray, namespace: str) -> Iterator[tuple[str, Report]]:
-    """Yield the name without the first slash, and the report, of each node in a namespace."""
+    """Yield the name, without the leading slash, and the report of each node in a namespace."""
     for status in message.status:
         if status.name.rpartition('/')[0] == namespace.strip('/'):
             yield status.name, Report(
@@ -34,7 +34,7 @@ def from_ros(message: DiagnosticArray, namespace: str) -> Iterator[tuple[str, Re
 
 
 def subscribe_reports(node: Node, on_report: Callable[[str, Report], None]) -> None:
-    """Call a function for each report of a node in the namespace of `node`."""
+    """Call `on_report` with the name and report of each node in the namespace of `node`."""
     namespace = node.get_namespace()
 
     def receive(message: DiagnosticArray) -> None:
@@ -49,7 +49,7 @@ def publish_reports(node: Node, report: Callable[[], Report]) -> None:
         node, DiagnosticArray, topics.DIAGNOSTICS, endpoints.EXCHANGE)
 
     def publish() -> None:
-        # Each report contains the faults since the previous one, even if nobody reads it.
+        # Called even without subscribers: a report contains the faults since the previous one.
         found = report()
         endpoints.publish_if_subscribed((publisher,), lambda: to_ros(
             found, node.get_fully_qualified_name(), node.get_clock().now().to_msg()))

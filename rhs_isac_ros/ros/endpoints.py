@@ -1,8 +1,8 @@
 """Quality of service, publishers, subscriptions, timers, and a thread for slow work.
 
-Publishers and subscriptions have no event handlers: on a subscription, they slow down executors;
-on a publisher, they crash a node that destroys it while an observer with an incompatible quality
-of service is present (ros2/rclpy#1644).
+Publishers and subscriptions have no event handlers. On a subscription, a handler slows down the
+executor; on a publisher, it crashes a node that destroys the publisher while an observer with an
+incompatible quality of service is present (ros2/rclpy#1644).
 
 The middleware may refuse to create an endpoint, for instance because a permission is missing. The
 node then runs without it, logs the refusal, and reports it in its diagnostics.
@@ -41,7 +41,7 @@ def _profile(
 EXCHANGE = _profile(128)
 # For acks: all users answer the first beacon of a new base station.
 ACKS = _profile(MAX_USERS)
-# For observers of all messages: a busy machine may not run an observer for several seconds.
+# For observers of all messages, which a busy machine may suspend for several seconds.
 OBSERVATION = _profile(4096)
 # For a current value, which late joiners receive as well.
 LATCHED = _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
@@ -69,10 +69,10 @@ def refusals(node: Node) -> dict[str, str]:
 
 
 def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> _CreatedT | None:
-    """Return the result of `create`, or None after logging once that the middleware refused it."""
+    """Return the result of `create`; if the middleware refuses, log this once and return None."""
     try:
         return create()
-    # For an action, rclpy raises a ValueError. RCLError is a RuntimeError, as is that of a thread.
+    # rclpy raises a ValueError for an action. RCLError and errors of threads are RuntimeErrors.
     except (RuntimeError, ValueError) as error:
         # The end of the text is a position in the sources of ROS.
         text = f'{what} was refused: {str(error).partition(", at ")[0].splitlines()[0]}'
@@ -84,7 +84,7 @@ def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> 
 
 
 class _NoTimer(Timer):
-    """Replaces a timer that was refused, and never expires."""
+    """Replacement for a timer that was refused; it never expires."""
 
     timer_period_ns = 0
 
@@ -113,7 +113,7 @@ def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> T
 
 
 class _NoPublisher(Publisher):
-    """Replaces a publisher that was refused, and publishes nothing."""
+    """Replacement for a publisher that was refused; it publishes nothing."""
 
     def __init__(self, topic_name: str) -> None:
         self._name = topic_name
@@ -149,7 +149,7 @@ def create_publisher(
 def publish_if_subscribed(publishers: Iterable[Publisher], make: Callable[[], Any]) -> None:
     """Publish the message that `make` returns on the topics with subscribers, if any.
 
-    Topics for observers often have none, and the creation of a message takes longer than the rest.
+    Topics for observers often have none, and making a message takes longer than publishing it.
     """
     if subscribed := [one for one in publishers if one.get_subscription_count()]:
         message = make()
@@ -182,7 +182,7 @@ def subscribe_messages(
     Parameters
     ----------
     sizes
-        Sizes to `check`, as in `Scenario.sizes`; None: no check.
+        Sizes that `check` expects, as in `Scenario.sizes`; None: no check.
     on_error
         Called with the reason why a message was dropped; by default, the node logs it.
     scenario_id, on_foreign
@@ -217,7 +217,7 @@ class UserTopics:
     """Publishers for each user, created on first use.
 
     `kinds` contains the types by name of the topic, with ``{user}`` for the number of the user.
-    The numbers are limited, because they come from messages and every topic slows down discovery.
+    Its limit is `max_users`: numbers come from messages, and every topic slows down discovery.
     """
 
     def __init__(self, node: Node, kinds: Mapping[str, type], max_users: int) -> None:
@@ -253,9 +253,9 @@ _IMMEDIATE_S = 1e-6
 
 
 class BackgroundWorker:
-    """A thread that runs jobs one after the other, and delivers results like messages.
+    """A thread that runs jobs one after the other.
 
-    The thread that spins the node calls the functions that receive the results.
+    The thread that spins the node calls the functions that receive the results, between messages.
     """
 
     def __init__(self, node: Node) -> None:
@@ -268,9 +268,9 @@ class BackgroundWorker:
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=node.get_name())
 
     def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
-        """Queue a job; its result, or its exception, reaches the thread that spins the node.
+        """Queue a job; the thread that spins the node passes its result to `on_result`.
 
-        If the thread cannot start, the job is refused.
+        An exception in the job is raised there. The job is refused if its thread cannot start.
         """
         def hand_over(future: Future[_Result]) -> None:
             self._done.append((future, on_result))

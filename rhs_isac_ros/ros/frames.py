@@ -53,7 +53,7 @@ class Frame:
 
     @classmethod
     def of(cls, node: Node, values: types.SimpleNamespace) -> 'Frame':
-        """Return the frame of ``frame_id`` and ``surface_pose``, or raise ParameterError."""
+        """Return the frame given by ``frame_id`` and ``surface_pose``, or raise ParameterError."""
         pose = values.surface_pose
         if len(pose) != 6:
             raise ParameterError(f'surface_pose: {len(pose)} numbers, expected six, x, y, z [m], '

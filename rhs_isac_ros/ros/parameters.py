@@ -1,4 +1,4 @@
-"""The declarations of all ROS parameters, and nodes with parameters that may change.
+"""The declarations of all ROS parameters, and nodes whose parameters may change.
 
 Descriptors, checks and documentation derive from the declarations. `protocol.settings` declares
 the parameters that are settings of a role.
@@ -65,7 +65,7 @@ class Parameter(Field):
 
     def check(self, value: Any) -> None:
         """Raise ParameterError for an invalid value."""
-        # ROS does not check lists, nor the ends of a range exactly.
+        # ROS checks neither lists nor the exact ends of a range.
         if problem := self.problem(value):
             raise ParameterError(f'{self.name}: {problem}')
 
@@ -103,7 +103,7 @@ _FRAME = (
         'pitch, yaw in radians.', low=-1e6, high=1e6),
 )
 
-# Parameters of roles that are not settings.
+# Parameters of the roles other than their settings.
 _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
     'bs': (
         _SEED,
@@ -185,7 +185,7 @@ CODEBOOK: Mapping[str, str] = {
 def declare(node: Node, executable: str) -> types.SimpleNamespace:
     """Declare the parameters of an executable, and return their values by name.
 
-    Raises ParameterError for a wrong type, or a value that is out of range or not a choice.
+    Raises ParameterError if a value has the wrong type, is out of range, or is not a choice.
     """
     return types.SimpleNamespace(
         **{parameter.name: _declare_one(node, parameter) for parameter in NODES[executable]})
@@ -197,7 +197,7 @@ def check_overrides(node: Node) -> None:
     Parameters of other executables are accepted, because nodes may share a parameter file.
     """
     known = known_names()
-    # rclpy has no public access to all overrides. Publishers declare qos_overrides themselves.
+    # rclpy gives no public access to all overrides. A publisher declares its qos_overrides.*.
     foreign = [f'{name}{hint(name)}' for name in sorted(node._parameter_overrides)
                if not (name in known or node.has_parameter(name)
                        or name.startswith('qos_overrides.'))]
@@ -236,12 +236,12 @@ def _declare_one(node: Node, parameter: Parameter) -> Any:
         raise ParameterError(
             f'{parameter.name}: {error}; expected {parameter.expected}') from None
     if value is None:
-        # A node with a parameter without value answers no request for several parameters, such as
-        # that of `ros2 param dump`.
+        # If a parameter has no value, the node does not answer a request for several parameters,
+        # such as a request of `ros2 param dump`.
         value = default
         node.set_parameters([RosParameter(parameter.name, typed, default)])
     if is_empty:
-        # A copy, since rclpy keeps the descriptor itself, which must allow the change above.
+        # A copy: rclpy keeps the original, and rejects a new descriptor of a read-only parameter.
         final = copy.copy(descriptor)
         final.read_only = not parameter.dynamic
         node.set_descriptor(parameter.name, final)
@@ -251,7 +251,7 @@ def _declare_one(node: Node, parameter: Parameter) -> Any:
 
 
 def settings_of(kind: type[Any], values: types.SimpleNamespace) -> Any:
-    """Return the settings of a class, from the parameters with the names of its fields."""
+    """Return settings of the class `kind`, from the parameters with the names of its fields."""
     with translated(ValueError, ParameterError):
         return kind(**{field.name: getattr(values, field.name)
                        for field in dataclasses.fields(kind)})
@@ -259,7 +259,7 @@ def settings_of(kind: type[Any], values: types.SimpleNamespace) -> Any:
 
 def calibrated_surface(
         values: types.SimpleNamespace, scenario: Scenario) -> SurfaceEstimate | None:
-    """Return the surface in the file of the parameter ``calibration_file``; None if empty."""
+    """Return the surface in the file ``calibration_file``; None if the parameter is empty."""
     with translated(CalibrationError, ParameterError, 'calibration_file'):
         return load_surface(values.calibration_file, scenario)
 
@@ -282,7 +282,7 @@ def same_value(one: RosParameter, other: RosParameter) -> bool:
 class ParameterizedNode(Node):
     """A node that checks each change of its parameters as a whole and converts it to settings.
 
-    The node declares the parameters of the executable, whose name is the default name of the node.
+    The node declares the parameters of `executable`, which is also the default name of the node.
     `values` contains the initial values by name. Raises ParameterError if one is invalid.
     """
 

@@ -1,4 +1,4 @@
-"""Presence of the nodes, from the topics of the ROS graph and their announcements."""
+"""Presence of other nodes, derived from the ROS graph and from their announcements."""
 
 import itertools
 import json
@@ -21,25 +21,25 @@ from rhs_isac_ros.protocol.presences import PERIOD_S, Presence, Presences
 from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.ros.roster import ROSTER, identifying_endpoints
 
-# Poll period while a role is missing or nodes are in conflict, and otherwise. A poll takes half a
-# millisecond, which adds up over many users.
+# Poll periods [s]: while a role is missing or nodes are in conflict, and otherwise. A poll takes
+# half a millisecond, which adds up over many users.
 _POLL_S, _IDLE_POLL_S = 0.1, 1.0
-# Polls before the first report of missing roles, while discovery is still under way.
+# Number of polls before the first report of missing roles, while discovery is still under way.
 _GRACE_POLLS = 10
 # Maximum number of incompatible endpoints that are logged, which bounds the log.
 _MAX_LOGGED = 16
-# Topics of every node, which are not ours.
+# Topics that ROS creates for every node, whose quality of service is not examined.
 _FOREIGN = ('/rosout', '/parameter_events')
-# What the middleware returns instead of the name of a node, which may arrive after its endpoints.
+# Placeholders of the middleware for the name of a node, which may arrive after its endpoints.
 _UNNAMED = ('_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_')
-# Number of bytes of the identity of an endpoint that identify its participant.
+# Number of leading bytes of the id of an endpoint (GID) that identify its participant.
 _PREFIX_LENGTH = 12
 
 _last_instance = 0
 
 
 def new_instance() -> int:
-    """Return the instance of a node that starts now, unique in this process [ns since 1970]."""
+    """Return an instance for a node that starts now [ns since 1970], unique in this process."""
     global _last_instance
     _last_instance = max(time.time_ns(), _last_instance + 1)
     return _last_instance
@@ -48,12 +48,12 @@ def new_instance() -> int:
 class Peers:
     """Polls the ROS graph for the roles that a node requires.
 
-    A role is missing if no node has all its `identifying_endpoints`. It is present once two polls
-    in a row have found them, so that its node has time to discover this one. Nodes of unique
-    roles also announce themselves periodically. A node that falls silent does not count, although
-    the graph contains it for some time. Of two nodes with the same role, the newer serves.
-    Endpoints that cannot exchange messages, because one requests a quality of service that the
-    other does not offer, are logged.
+    A role is missing if no node has all its `identifying_endpoints`. The role counts as present
+    once two polls in a row have found such a node, which then had time to discover this node.
+    Nodes of unique roles also announce themselves periodically. A node that falls silent does not
+    count, although it remains in the graph for some time. Of two nodes with the same role, the
+    newer one serves. Endpoints are logged if they cannot exchange messages, because one requests a
+    quality of service that the other does not offer.
 
     Parameters
     ----------
@@ -62,8 +62,8 @@ class Peers:
     instance
         Instance of the node; see `Message.sender`.
     on_missing
-        Called with the roles that are missing, by name with a description: as soon as none is
-        missing or after a grace period, and then on every change.
+        Called with descriptions of the missing roles, by name: first when no role is missing or
+        after a grace period, then on every change.
     on_rival
         Called with True if this node has to stand by for another one, or False if it may serve.
     """
@@ -74,27 +74,27 @@ class Peers:
             on_rival: Callable[[bool], None]) -> None:
         self._node, self._on_missing, self._on_rival = node, on_missing, on_rival
         self._required = {name: identifying_endpoints(name) for name in ROSTER[role].needed}
-        # By role that was found last: the number of endpoints of each topic then, and the nodes.
+        # By role found so far: the number of endpoints of each topic at that time, and the nodes.
         self._present: dict[str, tuple[tuple[int, ...], set[str]]] = {}
-        # Number of endpoints by topic at the last poll, and incompatible ones by topic and node.
+        # Numbers of endpoints at the last poll, by topic; incompatible ones, by topic and node.
         self._counts: list[tuple[str, int, int]] = []
         self._incompatible: dict[tuple[str, str], str] = {}
-        # Endpoints that were logged; those that are created again are not logged again.
+        # Endpoints that were logged, which are not logged again if they are created again.
         self._logged: set[tuple[str, str]] = set()
         self._presences = Presences(Presence(
             instance, scenario.id, role, node.get_fully_qualified_name(),
             json.dumps(scenario.fields())))
-        # Time of the last poll or announcement, and total of the times without [s].
+        # Time of the last poll or received announcement, and total duration of stalls [s].
         self._last_s, self._missed_s = time.monotonic(), 0.0
         # Nodes that the last poll found silent.
         self._silent: set[str] = set()
-        # The rival of which `on_rival` was informed last.
+        # The rival at the last call of `on_rival`; 0 if there was none.
         self._rival = 0
         self._closed, self._thread = threading.Event(), threading.Thread()
         if ROSTER[role].is_unique:
             endpoints.subscribe(node, ros.Presence, topics.PRESENCE, self._receive,
                                 endpoints.PRESENCES, raw=True)
-            # A thread announces the node also while it computes.
+            # A thread announces the node even while the node computes.
             self._thread = threading.Thread(
                 target=self._announce, daemon=True, args=[endpoints.create_publisher(
                     node, ros.Presence, topics.PRESENCE, endpoints.LATCHED)])
@@ -116,7 +116,7 @@ class Peers:
         self._set_period(_POLL_S)
 
     def conflicts(self) -> dict[str, str]:
-        """Return a description of each conflict and refusal, by key of the diagnostics."""
+        """Return a description of each conflict and refusal, by its key in the diagnostics."""
         return self._presences.conflicts() | {
             f'conflict.qos.{topic.lstrip("/")}.{name.lstrip("/")}': text
             for (topic, name), text in self._incompatible.items()} | {
@@ -160,16 +160,16 @@ class Peers:
             self._on_missing(missing)
 
     def _lacking(self, name: str) -> str:
-        """Return a missing role with the endpoints that it lacks; empty if it lacks none."""
+        """Describe a missing role and the endpoints that it lacks; return '' if it is present."""
         node, (publishers, subscriptions) = self._node, self._required[name]
-        # The counts do not apply remapping rules.
+        # The methods that count endpoints do not apply remapping rules.
         wanted = [*(('publisher', node.resolve_topic_name(topic)) for topic in publishers),
                   *(('subscriber', node.resolve_topic_name(topic)) for topic in subscriptions)]
         counts = tuple(node.count_publishers(topic) if kind == 'publisher'
                        else node.count_subscribers(topic) for kind, topic in wanted)
         known_counts, found = self._present.get(name, ((), set()))
         if counts != known_counts:
-            # Observers have single endpoints, so that only a node with all of them is present.
+            # Observers may have some of the endpoints, so only a node with all of them counts.
             owners = [{_owner(info) for info in (
                 node.get_publishers_info_by_topic(topic) if kind == 'publisher'
                 else node.get_subscriptions_info_by_topic(topic))} for kind, topic in wanted]
@@ -211,7 +211,7 @@ class Peers:
         for publisher, subscription in itertools.product(publishers, subscriptions):
             names = {full_name(publisher), full_name(subscription)}
             if publisher.node_name in _UNNAMED or subscription.node_name in _UNNAMED:
-                # The name may arrive after the endpoint; the next poll examines it again.
+                # The name may arrive after the endpoint, which the next poll examines again.
                 self._counts = []
             elif own in names:
                 compatibility, reason = qos_check_compatible(
@@ -254,7 +254,7 @@ class Peers:
         """Log changes of the known nodes, and serve or stand by."""
         logger = self._node.get_logger()
         for message in changes:
-            # Not one line: rclpy requires a single severity for each line that logs.
+            # Two calls, because rclpy requires that a line of code always logs with one severity.
             if message.warning:
                 logger.warning(message.text)
             else:
@@ -265,10 +265,10 @@ class Peers:
 
 
 def _owner(info: Any) -> str:
-    """Return the node of an endpoint, or its participant while the node is unknown.
+    """Return the node of an endpoint, or the participant while the node is unknown.
 
     If the process was unreachable for longer than the lease of discovery, its endpoints are
-    discovered again, but Fast DDS does not deliver the name again.
+    discovered again, but Fast DDS does not deliver the name of the node again.
     """
     if info.node_name in _UNNAMED:
         return bytes(info.endpoint_gid[:_PREFIX_LENGTH]).hex()

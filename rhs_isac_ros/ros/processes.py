@@ -21,20 +21,20 @@ from rhs_isac_ros import executables
 from rhs_isac_ros.executables import PARENT_ID
 from rhs_isac_ros.ros.startup import OVERRIDE
 
-# Maximum number of users with nodes of their own, unless more are requested; more share one node,
-# because every process takes memory and CPU time, even between its cycles.
+# Maximum number of users with nodes of their own, unless more nodes are requested. More users
+# share one node, because every process takes memory and CPU time, even between cycles.
 MAX_USER_NODES = 16
 # Memory of the process of a node [bytes], and the number of nodes that a core can run.
 _MEMORY_BYTES = 67_000_000
 _PROCESSES_PER_CORE = 40
-# In the range LOCALHOST, participants announce themselves to as many ports of this machine; later
-# ones are not discovered by all others.
+# With the discovery range LOCALHOST, a participant announces itself to this number of ports of the
+# machine; further participants are not discovered by all others.
 _MAX_LOCAL_PARTICIPANTS = 32
 # Above domain 101, the ports may collide with the ephemeral ports of Linux.
 _DOMAINS = 101
 _MEMORY_FILE = Path('/proc/meminfo')
 _RANGE, _LOCALHOST = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST'
-# Signals sent in order to end a process, each with the time to wait for its exit [s].
+# Signals sent in turn until a process ends, each with the time to wait for the exit [s].
 _STOP_SIGNALS = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0))
 _STOP_POLL_S = 0.01
 # Modules that nodes import only after their start; ROS imports the first one for type supports.
@@ -57,7 +57,7 @@ def claim_domain() -> str:
         domain = 1 + (os.getpid() + offset) % _DOMAINS
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
-            # An abstract name of Linux; it disappears with the socket.
+            # An abstract name of Linux, which disappears with the socket.
             claim.bind(f'\0rhs_isac_ros.domain.{domain}')
         except OSError:
             claim.close()
@@ -70,7 +70,7 @@ def claim_domain() -> str:
 def max_processes() -> int:
     """Return the number of nodes that this machine can run as separate processes.
 
-    If discovery limits the number, the process that observes them counts as well.
+    If discovery limits the number, it leaves room for the process that observes the nodes.
     """
     fields = dict(line.split(':') for line in
                   _MEMORY_FILE.read_text(encoding='ascii').splitlines())
@@ -84,10 +84,10 @@ def max_processes() -> int:
 
 def run_executable(
         command: Sequence[str], log: Path, environment: Mapping[str, str]) -> None:
-    """Run an executable as its command would, in this process, a new copy of another one.
+    """Run an executable as its command would, in this process, which is a new fork.
 
-    Output is appended to `log`. After SIGINT, which the caller has blocked, the exit code is 0,
-    even before the executable handles the signal.
+    Output is appended to `log`. The caller has blocked SIGINT; this function unblocks it. SIGINT
+    results in the exit code 0, even before the executable handles it.
     """
     signal.signal(signal.SIGINT, lambda number, _: sys.exit(0))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
@@ -97,7 +97,7 @@ def run_executable(
     os.environ.clear()
     os.environ.update(environment)
     name = Path(command[0]).name
-    # The name that `ps` and `top` show.
+    # Set the name that `ps` and `top` show.
     Path('/proc/self/comm').write_text(name, encoding='ascii')
     sys.argv = list(command)
     sys.exit(getattr(executables, name)())
@@ -115,10 +115,10 @@ class _Fork(ForkProcess):
                          args=(command, log, environment))
         for module in (f'rhs_isac_ros.nodes.{self.name}', *_LATE_MODULES):
             importlib.import_module(module)
-        # The garbage collection of the node then ignores what it shares with this process.
+        # The garbage collection of the node then ignores the objects shared with this process.
         gc.freeze()
         with warnings.catch_warnings():
-            # The tracing library of ROS has two threads, which wait and hold no lock.
+            # Forking is safe: the two threads of the tracing library of ROS wait and hold no lock.
             warnings.simplefilter('ignore', DeprecationWarning)
             signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
             try:
@@ -127,7 +127,7 @@ class _Fork(ForkProcess):
                 signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
 
     def poll(self) -> int | None:
-        """Return the exit code, the negative number of a signal, or None while running."""
+        """Return the exit code, negative after a signal, or None while the process runs."""
         return self.exitcode
 
     def send_signal(self, number: int) -> None:
@@ -144,7 +144,7 @@ class Processes:
     Parameters
     ----------
     fork
-        Whether to start them as copies of this process, which must not have used ROS before.
+        Whether to start executables as copies of this process, which must not have used ROS.
         Copies start in a tenth of the time, because they import nothing.
     """
 
@@ -152,7 +152,7 @@ class Processes:
             self, logs: Path, environment: Mapping[str, str], fork: bool = False) -> None:
         self._logs, self._fork = logs, fork
         self._environment = {**os.environ, **environment, PARENT_ID: str(os.getpid())}
-        # The enclave of this process; each node has its own.
+        # The variable gives the enclave of this process, but each node has its own.
         self._environment.pop(OVERRIDE, None)
         self._running: dict[str, subprocess.Popen[bytes] | _Fork] = {}
         self._commands: dict[str, list[str]] = {}
@@ -178,7 +178,7 @@ class Processes:
 
     def _spawn(self, name: str) -> None:
         command, log = self._commands[name], self._logs / f'{name}.log'
-        # The log of a process exists as soon as it is started.
+        # The log of a process exists from its start.
         log.touch()
         if self._fork:
             self._running[name] = _Fork(command, log, self._environment)

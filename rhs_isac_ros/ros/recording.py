@@ -58,7 +58,7 @@ def type_name(kind: type) -> str:
 
 
 def schema(kind: type) -> str:
-    """Return the definition of a message class and its nested messages, as ``ros2msg``."""
+    """Return the definition of a message class and its nested messages in ``ros2msg`` format."""
     first = type_name(kind).replace('/msg/', '/')
     texts: dict[str, str] = {}
     wanted = [first]
@@ -75,7 +75,7 @@ def schema(kind: type) -> str:
 
 
 def _offered_qos(profile: QoSProfile) -> str:
-    """Return a quality of service for ``ros2 bag play``, which then publishes latched topics."""
+    """Return a quality of service in YAML, as ``ros2 bag play`` needs it to latch topics."""
     unlimited = {'sec': 9223372036, 'nsec': 854775807}
     return yaml.safe_dump([{
         'history': profile.history.short_key, 'depth': profile.depth,
@@ -95,7 +95,7 @@ def _parts(text: str, package: str) -> Iterator[str]:
 class Recorder:
     """Writes the messages and the scenario of a network to a file.
 
-    Until it is complete, the file is called ``<name>.part``; it remains after an interruption.
+    The file is called ``<name>.part`` until it is complete, and remains after an interruption.
     Raises RecordingError if mcap is not installed or the file cannot be written.
     """
 
@@ -112,15 +112,15 @@ class Recorder:
         self._writer = Writer(self._stream)
         self._writer.start(profile='ros2', library='rhs_isac_ros')
         self._writer.add_metadata(_SCENARIO, {'yaml': yaml.safe_dump(scenario.changes())})
-        # Number of messages written, and why writing failed, for instance on a full disk.
+        # Number of messages written, and the reason why writing failed, such as a full disk.
         self.count, self.failure = 0, ''
 
     def record_topics(
             self, node: Node, on_message: Callable[[str, bytes], None] | None = None) -> None:
-        """Record all topics in the namespace of a node.
+        """Record the topics of `recorded_topics` in the namespace of a node.
 
         `on_message` is called with the relative name of the topic and the serialized message, once
-        the message is written.
+        the message is written or writing has failed.
         """
         for name, (kind, profile) in recorded_topics().items():
             channel = self._writer.register_channel(
@@ -211,7 +211,7 @@ def _fields(text: str) -> list[str]:
 
 
 def read_scenario(path: str | Path) -> Scenario | None:
-    """Return the scenario of a recording; None if there is none, as after ``ros2 bag record``.
+    """Return the scenario of a recording; None if there is none, as with ``ros2 bag record``.
 
     Raises RecordingError if the file cannot be read, ScenarioError if the scenario is invalid.
     """
@@ -232,7 +232,7 @@ def read_scenario(path: str | Path) -> Scenario | None:
 def _records(path: str | Path) -> Iterator[Any]:
     """Yield the records of a file and of its chunks, in the order of the file.
 
-    The readers of mcap would decompress a chunk to any size. Raises RecordingError if the file
+    The readers of mcap would decompress a chunk of any size. Raises RecordingError if the file
     cannot be read.
     """
     with translated(MissingLibraryError, RecordingError), optional_import(
@@ -275,9 +275,9 @@ def _decompressed(chunk: Any) -> Any:
 class CycleObserver(Node):
     """Collects the cycles of the network in its namespace, with times of `time.monotonic`.
 
-    With a `recorder`, which the caller closes, the observer also records all topics of the
-    namespace. It then receives exactly the recorded messages of the types `cycle_log.RECEIVES`,
-    and ignores `receives`, `sizes` and `on_malformed`, which are as in `subscribe_messages`.
+    With a `recorder`, which the caller closes, the observer also records the topics of the
+    namespace. It then observes exactly the recorded messages of types in `cycle_log.RECEIVES`.
+    Without one, `receives`, `sizes` and `on_malformed` are arguments of `subscribe_messages`.
     """
 
     def __init__(

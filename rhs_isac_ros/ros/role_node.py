@@ -37,8 +37,8 @@ class CodebookClient:
     """Fetches the codebook from the parameters of the optimizer whenever it changes.
 
     A message on the latched topic announces the codebook and triggers a request to the parameter
-    service. If there are two optimizers, either may answer. The announced codebook, whose id
-    proves its content, therefore replaces a missing response or another codebook. `Presences`
+    service. If there are two optimizers, either may answer. The announced codebook, whose content
+    is verified by its id, therefore replaces a missing response or another codebook. `Presences`
     selects the optimizer that announces. `codebook_id` is the id of the latest codebook, or ''.
     """
 
@@ -50,10 +50,10 @@ class CodebookClient:
         name = f'{topics.OPTIMIZER_NODE}/get_parameters'
         self._client = endpoints.create_or_refuse(
             node, f'client of {name}', lambda: node.create_client(GetParameters, name))
-        # The latest announcement until it is in use; its time; whether it has led to a request.
+        # The announced codebook until it is used, its arrival [s], and whether it is requested.
         self._announced: Codebook | None = None
         self._announced_s, self._is_requested = math.inf, False
-        # Why the latest codebook was rejected.
+        # Reason why the latest codebook was rejected; empty if it was not.
         self._problem = ''
         self.codebook_id = ''
         endpoints.subscribe(node, ros.Codebook, topics.CODEBOOK, self._on_announcement,
@@ -108,7 +108,7 @@ class CodebookClient:
     def _use(self, codebook: Codebook, values: Sequence[ParameterValue]) -> None:
         """Use the codebook in a response if it was announced, otherwise the announced one."""
         self._announced = None
-        # An invalid or incomplete response is not the announced codebook.
+        # An invalid or incomplete response is ignored.
         with contextlib.suppress(CodebookError, ValueError):
             fetched = Codebook.from_parameters(
                 dict(zip(_NAMES, map(parameter_value_to_python, values), strict=True)))
@@ -118,7 +118,7 @@ class CodebookClient:
             self._on_codebook(codebook)
 
 
-# With simulated time, the period of looking for the end of a state of the emulated world [s].
+# With simulated time, period of the checks whether a state of the emulated world has ended [s].
 _WORLD_POLL_S = 0.002
 # Maximum number of senders with another scenario that are logged.
 _MAX_LOGGED = 16
@@ -131,7 +131,7 @@ class Clocks:
 
     The world follows the clock of ROS if the node uses simulated time, otherwise the steady clock.
     The clock of the roles follows the steady clock, except in states that belong to the world,
-    such as the rest between cycles.
+    such as the rest between cycles; then it follows the world.
     """
 
     def __init__(self, node: Node) -> None:
@@ -150,7 +150,7 @@ class Clocks:
         return self._world_s
 
     def role_s(self, in_world: bool) -> float:
-        """Return the time of the roles [s]; `in_world` if their state belongs to the world."""
+        """Return the time of the roles [s]; if `in_world`, their state belongs to the world."""
         self._advance(in_world)
         return self._role_s
 
@@ -198,7 +198,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._has_optimizer = True
         self._sending: dict[type[m.Message], Publisher] = {}
         self._receiving: set[type[m.Message]] = set()
-        # Subjects of logged errors: a faulty sender must not fill the disk.
+        # Subjects of logged errors; each is logged once, so that no faulty sender fills the disk.
         self._logged: set[str] = set()
         self._statistics = RoleStatistics()
         # The same timer serves all deadlines. It is set only if it would expire too late, or after
@@ -255,7 +255,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             {**self.role.status(), **self._peers.conflicts()})
 
     def stand_by(self) -> None:
-        """Handle a newer node that takes over the role."""
+        """Handle the takeover of the role by a newer node."""
 
     def resume(self) -> None:
         """Handle the return to service, after the newer node has gone."""
@@ -277,7 +277,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 f'{self._codebook_client.codebook_id or "none"}')
 
     def set_lacking(self, text: str) -> None:
-        """Describe what the role lacks, apart from other roles; '' if nothing."""
+        """Set the text about anything that the role lacks besides other roles; '' for nothing."""
         if text != self._lacking:
             self._lacking = text
             # Before discovery, it is unknown which roles are missing.
@@ -341,7 +341,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             self._set_timer(deadline_s - now_s, deadline_s)
 
     def publish(self, message: m.Message) -> bool:
-        """Publish a message; return False if it is invalid (logged) or the node stands by."""
+        """Publish a message; return False if it is invalid (logged), or if the node stands by."""
         if self.stands_by:
             return False
         stamp_ns = message.stamp_ns or self.get_clock().now().nanoseconds
@@ -368,7 +368,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._log_error('dropped', error)
 
     def _on_foreign(self, message: m.Message) -> None:
-        """Count a message of another scenario, and log the first of each sender."""
+        """Count a message of another scenario, and log the first from each sender."""
         self.role.counters[events.Outcome.WRONG_SCENARIO.value] += 1
         if message.sender not in self._foreign and len(self._foreign) < _MAX_LOGGED:
             self._foreign.add(message.sender)
@@ -407,7 +407,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 f'{consequence}: {error}')
 
     def _set_timer(self, delay_s: float, due_s: float) -> None:
-        # The timer follows the steady clock, and the speed of a simulation is unknown.
+        # The timer follows the steady clock, but the speed of a simulation is unknown, so poll.
         if self.clocks.is_simulated and self._in_world():
             delay_s = min(delay_s, _WORLD_POLL_S)
         self._timer.timer_period_ns = max(int(delay_s * 1e9), 1)

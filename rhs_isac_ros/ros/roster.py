@@ -1,7 +1,7 @@
 """The roles of a network.
 
 Parameters, launch files, permissions, readiness, fault trials and the documented topics derive
-from their declarations in `ROSTER`.
+from the declarations of the roles in `ROSTER`.
 """
 
 import dataclasses
@@ -36,14 +36,14 @@ class Member:
 
     @property
     def sent(self) -> tuple[str, ...]:
-        """Topics that the nodes of the role publish, starting with messages of the protocol."""
+        """Topics that nodes of the role publish; topics of protocol messages come first."""
         return (*(topics.NAMES[kind] for kind in (self.role.SENDS if self.role else ())),
                 *self.publishes, topics.DIAGNOSTICS,
                 *((topics.PRESENCE,) if self.is_unique else ()))
 
     @property
     def received(self) -> tuple[str, ...]:
-        """Topics to which the nodes subscribe, starting with messages of the protocol."""
+        """Topics to which nodes of the role subscribe; topics of protocol messages come first."""
         return (*(topics.NAMES[kind] for kind in (self.role.RECEIVES if self.role else ())),
                 *((topics.CODEBOOK,) if self.has_codebook else ()),
                 *((topics.PRESENCE,) if self.is_unique else ()))
@@ -70,15 +70,15 @@ ROSTER: Mapping[str, Member] = {
         role=BaseStation, settings=BaseStationSettings, has_codebook=True,
         requires=('rhs_controller', 'channel', 'positioner', 'transmission')),
 }
-# Roles with only one node in a network.
+# Roles in which only one node of a network serves.
 UNIQUE = tuple(name for name, member in ROSTER.items() if member.is_unique)
 
 
 def identifying_endpoints(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the topics that show that a role is present: published ones and subscribed ones.
 
-    Each tuple contains the first topic that no other role publishes, or subscribes to, if any. One
-    topic is enough, because a node creates all of them together.
+    Each tuple contains at most one topic, the first that no other role publishes or subscribes to.
+    One is enough, because a node creates its publishers together, and likewise its subscriptions.
     """
     others = [member for other, member in ROSTER.items() if other != name]
     sent = {topic for member in others for topic in member.sent}

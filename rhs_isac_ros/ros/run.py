@@ -81,7 +81,7 @@ def check_parameters(
 
 
 def _names(executable: str) -> list[str]:
-    """Return the names of the parameters of an executable, without its composed nodes."""
+    """Return the names of the parameters of an executable, not of the nodes that it composes."""
     names = [parameter.name for parameter in NODES[executable]]
     return [*names, *CODEBOOK] if executable == 'optimizer' else names
 
@@ -139,7 +139,7 @@ def _example(parameters: Sequence[Parameter]) -> str:
 # Maximum time to destroy the nodes [s]. Fast DDS 2.14 can deadlock if a publisher is destroyed
 # while another participant times out.
 _DESTRUCTION_S = 10
-# Maximum time between two checks for a signal.
+# Maximum time between two checks for a signal [s].
 _POLL_S = 0.1
 
 
@@ -182,13 +182,13 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         executor = EventsExecutor()
         for node in nodes:
             executor.add_node(node)
-        # Otherwise, each garbage collection would examine the objects of all imported modules,
-        # which takes tens of milliseconds at any time during a cycle.
+        # Without the freeze, each garbage collection would examine the objects of all imported
+        # modules, which could delay a cycle by tens of milliseconds.
         gc.collect()
         gc.freeze()
         while ok() and not signals and not done():
             # This call returns after each message. Other ways of spinning do not return until the
-            # queue is empty, so that a busy node would miss signals.
+            # queue is empty, so a busy node would not react to signals.
             executor.spin_once(timeout_sec=_POLL_S)
     except ExternalShutdownException:
         pass
@@ -208,8 +208,8 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
             executor.shutdown()
         try_shutdown()
         signal.alarm(0)
-        # Python restores the default handlers at exit. A further signal, for instance from a
-        # launch after Ctrl-C, would then kill a process that is about to exit normally.
+        # Python restores the default handlers at exit. A further signal, for instance from
+        # `ros2 launch` after Ctrl-C, would then kill a process that is about to exit normally.
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
     return 0

@@ -1,7 +1,7 @@
-"""How a process joins the network: discovery, and an enclave of SROS 2.
+"""Joining the network: discovery by Fast DDS, and the enclave of SROS 2.
 
-Fast DDS takes a tenth of a second for discovery, and a second longer for each message that it
-misses. A node therefore joins while it imports its modules; this module imports little.
+Discovery takes a tenth of a second, and a second longer for each discovery message that is missed.
+It therefore starts before the modules of a node are imported; this module imports little.
 """
 
 import contextlib
@@ -24,11 +24,11 @@ from rhs_isac_ros.executables import EXECUTABLES
 
 # Environment variable with the profile file of Fast DDS.
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-# Options of nodes that need no services, so that access control need not permit any.
+# Options of nodes that need no services; access control then need not permit any.
 WITHOUT_SERVICES: Mapping[str, Any] = {
     'start_parameter_services': False,
     'parameter_overrides': [Parameter('start_type_description_service', value=False)]}
-# Keeps the participant of this process until its nodes do.
+# The hidden node, which keeps the participant of this process alive until there are other nodes.
 _holders: list[Node] = []
 
 
@@ -40,8 +40,8 @@ def discovery_profile_file() -> Path:
 def use_discovery_profile() -> None:
     """Shorten the discovery times of Fast DDS in this process.
 
-    Fast DDS reads the profile when the first node is created. A file that the environment already
-    names takes precedence; an empty name selects the defaults of Fast DDS.
+    Fast DDS reads the profile when the first node is created. A file that is already set in the
+    environment takes precedence; an empty name selects the defaults of Fast DDS.
     """
     file = os.environ.setdefault(_PROFILES, str(discovery_profile_file()))
     if not file:
@@ -50,7 +50,7 @@ def use_discovery_profile() -> None:
 
 
 def join(args: list[str]) -> None:
-    """Join the network with a hidden node, for a command line that begins with the program."""
+    """Join the network with a hidden node; `args` is a command line, including the program."""
     use_discovery_profile()
     rclpy.init(args=prepare(args), signal_handler_options=SignalHandlerOptions.NO)
     with one_line():
@@ -60,7 +60,7 @@ def join(args: list[str]) -> None:
 
 
 def leave() -> None:
-    """Destroy the hidden node, if there is one; nodes of the process keep its participant."""
+    """Destroy the hidden node, if any; other nodes of the process keep the participant."""
     while _holders:
         _holders.pop().destroy_node()
 
@@ -71,12 +71,12 @@ _ENABLE, _STRATEGY, _KEYSTORE, OVERRIDE = (
 # Files of an enclave.
 _FILES = ('identity_ca.cert.pem', 'cert.pem', 'key.pem', 'permissions_ca.cert.pem',
           'governance.p7s', 'permissions.p7s')
-# The remapping rules of the name and the namespace of a node.
+# The remapping rules for the name and the namespace of a node.
 _RULE = re.compile(r'(?:[^:]+:)?__(node|ns):=(.*)')
 
 
 class SecurityError(RuntimeError):
-    """DDS security is requested and cannot be used."""
+    """DDS security is requested, but cannot be used."""
 
 
 def is_enabled() -> bool:
@@ -85,17 +85,17 @@ def is_enabled() -> bool:
 
 
 def prepare(args: Sequence[str]) -> list[str]:
-    """Return a command line that names an enclave, if DDS security is enabled.
+    """Return the command line `args`, with an enclave if DDS security is enabled.
 
     The command line begins with the name of the program. By default, the enclave of a node is the
-    node's full name, and the enclave of a tool is ``operator``, whatever its name. The environment
-    is checked here, because ROS reports its errors with a traceback or not at all.
+    full name of the node, and the enclave of every tool is ``operator``. The environment is
+    checked here, because ROS reports errors in it with a traceback or not at all.
 
     Raises
     ------
     SecurityError
-        If a variable has an unknown value, or a file is missing, or the permissions are for
-        another domain.
+        If a variable has an unknown value; with the strategy ``Enforce``, also if the keystore or
+        a file is missing, or the permissions are for another domain.
     """
     for name, values in ((_ENABLE, ('', 'true', 'false')), (_STRATEGY, (
             '', 'Enforce', 'Permissive'))):
@@ -116,7 +116,7 @@ def prepare(args: Sequence[str]) -> list[str]:
 
 
 def _enclave(args: Sequence[str]) -> str:
-    """Return the enclave that a command line names, or the default of its node or tool."""
+    """Return the enclave in a command line, or the default for its node or tool."""
     if '--enclave' in args[:-1]:
         return args[args.index('--enclave') + 1]
     rules = {match[1]: match[2] for match in map(_RULE.fullmatch, args) if match}
@@ -132,7 +132,7 @@ def _check_enclave(enclave: str) -> None:
         raise SecurityError(f'{_KEYSTORE}: {keystore!r}, expected a keystore: '
                             'ros2 security generate_artifacts')
     folder = Path(keystore) / 'enclaves' / enclave.lstrip('/')
-    # A file *.p11 names a key in a device.
+    # A file *.p11 refers to a key on a device.
     missing = [name for name in _FILES if not (
         (folder / name).is_file() or (folder / name).with_suffix('.p11').is_file())]
     if missing:
@@ -149,10 +149,10 @@ def _check_enclave(enclave: str) -> None:
 
 @contextlib.contextmanager
 def one_line() -> Iterator[None]:
-    """Convert the error of a node or an endpoint that DDS security refuses to `SecurityError`."""
+    """Raise `SecurityError` in place of the error when DDS security refuses a node or endpoint."""
     try:
         with warnings.catch_warnings():
-            # ROS destroys the incomplete node.
+            # ROS warns when it destroys the incomplete node.
             warnings.simplefilter('ignore', RuntimeWarning)
             yield
     except rclpy_implementation.RCLError as error:

@@ -25,7 +25,7 @@ NAMES: Mapping[type[m.Message], str] = {
     m.ProtocolState: 'protocol_state',
 }
 
-# Topics without a message of the protocol.
+# Topics that carry no message of the protocol.
 POSITION = 'position'
 CODEBOOK = 'codebook'
 # Absolute, because the diagnostic aggregator expects this name.
@@ -52,7 +52,7 @@ PAUSE = '~/pause'
 RESUME = '~/resume'
 STEP = '~/step'
 
-# Node whose parameters are the codebook.
+# Node whose parameters hold the codebook.
 OPTIMIZER_NODE = 'optimizer'
 # Default of the parameter frame_id, the frame of standard messages.
 MAP_FRAME = 'map'
