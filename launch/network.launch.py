@@ -85,14 +85,14 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         nodes = [node for role in ROSTER for node in _nodes(given, role, users, values)]
     if 'true' in (given['visualizer'], given['rviz']):
         nodes.append(_node(given, 'visualizer', 'visualizer'))
-    # The recorder misses messages that precede its start and are not latched.
+    # The recorder comes first, because it misses earlier messages that are not latched.
     return [*_recorder(given), *nodes, *_rviz(given)]
 
 
 def _nodes(
         given: dict[str, str], role: str, users: int, values: dict[str, int | str]
 ) -> list[LaunchDescriptionEntity]:
-    """Return the nodes of a role, with those of the values that are parameters of it."""
+    """Return the nodes of a role, with the `values` that are parameters of this role."""
     known = {parameter.name for parameter in NODES[role]}
     values = {name: value for name, value in values.items() if name in known}
     if ROSTER[role].is_unique:
@@ -112,7 +112,7 @@ def _integer(name: str, given: dict[str, str], low: int) -> int:
 
 
 def _node(given: dict[str, str], executable: str, name: str | None, **values: int | str) -> Node:
-    # rcl gives precedence to the parameters that it reads last: those of the file.
+    # rcl gives precedence to the parameters that it reads last, which are those in the file.
     file = [ParameterFile(given['params_file'])] if given['params_file'] else []
     # JSON quotes a string so that YAML does not read it as another type.
     pairs = [f'{key}:={json.dumps(value, ensure_ascii=False)}'
@@ -163,12 +163,14 @@ def _rviz(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
 
 def _end_if_failed(
         respawns: bool, is_optional: bool, event: ProcessExited, context: LaunchContext) -> None:
-    """End the launch, with exit code 1, if a process failed that may not, or is invalid.
+    """End the launch with exit code 1 if a process failed that is not optional.
+
+    A process that will be restarted may fail, but not with the exit code `INVALID`.
 
     Raises
     ------
     RuntimeError
-        ``launch`` logs it and ends; its action ``Shutdown`` would result in exit code 0.
+        ``launch`` logs this error and ends; its action ``Shutdown`` would give exit code 0.
     """
     is_tolerated = is_optional or respawns and event.returncode != INVALID
     if event.returncode and not is_tolerated and not context.is_shutdown:

@@ -15,7 +15,7 @@ from pathlib import Path
 # Environment variable with the process id of a parent that its children must not outlive.
 PARENT_ID = 'RHS_ISAC_ROS_PARENT_ID'
 _PR_SET_PDEATHSIG = 1
-# Executables in `tools`; the others are the modules of `nodes`.
+# Executables in `tools`; all other executables are modules of `nodes`.
 _TOOLS = ('calibrate', 'demo', 'record', 'replay', 'snapshot', 'view', 'watch')
 # Subpackage of each executable.
 EXECUTABLES = {
@@ -65,7 +65,7 @@ def _join_network(name: str) -> None:
     arguments = sys.argv[1:]
     if EXECUTABLES[name] != 'nodes' or arguments[:1] not in ([], ['--ros-args']):
         return
-    # Before NumPy, which ROS imports, so that the limits of its threads apply.
+    # This import limits the threads of NumPy, so it must precede ROS, which imports NumPy.
     importlib.import_module('rhs_isac_ros.nodes')
     try:
         importlib.import_module('rhs_isac_ros.ros.startup').join([name, *arguments])
@@ -124,7 +124,7 @@ def exit_code_of(
         print_error(error, program)
         return 2
     except OSError as error:
-        # An error of a file contains its name.
+        # Errors about a file have a file name; errors about the output do not.
         if error.filename is not None:
             raise
         discard_stdout()

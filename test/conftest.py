@@ -17,7 +17,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import plugins
 
-# Fixtures that several folders share. Those of processes need ROS, which the pure layers do not.
+# Fixtures that several folders share. Processes and nodes need ROS; the pure layers do not.
 pytest_plugins = ['in_memory_network']
 if importlib.util.find_spec('rclpy'):
     pytest_plugins += ['node_processes', 'node_bench']
@@ -35,7 +35,7 @@ hypothesis.settings.register_profile(
 
 def pytest_addoption(parser):
     parser.addoption('--thorough', action='store_true',
-                     help='test each property on 5000 random examples instead of 150 fixed ones')
+                     help='test each property on 5000 random examples instead of 75 fixed ones')
 
 
 def pytest_configure(config):
@@ -121,7 +121,7 @@ def shipped() -> Codebook:
 
 @pytest.fixture(scope='session')
 def random_beams():
-    """Function of scenario and generator: a codebook with random phases and amplitudes."""
+    """Function that returns a codebook with random phases and amplitudes for a scenario."""
     def make(scenario: Scenario, rng: np.random.Generator) -> Codebook:
         sizes = scenario.sizes
         digital = rng.normal(size=(*(sizes[s] for s in ('N_B', 'N_SB', 'F', 'K')), 2)) @ [1, 1j]
@@ -170,7 +170,7 @@ class Plain:
                 * np.exp(-2j * np.pi * f / self.light * distance))
 
     def los_slope(self, position, i, j, m):
-        """Derivative of `los` by the coordinates, on a new last axis."""
+        """Derivative of `los` with respect to the coordinates, on a new last axis."""
         offset = position - self.element(m)
         distance = np.sqrt(np.sum(offset**2, axis=-1))
         rate = -2j * np.pi * self.frequency(i, j) / self.light - 1 / distance
@@ -205,7 +205,7 @@ class Plain:
                          for r, (j, _) in enumerate(self.rows)], axis=-1)
 
     def mean_slope(self, position, i):
-        """Derivative of `mean` by the coordinates, [..., N_SB F, 3]."""
+        """Derivative of `mean` with respect to the coordinates, [..., N_SB F, 3]."""
         pattern, elements = self.pattern(i), range(self.scenario.n_elements)
         slopes = {(j, m): self.los_slope(position, i, j, m)
                   for j in range(self.scenario.n_subbands) for m in elements}
@@ -218,7 +218,7 @@ class Plain:
         return 1 / (1 + 2j * np.pi * s.delay_spread_s * difference)
 
     def rho_t(self, i, q1, q2):
-        """J_0 by Bessel's integral; the mean over equidistant points is exact to rounding."""
+        """J_0 by Bessel's integral; the mean over equidistant points is exact up to rounding."""
         s = self.scenario
         doppler = s.max_user_speed_mps * s.center_frequencies_hz[i] / self.light
         argument = 2 * np.pi * doppler * (q1 - q2) * s.frame_duration_s
@@ -267,7 +267,7 @@ def table1_estimator(shipped):
 
 @pytest.fixture(autouse=True, scope='session')
 def without_installed_plugins():
-    """Hide plug-ins that are installed in the environment: they are not part of the tests."""
+    """Hide plug-ins that are installed in the environment, which are not part of the tests."""
     find, home = plugins.metadata.entry_points, Path(sysconfig.get_path('purelib'))
 
     def entry_points(**chosen):
@@ -283,7 +283,7 @@ def without_installed_plugins():
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
-    """Function that installs a package of one module with the metadata that pip writes."""
+    """Function that installs a package with one module, and the metadata that pip would write."""
     def install(package: str, code: str, points: dict[str, dict[str, str]]) -> Path:
         """Take code and objects of the module by group and name; return its folder."""
         folder = tmp_path / 'site'

@@ -1,6 +1,6 @@
-"""A headless Chromium, driven over a pipe in the DevTools protocol.
+"""A headless Chromium, controlled over a pipe with the DevTools protocol.
 
-As a program, it saves the picture of a view that opens the README, from its address::
+As a program, this module saves the first picture of the README from the address of a view::
 
     scripts/record run.mcap       # of scripts/run network
     scripts/view run.mcap --track --cycles 38
@@ -40,7 +40,7 @@ def executable():
 
 
 class Browser:
-    """A context manager with one page of a width and a height in pixels at the scale 1."""
+    """A context manager with one page; its width and height are in pixels at scale 1."""
 
     def __init__(self, width=1600, height=1000, scale=1.0):
         self._stack = contextlib.ExitStack()
@@ -102,19 +102,19 @@ class Browser:
             pass
 
     def picture(self, top=0):
-        """Return a picture of the page as PNG, without some pixels at the top."""
+        """Return a picture of the page as PNG, without `top` pixels at its upper edge."""
         clip = {'x': 0, 'y': top, 'width': self._size['width'],
                 'height': self._size['height'] - top, 'scale': 1}
         return base64.b64decode(
             self.call('Page.captureScreenshot', format='png', clip=clip)['data'])
 
     def scroll(self, x, y, distance):
-        """Turn the wheel of the mouse at a place; negative distances zoom in."""
+        """Turn the mouse wheel at a point of the page; negative distances zoom in."""
         self.call('Input.dispatchMouseEvent', type='mouseWheel', x=x, y=y, deltaX=0,
                   deltaY=distance)
 
     def drag(self, x, y, right, down):
-        """Drag with the left button from a place."""
+        """Drag with the left button from a point of the page, by a distance in pixels."""
         common = {'button': 'left', 'buttons': 1, 'clickCount': 1}
         self.call('Input.dispatchMouseEvent', type='mouseMoved', x=x, y=y)
         self.call('Input.dispatchMouseEvent', type='mousePressed', x=x, y=y, **common)
@@ -140,7 +140,7 @@ def main(address, file):
         # The page does not report when it has drawn the data.
         time.sleep(_DRAWING_S)
         browser.drag(300, 300, -70, 60)
-        # The viewer describes what the mouse points at; its menu is not in the picture.
+        # The viewer describes what is under the mouse, so move it to the menu, which is cut off.
         browser.call('Input.dispatchMouseEvent', type='mouseMoved', x=500, y=10)
         time.sleep(_DRAWING_S)
         Path(file).write_bytes(browser.picture(top=34))

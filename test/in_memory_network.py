@@ -79,7 +79,7 @@ Transport = Callable[[m.Message, str], Iterable[tuple[float, m.Message]]]
 
 
 def on_time(message: m.Message, recipient: str) -> list[tuple[float, m.Message]]:
-    """Deliver a message once; a transport returns delays and messages that arrive after them."""
+    """Deliver a message once; a transport returns pairs of a delay [s] and a delivered message."""
     return [(LATENCY_S, message)]
 
 
@@ -191,7 +191,7 @@ class Network:
         return name in self._roles
 
     def add_user(self, user: int, place, suffix: str = '') -> None:
-        """Start a user; with the suffix ``_twin`` it may have the number of another one."""
+        """Start a user; with the suffix ``_twin``, it may have the number of another user."""
         self.add_users({user: place}, f'user{user}{suffix}')
 
     def add_users(self, places, name: str) -> None:
@@ -202,7 +202,7 @@ class Network:
         self.add(name)
 
     def add(self, name: str) -> None:
-        """Start a role anew; ``<name>_twin`` is a second one."""
+        """Start a role, or start it again; ``<name>_twin`` is a second instance."""
         self.instances[name] = next(self._next_instance)
         role = self._roles[name] = self._build(name)
         if self._kind(name) in USE_CODEBOOKS and self._codebook is not None:
@@ -211,7 +211,7 @@ class Network:
         self._report_missing()
 
     def remove(self, name: str, noticed: bool = True) -> None:
-        """Crash a role; if not noticed, its peers detect it at the next change only."""
+        """Crash a role; unless this is `noticed`, its peers detect it only at the next change."""
         del self._roles[name]
         if noticed:
             self._report_missing()
@@ -229,7 +229,7 @@ class Network:
                 self.dispatch(name, CodebookOffered(codebook))
 
     def change(self, name: str, **values) -> None:
-        """Offer new settings to a role: those offered last, with these values replaced."""
+        """Offer a role the settings that were offered last, with these values replaced."""
         role = self._roles[name]
         self.dispatch(name, SettingsOffered(dataclasses.replace(role._settings.latest, **values)))
 
@@ -323,7 +323,7 @@ class Network:
         self.run(lambda: self._roles[name].state is state, limit_s)
 
     def sent(self, kind: type[m.Message], since: int = 0, **fields) -> list:
-        """Return messages of a class with these field values, from an index of the log on."""
+        """Return messages of a class with these field values, from index `since` of the log."""
         return [sent.message for sent in self.log[since:] if type(sent.message) is kind
                 and all(getattr(sent.message, k) == v for k, v in fields.items())]
 
@@ -339,7 +339,7 @@ class Network:
         return {name: dict(role.counters) for name, role in self._roles.items() if role.counters}
 
     def logged(self, name: str) -> list[str]:
-        """Return the texts that a role logged, without those that say that it serves."""
+        """Return the texts that a role logged, except for those that begin with ``serving``."""
         return [text for text in self.logged_texts(name) if not text.startswith('serving: ')]
 
     def logged_texts(self, name: str) -> list[str]:
@@ -437,7 +437,7 @@ class Network:
 
 @pytest.fixture(scope='module')
 def plain_beams():
-    """Replace the optimisation of beams, most of a cycle, by a function of the position."""
+    """Replace the optimisation of beams, which takes most of a cycle, by a simple function."""
     def choose(scenario, position, covariance_m2, bands, surface):
         angles = np.arange(scenario.n_elements) * np.abs(position).sum()
         digital = np.full((scenario.n_subbands, scenario.n_feeds), 0.1 + 0j)

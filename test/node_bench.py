@@ -1,4 +1,4 @@
-"""Nodes in the process of the test, which spins them itself, on the domain of `node_processes`."""
+"""Nodes in the process of a test, which spins them itself in the domain of `node_processes`."""
 
 import contextlib
 import dataclasses
@@ -40,7 +40,7 @@ class Bench:
         self._nodes = []
 
     def add(self, kind, *args, **options):
-        """Create a node and spin it from now on."""
+        """Create a node, and include it in all later spinning."""
         node = kind(*args, context=self.context, **options)
         self._nodes.append(node)
         self._executor.add_node(node)
@@ -52,7 +52,7 @@ class Bench:
         node.destroy_node()
 
     def spin_once(self):
-        """Spin once, as a node does: an exception is raised."""
+        """Spin once; as in a node's process, exceptions of callbacks are raised."""
         self._executor.spin_once(timeout_sec=0.01)
 
     def until(self, condition, what='the condition'):

@@ -142,7 +142,7 @@ class Watch:
         self._context = Context()
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self.node = Node('watch', namespace=namespace, context=self._context)
-        # It requires a standard error with a file descriptor, which pytest may have replaced.
+        # The executor requires a standard error with a descriptor, which pytest may have replaced.
         with contextlib.redirect_stderr(sys.__stderr__):
             self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self.node)

@@ -78,7 +78,7 @@ class CycleRecord(CycleTimes):
 
     @property
     def truth(self) -> m.GroundTruth | None:
-        """True position of the located user, sent by the same node; None if unknown."""
+        """True position from the node whose user was located; None if unknown."""
         instance = self.estimate.user_instance if self.estimate else 0
         return next((truth for sender, truth in reversed(self.truths.items())
                      if m.same_instance(sender, instance)), None)
@@ -117,7 +117,7 @@ class CycleLog:
         return [record for record in self.given_up if record.outcome != Outcome.NO_FIX.value]
 
     def add(self, message: m.Message, now_s: float) -> None:
-        """Add a message of one of the types `RECEIVES` that arrived at `now_s` [s]."""
+        """Add a message whose type is in `RECEIVES`; `now_s` is the time of its arrival [s]."""
         if not message.cycle_id:
             return
         if isinstance(message, m.Beacon):

@@ -42,7 +42,7 @@ class NodeStatus(NamedTuple):
 
 
 class Overview:
-    """Phase, cycles, users and nodes of one network; unknown values are 0, empty or None.
+    """Phase, cycles, users and nodes of one network; unknown values are 0, NaN, empty or None.
 
     `phase` is the phase of the base station, or `RESTING` between cycles. `codebook_id` belongs to
     the latest signals. `users` holds the latest complete cycle of each user by id, and `nodes` the
@@ -62,7 +62,7 @@ class Overview:
         self.began_s = math.inf
 
     def add(self, message: m.Message, now_s: float) -> None:
-        """Add a message of one of the types `cycle_log.RECEIVES` that arrived at `now_s` [s]."""
+        """Add a message whose type is in `cycle_log.RECEIVES`; it arrived at `now_s` [s]."""
         self.began_s = min(self.began_s, now_s)
         match message:
             case m.Beacon():
@@ -167,8 +167,8 @@ class UserState:
 class SceneState:
     """The configuration of the surface, the latest beam, and the users by id.
 
-    There are at most `MAX_USERS`, because the ids come from messages. Further users are ignored
-    until others are discarded.
+    There are at most `MAX_USERS` users, because their ids come from messages. Further users are
+    ignored until others are discarded.
     """
 
     def __init__(self) -> None:
@@ -178,7 +178,7 @@ class SceneState:
         self._beam_s = math.nan
 
     def add(self, message: m.Message, now_s: float) -> None:
-        """Add a message of one of the types `SCENE_RECEIVES` that arrived at `now_s` [s]."""
+        """Add a message whose type is in `SCENE_RECEIVES`; it arrived at `now_s` [s]."""
         match message:
             case m.RhsConfiguration():
                 self.configuration = message
@@ -206,7 +206,7 @@ class SceneState:
 
     @property
     def drawable(self) -> bool:
-        """Whether the surface, an estimate and its beam are known."""
+        """Whether the configuration of the surface, an estimate and its beam are known."""
         return self.configuration is not None and self.shown_beam is not None
 
     @property

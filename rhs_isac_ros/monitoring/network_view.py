@@ -50,7 +50,7 @@ _MAX_SERIES = 4
 _MAX_NODES = 4096
 # Maximum number of users in the scene, because the ids come from messages.
 _MAX_USERS = 64
-# Maximum number of users with a name in the scene: more names hide it.
+# Maximum number of users with a name in the scene: more names would hide the scene.
 _MAX_NAMES = 8
 # Number of latest cycles whose messages may still arrive.
 _MAX_CYCLES = 64
@@ -59,7 +59,7 @@ _RED, _WHITE, _GREEN, _BLUE, _ORANGE, _GREY = (
     (0.95, 0.3, 0.3), (0.95, 0.95, 0.95), (0.35, 0.8, 0.4), (0.4, 0.6, 1.0), (1.0, 0.65, 0.2),
     (0.6, 0.6, 0.6))
 _PHASE_COLOURS = dict(zip(m.Phase, (_BLUE, _GREEN, _ORANGE, _RED), strict=True))
-# In the chart of the modes: half the width, the distance between lines, and the height of the
+# In the chart of the modes: half the width, the distance between lines, and the height of
 # probability 1 [m].
 REACH_M, _STEP_M, HEIGHT_M = 3.0, 0.6, 3.0
 _LABEL_OFFSET_M = 0.2
@@ -95,7 +95,7 @@ class Charts:
                 yield Entry(cycle, path, Number(float(value)))
 
     def dropped(self, node: str, count: int) -> Iterator[Sample]:
-        """Yield the numbers of messages dropped by all nodes together, and by this node.
+        """Yield the number of messages dropped by all nodes, and the `count` dropped by a node.
 
         Only the first four nodes that dropped a message have their own series.
         """
@@ -160,7 +160,7 @@ def mode_axes() -> tuple[Lines, Points]:
 
 
 def mode_bars(user: int, found: WeightedModes, origin: np.ndarray) -> Lines:
-    """Return the modes as bars in the colour of a user, at their range error from the origin."""
+    """Return the modes as bars in the colour of a user; `origin` has the range error 0."""
     errors = np.linalg.norm(found.positions, axis=1) - np.linalg.norm(origin)
     return Lines(tuple(_line(error, HEIGHT_M * probability) for error, probability in zip(
         errors.tolist(), found.probabilities.tolist(), strict=True)),
@@ -168,7 +168,7 @@ def mode_bars(user: int, found: WeightedModes, origin: np.ndarray) -> Lines:
 
 
 def mode_estimate(position: np.ndarray, origin: np.ndarray) -> Lines:
-    """Return an estimate, float64 [3] [m], as a white line at its range error from the origin."""
+    """Return an estimate, float64 [3] [m], as a white line; `origin` has the range error 0."""
     error = float(np.linalg.norm(position) - np.linalg.norm(origin))
     return Lines((_line(error, HEIGHT_M),), (1.0, 1.0, 1.0), _LINE_WIDTH)
 
@@ -202,7 +202,7 @@ class NetworkView:
                 Entry(0, f'{MODES}/grid', grid), Entry(0, f'{MODES}/labels', labels)]
 
     def add(self, message: m.Message, now_s: float) -> list[Entry]:
-        """Add a message of one of the types `RECEIVES` that arrived at `now_s` [s]."""
+        """Add a message whose type is in `RECEIVES`; it arrived at `now_s` [s]."""
         cycle = self._count(message.cycle_id)
         if isinstance(message, cycle_log.RECEIVES):
             self._log.add(message, now_s)
@@ -219,7 +219,7 @@ class NetworkView:
         return [*self._charts.entries(self._count(0), self._charts.dropped(node, count))]
 
     def add_modes(self, received: m.ReceivedSignals, found: WeightedModes | None) -> list[Entry]:
-        """Add the modes of the posterior for received signals; None if there is no position."""
+        """Add the modes of the posterior of received signals; `found` is None without a fix."""
         if not self._shows(received.user):
             return []
         cycle, path = self._count(received.cycle_id), f'{_path(received.user)}/modes'
@@ -233,7 +233,7 @@ class NetworkView:
     def add_track(
             self, cycle_id: int, user: int, position: np.ndarray, covariance_m2: np.ndarray,
             velocity: np.ndarray) -> list[Entry]:
-        """Add a position [m] and a velocity [m/s] of a track; `cycle_id` 0 stands for unknown."""
+        """Add a position [m] and a velocity [m/s] of a track; `cycle_id` is 0 if unknown."""
         if not self._shows(user):
             return []
         positions = self._tracks.setdefault(user, new_path())
@@ -308,7 +308,7 @@ class NetworkView:
         return user in self._users
 
     def _count(self, cycle_id: int) -> int:
-        """Return the number of a cycle; messages outside of cycles belong to the latest one."""
+        """Return the number of a cycle; messages outside of cycles belong to the latest cycle."""
         if not cycle_id:
             return max(self.n_cycles, 1)
         if cycle_id not in self._cycles:

@@ -11,10 +11,10 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Outcome, Send, kind_of
 
-# Number of latest durations in the percentiles.
+# Number of latest durations from which percentiles are computed.
 _MAX_DURATIONS = 512
 _PERCENTS = (50, 95, 99)
-# Counters that are no faults.
+# Counters that do not indicate faults.
 _NO_FAULTS = {Outcome.UNANSWERED.value}
 # Maximum number of reasons in a summary.
 _MAX_REASONS = 3
@@ -22,10 +22,10 @@ _MAX_REASONS = 3
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """Diagnostics of a node: whether there is a fault, a line about it, and all values.
+    """Diagnostics of a node: whether there is a fault, a one-line summary, and all values.
 
-    A fault is one that persists or has occurred since the last report. ``docs/interfaces.rst``
-    lists the keys of the values.
+    `fault` is True if a fault persists or has occurred since the last report.
+    ``docs/interfaces.rst`` lists the keys of the values.
     """
 
     fault: bool
@@ -39,7 +39,7 @@ class RoleStatistics:
     def __init__(self) -> None:
         # Descriptions of the roles that are missing.
         self.missing: tuple[str, ...] = ()
-        # Number of messages by section of the report and by type; faults up to the last report.
+        # Number of messages by section of the report and by type; faults until the last report.
         self._messages: dict[str, collections.Counter[str]] = {
             'received': collections.Counter(), 'sent': collections.Counter()}
         self._faults: collections.Counter[str] = collections.Counter()
@@ -53,7 +53,7 @@ class RoleStatistics:
         self._messages['received'][kind.__name__] += 1
 
     def record(self, event: Event, actions: Sequence[Action], handling_s: float) -> None:
-        """Record an event, the actions that it caused, and the time taken [s]."""
+        """Record an event, the actions that it caused, and the time taken to handle it [s]."""
         if isinstance(event, CodebookOffered):
             self._codebook_id = event.codebook.id
         self._durations_s['handling_ms'].append(handling_s)
@@ -73,7 +73,7 @@ class RoleStatistics:
             status: Mapping[str, str] = types.MappingProxyType({})) -> Report:
         """Create a report, with the faults since the previous call.
 
-        The `phase` is the state of the role, which is `blocked` if it lacks something in this
+        `phase` is the state of the role, and `blocked` whether the role lacks something in this
         state. `status` contains the status of the role and the conflicts of the node.
         """
         values = {'phase': phase} if phase else {}
@@ -109,7 +109,7 @@ class RoleStatistics:
         return Report(True, summary, values)
 
     def _codebook_ids(self, in_use: str) -> dict[str, str]:
-        """Return the ids of the codebook in use (or first offered) and of a pending one."""
+        """Return the ids of the codebook in use (or first offered) and of a pending codebook."""
         if not self._codebook_id:
             return {}
         if in_use in ('', self._codebook_id):

@@ -22,7 +22,7 @@ Colour: TypeAlias = tuple[float, float, float]
 
 
 class Points(NamedTuple):
-    """Balls, or discs in a plane, with one label for each or no labels."""
+    """Balls, or discs in a plane; `labels` contains one label for each, or is empty."""
 
     positions: np.ndarray
     colours: np.ndarray
@@ -43,7 +43,7 @@ class Ellipsoids(NamedTuple):
 
 
 class Boxes(NamedTuple):
-    """Cuboids along the coordinate axes, solid or as outlines."""
+    """Cuboids aligned with the coordinate axes, drawn solid or as outlines."""
 
     centres: np.ndarray
     half_sizes_m: np.ndarray
@@ -73,7 +73,7 @@ class Picture(NamedTuple):
 
 
 class Series(NamedTuple):
-    """The name of the numbers on a path, and their style: a line or dots."""
+    """The name and the style, a line or dots, of the numbers on a path."""
 
     name: str
     colour: Colour
@@ -112,9 +112,9 @@ class Entry(NamedTuple):
     entity: Entity
 
 
-# Level relative to the maximum of a beam that corresponds to zero length of a lobe.
+# Level, relative to the maximum of a beam, at which the radius of a lobe is zero.
 MIN_LEVEL_DB = -20.0
-# Radius of the invisible balls of labels.
+# Radius of the invisible balls to which labels are attached.
 INVISIBLE_M = 1e-3
 # The hues of consecutive users differ by the golden ratio.
 _HUE_STEP = 0.618034
@@ -125,13 +125,13 @@ _MODE_RADIUS_M = 0.2
 # Modes with a smaller probability are not shown.
 _MIN_PROBABILITY = 0.005
 _LINE_WIDTH, _PATH_WIDTH = 2.0, 0.8
-# Brightness of paths, so that other entities stand out against them.
+# Relative brightness of paths, which are dim so that other entities stand out.
 _DIM = 0.45
-# Height of the name above the user, where it does not hide the estimate.
+# Height of the name above the user, so that the name does not hide the estimate.
 _NAME_HEIGHT_M = 1.0
 # Edge of the enlarged surface, relative to the distance of the region.
 _BOARD_SIZE = 0.2
-# Viewers do not show bodies without extent.
+# Minimum half size: viewers do not show bodies without extent.
 _MIN_HALF_SIZE_M = 1e-3
 _MAX_GREY = 255
 
@@ -175,7 +175,7 @@ def board(scenario: Scenario, configuration: np.ndarray | None, enlarged: bool =
     """Return the surface as one plate for each element, from dark for 0 to bright for 1.
 
     The brightness is the mean over the frames of a configuration, float64 [F, N_E] in [0, 1], or
-    None. The `enlarged` surface shows single elements in a view of the whole region.
+    0.5 for None. If `enlarged`, single elements are visible in a view of the whole region.
     """
     positions, interval_m = element_positions(scenario), element_interval_m(scenario)
     if enlarged:
@@ -239,8 +239,8 @@ def path(user: int, positions: Iterable[np.ndarray]) -> Lines:
 def traced(scenario: Scenario, message: m.GroundTruth) -> Lines:
     """Return the propagation paths to the surface from the traced position nearest to a user.
 
-    A reflecting wall is halfway between the virtual source of a path and the user.
-    Paths with more reflections are left out. Without a channel file, there are no paths.
+    The wall that reflects a path is halfway between the user and the path's virtual source.
+    Paths with several reflections are left out. Without a channel file, there are no paths.
     """
     strips: list[np.ndarray] = []
     if channel := scenario.channel:
@@ -258,7 +258,7 @@ def traced(scenario: Scenario, message: m.GroundTruth) -> Lines:
 def track(
         user: int, positions: Iterable[np.ndarray], velocity: np.ndarray,
         covariance_m2: np.ndarray) -> tuple[Lines, Ellipsoids]:
-    """Return a track with the motion in the next second, and the 95 % ellipsoid.
+    """Return a track, extended by the motion in the next second, and the 95 % ellipsoid.
 
     The positions, float64 [3] [m] each, end with the latest one.
     """

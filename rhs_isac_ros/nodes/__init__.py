@@ -1,8 +1,8 @@
-"""The executables of the roles: thin adapters between a role and ROS 2."""
+"""The executables that run nodes, most of them thin adapters between a role and ROS 2."""
 
 import os
 
 # Many processes compute small matrix products, so additional threads would only compete for the
-# cores. The libraries read these variables when NumPy is imported, which must happen later.
+# cores. The libraries read these variables when NumPy is imported, so they are set before that.
 for _name in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS'):
     os.environ.setdefault(_name, '1')

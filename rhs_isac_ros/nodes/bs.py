@@ -34,7 +34,7 @@ _MAX_GOALS = 100
 
 @dataclasses.dataclass(eq=False)
 class _Goal:
-    """A goal in progress, and the cycle that serves its user; 0 until this cycle begins."""
+    """A goal in progress; `cycle_id` is the cycle that positions its user, or 0 before that."""
 
     handle: Any
     future: Future
@@ -42,9 +42,9 @@ class _Goal:
 
 
 class LocateServer:
-    """Serves the action ``locate``, following the messages of the base station.
+    """Serves the action ``locate`` from the messages that the base station sends and receives.
 
-    It calls `request` with the user of each accepted goal, and `pose` to convert an estimate.
+    `request` asks the base station to serve a user; `pose` converts an estimate to a pose.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class LocateServer:
             cancel_callback=self._cancel))
 
     def observe(self, message: m.ProtocolState | m.PositionEstimate | m.NoFix) -> None:
-        """Process a message that the base station has sent or received."""
+        """Update the goals with a message that the base station has sent or received."""
         phase = message.phase if isinstance(message, m.ProtocolState) else None
         for goal in [one for one in self._goals if one.handle.request.user == message.user]:
             if phase is m.Phase.POSITIONING:
@@ -67,7 +67,7 @@ class LocateServer:
             if goal.cycle_id != message.cycle_id:
                 continue
             if phase is m.Phase.BEACONING:
-                # The cycle has ended without a position, so the user needs another one.
+                # The cycle has ended without a position, so the user needs another cycle.
                 goal.cycle_id = 0
                 self._request(message.user)
             match message:
@@ -80,7 +80,7 @@ class LocateServer:
                     self._end(goal, f'no fix: {message.reason}')
 
     def destroy(self, delay_s: float = 0.0) -> None:
-        """Abort all goals, and withdraw the action `delay_s` later, when the results are sent."""
+        """Abort all goals; withdraw the action `delay_s` [s] later, once the results are sent."""
         for goal in list(self._goals):
             self._end(goal, 'the base station ends or stands by')
         server, self._server = self._server, None
@@ -103,7 +103,7 @@ class LocateServer:
     def _cancel(self, handle: Any) -> CancelResponse:
         for goal in self._goals:
             if goal.handle.goal_id == handle.goal_id:
-                # Later, when the handle has the state CANCELING.
+                # Not yet: the handle enters the state CANCELING after this callback.
                 self._later(0.0, functools.partial(self._end, goal, 'canceled'))
         return CancelResponse.ACCEPT
 
@@ -143,7 +143,7 @@ class LocateServer:
         goal.future.set_result(result or Locate.Result(reason=reason))
 
 
-# Time for a node that stands by to send the results of its goals [s].
+# Time in which a node that stands by can still send the results of its goals [s].
 _FAREWELL_S = 0.5
 
 
@@ -172,7 +172,7 @@ class BsNode(RoleNode[BaseStation]):
                 self.create_service, Trigger, name, functools.partial(self._on_request, request)))
 
     def stand_by(self) -> None:
-        """End the action ``locate``, and abandon the cycle."""
+        """Withdraw the action ``locate``, and abandon the cycle."""
         self._end_locate(_FAREWELL_S)
         self.dispatch(events.StoodBy())
 
@@ -182,13 +182,13 @@ class BsNode(RoleNode[BaseStation]):
         self._locate = self._make_locate()
 
     def dispatch(self, event: events.Event) -> None:
-        """Pass an event to the role and to the action ``locate``."""
+        """Pass an event to the role, and an estimate or a missing fix to the action ``locate``."""
         super().dispatch(event)
         if self._locate and isinstance(event, m.PositionEstimate | m.NoFix):
             self._locate.observe(event)
 
     def publish(self, message: m.Message) -> bool:
-        """Publish a message, and pass it to the action ``locate``."""
+        """Publish a message, and pass a published `ProtocolState` to the action ``locate``."""
         is_published = super().publish(message)
         if is_published and self._locate and isinstance(message, m.ProtocolState):
             self._locate.observe(message)
@@ -200,7 +200,7 @@ class BsNode(RoleNode[BaseStation]):
         self._locate = None
 
     def execute(self, action: events.Action) -> None:
-        """Store a reply for the service that requested it."""
+        """Store a reply for the service call that caused it."""
         if isinstance(action, events.Reply):
             self._reply = action
         else:
@@ -223,7 +223,7 @@ class BsNode(RoleNode[BaseStation]):
 
 
 def _cycle_from_clock() -> int:
-    """Return the milliseconds since 1970. A cycle takes longer than 1 ms, so no id is reused."""
+    """Return the milliseconds since 1970 as a cycle id, unused because a cycle takes over 1 ms."""
     return time.time_ns() // 1_000_000
 
 

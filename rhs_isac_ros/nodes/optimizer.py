@@ -1,4 +1,4 @@
-"""The executable ``optimizer``: optimises a codebook, and holds it as parameters or pushes it."""
+"""The executable ``optimizer``: optimises a codebook, and holds it or sends it to a network."""
 
 import argparse
 import sys
@@ -37,11 +37,11 @@ from rhs_isac_ros.support.arguments import ArgumentParser, HelpFormatter, input_
 
 
 class GroupParameterService(ParameterService):
-    """Parameter services of a node with a group of parameters that only change together.
+    """Parameter services of a node with a group of parameters that can only be set together.
 
     The service ``set_parameters`` of rclpy, which ``ros2 param load`` uses, sets parameters one by
-    one. Here, all parameters in a request whose names begin with `prefix` are set, or none. Create
-    the node with ``start_parameter_services=False``.
+    one. Here, it sets either all or none of the parameters in a request whose names begin with
+    `prefix`. Create the node with ``start_parameter_services=False``.
     """
 
     def __init__(self, node: Node, prefix: str) -> None:
@@ -76,10 +76,10 @@ class PushError(RuntimeError):
 
 
 def push(node: Node, codebook: Codebook, timeout_s: float = 10.0) -> None:
-    """Set the parameters of the optimizer in the namespace of a node to a codebook.
+    """Send a codebook to the optimizer in the namespace of a node, by setting its parameters.
 
     This function spins the node, so it must not be called from a callback. It raises PushError if
-    there is no optimizer, or if the optimizer does not respond or rejects the codebook.
+    no optimizer responds within `timeout_s`, or if the optimizer rejects the codebook.
     """
     optimizer = f'{node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
     client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)
@@ -100,7 +100,7 @@ def push(node: Node, codebook: Codebook, timeout_s: float = 10.0) -> None:
 
 
 class OptimizerNode(ParameterizedNode):
-    """Holds the codebook as parameters that only change together, and announces it.
+    """Holds the codebook as parameters that can only be set together, and announces it.
 
     The first codebook comes from a parameter file on the command line or from ``codebook_file``.
     While a newer optimizer is present, this one withdraws its announcement.
@@ -118,7 +118,7 @@ class OptimizerNode(ParameterizedNode):
         for name, text in CODEBOOK.items():
             self.declare_parameter(name, defaults[name], ParameterDescriptor(description=text))
         self._codebook_id, self._refused = '', 0
-        # A file of an earlier version contains another provenance, and may lack the id.
+        # In a file of an earlier version, the provenance differs and the id may be missing.
         self.set_parameters_atomically(
             ros_parameters(self._first_codebook(file).to_parameters()))
         self._announce(False)
@@ -220,7 +220,7 @@ def _given_codebook_values(changes: list[Parameter]) -> dict[str, Any]:
 def main(args: Sequence[str] | None = None) -> int:
     """Run the executable, and return its exit code.
 
-    Without options, hold a codebook. With options, optimise one and write it to a file first; with
+    Without options, hold a codebook. With options, first optimise one and write it to a file; with
     ``--push``, send it to a running optimizer instead of holding it. The exit code is 0 on success
     or after a signal, 1 if a network does not accept the codebook, and 2 if an argument or a file
     is invalid.

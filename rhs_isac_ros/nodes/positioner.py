@@ -30,7 +30,7 @@ from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import ParameterError
 
-# Minimum time between reports of the progress of a table.
+# Minimum time between log messages about the progress of a table [s].
 _LOG_PERIOD_S = 5.0
 
 
@@ -52,9 +52,9 @@ class PositionerNode(RoleNode[Positioner]):
         self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
 
     def make_settings(self, values: types.SimpleNamespace) -> PositionerSettings:
-        """Return the settings for parameters whose files and plug-ins can be loaded.
+        """Return the settings; raise ParameterError if a file or a plug-in cannot be loaded.
 
-        Only the construction of the estimator checks whether a model fits the codebook.
+        Whether a model fits the codebook is only checked when the estimator is built.
         """
         settings: PositionerSettings = super().make_settings(values)
         calibrated_surface(values, self.scenario)
@@ -64,7 +64,7 @@ class PositionerNode(RoleNode[Positioner]):
                 plugins.load(plugins.ESTIMATORS, settings.estimator)
             return settings
         if settings.estimator != positioning.NeuralEstimator.name:
-            # Other estimators do not use the file, so a change of it must not rebuild them.
+            # Other estimators do not use the model, so a new `model_file` must not rebuild them.
             return dataclasses.replace(settings, model_file='')
         if settings.calibration_file:
             raise ParameterError(
@@ -90,21 +90,21 @@ class PositionerNode(RoleNode[Positioner]):
             options['surface'] = load_surface(settings.calibration_file, self.scenario)
         estimator = positioning.make_estimator(
             settings.estimator, self.scenario, codebook, **options)
-        # The first estimate takes longer than later ones, so it is not left to a user.
+        # The first estimate takes longer than later ones; no user should have to wait for it.
         center = np.array([self.scenario.roi_center_m])
         estimator.estimate(simulate_received(
             self.scenario, codebook, center, np.random.default_rng(0))[0])
         return estimator
 
     def _on_progress(self, share: float) -> None:
-        """Log the progress of a long computation of a table, in the background thread."""
+        """Log the completed share of a table; called from the background thread."""
         self._table = f'{100 * share:.0f} %' if share < 1 else ''
         self.get_logger().info(  # type: ignore[no-untyped-call]
             f'table of templates: {100 * share:.0f} % computed',
             throttle_duration_sec=_LOG_PERIOD_S, skip_first=True)
 
     def report(self) -> Report:
-        """Return the diagnostics, including the progress while a table is computed."""
+        """Return the diagnostics, which show progress while a table is being computed."""
         report = super().report()
         if not self._table:
             return report
@@ -137,7 +137,7 @@ class PositionerNode(RoleNode[Positioner]):
             self.subscribe()
 
     def publish(self, message: m.Message) -> bool:
-        """Publish a message, and the poses of an estimate; return whether this succeeded."""
+        """Publish a message, an estimate also as a pose; return whether the message was sent."""
         is_published = super().publish(message)
         if is_published and isinstance(message, m.PositionEstimate):
             publishers = self._pose, *self._user_poses.publishers(message.user)

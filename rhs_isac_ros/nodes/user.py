@@ -29,7 +29,7 @@ _MAX_AGE_S = 5.0
 class RobotMobility:
     """Mobility of a robot: the latest position, extrapolated with the velocity.
 
-    A position is valid for `timeout_s`. The text of `lack` begins with `source`.
+    `source` describes the origin of the positions. A position is valid for `timeout_s`.
     """
 
     def __init__(self, node: Node, frame: Frame, source: str, timeout_s: float) -> None:
@@ -40,7 +40,7 @@ class RobotMobility:
         self._position, self._velocity = np.full(3, np.nan), np.zeros(3)
 
     def put(self, stamp_ns: int, position: np.ndarray, velocity: np.ndarray) -> None:
-        """Store a position [3] [m] and a velocity [3] [m/s] in the frame of standard messages."""
+        """Store a position [3] [m] and a velocity [3] [m/s] in `frame`; stamp 0 means now."""
         self._error = ''
         self._arrived_s = time.monotonic()
         self._stamp_ns = stamp_ns or self._clock.now().nanoseconds
@@ -53,7 +53,7 @@ class RobotMobility:
 
     @property
     def lack(self) -> str:
-        """Reason why there is currently no position; empty if there is one."""
+        """Reason why there is currently no position; empty if there is a position."""
         if self._error:
             return f'{self._source}: {self._error}'
         if time.monotonic() > self._arrived_s + self._timeout_s:
@@ -75,7 +75,7 @@ class RobotMobility:
 
 
 def follow_odometry(node: Node, frame: Frame, topic: str, timeout_s: float) -> RobotMobility:
-    """Return the mobility of a robot whose odometry is in the frame `frame`."""
+    """Return the mobility of a robot that publishes odometry in the frame `frame` on a topic."""
     full_name = node.resolve_topic_name(topic)
     mobility = RobotMobility(node, frame, f'odometry on {full_name}', timeout_s)
 
@@ -99,7 +99,7 @@ def follow_odometry(node: Node, frame: Frame, topic: str, timeout_s: float) -> R
 
 
 def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> RobotMobility:
-    """Return the mobility of a frame of tf2, with velocities from consecutive transforms.
+    """Return the mobility of the frame `child` in tf2; consecutive transforms give the velocity.
 
     Raises ParameterError if ``tf2_ros`` is not installed.
     """
@@ -112,7 +112,7 @@ def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> Robo
     mobility = RobotMobility(node, frame, f'transform from {frame.name} to {child}', timeout_s)
 
     def listen() -> tuple[Any, Any]:
-        # The buffer offers a service.
+        # The buffer also creates a service, which may be refused.
         buffer = tf2_ros.Buffer(node=node)
         return buffer, tf2_ros.TransformListener(buffer, node)
     source = endpoints.create_or_refuse(node, f'subscription to {topics.TF}', listen)
@@ -141,7 +141,7 @@ def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> Robo
 class UserNode(RoleNode[User]):
     """One or many users of the network."""
 
-    # The mobility of a robot, if the user is one.
+    # The mobility of the robot, if the user is a robot.
     _robot: RobotMobility | None = None
 
     def __init__(self, name: str = '', **node_options: Any) -> None:

@@ -1,4 +1,4 @@
-"""The executable ``visualizer``: publishes what RViz and Foxglove show of a network."""
+"""The executable ``visualizer``: publishes markers, paths and transforms for RViz and Foxglove."""
 
 import copy
 import functools
@@ -33,7 +33,7 @@ from rhs_isac_ros.ros.topics import RHS_FRAME, TF, TF_STATIC
 
 # Opacity of translucent bodies.
 _ELLIPSOID, _OUTLINE, _MESH = 0.35, 0.15, 0.25
-# Width in the scene of one screen point of line width [m].
+# Width in the scene that corresponds to a line width of one screen point [m].
 _LINE_M = 0.02
 
 
@@ -41,7 +41,7 @@ def marker(
         namespace: str, number: int,
         shape: shapes.Points | shapes.Ellipsoids | shapes.Boxes | shapes.Lines | shapes.Mesh,
         stamp: Time) -> Marker:
-    """Convert a shape to a marker; ellipsoids and boxes that are not solid are translucent."""
+    """Convert a shape to a marker; ellipsoids, meshes and outlined boxes are translucent."""
     match shape:
         case shapes.Points():
             found = _marker(namespace, number, Marker.SPHERE, stamp)
@@ -84,14 +84,14 @@ def deletion(namespace: str, number: int, stamp: Time) -> Marker:
 
 
 def place(marker: Marker, frame: Frame) -> Marker:
-    """Express the pose of a marker, to which its points are relative, in a frame."""
+    """Express the pose of a marker in a frame, in place; its points are relative to the pose."""
     marker.header.frame_id = frame.name
     marker.pose = frame.pose(marker.pose)
     return marker
 
 
 def path(positions: Iterable[np.ndarray], stamp: Time, frame: Frame) -> Path:
-    """Return positions, float64 [3] [m] each, as a path in a frame, without orientations."""
+    """Convert positions, float64 [3] [m] each, to a path in a frame, without orientations."""
     header = Header(stamp=stamp, frame_id=frame.name)
     return Path(header=header, poses=[
         PoseStamped(header=header, pose=Pose(position=to_ros(Point, frame.from_surface(position))))
@@ -135,7 +135,7 @@ def transform(
 
 
 class TransformPublisher:
-    """Publishes transforms if ``tf2_msgs`` is `available`; there is no wheel of it.
+    """Publishes transforms if ``tf2_msgs``, which has no wheel, is installed (`available`).
 
     The constructor publishes the static transform of the surface.
     """

@@ -51,7 +51,7 @@ def integer(low: int, high: int = 10**9) -> Callable[[str], int]:
 
 # Further types for argparse.
 positive_int = integer(1)
-# A seed is valid as a ROS parameter too.
+# Every such seed is also valid as a ROS parameter.
 seed = integer(0, 2**31 - 1)
 positive_float = _number(Field(float, low=0, is_open=True))
 nonnegative_float = _number(Field(float, low=0))
@@ -104,7 +104,7 @@ def picture_file(text: str) -> Path:
 
 
 def output_folder(text: str) -> Path:
-    """Parse the path of a folder that exists or can be made, or raise ArgumentTypeError."""
+    """Parse the path of a folder that exists or can be created, or raise ArgumentTypeError."""
     path = Path(text)
     # The nearest ancestor that exists; the root always does.
     try:
@@ -123,7 +123,7 @@ def check_distinct(
         parser: argparse.ArgumentParser, options: argparse.Namespace, unused: str = '') -> None:
     """Exit with a usage error if an output file is also an input or another output.
 
-    The default of the option `unused` has no effect.
+    The option `unused` is ignored, because its default is not used.
     """
     outputs, names = (output_file, picture_file), dict[Path, str]()
     # Inputs come first.

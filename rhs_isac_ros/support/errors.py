@@ -8,7 +8,7 @@ from collections.abc import Iterator
 def translated(
         caught: type[Exception] | tuple[type[Exception], ...], kind: type[Exception],
         place: object = '') -> Iterator[None]:
-    """Convert exceptions of the block to another kind, prefixed by a file or a field."""
+    """Convert exceptions in a block to another kind, with `place` (a file or field) as prefix."""
     try:
         yield
     except caught as error:

@@ -76,7 +76,7 @@ class Field:
                 and all(isinstance(number, float) for number in value))
 
     def _choice_problem(self, value: str) -> str:
-        # Listing the installed plug-ins takes time; the built-in choices do not need it.
+        # Listing the installed plug-ins takes time, and is not necessary for built-in choices.
         installed = plugins.names(self.plugins) if value not in self.choices else ()
         if value in (*self.choices, *installed):
             return ''

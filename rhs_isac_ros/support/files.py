@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 # Maximum size of the arrays of an archive, and of a YAML file, which takes up to 240 times as much
-# memory [bytes].
+# memory as its size [bytes].
 _MAX_BYTES, _MAX_YAML_BYTES = 2**28, 2**24
 # Maximum depth of the lists and mappings of a YAML file.
 _MAX_YAML_DEPTH = 16
@@ -78,7 +78,7 @@ def read_yaml(path: str | Path) -> Any:
         if len(data) > _MAX_YAML_BYTES:
             raise ValueError(f'more than {_MAX_YAML_BYTES} bytes')
         text, depth = data.decode(), 0
-        # The C loader ends the process if the nesting is deep.
+        # In the C loader, deep nesting would end the process.
         for event in yaml.parse(text, _LOADER):
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
@@ -102,9 +102,9 @@ def write_archive(path: str | Path, arrays: Mapping[str, np.ndarray | float],
 def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np.ndarray]:
     """Read the arrays of a file of NumPy's format ``.npz``.
 
-    With names, the result is empty unless the file has exactly these arrays, apart from ``about``,
-    and does not compress them: compressed arrays may be far larger than the file. Raises
-    ArchiveError if the file cannot be read, is damaged, or contains more than 256 MiB.
+    With `names`, the result is empty unless the file has exactly these arrays, apart from
+    ``about``, and does not compress them: compressed arrays may be far larger than the file.
+    Raises ArchiveError if the file cannot be read, is damaged, or contains more than 256 MiB.
     """
     try:
         with open(path, 'rb') as stream:
@@ -126,7 +126,7 @@ def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np
 
 def read_archive(path: str | Path, kind: str, version: int, names: set[str]
                  ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read arrays and their description, without its ``format``.
+    """Read arrays and their description, without the key ``format``.
 
     Raises ArchiveError if the file cannot be read, is damaged, has a format other than `version`
     or arrays other than `names`. `kind` describes the content in errors.

@@ -14,7 +14,7 @@ class MissingLibraryError(ImportError):
 
 @contextlib.contextmanager
 def optional_import(purpose: str, extra: str = '') -> Iterator[None]:
-    """Replace an ImportError inside the block by a MissingLibraryError with instructions.
+    """Replace an ImportError in a block with a MissingLibraryError that contains instructions.
 
     The message begins with `purpose`, the task that needs the library. `extra` is the extra of
     this package that installs it.

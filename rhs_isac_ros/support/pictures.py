@@ -14,7 +14,7 @@ PICTURE_FORMATS = ('png', 'pdf', 'svg')
 COLUMN_IN, PAGE_IN = 3.5, 7.16
 # Colour map whose lightness grows with the value, even for colour-blind readers.
 COLOUR_MAP = 'cividis'
-# Matplotlib annotates the keys as literals, in some versions only.
+# Only some versions of Matplotlib annotate the keys as literals.
 _STYLE: dict[Any, object] = {
     # STIX resembles Times, the font of the paper, and is part of Matplotlib.
     'font.family': 'STIXGeneral', 'mathtext.fontset': 'stix', 'font.size': 8.0,
@@ -33,9 +33,9 @@ _STYLE: dict[Any, object] = {
     'pdf.fonttype': 42,
     # Text as outlines, because an SVG file contains no fonts.
     'svg.fonttype': 'path',
-    # Ids are the same in each run.
+    # With a fixed salt, ids are the same in each run.
     'svg.hashsalt': 'rhs_isac_ros'}
-# Decimal places of positions, relative to the size of a figure.
+# Decimal places of positions, which are relative to the size of a figure.
 _POSITION_DIGITS = 6
 # Without dates, repeated runs write the same file.
 _METADATA: dict[str, dict[str, Any]] = {
@@ -68,7 +68,7 @@ LOOKS = (
 
 
 def look(index: int) -> Look:
-    """Return the look of a series by its index; beyond the last one, looks repeat."""
+    """Return the look of a series by its index; looks repeat after the last of `LOOKS`."""
     return LOOKS[index % len(LOOKS)]
 
 
@@ -101,16 +101,16 @@ def new_figure(width_in: float, height_in: float) -> Any:
 def new_panels(
         width_in: float, height_in: float, n_rows: int, n_columns: int,
         **sharing: bool) -> tuple[Any, Any, Any]:
-    """Return a figure with the panels and the axes of `add_panels`."""
+    """Return a new figure, and the panels and the axes that `add_panels` adds to it."""
     figure = new_figure(width_in, height_in)
     return figure, *add_panels(figure.add_gridspec(1, 1)[0], n_rows, n_columns, **sharing)
 
 
 def add_panels(
         place: Any, n_rows: int, n_columns: int, **sharing: bool) -> tuple[Any, Any]:
-    """Return panels, an array of axes, and axes above them for a legend.
+    """Add panels in a grid; return them, an array of axes, and axes above them for a legend.
 
-    `place` is a Matplotlib `SubplotSpec`; `sharing` are ``sharex`` and ``sharey``.
+    `place` is a Matplotlib `SubplotSpec`; `sharing` may contain ``sharex`` and ``sharey``.
     """
     # The layout reserves the height of the legend. Before Matplotlib 3.7, it would reserve none
     # for a legend of the figure itself.
@@ -122,7 +122,7 @@ def add_panels(
 
 
 def label_decades(axis: Any) -> None:
-    """Label a logarithmic axis with plain numbers, after drawing on it."""
+    """Label a logarithmic axis with plain numbers; call this after drawing on it."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     low, high = axis.get_view_interval()

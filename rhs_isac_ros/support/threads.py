@@ -73,7 +73,7 @@ class _OneBlasThread(contextlib.ContextDecorator):
         return max(numbers, default=1)
 
     def after_fork(self) -> None:
-        """Restore the settings in a child process, to which the other callers do not belong."""
+        """Restore the settings in a child process, which begins with no callers."""
         self._lock, self._own, self._depth = threading.Lock(), threading.local(), 0
         _restore(self._saved)
         self._saved = []
@@ -81,8 +81,8 @@ class _OneBlasThread(contextlib.ContextDecorator):
     def find_libraries(self) -> None:
         """Find the BLAS libraries that the process has loaded.
 
-        The search holds the lock of the dynamic loader and needs the lock of the interpreter. It
-        would wait forever for a thread that is importing an extension module. It therefore runs
+        The search holds the lock of the dynamic loader and needs the lock of the interpreter, so
+        it would deadlock with a thread that is importing an extension module. It therefore runs
         while this module is imported, and later only in functions that load SciPy's own BLAS.
         """
         found = ThreadpoolController().select(user_api='blas').lib_controllers
@@ -96,7 +96,7 @@ class _OneBlasThread(contextlib.ContextDecorator):
 
 
 def _limit(libraries: Iterable[_Library]) -> list[tuple[_Library, int]]:
-    """Set libraries to one thread; return those that had more, with the number."""
+    """Set libraries to one thread; return the libraries that had more, with their numbers."""
     saved = [(library, number) for library in libraries
              if (number := library.get_num_threads() or 1) > 1]
     for library, _ in saved:
@@ -127,7 +127,7 @@ if hasattr(os, 'register_at_fork'):
 def map_blocks(
         function: Callable[[_Item], _Result], blocks: Sequence[_Item],
         progress: Callable[[float], None] | None = None) -> list[_Result]:
-    """Call a function with each block, on as many threads as BLAS may use, up to all cores.
+    """Call a function with each block, on as many threads as BLAS may use, at most one per core.
 
     The results have the order of the blocks and do not depend on the number of threads. A limit of
     BLAS, such as ``OPENBLAS_NUM_THREADS``, also applies here. The function must not change data

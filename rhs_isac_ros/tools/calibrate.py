@@ -47,15 +47,15 @@ from rhs_isac_ros.tools import command
 RECEIVES = (m.GroundTruth, m.ReceivedSignals)
 _CYCLES = 200
 _TIMEOUT_S = 600.0
-# Number of pilots for which the errors before and after are compared.
+# Maximum number of pilots whose errors before and after the calibration are compared.
 _N_COMPARED = 200
 
 
 class PilotLog:
-    """Collects signals, true positions and codebooks of one user, or of all users (user 0).
+    """Collects codebooks, and signals and true positions of one user, or of all users (user 0).
 
-    Unlike `CycleLog`, it includes cycles without a fix: before a calibration, there may be only
-    such cycles.
+    Unlike `CycleLog`, it includes cycles without a fix: before a calibration, there may be no
+    other cycles.
     """
 
     def __init__(self, user: int = 0) -> None:
@@ -65,7 +65,7 @@ class PilotLog:
         self.codebooks: dict[str, Codebook] = {}
 
     def add(self, found: m.Message | Codebook) -> None:
-        """Add a codebook, or a message of one of the types `RECEIVES`."""
+        """Add a codebook, or a message whose type is in `RECEIVES`."""
         match found:
             case Codebook():
                 self.codebooks[found.id] = found
@@ -75,8 +75,8 @@ class PilotLog:
                 self._signals.setdefault(found.cycle_id, found)
 
     def has_pilots(self, n: int) -> bool:
-        """Return whether the positions and codebooks of `n` pilots are known."""
-        # Counting the signals first is quicker.
+        """Return whether the positions and codebooks of at least `n` pilots are known."""
+        # Counting the signals is quicker, so it comes first.
         return len(self._signals) >= n and self.n_pilots >= n
 
     @property
@@ -137,7 +137,7 @@ def _calibrate(options: argparse.Namespace, arguments: list[str]) -> int:
 
 
 def _arrays(options: argparse.Namespace) -> Pilots:
-    """Return the pilots of a file with the arrays ``positions`` and ``received``."""
+    """Return the pilots in a file with the arrays ``positions`` and ``received``."""
     arrays = read_arrays(options.file)
     for name in ('positions', 'received'):
         if name not in arrays:
@@ -177,14 +177,14 @@ def _collected(
 
 
 def _survey(scenario: Scenario, pilots: Sequence[Pilots], options: argparse.Namespace) -> None:
-    """Estimate the multipath from the codebook with the most pilots."""
+    """Estimate the multipath from the largest group of pilots with the same codebook."""
     group = max(pilots, key=lambda group: len(group.positions))
     n_other = sum(len(one.positions) for one in pilots) - len(group.positions)
     if n_other:
         print(f'{n_other} pilots with other codebooks have no effect')
     surface = load_surface(str(options.calibration or ''), scenario)
     with warnings.catch_warnings():
-        # The report contains them.
+        # The report contains these warnings.
         warnings.simplefilter('ignore', SurveyWarning)
         estimate = survey(scenario, group.beams, group.positions, group.received, surface)
     print(survey_report(estimate), flush=True)
@@ -232,7 +232,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--cycles', type=positive_int, default=_CYCLES, metavar='N',
         help=f'pilots to collect from a running network (default: {_CYCLES})')
     add('--timeout', type=positive_float, default=_TIMEOUT_S, metavar='S',
-        help=f'maximum time to collect them (default: {_TIMEOUT_S:g} s)')
+        help=f'maximum time to collect the pilots (default: {_TIMEOUT_S:g} s)')
     return parser
 
 

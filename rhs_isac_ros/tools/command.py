@@ -1,4 +1,4 @@
-"""The entry point of the commands, and their shared code for nodes, recordings and tables."""
+"""Code that the commands share: their entry point, nodes, recordings and tables."""
 
 import argparse
 import contextlib
@@ -39,10 +39,10 @@ from rhs_isac_ros.support.arguments import check_distinct, input_file
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.optional import MissingLibraryError
 
-# Period of polling the graph [s], whose changes do not wake the executor.
+# Period of polling the graph [s], because changes of the graph do not wake the executor.
 _POLL_PERIOD_S = 0.02
-# Discovery is complete when the graph has not changed for this time [s]. With DDS security, it
-# pauses for the exchange of keys.
+# Discovery is complete when the graph has not changed for this time [s]. With DDS security,
+# discovery pauses while keys are exchanged.
 _SETTLE_S = 1.0 if startup.is_enabled() else 0.4
 # Errors in arguments and files.
 INVALID = (RecordingError, ScenarioError, CodebookError, CalibrationError, ModelError,
@@ -68,13 +68,13 @@ def entry(
     """Return the main function of a command whose command line may contain ROS arguments.
 
     The function takes arguments, by default from the command line. It returns the exit code of
-    `work`; 0 after a signal or if the reader closes the output; 1 after a `ToolError`; 2 if an
-    argument or a file is invalid.
+    `work`; 0 after a signal or if the reader closes the output; 1 after a `ToolError` or if a
+    library is missing; 2 if an argument or a file is invalid.
 
     Parameters
     ----------
     work
-        Takes the options, and the command line with the name of the program.
+        Runs the command. Takes the options, and the command line with the name of the program.
     conflict
         Returns an error if options contradict each other, otherwise ''.
     """
@@ -112,7 +112,7 @@ def print_now(*values: object, end: str = '\n') -> None:
 
 
 def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> str:
-    """Return a table; `align` has ``<`` or ``>`` for each column; heads may have several lines."""
+    """Return a table as text; `align` is ``<`` or ``>`` per column; heads may have line breaks."""
     lines = [*itertools.zip_longest(*(head.split('\n') for head in heads), fillvalue=''), *rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return '\n'.join('  '.join(
@@ -121,7 +121,7 @@ def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) 
 
 
 def none_within(what: str, timeout_s: float) -> ToolError:
-    """Return the error that a network did not provide something within a time [s]."""
+    """Return the error for a network that did not provide something within a time [s]."""
     return ToolError(f'{what} within {timeout_s:g} s, in the domain '
                      f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace')
 
@@ -144,7 +144,7 @@ def observe(
 
 def subscribe_codebooks(
         node: Node, scenario: Scenario, on_codebook: Callable[[Codebook], None]) -> None:
-    """Subscribe to the codebooks of a network that fit the scenario; drop all others."""
+    """Subscribe to the codebooks of a network, and drop codebooks that do not fit the scenario."""
     def receive(content: bytes) -> None:
         try:
             codebook = convert.from_bytes(convert.CodebookMessage, content).codebook()
@@ -173,9 +173,9 @@ def recorded(
 ) -> Iterator[tuple[Any, float]]:
     """Yield the recorded messages of a network and their times [s], in order.
 
-    The `kinds` are classes of messages, `Codebook`, or `Report`, which yields pairs of a node's
-    name and its report. Raises RecordingError if the file is not a recording, or a message is
-    malformed or does not fit the scenario.
+    `kinds` contains classes of messages, `Codebook` or `Report`. A report is yielded in a pair
+    with the name of its node. Raises RecordingError if the file is not a recording, or a message
+    is malformed or does not fit the scenario.
     """
     prefix = topic_prefix(namespace)
     names: dict[type, str] = {**topics.NAMES, Codebook: topics.CODEBOOK}
@@ -220,7 +220,7 @@ class Session(contextlib.AbstractContextManager['Session']):
         try_shutdown()
 
     def spin_until(self, condition: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Spin until a condition holds, at most for `timeout_s`; return whether it holds."""
+        """Spin until a condition holds or `timeout_s` has passed; return whether it holds."""
         end_s = None if timeout_s is None else time.monotonic() + timeout_s
         while not condition():
             if end_s is not None and time.monotonic() >= end_s:
@@ -229,7 +229,7 @@ class Session(contextlib.AbstractContextManager['Session']):
         return True
 
     def discover(self, timeout_s: float) -> None:
-        """Spin until the graph has other nodes and has settled, at most for `timeout_s`."""
+        """Spin until the graph has other nodes and has settled, or `timeout_s` has passed."""
         graph, changed_s = self._graph(), time.monotonic()
 
         def settled() -> bool:
@@ -251,7 +251,7 @@ class Session(contextlib.AbstractContextManager['Session']):
             name = expand_topic_name(topic, self.node.get_name(), self.node.get_namespace())
             validate_full_topic_name(name)
         except (ValueError, InvalidTopicNameException) as error:
-            # The end of the text is a position in the sources of ROS.
+            # The text ends with a location in the source code of ROS.
             raise ToolError(str(error).partition(', at /')[0]) from None
         return name
 

@@ -1,4 +1,4 @@
-"""The executable ``demo``: runs each node of a network as a process, and reports the cycles."""
+"""The executable ``demo``: runs each node of a network as a process, and reports on the cycles."""
 
 import argparse
 import contextlib
@@ -82,9 +82,9 @@ def start_network(
         **given: Any) -> None:
     """Start each node of a network in a separate process; if `together`, the users share a node.
 
-    Users walk at random at the scenario's maximum speed. The parameters `given`, which should
-    include the file of the scenario, apply to all nodes that have them; None selects the default.
-    With ``first_cycle=1``, cycles are reproducible for a seed.
+    Users walk at random at the scenario's maximum speed. Each parameter in `given` applies to all
+    nodes that have it; None selects its default. A scenario other than Table I also needs its
+    ``scenario_file``. With ``first_cycle=1``, cycles are reproducible for a seed.
     """
     for role, member in ROSTER.items():
         known = {parameter.name for parameter in parameters.NODES[role]}
@@ -105,7 +105,7 @@ def watch(
         on_progress: Callable[[int, int], None]) -> str:
     """Spin an observer until it has received a number of complete cycles.
 
-    `on_progress` is called with the current and the final number whenever the current one changes.
+    Whenever the number changes, `on_progress` is called with it and with the number to wait for.
     Returns the error that ended the wait, or ''.
     """
     seen, changed_s = -1, time.monotonic()
@@ -124,7 +124,7 @@ def watch(
 
 
 def table(cycles: Sequence[CompleteCycle]) -> str:
-    """Return a table of cycles, one in each line."""
+    """Return a table with one line for each cycle."""
     return text_table(_HEADS, map(_row, cycles), '>' * len(_HEADS))
 
 
@@ -140,7 +140,7 @@ def _row(cycle: CompleteCycle) -> list[str]:
 
 
 def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) -> str:
-    """Return statistics of at least one complete cycle, and a line for each cycle given up."""
+    """Return statistics of one or more complete cycles, and a line for each cycle given up."""
     errors = np.array([cycle.error_m for cycle in cycles])
     bounds = np.sqrt([cycle.estimate.crlb_m2 for cycle in cycles])
     lengths = np.array([cycle.duration_s for cycle in cycles])
@@ -161,8 +161,8 @@ def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) ->
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demonstration, and return its exit code.
 
-    It is 0 if every cycle was served or had no fix, even after Ctrl-C; 1 otherwise; 2 if an
-    argument or a file is invalid.
+    The code is 0 if every cycle was served or had no fix, even after Ctrl-C; 2 if an argument or a
+    file is invalid; otherwise 1.
     """
     parser = _parser()
     options = parser.parse_args(arguments)
@@ -191,7 +191,7 @@ def _run(
     if together:
         print(f'the {options.users} users share one process', file=sys.stderr)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
-        # The processes run until the cycles are observed.
+        # The processes run until the cycles have been observed.
         with Processes(Path(logs), {'ROS_LOG_DIR': logs}, fork=True) as processes:
             problem = ''
             try:
@@ -220,7 +220,7 @@ def _observe(
     rclpy.init(args=startup.prepare(['demo']))
     with startup.one_line():
         observer = CycleObserver(recorder, log=log, **startup.WITHOUT_SERVICES)
-    # Use the time in which the network starts.
+    # Use the time that the network takes to start.
     prepare_drawing()
     try:
         return watch(observer, processes, cycles, _show_progress)

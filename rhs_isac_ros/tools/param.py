@@ -1,4 +1,4 @@
-"""``scripts/param``: replaces ``ros2 param``, which has no wheel, with the same output."""
+"""``scripts/param``: replaces ``ros2 param``, which has no wheel; the output is the same."""
 
 import argparse
 import sys
@@ -20,7 +20,7 @@ from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run
 
 # Maximum time to discover a node [s], including the exchange of keys for DDS security.
 _DISCOVERY_TIMEOUT_S = 10.0
-# Maximum time to discover a node's services, and for a response [s].
+# Maximum time to discover a node's services, and to wait for a response [s].
 _SERVICE_TIMEOUT_S = 5.0
 _LABELS = {
     ParameterType.PARAMETER_BOOL: 'Boolean value is:',
@@ -78,7 +78,7 @@ def dump(session: Session, options: argparse.Namespace) -> None:
     node = _find(session, options)
     names = _names(session, node)
     types = _call(session, node, lambda client: client.get_parameter_types(names)).types
-    # A node of rclpy answers a request for several values with none if one of them is not set.
+    # If one of several requested parameters is not set, a node of rclpy returns no values at all.
     names = [name for name, kind in zip(names, types, strict=True)
              if kind != ParameterType.PARAMETER_NOT_SET]
     tree: dict[str, Any] = {}
@@ -92,7 +92,7 @@ def dump(session: Session, options: argparse.Namespace) -> None:
 
 
 def load(session: Session, options: argparse.Namespace) -> None:
-    """Set all parameters in a parameter file, even if they are for other nodes."""
+    """Set all parameters in a parameter file on one node, even those meant for other nodes."""
     file = options.parameter_file
     try:
         names = list(parameter_dict_from_yaml_file(file, use_wildcard=True))

@@ -20,10 +20,10 @@ from rhs_isac_ros.support.pictures import PAGE_IN, label_decades, look, new_figu
 # the view from above.
 _ERRORS_IN, _REST_IN, _VIEW_SHARE = 1.4, 1.9, 0.94
 _SCENE_IN = 5.7
-# Space around the region and the surface [m]; for ellipses, up to a share of the region is added.
+# Margin around region and surface [m]; maximum margin for ellipses, as a share of the region.
 _MARGIN_M, _CYCLES_MAX_MARGIN, _SCENE_MAX_MARGIN = 0.8, 0.4, 0.25
-# Relative height of the axes for the legend, to which the layout adds the legend itself. For the
-# legend of a figure, the layout has reserved space only since Matplotlib 3.7.
+# Relative height of the axes for the legend; the layout adds the height of the legend itself.
+# Before Matplotlib 3.7, the layout reserves no space for the legend of a figure.
 _LEGEND_ROW = 0.001
 # Maximum number of cycles with a number in the view, and of users in each legend.
 _MAX_NUMBERS, _CYCLES_MAX_LABELS, _SCENE_MAX_LABELS = 60, 6, 8
@@ -297,5 +297,5 @@ def _patch(label: str, **style: Any) -> Any:
 
 
 def _further(users: Sequence[int], n_shown: int) -> list[Any]:
-    """Return a line for a legend with the number of users that are not shown."""
+    """Return a legend entry with the number of users that are not shown, if there are any."""
     return [_mark(f'and {len(users) - n_shown} more users')] if len(users) > n_shown else []

@@ -67,8 +67,8 @@ _TIMEOUT_S = 60.0
 class RepublisherNode(Node):
     """Publishes messages at their recorded times, once all topics have subscribers.
 
-    `messages` contains the topic, the message and the time [s] of each message, sorted by time.
-    All `names` of topics are relative. `rate` is the speed relative to the recording. The
+    `messages` contains the topic, the content and the time [s] of each message, sorted by time.
+    `names` are the relative names of the topics. `rate` is the speed relative to the recording.
     `optimizer` receives the codebooks, or is None if another node provides them. `waits_for` is
     the first topic without subscribers, or ''; `count` messages have been published.
     """
@@ -80,7 +80,7 @@ class RepublisherNode(Node):
         self.optimizer: OptimizerNode | None = None
         self.count, self.finished, self.waits_for = 0, False, next(iter(names))
         self._waits_s = self._publish(messages, rate)
-        # Endpoints at the last poll, and the time of their last change [s].
+        # Numbers of publishers and subscribers by topic, and the time of their last change [s].
         self._endpoints: list[tuple[int, int]] = []
         self._unchanged_since_s = time.monotonic()
         kinds = recorded_topics()
@@ -133,7 +133,7 @@ class RepublisherNode(Node):
 
     def _publish(
             self, messages: Iterable[tuple[str, bytes, float]], rate: float) -> Iterator[float]:
-        """Publish messages; yield the time until the next one is due [s], unless it is due."""
+        """Publish each message when it is due; until then, yield the remaining time [s]."""
         # Steady time at the recorded time 0 [s]. Codebooks before the first message are due now.
         origin_s = -math.inf
         for name, content, time_s in messages:
@@ -150,7 +150,7 @@ class RepublisherNode(Node):
                     ros_parameters(codebook.to_parameters()))
 
     def check(self, end_s: float, timeout_s: float) -> None:
-        """Raise ToolError if another node publishes, or there is no subscriber by `end_s`."""
+        """Raise ToolError if another node publishes, or a topic has no subscriber by `end_s`."""
         for name, publisher in self._message_publishers.items():
             if self.count_publishers(publisher.topic_name) > 1:
                 raise ToolError(f'{name}: already published by another node')
@@ -197,7 +197,7 @@ def _messages(
 
 
 def _first_codebook(options: argparse.Namespace) -> Codebook:
-    """Return the codebook that was used to receive the first signals."""
+    """Return the codebook with which the first signals were received."""
     used = ''
     codebooks: dict[str, convert.CodebookMessage] = {}
     for name, content, _ in _messages(options, [_SIGNALS, topics.CODEBOOK]):

@@ -14,7 +14,7 @@ from rhs_isac_ros.monitoring import network_view, shapes
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 _VERSION = '0.22'
-# The time line of the viewer.
+# The timeline of the viewer.
 _TIMELINE = 'cycle'
 # Number of coordinates in a plane.
 _PLANE = 2
@@ -46,7 +46,7 @@ class RerunStream:
         self._server: subprocess.Popen[bytes] | None = None
 
     def save(self, path: Path) -> None:
-        """Write to ``<name>.part``, which `close` renames; raise OSError if this fails."""
+        """Write to ``<name>.part``, which `close` renames; raise OSError if that is impossible."""
         partial = path.with_name(f'{path.name}.part')
         self._files = partial, path
         # Rerun reports an unwritable file without its reason.
@@ -57,9 +57,9 @@ class RerunStream:
     def serve(self, port: int, bind: str) -> str:
         """Serve the viewer on a port, and the data on the next one; return the address.
 
-        The third port receives the data from this process. `bind` is the address of the network
-        interface, or ``0.0.0.0`` for all. Raises OSError if a port is not free or the address does
-        not belong to this machine, and RuntimeError if the server does not start.
+        A third port, ``port + 2``, receives the data from this process. `bind` is the address of a
+        network interface, or ``0.0.0.0`` for all. Raises OSError if a port is in use or the
+        address is not one of this machine, and RuntimeError if the server does not start.
         """
         ports = range(port, port + 3)
         for number in ports:
@@ -67,7 +67,7 @@ class RerunStream:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind((bind, number))
         # A server in this process would listen on all network interfaces. The kernel ends the new
-        # process with this one, unlike a server that `python -m rerun` starts.
+        # process when this one ends; a server that `python -m rerun` starts would remain.
         program = Path(self._rerun.__file__).parents[1] / 'rerun_cli' / 'rerun'
         self._server = subprocess.Popen(
             ['setpriv', '--pdeathsig', 'TERM', program, '--serve-web', '--bind', bind,
@@ -129,7 +129,7 @@ def _is_listening(host: str, port: int) -> bool:
 
 
 def blueprint() -> Any:
-    """Return the blueprint: the scene above the modes, beside charts, the surface and the log."""
+    """Return the blueprint: the scene above modes and surface, beside the charts and the log."""
     import rerun.blueprint as rrb
 
     scene = rrb.Spatial3DView(
@@ -185,7 +185,7 @@ def _archetype(entity: shapes.Entity) -> Any:
             return lines(strips, colors=_colours([colour]), radii=_radius(width))
         case shapes.Mesh(points, colour):
             grid = [*points[::_MESH_STEP], *np.swapaxes(points, 0, 1)[::_MESH_STEP]]
-            # Most lines of a lobe are a single point.
+            # Most lines of a lobe collapse to the origin.
             return rr.LineStrips3D(
                 [line for line in grid if line.any()], radii=_radius(_MESH_WIDTH),
                 colors=_colours(_MESH_DIM * np.array([colour])))
@@ -206,7 +206,7 @@ def _archetype(entity: shapes.Entity) -> Any:
 
 
 def _radius(width: float) -> float:
-    """Convert a width in screen points to a radius, which is negative in Rerun."""
+    """Convert a width in screen points to a radius; in Rerun, such radii are negative."""
     return -width / 2
 
 

@@ -112,15 +112,15 @@ def _missing(scene: SceneState) -> list[str]:
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog=_PROGRAM, description='Draw the scene of a network when every user has an '
-        'estimate, or some seconds after the first one. ROS arguments select the namespace: '
+        'estimate, or some seconds after the first estimate. ROS arguments select the namespace: '
         '--ros-args -r __ns:=/lab')
     add = parser.add_argument
     add('--output', type=picture_file, default='scene.png', metavar='FILE',
         help='picture to write: PNG, PDF or SVG (default: scene.png)')
     add('--wait', type=nonnegative_float, default=5.0, metavar='S',
-        help='wait for the estimates of further users after the first one (default: 5 s)')
+        help='time to wait for further estimates after the first one (default: 5 s)')
     add('--timeout', type=nonnegative_float, default=30.0, metavar='S',
-        help='maximum wait in all; the scene is then drawn as far as it is known '
+        help='maximum wait in total; the known part of the scene is then drawn '
         '(default: 30 s)')
     command.add_files(parser, 'config')
     return parser

@@ -1,4 +1,4 @@
-"""``scripts/topic``: replaces ``ros2 topic``, which has no wheel, with the same output."""
+"""``scripts/topic``: replaces ``ros2 topic``, which has no wheel; the output is the same."""
 
 import argparse
 import array
@@ -20,16 +20,16 @@ from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run_verb
 
 _MAX_LENGTH = 128
-# Maximum number of latest messages in a rate.
+# Maximum number of latest messages from which a rate is computed.
 _MAX_TIMES = 10001
-# Time for the discovery of other nodes [s], without the daemon of ``ros2``.
+# Time to discover other nodes [s]; unlike ``ros2``, this tool has no daemon.
 _DISCOVERY_TIMEOUT_S = 3.0
 
 
 def as_yaml(message: Any, max_length: int | None = None) -> str:
     """Return a ROS message as YAML that ends with a newline.
 
-    Dots replace the entries of an array or the characters of a string beyond `max_length`, if any.
+    Dots replace array entries and string characters beyond `max_length`, unless it is None.
     """
     return yaml.dump(_plain(message, max_length), sort_keys=False, allow_unicode=True,
                      width=sys.maxsize, default_flow_style=False)

@@ -55,11 +55,11 @@ from rhs_isac_ros.tools.rerun_stream import RerunStream
 
 # Maximum number of codebooks, whose tables take some megabytes each.
 _MAX_CODEBOOKS = 32
-# With Table I, the bound on the root mean squared error then has a standard error of 2.4 %.
+# Number of phases for a bound. With Table I, the root of the bound has a standard error of 2.4 %.
 _N_PHASES = 256
-# If no cycle is observed in this time, the reason is logged [s].
+# Time to wait for the first cycle before the reason for its absence is logged [s].
 _SILENCE_S = 5.0
-# Maximum number of tracks that the view shows; the numbers of users come from messages.
+# Maximum number of tracks that the view shows, because user numbers come from messages.
 _MAX_TRACKS = 64
 # Minimum time between two beams [s]: their patterns take most of the computing time of a view.
 _BEAM_PERIOD_S = 0.2
@@ -72,7 +72,7 @@ _SWITCH_INTERVAL_S = 5e-4
 class Posteriors:
     """Computes the posteriors of received signals, for the latest codebooks.
 
-    The messages of the network do not contain the modes, because this would lengthen every cycle.
+    Messages do not contain the modes, because including them would lengthen every cycle.
     `surface` is as in `make_estimator`.
     """
 
@@ -82,7 +82,7 @@ class Posteriors:
         self._tracks = Tracks()
 
     def __contains__(self, codebook_id: str) -> bool:
-        """Return whether a codebook is one of the latest 32 that were added."""
+        """Return whether a codebook is among the latest 32 that were added."""
         return codebook_id in self._estimators
 
     def add(self, codebook: Codebook) -> None:
@@ -96,7 +96,7 @@ class Posteriors:
             self._scenario, codebook, np.random.default_rng(0), _N_PHASES).value
 
     def modes(self, received: m.ReceivedSignals) -> WeightedModes | None:
-        """Return the modes of the posterior, or None without a position or a known codebook."""
+        """Return the modes of the posterior, or None without a fix or with an unknown codebook."""
         estimator = self._estimators.get(received.codebook_id)
         with contextlib.suppress(SignalError):
             return weighted_modes(estimator, received.signals) if estimator else None
@@ -107,8 +107,8 @@ class Posteriors:
     ) -> TrackEstimate | None:
         """Continue the track of a user with signals that arrived at `now_s` [s].
 
-        The typical speed of users is `speed_mps`. Returns None before the second position, or
-        without a known codebook.
+        The typical speed of users is `speed_mps`. Returns None before the second position, without
+        a fix, or with an unknown codebook.
         """
         estimator = self._estimators.get(received.codebook_id)
         with contextlib.suppress(SignalError):
@@ -121,7 +121,7 @@ class Posteriors:
 class ViewNode(Node):
     """Converts the messages in its namespace to entries, and passes them to `write`.
 
-    Modes and bounds are computed in the background. If cycles are faster, the modes and the beams
+    Modes and bounds are computed in the background. At high cycle rates, the modes and the beams
     of some cycles are left out. `mismatch` is the error of the last message that did not match the
     scenario, or ''.
     """
@@ -279,7 +279,7 @@ def _conflict(options: argparse.Namespace) -> str:
                 'for a running network, --ros-args -r __ns:=/lab selects the namespace')
     if options.track_speed and not options.track:
         return 'argument --track-speed: expected together with --track'
-    # By its suffix, Rerun recognises its files.
+    # Rerun recognises its files by this suffix.
     if options.save and options.save.suffix != '.rrd':
         return f"argument --save: '{options.save}', expected a name that ends with .rrd"
     return ''
@@ -320,7 +320,7 @@ def _open(stream: RerunStream, options: argparse.Namespace) -> None:
 def _show_live(
         stream: RerunStream, scenario: Scenario, posteriors: Posteriors,
         options: argparse.Namespace, arguments: Sequence[str]) -> int:
-    # Otherwise, with many messages, the background threads would wait 5 ms for each step.
+    # At the default of 5 ms, many messages would delay every step of the background threads.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     code, node = command.observe(
         lambda: ViewNode(scenario, posteriors, stream.write), arguments,
@@ -360,7 +360,7 @@ def _parser() -> argparse.ArgumentParser:
         help=f'port of the viewer; its data use the next two (default: {_PORT})')
     add('--bind', default='127.0.0.1', metavar='ADDRESS',
         help='address that the viewer listens on; by default only this machine can connect, '
-        'with 0.0.0.0 any other')
+        'with 0.0.0.0 any machine can')
     add = parser.add_argument_group('recording').add_argument
     add('--namespace', help='namespace of the recorded network (default: /)')
     add('--track', action='store_true',

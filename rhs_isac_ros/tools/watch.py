@@ -29,7 +29,7 @@ _PROGRAM = 'watch'
 _REFRESH_PERIOD_S = 0.25
 # Refresh period when the output is not a terminal [s].
 _PRINT_PERIOD_S = 1.0
-# After this time, every node has published its diagnostics, which it does once a second [s].
+# Nodes publish diagnostics once a second, so all diagnostics have arrived after this time [s].
 _DIAGNOSTICS_TIMEOUT_S = 1.3
 
 
@@ -146,7 +146,7 @@ def _watch(options: argparse.Namespace, arguments: list[str]) -> int:
 
 
 def _show_live(arguments: Sequence[str]) -> int:
-    """Redraw the view on a terminal, or print the views one after the other."""
+    """Redraw the view on a terminal; elsewhere, print one view after another."""
     from rich.console import Console
     from rich.live import Live
 

@@ -1,7 +1,7 @@
 """Positioning error with different band plans at equal spectrum, power and number of pilots.
 
-Problem: two bands 0.5 GHz apart repeat every 0.6 m of range. What do four bands gain that are
-chosen for the region, each with half as many frames? All plans are evaluated with the posterior
+Problem: the phases of two bands 0.5 GHz apart repeat every 0.6 m of range. What is the gain of
+four bands chosen for the region, each with half as many frames? The estimator is the posterior
 mean. The 95 % region of an estimate is the ellipsoid of its covariance that contains 95 % of a
 Gaussian. How close does the coordinate search come to the best of all plans of a small raster?
 

@@ -3,13 +3,13 @@
 Problem: coefficients of the elements deviate and some elements have failed. A reference user sends
 pilots at known positions, and the calibration estimates the surface from the received
 signals. How large are the errors of fresh users with the calibration, compared with those before
-it, and with exact knowledge of the surface? The benchmark `robustness` has the errors with a
+it, and with exact knowledge of the surface? The benchmark `robustness` reports the errors with a
 scenario that declares the deviations.
 
 Each surface has its own pilots; all surfaces share the fresh positions. Brackets contain 95 %
 intervals: of a bootstrap over surfaces and positions together for mean squared errors and their
 ratios, and Wilson's for shares. Mean squared errors are those of the fixes. The calibration
-assumes the declared distribution of surfaces; with --silent, its defaults.
+assumes the declared distribution of surfaces, or with --silent its default distribution.
 """
 
 import os

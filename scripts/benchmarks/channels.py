@@ -1,7 +1,7 @@
 """Positioning on channels that a ray tracer computed, before and after a survey of the hall.
 
 Problem: the estimator assumes Gaussian multipath that three fields of the scenario declare, and a
-hall has walls. What do positions at known places teach it? Signals follow the traced paths of
+hall has walls. What does a survey at known positions gain? Signals follow the traced paths of
 users in an empty hall and in one with reflections; other users of the same hall are the survey.
 `calibration.survey` estimates the covariance of the multipath from 10 to 300 of these, drawn
 several times, each time with other thermal noise in all signals. The 95 % region of an estimate is

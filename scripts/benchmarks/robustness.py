@@ -2,8 +2,8 @@
 
 Problem: real signals are not those of the model. How large are the errors, do the 95 % regions
 contain the user, how many phases have no fix, and would the residuals cause a warning? Each
-deviation is measured twice: with a scenario that is silent about it, and with one that declares
-it, as an uncertainty or as the true value. Users outside of the region should have no fix.
+deviation is measured twice: with a scenario that omits it, and with a scenario that declares it,
+as an uncertainty or as the true value. Users outside of the region should have no fix.
 
 The 95 % region of an estimate is the ellipsoid of its covariance that contains 95 % of a Gaussian.
 Brackets contain 95 % intervals: Wilson's for shares, and for mean squared errors the percentile

@@ -6,7 +6,7 @@ long do its calls take with an untouched environment, relative to a process with
 OPENBLAS_NUM_THREADS=1, while all cores but one are busy?
 
 Both processes take turns, so that a disturbance affects both. With --unlimited, a third process
-works without the limit.
+runs without the limit.
 """
 
 import argparse

@@ -6,8 +6,8 @@ cycles by Eq. (4), as in the channel node. How large are the errors of the track
 single cycles, are the covariances consistent with them, and how much time does the track take
 beyond the estimate of a cycle?
 
-Cycles within the first two seconds are not counted. Intervals are those of 95 % over the walks,
-from resampling; the cycles of a walk are not independent. The 95 % region of an estimate is the
+Cycles within the first two seconds are not counted. The 95 % intervals are from resampling of the
+walks, because the cycles of a walk are not independent. The 95 % region of an estimate is the
 ellipsoid of its covariance that contains 95 % of a Gaussian. --bands and --frames replace bands
 and frames of the scenario, with a codebook that is not optimised unless --codebook names one.
 

@@ -1,8 +1,8 @@
 """Cycle rate and waiting times with few users and with many.
 
-Problem: a cycle serves one user. By how much do the others slow it down, as processes of their own
-or in one process? The networks are compared with one of few users and with the hops of a cycle in
-bare rclpy, measured in the same run.
+Problem: a cycle serves one user. How much do other users slow it down, as separate processes or in
+one process? Networks with many users are compared with a network of few users, and with the hops
+of a cycle in bare rclpy, measured in the same run.
 """
 
 import os

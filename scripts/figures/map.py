@@ -2,8 +2,8 @@
 
 Problem: where in the region is the error of `bayes` large, and which bound shows it? The maps are
 the root of the average Cramer-Rao bound, the root mean squared error of the informed estimator of
-the global bound, and that of `bayes`, in squares of the horizontal plane, for each band plan: that
-of Table I, four equally and four unequally spaced bands, and those of --plan.
+the global bound, and that of `bayes`, in squares of the horizontal plane, for several band plans:
+that of Table I, four equally and four unequally spaced bands, and the plans given with --plan.
 
 A trial is a block of 250 positions of `bayes`. Codebooks are optimised against ambiguities.
 

@@ -1,12 +1,12 @@
 """Errors of band plans with imperfect synchronisation of phases, sampling times and carriers.
 
 Problem: with the same spectrum, power and number of pilots, bands at unequal distances resolve the
-range ambiguities that two bands, or equally spaced ones, leave. They compare phases of different
-bands, so that the oscillator must keep its phase when it is retuned. Up to which errors of phase,
-timing and carrier does the gain remain? The scenario declares the standard deviations, and `bayes`
-averages over the unknowns. Codebooks are optimised without them.
+range ambiguities that two bands, or equally spaced ones, leave. The estimate then relies on phase
+differences between bands, so the oscillator must keep its phase when it is retuned. How large may
+errors of phase, timing and carrier be before the gain is lost? The scenario declares the standard
+deviations, and `bayes` averages over the unknowns. Codebooks are optimised without them.
 
-A trial is a block of 250 positions. The phase of each band is uniform, in effect, at 6.28 rad.
+A trial is a block of 250 positions. At 6.28 rad, the phase of each band is effectively uniform.
 Timing and carrier offsets act within a band only.
 
 Duration on two cores: three minutes with --quick, about half an hour without.

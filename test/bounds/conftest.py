@@ -1,4 +1,4 @@
-"""A scenario with impairments, and a comparison of gradients with differences."""
+"""A scenario with impairments, and a comparison of gradients with finite differences."""
 
 import numpy as np
 import pytest
@@ -25,9 +25,9 @@ def uncertain_codebook(uncertain, random_beams) -> Codebook:
 
 @pytest.fixture(scope='session')
 def assert_gradients():
-    """Function that compares gradients with differences of a value in random directions."""
+    """Function that compares gradients with finite differences in random directions."""
     def check(gradients, value, codebook, rng, slack=0.0, step=1e-5):
-        """Take a function of analog and digital variables; `slack` is its rounding error."""
+        """Compare; `value` takes analog and digital variables, with rounding error `slack`."""
         start = {'analog': codebook.analog, 'digital': codebook.digital}
         for _ in range(2):
             for (name, values), gradient in zip(start.items(), gradients, strict=True):

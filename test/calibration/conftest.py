@@ -1,4 +1,4 @@
-"""A small scenario, a surface with errors, and pilots of it."""
+"""A small scenario, surfaces with errors, and their pilots."""
 
 import dataclasses
 
@@ -25,7 +25,7 @@ def beams(random_beams):
 
 @pytest.fixture(scope='session')
 def damaged(beams):
-    """Function of a seed: a surface with at least one failed element."""
+    """Function that returns a surface with at least one failed element for a seed."""
     def make(seed):
         surface = draw_surface(SCENARIO, np.random.default_rng(seed))
         stuck = surface.stuck.copy()

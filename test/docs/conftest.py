@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parents[2] / 'docs'
-# The extensions import each other as Sphinx does.
+# The extensions import each other by name, as Sphinx imports them.
 sys.path.insert(0, str(DOCS / 'extensions'))
 
 

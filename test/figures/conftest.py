@@ -12,7 +12,7 @@ FOLDER = Path(__file__).parents[2] / 'scripts' / 'figures'
 @pytest.fixture(scope='session')
 def load_figure():
     """Callable that imports a script by name."""
-    # As Python does when it runs a script, so that it finds its parts.
+    # As when Python runs a script, so that the script finds its parts.
     sys.path.insert(0, str(FOLDER))
 
     def load(name):

@@ -35,7 +35,7 @@ class ReferenceLink:
         return scenario.subband_width_hz * total
 
     def best_beam(self, analog, position):
-        """Beam of the highest capacity with a given configuration."""
+        """Beam with the highest capacity for a given configuration."""
         scenario, los = self.plain.scenario, self.los(position)
         gains, directions = [], []
         for j in range(scenario.n_subbands):

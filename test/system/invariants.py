@@ -26,9 +26,9 @@ CHECK_DELAY_S = 1.0
 _MAX_CYCLES = 64
 # Noise is complex Gaussian: |n|^2 exceeds this multiple of its power with probability e^-40.
 _MAX_NOISE_FACTOR = 40.0
-# Signals may deviate from their mean by as much as they do with probability e^-20.
+# Signals may deviate from their mean up to a limit, exceeded with at most probability e^-20.
 _RESIDUAL_EXPONENT = 20.0
-# The type of message whose absence is the fault, if any, and a description.
+# The type of message whose absence is the fault, or None, and a description of the fault.
 _Fault = tuple[type[m.Message] | None, str]
 
 
@@ -112,12 +112,12 @@ class InvariantChecker:
         """Tolerate missing messages of some types until the first of each type arrives.
 
         Call this when a publisher has terminated or is unreachable, or before another node
-        replaces it, because other nodes may discover its successor earlier than this one.
+        replaces it, because other nodes may discover its successor earlier than this node.
 
         Parameters
         ----------
         kinds
-            Types of the messages that it publishes.
+            Types of the messages that the publisher sends.
         by_another
             Whether the first message of each type must be from another node than the latest one.
         """
@@ -199,7 +199,7 @@ class InvariantChecker:
             yield from self._content_faults(cycle, codebook)
 
     def _content_faults(self, cycle: _CycleMessages, codebook: Codebook) -> Iterator[_Fault]:
-        """Compare the received signals with those at the feeds, combined by the codebook."""
+        """Compare the received signals with the feed signals, combined by the codebook."""
         yield from self._position_faults(cycle)
         for band, reports in cycle.applied.items():
             if any(not np.array_equal(report.analog, codebook.analog[band]) for report in reports):
@@ -214,9 +214,9 @@ class InvariantChecker:
 
     def _matches(
             self, feeds: list[np.ndarray], cycle: _CycleMessages, codebook: Codebook) -> bool:
-        """Return whether the received signals are those at the feeds, combined, and noise."""
-        # Amplitudes, because the powers of forged signals may overflow. The sums may as well; the
-        # result is then no match.
+        """Return whether the received signals are the combined feed signals and noise."""
+        # Compare amplitudes, because the powers of forged signals may overflow. Sums that overflow
+        # do not match.
         with np.errstate(over='ignore', invalid='ignore'):
             expected = receive_feeds(self._scenario, codebook, np.stack(feeds), None)
             noise = np.abs(cycle.signals[0].signals - expected).max()

@@ -35,7 +35,7 @@ class NetworkObserver(CycleObserver):
     reports
         Newest report of each node by name.
     warnings
-        Summaries of the reports with a fault, each once, by name of the node.
+        Distinct summaries of the reports with a fault, by name of the node.
     n_codebooks
         Number of codebooks received.
     on_phase
@@ -46,8 +46,8 @@ class NetworkObserver(CycleObserver):
         super().__init__(
             receives=dict.fromkeys((*cycle_log.RECEIVES, *invariants.RECEIVES)),
             sizes=scenario.sizes, on_malformed=lambda error: None, **node_options)
-        # It takes messages in the order of their arrival. The standard executor takes one message
-        # of each topic in turn, so that under load the queue of the feed signals overflows.
+        # This executor takes messages in the order of their arrival. The standard executor takes
+        # one message of each topic in turn, so under load the queue of feed signals overflows.
         self._executor = EventsExecutor()
         self._executor.add_node(self)
         self.invariants = invariants.InvariantChecker(scenario)

@@ -1,4 +1,4 @@
-"""The time to recover, in both kinds of trials."""
+"""The time to recover, for both kinds of trials."""
 
 import math
 

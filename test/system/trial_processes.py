@@ -14,7 +14,7 @@ class TrialProcesses(Processes):
     Parameters
     ----------
     logs, environment
-        As those of `Processes`.
+        As in `Processes`.
     command_prefix
         Takes the name of a process, and returns a prefix of its command, such as ``ip netns exec
         lab``.

@@ -2,8 +2,8 @@
 
 The reference evaluates all pairs in double precision in each step of L-BFGS-B, with 30
 corrections. Its speed is measured in the same run as that of the search on samples, in processor
-time. With the two bands of Table I, its final value is that of the shipped codebook, which 3000 of
-its steps have made; with four bands, it is taken to need as many evaluations.
+time. With the two bands of Table I, its final value is that of the shipped codebook, the result of
+3000 of its steps; with four bands, it is assumed to need as many evaluations.
 """
 
 import math

@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0 if all trials passed, also after Ctrl-C; 1 if one failed; 2 if an argument
+        Exit code: 0 if all trials passed, or after Ctrl-C; 1 if a trial failed; 2 if an argument
         or a file is invalid.
     """
     parser = _parser()
@@ -180,11 +180,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--nodes', nargs='+', choices=crashes.NODES, metavar='NODE',
                         help=f'only kill these nodes; one or more of {", ".join(crashes.NODES)}')
     parser.add_argument('--phases', nargs='+', choices=_PHASES, metavar='PHASE',
-                        help=f'only kill nodes in these phases; of {", ".join(_PHASES)}')
+                        help=f'only kill nodes in these phases, out of {", ".join(_PHASES)}')
     parser.add_argument('--repeat', type=positive_int, default=1, metavar='N',
                         help='number of times that each node is killed in each phase')
     parser.add_argument('--intruders', nargs='+', choices=intruders.INTRUDERS, metavar='NODE',
-                        help='only start these second nodes, which may be repeated; of '
+                        help='only start these second nodes, which may be repeated, out of '
                              f'{", ".join(intruders.INTRUDERS)}')
     parser.add_argument('--seconds', type=positive_float, default=intruders.SECONDS,
                         metavar='S', help='duration of each intrusion')

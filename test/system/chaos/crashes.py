@@ -83,7 +83,7 @@ def crash(
     Raises
     ------
     ChaosError
-        If the network does not serve its users before, or a node keeps reporting this node.
+        If the network does not serve its users before the trial, or a node still reports `node`.
     """
     wait_for_service(observer)
     _wait_until_found(observer, node)
@@ -109,10 +109,10 @@ def crash(
 
 
 def _wait_until_found(observer: NetworkObserver, node: str) -> None:
-    """Wait until no fault that a node reports names the given one.
+    """Wait until no node reports a fault that names the given node.
 
-    The network serves without the optimizer. A node that has not found the restarted one yet would
-    log nothing if it were killed again.
+    The network also serves without an optimizer. If the restarted optimizer were killed before a
+    node had found it, that node would log nothing.
     """
     def faults() -> list[str]:
         return [f'{name}: {report.summary}' for name, report in observer.reports.items()

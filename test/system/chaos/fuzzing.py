@@ -23,7 +23,7 @@ from system.chaos.mutations import mutate
 from system.chaos.trial import ChaosError, both_served
 from system.observer import NetworkObserver
 
-# Mutations in a row on one topic; the queues of the nodes hold four times as many messages.
+# Mutations on one topic between checks; the queues of the nodes hold four times as many messages.
 _BATCH = 32
 _TIMEOUT_S = 30.0
 _MAX_ORIGINALS = 32
@@ -52,9 +52,9 @@ class FuzzResult:
     sent
         Number of mutations by topic.
     malformed
-        By node: number of mutations received that violate the declaration of their type.
+        Number of received mutations that violate the declaration of their type, by node.
     counted
-        By node: number of messages that it counted as malformed.
+        Number of messages that a node counted as malformed, by node.
     dropped
         Number of messages that all nodes dropped, by reason.
     ended
@@ -87,7 +87,7 @@ class _Mutator:
         self.originals: collections.deque[bytes] = collections.deque(maxlen=_MAX_ORIGINALS)
         self._kind = kind
         self._publisher = node.create_publisher(kind, name, profile)
-        # The observer receives its own messages late on a busy machine.
+        # On a busy machine, the observer receives its own messages late.
         self._published: NewestDict[bytes, None] = NewestDict(_MAX_PUBLISHED)
         subscribe(node, kind, name, self._receive, profile, raw=True)
 
@@ -159,7 +159,7 @@ def fuzz(
     Raises
     ------
     ChaosError
-        If a node does not receive the messages of another one, or a mutation.
+        If a topic has no messages, or a node does not receive all mutations.
     """
     mutators = [_Mutator(observer, name, convert.ros_type(kind), profile_for(kind))
                 for name, kind in _PROTOCOL.items()]

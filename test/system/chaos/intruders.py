@@ -26,10 +26,10 @@ from system.chaos.trial import (
 from system.observer import NetworkObserver
 from system.trial_processes import TrialProcesses
 
-# A channel of another scenario, a node with the number of user 1, and a second base station beside
-# an observer that requests an incompatible quality of service.
+# A channel with another scenario, a node with the number of user 1, and a second base station
+# together with an observer that requests an incompatible quality of service.
 SCENARIO, USER, OBSERVER = 'scenario', 'user', 'observer'
-# The second nodes, also one of each role.
+# All second nodes, among them one of each role.
 INTRUDERS = (*UNIQUE, USER, SCENARIO, OBSERVER)
 SECONDS = 4.0
 _PROCESS = 'intruder'
@@ -43,14 +43,14 @@ _NAMES_OF_CONFLICTS = (
 class IntrusionTrial(Trial):
     """Result of one trial, whose fault ends with the intruder.
 
-    Of two users with one number, the first is killed instead, and the second is served.
+    With two users of the same number, the first user is killed, and the second is then served.
 
     Attributes
     ----------
     intruder
         Which node was started in addition.
     served
-        Number of cycles served while it was present.
+        Number of cycles served while the intruder was present.
     """
 
     intruder: str
@@ -68,9 +68,9 @@ def intrude_all(
     processes
         The network, with the users 1 and 2.
     intruders
-        Some of `INTRUDERS`; one may be repeated.
+        Some of `INTRUDERS`, possibly repeated.
     seconds
-        Duration of each intrusion, from the first report of it [s].
+        Duration of each intrusion after it has first been reported [s].
     folder
         Directory for the files of the intruders.
     parameters
@@ -96,7 +96,7 @@ def intrude_all(
 
 @contextlib.contextmanager
 def _incompatible_observer() -> Iterator[None]:
-    """Run a node that requests the latest message of every topic, which most do not offer."""
+    """Run a node that requests every topic as latched, which most publishers do not offer."""
     node = Node('incompatible')
     for kind, name in topics.NAMES.items():
         subscribe(node, convert.ros_type(kind), name, lambda content: None, LATCHED, raw=True)
@@ -144,7 +144,7 @@ def _intrude(
     observer.spin_until(lambda: bool(_diagnosed(observer)), TIMEOUT_S)
     observer.spin_for(seconds)
     served = sum(record.outcome == 'served' for record in observer.log.ended[first:])
-    # A number belongs to the first node with it, a role to the last.
+    # A user number belongs to the first node that has it, and a role to the last.
     processes.kill(_USER_NODE if intruder == USER else _PROCESS)
     # The older node creates its publishers again.
     observer.invariants.expect_rediscovery(

@@ -26,7 +26,7 @@ def mutate(kind: type, originals: Sequence[bytes], rng: np.random.Generator) -> 
     Parameters
     ----------
     kind
-        Its ROS type.
+        ROS type of the message.
     originals
         Messages of this type to mutate, in CDR; may be empty.
 
@@ -51,12 +51,12 @@ def mutate(kind: type, originals: Sequence[bytes], rng: np.random.Generator) -> 
         for _ in range(rng.integers(1, 9)):
             changed[rng.integers(4, len(changed)) if len(changed) > 4 else 0] = rng.integers(256)
         return bytes(changed)
-    # Only whole words are cut off: DDS pads to words with zeros, which may restore the message.
+    # Cut off whole words only: DDS pads a message to whole words with zeros, which may restore it.
     return original[:4 * rng.integers(1, len(original) // 4 + 1)]
 
 
 def random_message(kind: type, rng: np.random.Generator) -> Any:
-    """Create a ROS message whose fields have random values, extreme ones among them."""
+    """Create a ROS message whose fields have random values, some of them extreme."""
     message = kind()
     for name, field_type in kind.get_fields_and_field_types().items():
         setattr(message, name, _value(field_type, rng))
@@ -82,7 +82,7 @@ def _entry_type(field_type: str) -> str:
 
 
 def _value(field_type: str, rng: np.random.Generator) -> Any:
-    """Create a value of a type as `get_fields_and_field_types` names it."""
+    """Create a value of a type whose name is as in `get_fields_and_field_types`."""
     if match := _ARRAY.match(field_type):
         return _values(match[1], int(match[2]), rng, fixed=True)
     if match := _SEQUENCE.match(field_type):

@@ -50,7 +50,7 @@ def trial_summary(kind: str, trials: Sequence[Trial]) -> str:
 
 
 def publication_summary(figures: Mapping[str, Any]) -> str:
-    """Return the publications that `trial_figures` counted as one line."""
+    """Return one line about the publications that `trial_figures` counted."""
     return (f'{figures["wrong_publications"]} wrong publications among '
             f'{figures["checked_publications"]}, {figures["unverified_publications"]} of which '
             'preceded the discovery of a node by the observer')
@@ -66,7 +66,7 @@ def intrusion_line(trial: IntrusionTrial) -> str:
 
 
 def _row(first: str, trial: Trial) -> str:
-    """Return the first columns and those that all trials have, followed by the violations."""
+    """Return the first columns and the columns of all trials, followed by the violations."""
     loggers = sorted({line.partition(':')[0] for line in trial.logged})
     reporters = f'{", ".join(loggers) or "-"}; {", ".join(trial.diagnosed) or "-"}'
     others = 'running' if trial.others_running else 'ENDED'
@@ -92,7 +92,7 @@ def soak_figures(result: SoakResult, invariants: InvariantChecker) -> dict[str, 
 
 
 def soak_text(result: SoakResult, figures: Mapping[str, Any]) -> str:
-    """Return a soak test and its figures of `soak_figures` as lines."""
+    """Return a soak test and its figures, as returned by `soak_figures`, as lines."""
     lines = [
         f'{result.minutes:.1f} minutes, {result.cycles} cycles, '
         f'{100 * result.estimate_share:.2f} % of which led to an estimate',

@@ -14,7 +14,7 @@ IMPAIRMENTS = Impairments(
     loss_probability=0.05, double_probability=0.05, delay_s=0.001, jitter_s=0.005)
 # Requirements: share of the cycles that lead to an estimate, and relative growth of the memory.
 MIN_ESTIMATE_SHARE, MAX_MEMORY_GROWTH = 0.99, 0.05
-# The growth counts from this time on, or from a third of the run if that is earlier [s].
+# Start of the measurement of growth [s], or a third of the run if that is earlier.
 _WARM_UP_S = 60.0
 _TIMEOUT_S = 30.0
 
@@ -86,7 +86,7 @@ def soak(
     Raises
     ------
     ChaosError
-        If no first cycle ends.
+        If no cycle ends at the start.
     """
     log = observer.log
     if not observer.spin_until(lambda: bool(log.ended), _TIMEOUT_S):

@@ -9,7 +9,7 @@ from system.observer import NetworkObserver
 from system.recovery import RECOVERY_LIMIT_S
 
 TIMEOUT_S = 30.0
-# Number of latest cycles among which a served one is sought.
+# Number of latest cycles among which a served cycle is sought.
 _N_LATEST = 20
 
 
@@ -24,8 +24,8 @@ class Trial:
     Attributes
     ----------
     recovery_s
-        Time from the end of the fault to the end of the first cycle that was served after it,
-        for a user of one of its own cycles [s]; infinite if there was none.
+        Time from the end of the fault to the end of the first cycle served after it [s]; if the
+        fault concerns a user, the first cycle of this user. Infinite if there was none.
     others_running
         Whether all other processes kept running.
     logged
@@ -55,18 +55,18 @@ class Trial:
 
 
 def both_served(observer: NetworkObserver, first: int) -> bool:
-    """Return whether users 1 and 2 were served in the cycles from the index `first` on."""
+    """Return whether users 1 and 2 were served in the cycles since the index `first`."""
     return {1, 2} <= {
         record.user for record in observer.log.ended[first:] if record.outcome == 'served'}
 
 
 def wait_for_service(observer: NetworkObserver) -> None:
-    """Wait until both users have been served in cycles that end from now on.
+    """Wait until both users have been served in cycles that end after this call.
 
     Raises
     ------
     ChaosError
-        If they are not.
+        If they are not served in time.
     """
     first = len(observer.log.ended)
     if not observer.spin_until(lambda: both_served(observer, first), TIMEOUT_S):
@@ -78,16 +78,16 @@ def wait_for_service(observer: NetworkObserver) -> None:
 def measure_recovery(
         observer: NetworkObserver, end_s: float, user: int | None,
         also: Callable[[], bool] = lambda: True) -> float:
-    """Return the time from the end of a fault until a cycle was served [s]; infinite: never.
+    """Return the time from the end of a fault until a cycle was served [s]; infinite if never.
 
     Parameters
     ----------
     end_s
         End of the fault on the clock `time.monotonic` [s].
     user
-        User that must be served; None: any.
+        User that must be served; None for any user.
     also
-        A further condition.
+        A further condition for recovery.
     """
     def recovered() -> bool:
         return also() and any(
@@ -103,7 +103,7 @@ def warnings_since(
     Parameters
     ----------
     log_lengths
-        Length of each log at the beginning, by name of the process.
+        Length of each old log, by name of the process.
     """
     return [f'{name}: {line.split("]: ", 1)[-1]}'
             for name, length in log_lengths.items() if name != excluded

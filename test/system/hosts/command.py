@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0 if all outages passed; 1 if not; 2 if an argument or a file is invalid; 77
+        Exit code: 0 if all outages passed, otherwise 1; 2 if an argument or a file is invalid; 77
         if network namespaces are unavailable; 130 after Ctrl-C or SIGTERM.
     """
     parser = _parser()
@@ -150,11 +150,11 @@ def _parser() -> argparse.ArgumentParser:
         'network namespaces are unavailable.')
     parser.add_argument('--pull', action='append', choices=list(plan.HOSTS), metavar='NAME',
                         help=f'host to disconnect: {", ".join(plan.HOSTS)}; may be repeated; by '
-                        'default each in turn')
+                        'default, each host in turn')
     parser.add_argument('--seconds', type=_positive, default=6.0,
                         help='duration of each outage')
     parser.add_argument('--users', type=integer(1, min(64, max_user_processes())), metavar='N',
-                        default=2, help='number of users, each a process')
+                        default=2, help='number of users, each in its own process')
     add_network_options(parser)
     parser.add_argument('--usual-discovery', action='store_true',
                         help="use Fast DDS's default settings instead of the package's profile")

@@ -72,7 +72,7 @@ class Hosts:
         Raises
         ------
         OSError
-            If that is not permitted.
+            If this process may not enter the namespace.
         """
         libc = ctypes.CDLL(None, use_errno=True)
         with open(_FOLDER / plan.namespace(self._pid, host), 'rb') as file:
@@ -80,7 +80,7 @@ class Hosts:
                 raise OSError(ctypes.get_errno(), f'setns to the host {host}')
 
     def command_prefix(self, node: str) -> list[str]:
-        """Return the prefix of a command that runs it on the host of a node."""
+        """Return the prefix with which a command runs on the host of a node."""
         return plan.command_prefix(self._pid, node)
 
     def disconnect(self, host: str) -> None:
@@ -128,7 +128,7 @@ def _run(command: plan.Command) -> str:
 def interruptible(callback: Callable[[], int]) -> int:
     """Call a function and return its result; SIGTERM and SIGHUP interrupt it like Ctrl-C.
 
-    Further signals are ignored after the first one, so that the function can clean up.
+    Signals after the first are ignored, so that the function can clean up.
     """
     def interrupt(number: int, frame: object) -> None:
         for other in before:

@@ -1,6 +1,6 @@
 """The hosts with their nodes, and the commands that create, disconnect and remove them.
 
-A host is a network namespace. A pair of virtual Ethernet devices connects each to a bridge in
+A host is a network namespace. A pair of virtual Ethernet devices connects each host to a bridge in
 another namespace, so that the machine's own network is not touched.
 """
 
@@ -27,10 +27,10 @@ WAITING: dict[str, tuple[str, ...]] = {
     'positioner': ('bs',),
     'users': (),
 }
-# Time without announcements of a node; for users, which receive none, the time after which Fast
-# DDS removes an unreachable node from the graph [s].
+# Time after which bs misses announcements, and after which Fast DDS removes an unreachable node
+# from the graph; users receive no announcements and rely on the graph [s].
 _MISSED_AFTER_S = {'bs': SILENCE_S, 'user': 20.0}
-# Maximum time from then to the report [s].
+# Maximum time from then until a node reports that it is waiting [s].
 _REPORT_DELAY_S = 3.0
 
 _PREFIX = 'rhs_isac'
@@ -101,13 +101,13 @@ def create(pid: int) -> list[Command]:
 
 
 def addresses() -> dict[str, str]:
-    """Return the IPv4 addresses of all hosts and of the observer's, all in one network."""
+    """Return the IPv4 addresses of all hosts, including the observer's, in one network."""
     return {host: f'{_NETWORK}.{number}'
             for number, host in enumerate((*HOSTS, OBSERVER), start=1)}
 
 
 def port(host: str) -> str:
-    """Return the name of the bridge's device that leads to a host."""
+    """Return the name of the device that connects the bridge with a host."""
     # Linux limits names of devices to 15 characters.
     return f'to_{host}'[:15]
 
@@ -118,11 +118,11 @@ def set_link(pid: int, host: str, up: bool) -> Command:
 
 
 def command_prefix(pid: int, node: str) -> list[str]:
-    """Return the prefix of a command that runs it on the host of a node."""
+    """Return the prefix with which a command runs on the host of a node."""
     return ['ip', 'netns', 'exec', namespace(pid, host_of(node))]
 
 
 def waiting(host: str, seconds: float) -> tuple[str, ...]:
-    """Return the nodes that report during an outage of a host [s] that they wait for its nodes."""
+    """Return the nodes that must report that they wait for a host, in an outage of `seconds`."""
     return tuple(node for node in WAITING[host]
                  if seconds >= _MISSED_AFTER_S[node] + _REPORT_DELAY_S)

@@ -79,7 +79,7 @@ class Trial:
         self._spin(invariants.CHECK_DELAY_S)
 
     def _spin(self, seconds: float, cycles: int = 0) -> None:
-        """Observe for a time, or until this many cycles have begun and been served."""
+        """Observe for a time, or until a number of cycles (0: none) have begun and been served."""
         begin_s = time.monotonic()
 
         def done() -> bool:

@@ -10,7 +10,7 @@ from rhs_isac_ros.monitoring.cycle_log import CycleTimes
 from system.recovery import RECOVERY_LIMIT_S, finite
 
 _WARNING, _WAITING = '[WARN]', 'waiting for '
-# Messages that were sent before an outage have arrived after this time [s].
+# Time within which messages that were sent before an outage arrive [s].
 _IN_FLIGHT_S = 0.2
 
 
@@ -25,8 +25,8 @@ class Outage:
     outage_s
         Duration [s].
     recovery_s
-        Time from the return of the link to the end of the first cycle that began after it [s];
-        infinite if there was none.
+        Time from the restoration of the link to the end of the first cycle that began after that
+        [s]; infinite if there was none.
     before, during, after
         Complete cycles observed before the outage, during it, and after it. A network needs all
         of its hosts: a complete cycle during the outage has bypassed the link.
@@ -66,12 +66,12 @@ def recovery_s(cycles: Sequence[CycleTimes], restored_s: float) -> float:
     cycles
         Complete cycles.
     restored_s
-        When the link was restored [s].
+        Time at which the link was restored [s].
 
     Returns
     -------
     float
-        Time to the end of the first cycle that began after that [s]; infinite if there is none.
+        Time to the end of the first cycle that began after `restored_s` [s]; infinite if none did.
     """
     return min((cycle.ended_s - restored_s for cycle in cycles if cycle.began_s >= restored_s),
                default=math.inf)
