@@ -304,8 +304,12 @@ class CycleObserver(Node):
             self.log.add(message, now_s)
 
     def _on_recorded(self, kind: type[m.Message] | None, message: bytes) -> None:
-        if kind is not None:
+        if kind is None:
+            return
+        try:
             self._on_message(convert.from_bytes(kind, message))
+        except m.MessageError as error:
+            self.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
 
     def _on_message(self, message: m.Message) -> None:
         self.observe(message, time.monotonic())

@@ -129,15 +129,21 @@ def test_an_observer_logs_the_cycles_that_it_records(bench, probe, tmp_path):
     observer = bench.add(CycleObserver, recorder)
     beacon = probe.create_publisher(ros.Beacon, 'beacon', EXCHANGE)
     state = probe.create_publisher(ros.ProtocolState, 'protocol_state', EXCHANGE)
-    for publisher in (beacon, state):
+    signals = probe.create_publisher(ros.ReceivedSignals, 'received_signals', EXCHANGE)
+    for publisher in (beacon, state, signals):
         bench.until(publisher.get_subscription_count, 'the recorder')
     beacon.publish(ros.Beacon(cycle_id=7))
     bench.until(lambda: recorder.count == 1)
+    # A malformed message is recorded, but not logged.
+    signals.publish(ros.ReceivedSignals(cycle_id=7, signals=ros.ComplexArray(
+        shape=array.array('I', [2]))))
+    bench.until(lambda: recorder.count == 2)
     state.publish(ros.ProtocolState(cycle_id=7, user=1, outcome='no_ack'))
     bench.until(lambda: observer.log.given_up)
     assert observer.log.given_up[0].cycle_id == 7
     recorder.close()
-    assert [topic for topic, _, _ in read(tmp_path / 'run.mcap')] == ['/beacon', '/protocol_state']
+    assert [topic for topic, _, _ in read(tmp_path / 'run.mcap')] == [
+        '/beacon', '/received_signals', '/protocol_state']
 
 
 @pytest.mark.parametrize('content', [b'', b'no recording at all', None], ids=str)
