@@ -28,7 +28,7 @@ _CYCLE_SERVICES = (topics.PAUSE, topics.RESUME, topics.STEP)
 _LOCATE_TOPICS = tuple(f'{topics.LOCATE}/_action/{name}' for name in ('feedback', 'status'))
 _LOCATE_SERVICES = tuple(
     f'{topics.LOCATE}/_action/{name}' for name in ('cancel_goal', 'get_result', 'send_goal'))
-# A buffer of tf2 offers its frames.
+# A tf2 buffer offers its frames through this service.
 _TF_SERVICE = 'tf2_frames'
 _GET_CODEBOOK = f'{topics.OPTIMIZER_NODE}/get_parameters'
 _VERSION = '0.2.0'

@@ -41,7 +41,10 @@ def marker(
         namespace: str, number: int,
         shape: shapes.Points | shapes.Ellipsoids | shapes.Boxes | shapes.Lines | shapes.Mesh,
         stamp: Time) -> Marker:
-    """Convert a shape to a marker; ellipsoids, meshes and outlined boxes are translucent."""
+    """Convert a shape to a marker; ellipsoids, meshes and outlined boxes are translucent.
+
+    A marker has one place and size, so only the first point or ellipsoid of a shape is drawn.
+    """
     match shape:
         case shapes.Points():
             found = _marker(namespace, number, Marker.SPHERE, stamp)

@@ -74,7 +74,7 @@ def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> 
         return create()
     # rclpy raises a ValueError for an action. RCLError and errors of threads are RuntimeErrors.
     except (RuntimeError, ValueError) as error:
-        # The end of the text is a position in the sources of ROS.
+        # The text ends with a position in the ROS sources, which does not help here.
         text = f'{what} was refused: {str(error).partition(", at ")[0].splitlines()[0]}'
         known = _refusals.setdefault(node, {})
         if what not in known:

@@ -114,7 +114,7 @@ def output_folder(text: str) -> Path:
         check_writable(found / 'file')
     except (OSError, ValueError):
         raise argparse.ArgumentTypeError(
-            f'{text!r}, expected a folder that exists or can be made, and can be written'
+            f'{text!r}, expected a folder that is writable or can be created'
         ) from None
     return path
 
@@ -132,4 +132,4 @@ def check_distinct(
         if isinstance(path, Path) and action.dest != unused:
             other = names.setdefault(path.resolve(), name)
             if other != name and action.type in outputs:
-                parser.error(f'argument {name}: {path}, expected another file than {other}')
+                parser.error(f'argument {name}: {path}, expected a file other than {other}')

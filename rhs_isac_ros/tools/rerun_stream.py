@@ -80,7 +80,7 @@ class RerunStream:
         for number in ports:
             while not _is_listening(host, number):
                 if self._server.poll() is not None or time.monotonic() > end_s:
-                    raise RuntimeError('the server of Rerun does not start')
+                    raise RuntimeError('the Rerun server does not start')
                 time.sleep(_POLL_S)
         self._rerun.connect_tcp(
             f'{"127.0.0.1" if host == "localhost" else host}:{ports[-1]}',

@@ -82,7 +82,7 @@ class Posteriors:
         self._tracks = Tracks()
 
     def __contains__(self, codebook_id: str) -> bool:
-        """Return whether a codebook is among the latest 32 that were added."""
+        """Return whether a codebook is among the latest that were added."""
         return codebook_id in self._estimators
 
     def add(self, codebook: Codebook) -> None:
@@ -313,7 +313,7 @@ def _open(stream: RerunStream, options: argparse.Namespace) -> None:
         address = stream.serve(options.port, options.bind)
     except (OSError, RuntimeError) as error:
         raise ToolError(f'{options.bind}, ports {options.port} to {options.port + 2}: {error}; '
-                         'choose others with --port') from None
+                         'choose others with --port and --bind') from None
     command.print_now(address)
 
 

@@ -1,10 +1,10 @@
 """The price of a wrong declaration: fields of the scenario that are wrong by a factor of two.
 
-Problem: the estimator assumes the band plan, and in truth a single field is twice or half as large
-(a level: 3 dB higher or lower; the refractive index: 0.2 %). How large do the errors become, and
-does the local description by `bounds.misspecified` predict them? Columns are the root mean squared
-errors of that description, for positions where it claims validity, and of the estimator `ml` on
-simulated signals at the same positions, with the 95 % interval of the ratio of the mean squared
+Problem: the estimator assumes the band plan, but the true value of one field is twice or half that
+of the plan (a level: 3 dB higher or lower; the refractive index: 0.2 %). How large do the errors
+become, and does `bounds.misspecified` predict them? The columns are the predicted root mean
+squared error, over the positions where the prediction is `valid`, and that of the estimator `ml`
+on simulated signals at the same positions, with the 95 % interval of the ratio of the mean squared
 errors from a bootstrap over the positions. Signals without a fix are left out.
 """
 

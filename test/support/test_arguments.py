@@ -86,4 +86,4 @@ def test_an_output_differs_from_inputs_and_other_outputs(tmp_path, capsys):
             check_distinct(parser, parser.parse_args(arguments), unused)
         error = capsys.readouterr().err
         assert f'argument {name}: ' in error
-        assert f', expected another file than {other};' in error
+        assert f', expected a file other than {other};' in error
