@@ -61,6 +61,14 @@ def test_where_valid_it_is_the_error_of_the_estimator(plan, positions, field, va
     assert np.mean(error / own) < 1.5
 
 
+def test_it_holds_for_errors_far_below_a_wavelength(plan, positions):
+    scenario, codebook = plan
+    quiet = dataclasses.replace(scenario, multipath_to_los_db=-35.0)
+    result = compare(quiet, quiet, codebook, positions)
+    assert np.median(result.mse_m2)**0.5 < 5e-3
+    assert result.valid.mean() > 0.85
+
+
 def test_an_unknown_surface_moves_the_position(plan, positions):
     scenario, codebook = plan
     rng = np.random.default_rng(3)

@@ -1,5 +1,6 @@
 """The error caused by the confusion of pairs of positions."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -295,6 +296,35 @@ def test_hardly_any_phases_are_better(phases):
     assert np.mean(excess < 1e-3) > 0.9
     np.testing.assert_allclose(
         penalties, np.einsum('na,ab,nb->n', found, inverse, found), atol=1e-9)
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
+@pytest.mark.parametrize('phases', [
+    {'phase_std_rad': 0.7}, {'phase_std_rad': 0.3, 'band_phase_std_rad': 0.5}])
+def test_unknown_phases_minimise_the_distance(
+        scenario, codebook, pairs, plain, assert_gradients, phases, tolerance):
+    """Compared with the definition, evaluated on a grid of phases."""
+    unknown, p = dataclasses.replace(scenario, **phases), plain(
+        scenario, codebook.analog, codebook.digital)
+    scales = nuisance_of(unknown).scaled_phases
+    z = np.stack(np.meshgrid(*[np.linspace(-2.5, 2.5, 41)] * scales.shape[1]), -1).reshape(
+        -1, scales.shape[1])
+    turns, distances = np.exp(1j * z @ scales.T), np.tile(np.sum(z**2, axis=1), (N_PAIRS, 1))
+    for i, spatial in enumerate(multipath_covariance(scenario)):
+        inverse = np.linalg.inv(p.covariance(i, spatial))
+        for n, (first, second) in enumerate(zip(p.mean(pairs[0], i), p.mean(pairs[1], i),
+                                                strict=True)):
+            delta = turns[:, i, None] * first - second
+            distances[n] += 2 * np.einsum('za,ab,zb->z', delta.conj(), inverse, delta).real
+    expected = np.mean(np.sum((pairs[0] - pairs[1])**2, axis=1) * [
+        math.erfc(math.sqrt(least / 8)) / 2 for least in distances.min(axis=1)])
+    cost = PairwiseErrorCost(unknown, *pairs, tolerance=tolerance)
+    assert cost.value(codebook) == pytest.approx(expected, rel=3e-3)
+    assert expected > 1.05 * PairwiseErrorCost(scenario, *pairs).value(codebook)
+    value, *gradients = cost(codebook)
+    assert value == pytest.approx(cost.value(codebook), rel=1e-8)
+    assert_gradients(gradients, lambda **beams: cost.value(Codebook(**beams)), codebook,
+                     np.random.default_rng(0))
 
 
 def test_small_phases_equal_the_linear_model():

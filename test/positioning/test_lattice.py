@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.positioning.coordinates import jacobian, to_polar, to_positions
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Expansion, Resolution, lay_grid
 
@@ -52,6 +53,17 @@ def test_the_grid_follows_the_number_of_distinguishable_directions(changes, fact
     counts = [len(lay_grid(scenario).nodes) / len(lay_grid(scenario).segments)
               for scenario in (base, dataclasses.replace(base, **changes))]
     assert counts[1] / counts[0] == pytest.approx(factor, rel=0.35)
+
+
+def test_a_step_in_direction_changes_the_phase_at_the_edge_by_one_radian():
+    scenario = Scenario()
+    edge_m = np.abs(element_positions(scenario)).max()
+    wavenumber = 2 * np.pi * (
+        max(scenario.center_frequencies_hz)
+        + (scenario.n_subbands - 1) / 2 * scenario.subband_width_hz) / 299_792_458
+    assert Resolution.of(scenario).direction == pytest.approx(1 / (wavenumber * edge_m), rel=1e-9)
+    single = dataclasses.replace(scenario, elements_per_side=1, n_feeds=1)
+    assert list(Resolution.of(single).direction) == [0.4, 0.4]
 
 
 def test_range_cells_follow_the_bandwidth():

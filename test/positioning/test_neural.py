@@ -1,6 +1,7 @@
 """The neural estimator and its training."""
 
 import dataclasses
+import json
 import sys
 
 import numpy as np
@@ -147,6 +148,8 @@ def test_a_model_of_another_purpose_is_rejected(
     network = training[0]
     other = random_beams(scenario, np.random.default_rng(1))
     network.save(tmp_path / 'model.npz')
+    with np.load(tmp_path / 'model.npz') as arrays:
+        assert json.loads(str(arrays['about']))['format'] == 1
     for model, message in ((network, '^model: trained for codebook'),
                            (tmp_path / 'model.npz', 'model.npz: trained for codebook')):
         with pytest.raises(ModelError, match=f'{message} {codebook.id}, expected {other.id}'):

@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.special import i0e, ive
-from scipy.stats import qmc
+from scipy.stats import multivariate_normal, qmc
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import estimators, make_estimator
 from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
-from rhs_isac_ros.positioning.posterior import BandPhases
+from rhs_isac_ros.positioning.posterior import _SPREAD, BandPhases, _log_proposal
+from rhs_isac_ros.positioning.search import Modes
 
 SCENARIO = Scenario(
     center_frequencies_hz=(2.5e9, 2.54e9, 2.6e9), elements_per_side=6, angular_spread_deg=2.0,
@@ -53,6 +54,19 @@ def posterior_moments(scenario, codebook, received, log2_points):
     weights = np.exp(values - values.max(axis=1, keepdims=True))
     return (np.array([np.average(points, axis=0, weights=one) for one in weights]),
             np.array([np.cov(points.T, aweights=one, ddof=0) for one in weights]))
+
+
+def test_the_density_of_samples_is_that_of_all_modes():
+    rng, n = np.random.default_rng(4), 4
+    roots = rng.normal(size=(n, 3, 3)) + 3 * np.eye(3)
+    means, curvature = rng.normal(5, 1, (n, 3)), roots @ np.swapaxes(roots, 1, 2)
+    fields = dict.fromkeys(Modes._fields, np.zeros(n))
+    modes = Modes(**fields | {
+        'points': means - 0.1, 'roi_offset': np.full((n, 3), 0.1), 'curvature': curvature})
+    points = rng.normal(5, 1, (20, 3))
+    expected = sum(multivariate_normal(mean, _SPREAD**2 * np.linalg.inv(one)).pdf(points)
+                   for mean, one in zip(means, curvature, strict=True))
+    np.testing.assert_allclose(np.exp(_log_proposal(points, modes)), expected, rtol=1e-9)
 
 
 @pytest.mark.slow
