@@ -49,7 +49,7 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
     return mixture_weights(exponents)[1] - mixture_weights(prior)[1]
 
 
-def share_of_level(n: int, std_db: float) -> float:
+def share_of_level(n: float, std_db: float) -> float:
     """Return the share, from 0 to 1, of the variance of a log energy that is due to its level.
 
     The energy is that of n complex Gaussian numbers whose unknown level is a log-normal power. If

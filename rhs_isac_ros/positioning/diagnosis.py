@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.gaussian import FALSE_ALARM, energy_limit
+from rhs_isac_ros.model.gaussian import FALSE_ALARM, energy_limit, share_of_level
 from rhs_isac_ros.positioning.alternatives import ALTERNATIVES, probabilities_of
 from rhs_isac_ros.positioning.estimate import Estimate
 
@@ -108,18 +108,23 @@ class InnovationTest:
     """Mean and variance of the energy of the last residuals, compared with the expectation.
 
     Twice an energy has approximately a chi-square distribution; `Estimate.expected_residual` is
-    half its mean. Raises ValueError if the window is shorter than `MIN_RETURN`, because no warning
-    could then end.
+    half its mean. With a measured covariance, the energy is also multiplied by the level of the
+    multipath, a log-normal power with the median and the standard deviation `level_db`. Users at
+    rest, or in one part of the hall, do not change their level, so all residuals may have the
+    same. Raises ValueError if the window is shorter than `MIN_RETURN`, because no warning could
+    then end.
     """
 
     #: Whether the residuals deviate from the model. It becomes True when their mean or variance
     #: over the window is improbable, and False when both are probable for the last `MIN_RETURN`.
     drifts: bool
 
-    def __init__(self, window: int = WINDOW) -> None:
+    def __init__(
+            self, window: int = WINDOW, level_db: tuple[float, float] = (0.0, 0.0)) -> None:
         if window < MIN_RETURN:
             raise ValueError(f'window: {window}, expected at least {MIN_RETURN}')
-        self._window = window
+        self._window, (median_db, self._std_db) = window, level_db
+        self._median = 10**(median_db / 10)
         self.clear()
 
     def clear(self) -> None:
@@ -132,23 +137,27 @@ class InnovationTest:
         if np.isnan(energy) or np.isnan(expected):
             return
         scale = max(expected, 1.0)
-        deviation = (energy - expected) / scale**0.5
+        share = share_of_level(scale, self._std_db)
+        shape = scale * (1 - share)
+        std = scale / shape**0.5
+        deviation = (energy / self._median - expected) / std
         deviation = min(max(deviation, -_MAX_DEVIATIONS), _MAX_DEVIATIONS)
+        variance, square_variance = max(expected, 0.0), 2 + 6 / shape
         self._residuals.append(_Residual(
-            expected + deviation * scale**0.5, expected, min(deviation**2, _MAX_SQUARE),
-            2 + 6 / scale))
+            1, expected + deviation * std, expected, min(deviation**2, _MAX_SQUARE),
+            variance, square_variance * (1 - share**2),
+            (variance * share / (1 - share))**0.5, square_variance**0.5 * share))
         if self.drifts:
             latest = list(self._residuals)[-MIN_RETURN:]
             total = _Residual.total(latest)
-            if len(latest) == MIN_RETURN and (
-                    _probability(total, MIN_RETURN) >= RETURN
-                    and _spread_probability(total, MIN_RETURN) >= SPREAD_RETURN):
+            if (len(latest) == MIN_RETURN and total.probability() >= RETURN
+                    and total.spread_probability() >= SPREAD_RETURN):
                 self.clear()
                 self._residuals.extend(latest)
         elif len(self._residuals) >= MIN_FIXES:
-            n, total = len(self._residuals), _Residual.total(self._residuals)
-            self.drifts = (_probability(total, n) < FALSE_WARNING
-                           or _spread_probability(total, n) < FALSE_SPREAD_WARNING)
+            total = _Residual.total(self._residuals)
+            self.drifts = (total.probability() < FALSE_WARNING
+                           or total.spread_probability() < FALSE_SPREAD_WARNING)
 
     @property
     def n_fixes(self) -> int:
@@ -171,39 +180,46 @@ class InnovationTest:
 class _Residual(NamedTuple):
     """A residual, or a sum of several."""
 
+    n: int
     energy: float
     expected: float
     square: float  # Square of the normalised deviation.
-    square_variance: float
+    # Variances of the energy and of the square without the part that is due to the level, and the
+    # standard deviations due to the level, which all residuals may have in common.
+    own_variance: float
+    own_square_variance: float
+    common_std: float
+    common_square_std: float
 
     @classmethod
     def total(cls, residuals: Iterable['_Residual']) -> '_Residual':
-        return cls(*map(sum, zip((0.0,) * 4, *residuals, strict=True)))
+        return cls(*map(sum, zip((0,) * len(cls._fields), *residuals, strict=True)))
+
+    def probability(self) -> float:
+        """Return the two-sided p-value of the sum of energies."""
+        # Every node imports this package, and SciPy takes longer to load than ROS.
+        from scipy.special import gammainc, gammaincc
+
+        # With few measurements and many modes, an expectation may be negative.
+        expected, slack = max(self.expected, 0.5 * self.n), _TOLERANCE * self.n
+        shape = expected**2 / max(self.own_variance + self.common_std**2, 0.5 * self.n)
+        low, high = (shape / expected * (self.energy + sign * slack) for sign in (-1, 1))
+        return 2 * float(min(gammainc(shape, high), gammaincc(shape, max(low, 0.0))))
+
+    def spread_probability(self) -> float:
+        """Return the one-sided p-value of the sum of squared deviations."""
+        from scipy.special import gammaincc
+
+        # The sum is approximately a gamma variable. The square of a normalised gamma variable of
+        # shape k has the mean 1 and the variance 2 + 6 / k.
+        mean = self.n * (1 + _SPREAD_TOLERANCE)
+        variance = (self.own_square_variance + self.common_square_std**2) * (
+            1 + _SPREAD_TOLERANCE)**2
+        return float(gammaincc(mean**2 / variance, max(self.square, 0.0) * mean / variance))
 
 
-def _probability(total: _Residual, n: int) -> float:
-    """Return the two-sided p-value of a sum of `n` energies."""
-    # Every node imports this package, and SciPy takes longer to load than ROS.
-    from scipy.special import gammainc, gammaincc
-
-    # With few measurements and many modes, an expectation may be negative.
-    expected, slack = max(total.expected, 0.5 * n), _TOLERANCE * n
-    return 2 * float(min(gammainc(expected, total.energy + slack),
-                         gammaincc(expected, max(total.energy - slack, 0.0))))
-
-
-def _spread_probability(total: _Residual, n: int) -> float:
-    """Return the one-sided p-value of a sum of `n` squared deviations."""
-    from scipy.special import gammaincc
-
-    # The sum is approximately a gamma variable. The square of a normalised gamma variable of
-    # shape k has the mean 1 and the variance 2 + 6 / k.
-    mean = n * (1 + _SPREAD_TOLERANCE)
-    variance = total.square_variance * (1 + _SPREAD_TOLERANCE)**2
-    return float(gammaincc(mean**2 / variance, max(total.square, 0.0) * mean / variance))
-
-
-def diagnose(estimates: Collection[Estimate], deviates: bool) -> dict[str, str]:
+def diagnose(estimates: Collection[Estimate], deviates: bool,
+             level_std_db: float = 0.0) -> dict[str, str]:
     """Return texts for the diagnostics from the estimates of the latest cycles.
 
     ``probability.<alternative>`` is the mean probability of an alternative. ``no_fix.share`` and
@@ -221,11 +237,13 @@ def diagnose(estimates: Collection[Estimate], deviates: bool) -> dict[str, str]:
         str(one.reason).partition(':')[0] for one in estimates if one.reason)
     if subjects:
         values['no_fix.share'] = f'{sum(subjects.values())} of {len(estimates)}'
-        values['no_fix.cause'] = _cause(estimates, subjects.most_common()[0][0], deviates)
+        values['no_fix.cause'] = _cause(
+            estimates, subjects.most_common()[0][0], deviates, level_std_db)
     return values
 
 
-def _cause(estimates: Collection[Estimate], subject: str, deviates: bool) -> str:
+def _cause(estimates: Collection[Estimate], subject: str, deviates: bool,
+           level_std_db: float) -> str:
     """Return the likely cause, given the most frequent subject of the reasons."""
     residual, expected = np.array([
         (one.residual, one.expected_residual) for one in estimates
@@ -233,6 +251,8 @@ def _cause(estimates: Collection[Estimate], subject: str, deviates: bool) -> str
     is_alternative = subject in {kind.reason for kind in ALTERNATIVES}
     if len(residual) < MIN_FIXES or is_alternative and not deviates:
         return subject
-    # The energy of n complex measurements has the relative variance 1 / n.
-    dispersion = float(np.var(np.log(residual / expected)) * np.mean(expected))
+    # The energy of n complex measurements has the relative variance 1 / n, beside that of levels.
+    n = float(np.mean(expected))
+    shape = n * (1 - share_of_level(n, level_std_db))
+    dispersion = float(shape * np.var(np.log(residual / expected)))
     return LEVEL if dispersion <= _MAX_DISPERSION else SPREAD

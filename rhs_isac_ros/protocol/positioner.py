@@ -106,9 +106,9 @@ class ResidualWatch:
     changes.
     """
 
-    def __init__(self) -> None:
-        self._codebook_id = ''
-        self._all = InnovationTest()
+    def __init__(self, level_db: tuple[float, float] = (0.0, 0.0)) -> None:
+        self._codebook_id, self._level_db = '', level_db
+        self._all = InnovationTest(WINDOW, level_db)
         self._users: NewestDict[int, InnovationTest] = NewestDict(MAX_USERS)
         self._warning = ''
         self._estimates: collections.deque[Estimate] = collections.deque(maxlen=WINDOW)
@@ -119,7 +119,7 @@ class ResidualWatch:
             self.clear()
             self._codebook_id = codebook_id
         self._estimates.append(estimate)
-        own = self._users.get(user) or InnovationTest(_USER_WINDOW)
+        own = self._users.get(user) or InnovationTest(_USER_WINDOW, self._level_db)
         self._users.put(user, own)
         for monitor in (self._all, own):
             monitor.add(float(estimate.residual), float(estimate.expected_residual))
@@ -142,7 +142,7 @@ class ResidualWatch:
         the residuals relative to the expectation, ``residual.fixes`` is the number of fixes that
         they cover, and ``warning.residual`` is the text of the current warning.
         """
-        values = diagnose(self._estimates, bool(self._warning))
+        values = diagnose(self._estimates, bool(self._warning), self._level_db[1])
         if self._all.n_fixes:
             values |= {'residual.ratio': f'{self._all.ratio:.3f}',
                        'residual.spread': f'{self._all.spread:.3f}',
@@ -220,7 +220,8 @@ class Positioner(Role):
         self._tracks = Tracks()
         # Users whose latest signals yielded no position, so that only changes are logged.
         self._lost: NewestDict[int, _Loss] = NewestDict(MAX_USERS)
-        self._residuals = ResidualWatch()
+        self._residuals = ResidualWatch(
+            scenario.multipath.level_db if scenario.multipath else (0.0, 0.0))
         # The last signals that were answered, and the messages of the answer.
         self._answered: tuple[m.ReceivedSignals, list[events.Action]] | None = None
 

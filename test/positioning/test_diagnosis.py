@@ -213,6 +213,37 @@ def test_the_variance_of_the_model_causes_no_warning(shape):
             assert not test.drifts
 
 
+@pytest.mark.parametrize('level_db', [-4.5, -3.0, -1.0])
+def test_a_user_at_rest_may_have_any_usual_level(level_db):
+    """The level of a measured covariance differs among users, here by 1 dB, and stays the same."""
+    values = energies(WINDOW, 10**(level_db / 10))
+    test = InnovationTest(WINDOW, (-3.0, 1.0))
+    for value in values:
+        test.add(float(value), EXPECTED)
+        assert not test.drifts
+    assert test.ratio == pytest.approx(10**((level_db + 3) / 10), rel=0.03)
+    known = InnovationTest(WINDOW, (-3.0, 0.0))
+    for value in values:
+        known.add(float(value), EXPECTED)
+    assert known.drifts == (level_db != -3.0)
+
+
+def test_levels_of_many_users_are_no_excess_of_the_variance():
+    levels = 10**(np.random.default_rng(1).normal(0, 0.1, WINDOW))
+    test = InnovationTest(WINDOW, (0.0, 1.0))
+    for value in levels * energies(WINDOW):
+        test.add(float(value), EXPECTED)
+    assert not test.drifts
+    assert test.spread == pytest.approx(1, abs=0.2)
+
+
+def test_a_level_far_from_the_survey_causes_a_warning():
+    test = InnovationTest(WINDOW, (-3.0, 1.0))
+    for value in energies(MIN_FIXES, 10**-1.3):
+        test.add(float(value), EXPECTED)
+    assert test.drifts
+
+
 def test_few_residuals_are_not_judged():
     assert not filled([1e6] * (MIN_FIXES - 1)).drifts
     assert filled([1e6] * MIN_FIXES).drifts

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.positioning import Estimate, TrackEstimate
+from rhs_isac_ros.model import Scenario, simulate_received
+from rhs_isac_ros.positioning import Estimate, TrackEstimate, make_estimator
 from rhs_isac_ros.positioning.diagnosis import MIN_FIXES, MIN_RETURN, WINDOW
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import SettingsOffered
@@ -69,6 +70,21 @@ def test_many_deviating_users_make_one_line_of_bounded_length():
     text = watch.status()['warning.residual']
     assert 'user 8: ' in text
     assert text.endswith('; 11 more users')
+
+
+@pytest.mark.parametrize('n_places', [1, 60])
+def test_the_shipped_hall_causes_no_warning(pytestconfig, shipped, n_places):
+    scenario = Scenario.from_yaml(pytestconfig.rootpath / 'config' / 'hall.yaml')
+    positions = scenario.sample_positions(n_places, np.random.default_rng(n_places))
+    found = make_estimator('bayes', scenario, shipped).estimate(simulate_received(
+        scenario, shipped, np.resize(positions, (60, 3)), np.random.default_rng(1)))
+    watch, unaware = ResidualWatch(scenario.multipath.level_db), ResidualWatch()
+    for one in zip(found.mean, found.covariance, found.reason, found.residual,
+                   found.expected_residual, strict=True):
+        assert watch.add(1, 'a', Estimate(*one)) == ('', False)
+        unaware.add(1, 'a', Estimate(*one))
+    assert 'warning.residual' in unaware.status()
+    assert 0.7 < float(watch.status()['residual.ratio']) < 1.5
 
 
 def test_users_who_may_be_outside_are_not_compared():
