@@ -171,7 +171,13 @@ def test_the_bands_are_chosen_with_the_codebook(call, files, scenario, capsys, m
     monkeypatch.setattr(band_plan, '_SHORT_POSITIONS', 4)
     monkeypatch.setattr(band_plan, '_SHORT_PHASES', 4)
     monkeypatch.setattr(band_plan, '_PHASES', 4)
-    plan = files / 'plan.yaml'
+    plan, optimize = files / 'plan.yaml', __main__.optimize
+
+    def checked(scenario, **options):
+        # If the search does not finish, its codebook belongs to the plan in the file.
+        assert Scenario.from_yaml(plan).id == scenario.id
+        return optimize(scenario, **options)
+    monkeypatch.setattr(__main__, 'optimize', checked)
     assert call('--spectrum', '2.5e9:2.52e9', '3e9:3e9', '--bands', 2, '--raster', 5e6,
                 '--steps', 3, '--plan', plan) == 0
     chosen, codebook = Scenario.from_yaml(plan), Codebook.load(files / 'codebook.yaml')
