@@ -129,3 +129,7 @@ def test_the_report_lists_failures_errors_and_gains(calibration, scenario):
               if line.startswith('  ') and 'stuck' not in line]
     assert errors == sorted(errors, reverse=True)
     assert len(errors) == 5
+    working = ~calibration.surface.failed
+    rms = 100 * np.sqrt(np.mean(np.abs(calibration.surface.gains[working] - 1)**2))
+    known = 100 * np.sqrt(np.mean(calibration.surface.std()[:25][working]**2))
+    assert f'errors of working elements: {rms:.2f} % rms, known to {known:.2f} % rms' in lines
