@@ -41,6 +41,12 @@ def test_comparisons_of_the_same_cases_are_paired():
     assert own.reduction_from(baseline) == pytest.approx((40, 40, 40), abs=1e-3)
 
 
+def test_differences_of_the_same_results_are_paired():
+    results = np.random.default_rng(0).exponential(size=(3, 50))
+    one, other = (replicate(results + shift, 0)[0] for shift in (0.5, 0.0))
+    assert one.minus(other).interval() == pytest.approx((0.5, 0.5, 0.5), abs=1e-5)
+
+
 def test_the_interval_of_many_cases_is_that_of_their_standard_error():
     results = np.random.default_rng(0).normal(10, 1, size=(1, 4000))
     value, low, high = replicate(results, 0)[0].interval()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
+from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import (
     ModelError,
@@ -141,6 +142,12 @@ def test_all_valid_signals_are_located(scenario, codebook, training):
 def test_invalid_signals_are_errors(scenario, codebook, training, signals):
     with pytest.raises(SignalError, match='^received: '):
         NeuralEstimator(scenario, codebook, training[0]).estimate(signals)
+
+
+def test_a_codebook_of_another_scenario_is_rejected(scenario, codebook, training):
+    larger = dataclasses.replace(scenario, n_frames=scenario.n_frames + 1)
+    with pytest.raises(CodebookError, match='expected'):
+        NeuralEstimator(larger, codebook, training[0])
 
 
 def test_a_model_of_another_purpose_is_rejected(

@@ -94,8 +94,14 @@ def test_exactly_one_of_several_nodes_serves():
     assert serving == [all_of_them[0]]
 
 
+def test_a_clock_may_be_ahead_by_less_than_an_hour(presences):
+    assert presences.add(
+        dataclasses.replace(other(), sender=NOW_NS + 3500 * 10**9), NOW_NS, 0.0)
+    assert presences.stands_by
+
+
 @pytest.mark.parametrize('changes', [
-    {'role': 'channel'}, {'sender': 0}, {'sender': NOW_NS + 2 * 3600 * 10**9},
+    {'role': 'channel'}, {'sender': 0}, {'sender': NOW_NS + 3700 * 10**9},
     {'sender': 2**64 - 1}])
 def test_other_roles_and_impossible_instances_are_ignored(presences, changes):
     assert presences.add(dataclasses.replace(other(), **changes), NOW_NS, 0.0) == []

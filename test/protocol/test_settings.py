@@ -1,13 +1,24 @@
 """Settings of roles, and their description."""
 
+import dataclasses
+
 import pytest
 
 from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
+    Impairments,
     PendingSettings,
     PositionerSettings,
+    TransmissionSettings,
     shown,
 )
+
+
+@pytest.mark.parametrize(
+    'kind', [BaseStationSettings, Impairments, PositionerSettings, TransmissionSettings])
+def test_defaults_are_valid(kind):
+    for field in dataclasses.fields(kind):
+        assert field.metadata['declared'].problem(field.default) == '', field.name
 
 
 def test_settings_in_use_and_pending_are_described():
