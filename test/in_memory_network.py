@@ -37,7 +37,6 @@ from rhs_isac_ros.protocol.events import (
     Timeout,
 )
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
-from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.protocol.settings import BaseStationSettings, Impairments, PositionerSettings
 from rhs_isac_ros.protocol.transmission import Transmission
 from rhs_isac_ros.ros.roster import ROSTER
@@ -178,7 +177,7 @@ class Network:
         self._started = False
         for user, place in users.items():
             self.add_user(user, place)
-        for name in (*PEERS['bs'], 'bs'):
+        for name in (*(role for role in ROLES if role not in ('user', 'bs')), 'bs'):
             if name not in absent:
                 self.add(name)
         self._started = True
@@ -396,7 +395,7 @@ class Network:
 
     def _build(self, name: str):
         scenario, step_s = self.scenario, self.settings.step_timeout_s
-        match self._kind(name):
+        match kind := self._kind(name):
             case 'bs':
                 rng = streams.generator(self.seed, streams.BASE_STATION)
                 # Cycle ids are never repeated, as with the clock of the node.
@@ -407,8 +406,6 @@ class Network:
                 return user_role.User(
                     self._mobilities[name], step_s, self._beacon_timeout_s,
                     self.instances[name])
-            case 'rhs_controller':
-                return RhsController()
             case 'channel':
                 # Two channels differ in their multipath. Without memory, the expected signals
                 # depend on the seed alone.
@@ -418,7 +415,7 @@ class Network:
                 return Positioner(scenario, lambda: self.now_s)
             case 'transmission':
                 return Transmission(scenario)
-        raise ValueError(name)
+        return ROLES[kind]()
 
     def _receive(self, codebook, feeds, user: int, cycle_id: int, noise: bool) -> np.ndarray:
         rng = streams.generator(self.seed, streams.RECEIVER, user, cycle_id)

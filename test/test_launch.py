@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.ros.roster import UNIQUE
 
 ROOT = Path(__file__).parents[1]
 FILES = ('network.launch.py', 'network.launch.xml')
@@ -100,7 +101,7 @@ def test_both_files_list_the_same_arguments():
     assert python == xml and python.keys() == module.ARGUMENTS.keys()
 
 
-ONE_EACH = ['rhs_controller', 'positioner', 'transmission', 'optimizer', 'channel']
+ONE_EACH = [name for name in UNIQUE if name != 'bs']
 
 
 @needs_launch

@@ -33,6 +33,7 @@ from rhs_isac_ros.protocol.events import (
 from rhs_isac_ros.protocol.role import ANY, SAME, StateMachine, always, rows_for
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.user_registry import POLICIES
+from rhs_isac_ros.ros.roster import ROSTER
 
 # The first state, the states without a time-out, and the state that a role reaches if it receives
 # no messages.
@@ -55,6 +56,11 @@ TIMED = [(name, state) for name, role in ROLES.items()
 WITHOUT_ROWS = [(name, state, event) for name, role in ROLES.items()
                 for state in role.machine.STATES for event in role.machine.EVENT_NAMES
                 if not rows_for(role.machine.TABLE, state, event)]
+
+
+def test_all_state_machines_are_tested():
+    assert ROLES.keys() == {
+        name for name, member in ROSTER.items() if hasattr(member.role, 'TABLE')}
 
 
 @pytest.fixture(params=ROLES)

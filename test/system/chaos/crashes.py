@@ -21,7 +21,9 @@ from system.trial_processes import TrialProcesses
 # Messages that each node publishes.
 PUBLISHES = {name if member.is_unique else f'{name}_1': member.role.SENDS if member.role else ()
              for name, member in ROSTER.items()}
-NODES = tuple(PUBLISHES)
+# Nobody misses a role that no other needs.
+_NEEDED = {name for member in ROSTER.values() for name in member.needed}
+NODES = tuple(name for name in PUBLISHES if name in _NEEDED or name not in ROSTER)
 PHASES = tuple(m.Phase)
 # A killed node is restarted after this time [s]. Until then, the other nodes must report that it
 # is missing: users wait 1.5 s for a beacon, and diagnostics are published once a second.

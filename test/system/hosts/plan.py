@@ -8,9 +8,11 @@ import re
 from collections.abc import Callable, Iterable
 
 from rhs_isac_ros.protocol.presences import SILENCE_S
+from rhs_isac_ros.ros.roster import ROSTER
 
+_ELSEWHERE = ('bs', 'rhs_controller', 'channel', 'positioner', 'transmission', 'user')
 HOSTS: dict[str, tuple[str, ...]] = {
-    'base_station': ('bs', 'optimizer'),
+    'base_station': ('bs', *(name for name in ROSTER if name not in _ELSEWHERE)),
     'surface': ('rhs_controller',),
     'channel': ('channel',),
     'positioner': ('positioner', 'transmission'),
