@@ -29,9 +29,8 @@ from rhs_isac_ros.ros.roster import ROSTER
 from rhs_isac_ros.ros.topics import NAMES
 
 # Roles, in the order of the columns.
-_ORDER = ('user', 'channel', 'bs', 'rhs_controller', 'positioner', 'transmission')
-RECEIVES = {name: ROSTER[name].role.RECEIVES for name in dict.fromkeys((*_ORDER, *ROSTER))
-            if ROSTER[name].role}
+RECEIVES = {name: ROSTER[name].role.RECEIVES for name in (
+    'user', 'channel', 'bs', 'rhs_controller', 'positioner', 'transmission')}
 _COLUMN, _ROW, _TOP, _LEFT = 165, 24, 50, 70
 # The page includes the picture, so that its style must not match other pictures. The background is
 # that of the theme, light or dark.
