@@ -132,6 +132,7 @@ class OptimizerNode(ParameterizedNode):
         self.add_post_set_parameters_callback(self._on_codebook_set)
         # Last, so that no request arrives before the parameters are declared.
         self._parameter_service = GroupParameterService(self, CODEBOOK_PREFIX)
+        self._peers.take_role()
 
     def _first_codebook(self, file: Path | str) -> Codebook:
         codebook = Codebook.from_parameters(self._codebook_values())

@@ -28,7 +28,7 @@ class Presence:
 
     sender: int  # instance of the node: its start [ns since 1970]
     scenario_id: str
-    role: str
+    role: str  # empty until the node has created its publishers and subscriptions
     node: str  # fully qualified name
     scenario: str  # the result of `Scenario.fields`, in JSON
 
@@ -80,9 +80,13 @@ class Presences:
                   for scenario_id in ended), *self._choose(present)]
 
     def silent(self) -> set[str]:
-        """Return the names of the nodes that have announced themselves and fallen silent."""
+        """Return the names of known nodes of which no instance announces a role.
+
+        A node that was restarted after a crash has no role yet, although the graph still contains
+        the publishers and subscriptions of its predecessor.
+        """
         return {other.node for other, _ in self._known.values()} - {
-            other.node for other in self._present()}
+            other.node for other in self._present() if other.role}
 
     def _present(self) -> list[Presence]:
         return [other for other, last_s in self._known.values()
@@ -119,7 +123,7 @@ class Presences:
         """Find the newest other node of the role; log a change of the node that serves."""
         own, before = self.own, self._rival if self.stands_by else None
         rivals = [other for other in present
-                  if other.role == own.role and not self._is_stranger(other)]
+                  if other.role and other.role == own.role and not self._is_stranger(other)]
         self._rival = max(rivals, key=lambda other: other.sender, default=None)
         rival = self._rival
         if rival and rival != before and rival.sender != self._logged_older:

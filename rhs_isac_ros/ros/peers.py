@@ -1,5 +1,6 @@
 """Presence of other nodes, derived from the ROS graph and from their announcements."""
 
+import dataclasses
 import itertools
 import json
 import threading
@@ -51,7 +52,8 @@ class Peers:
     A role is missing if no node has all its `identifying_endpoints`. The role counts as present
     once two polls in a row have found such a node, which then had time to discover this node.
     Nodes of unique roles also announce themselves periodically. A node that falls silent does not
-    count, although it remains in the graph for some time. Of two nodes with the same role, the
+    count, although it remains in the graph for some time, nor does its successor of the same name
+    until it has called `take_role`. Of two nodes with the same role, the
     newer one serves. Endpoints are logged if they cannot exchange messages, because one requests a
     quality of service that the other does not offer.
 
@@ -81,8 +83,9 @@ class Peers:
         self._incompatible: dict[tuple[str, str], str] = {}
         # Endpoints that were logged, which are not logged again if they are created again.
         self._logged: set[tuple[str, str]] = set()
+        self._role = role
         self._presences = Presences(Presence(
-            instance, scenario.id, role, node.get_fully_qualified_name(),
+            instance, scenario.id, '', node.get_fully_qualified_name(),
             json.dumps(scenario.fields())))
         # Time of the last poll or received announcement, and total duration of stalls [s].
         self._last_s, self._missed_s = time.monotonic(), 0.0
@@ -90,7 +93,7 @@ class Peers:
         self._silent: set[str] = set()
         # The rival at the last call of `on_rival`; 0 if there was none.
         self._rival = 0
-        self._closed, self._thread = threading.Event(), threading.Thread()
+        self._closed, self._changed, self._thread = False, threading.Event(), threading.Thread()
         if ROSTER[role].is_unique:
             endpoints.subscribe(node, ros.Presence, topics.PRESENCE, self._receive,
                                 endpoints.PRESENCES, raw=True)
@@ -102,9 +105,15 @@ class Peers:
         self._timer = endpoints.steady_timer(node, _POLL_S, self._poll)
         self.restart()
 
+    def take_role(self) -> None:
+        """Announce the role, once the node has created all its publishers and subscriptions."""
+        self._presences.own = dataclasses.replace(self._presences.own, role=self._role)
+        self._changed.set()
+
     def close(self) -> None:
         """End the announcements, before the node is destroyed."""
-        self._closed.set()
+        self._closed = True
+        self._changed.set()
         if self._thread.is_alive():
             self._thread.join()
 
@@ -225,7 +234,8 @@ class Peers:
 
     def _announce(self, publisher: Publisher) -> None:
         """Announce this node periodically until it ends."""
-        while not self._closed.is_set():
+        while not self._closed:
+            self._changed.clear()
             try:
                 publisher.publish(convert.to_bytes(
                     self._presences.own, self._node.get_clock().now().nanoseconds, frame=''))
@@ -236,7 +246,7 @@ class Peers:
                     return
                 self._node.get_logger().error(
                     f'others may miss this node: {topics.PRESENCE}: {error}', once=True)
-            self._closed.wait(PERIOD_S)
+            self._changed.wait(PERIOD_S)
 
     def _receive(self, content: bytes) -> None:
         try:

@@ -245,6 +245,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         endpoints.subscribe_messages(
             self, kinds, self._sizes, self._on_message, self._on_malformed, self.scenario.id,
             on_foreign=self._on_foreign, on_arrival=self._statistics.count_received)
+        self._peers.take_role()
 
     def report(self) -> Report:
         """Return the diagnostics of the role, with the faults since the last report."""

@@ -83,6 +83,23 @@ def test_a_name_is_silent_if_none_of_its_instances_announces_itself(presences):
     assert presences.silent() == {'/optimizer', '/channel'}
 
 
+def test_a_restarted_node_is_silent_until_it_has_a_role(presences):
+    presences.add(other(age_s=2, node='/channel', role='channel'), NOW_NS, 0.0)
+    presences.add(other(node='/channel', role=''), NOW_NS, 2.0)
+    assert presences.silent() == {'/channel'}
+    presences.add(other(node='/channel', role='channel'), NOW_NS, 2.1)
+    assert presences.silent() == set()
+
+
+def test_nodes_without_a_role_do_not_supersede():
+    starting = Presences(dataclasses.replace(OWN, role=''))
+    for presences in (starting, Presences(OWN)):
+        assert presences.add(other(role=''), NOW_NS, 0.0) == []
+        assert not presences.stands_by
+    # Nodes with another scenario are reported at once.
+    assert starting.add(other(role='', scenario_id='sc2'), NOW_NS, 0.0)
+
+
 def test_exactly_one_of_several_nodes_serves():
     all_of_them = [other(age_s=age_s) for age_s in range(4)]
     serving = []

@@ -166,6 +166,25 @@ def test_a_node_that_has_fallen_silent_is_missing_although_the_graph_contains_it
         bench.until(lambda: 'positioner' not in reports[-1], 'presence of the second instance')
 
 
+def test_the_endpoints_of_a_killed_process_do_not_belong_to_its_successor(bench):
+    killed = bench.add(Node, 'positioner')
+    create_endpoints(killed, REQUIRED['bs']['positioner'])
+    publisher = killed.create_publisher(ros.Presence, topics.PRESENCE, LATCHED)
+    announcement = {'node': '/positioner', 'scenario': '{}'}
+    reports = []
+    watch = Peers(bench.add(Node, 'monitor'), 'bs', new_instance(), Scenario(), reports.append,
+                  lambda stands_by: None)
+    publisher.publish(ros.Presence(sender=1, role='positioner', **announcement))
+    bench.until(lambda: reports and 'positioner' not in reports[-1], 'presence')
+    bench.until(lambda: 'positioner' in reports[-1], 'silence')
+    n_reports, n_polls = len(reports), watch._polls
+    publisher.publish(ros.Presence(sender=2, role='', **announcement))
+    bench.until(lambda: watch._polls > n_polls + 20, 'polls')
+    assert len(reports) == n_reports
+    publisher.publish(ros.Presence(sender=2, role='positioner', **announcement))
+    bench.until(lambda: 'positioner' not in reports[-1], 'presence of the successor')
+
+
 @pytest.mark.parametrize('unknown', ['_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_'])
 def test_endpoints_without_the_name_of_their_node_belong_to_their_participant(unknown):
     """Fast DDS does not deliver names again after a process has stood still."""
