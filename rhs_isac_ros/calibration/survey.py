@@ -118,7 +118,7 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
 
 
 def survey_report(estimate: MultipathEstimate) -> str:
-    """Describe an estimate: fields, weights, and the expected coverage."""
+    """Describe an estimate: fields, weight of the prior, inflation, and expected coverage."""
     about = estimate.about
     coverage, low, high = (100 * share for share in about['coverage'])
     return '\n'.join([

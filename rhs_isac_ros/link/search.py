@@ -212,7 +212,7 @@ class _Waves(NamedTuple):
         return cls(analog, np.log1p(snr).sum(axis=-1), on_board, in_air)
 
     def improved(self, known: np.ndarray, paths: np.ndarray, fixed: np.ndarray) -> '_Waves':
-        """Match configurations to these waves over paths `known`; compute waves over `paths`."""
+        """Match configurations to the waves over `known` paths; return their waves on `paths`."""
         analog = _enabled(self.on_board * self.in_air, known, fixed)
         return _Waves.at(paths, analog, self.on_board)
 

@@ -318,9 +318,9 @@ class WeightedModes(NamedTuple):
 def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> WeightedModes | None:
     """Compute the modes for the signals of one phase, complex128 [N_B, N_SB F] or [N_B, N_SB, F].
 
-    The mixture has the mean and covariance of `BayesEstimator`, apart from the sampling error of
-    its mean, unless that estimate is an average over draws. The result is None if there is no
-    position. Raises `SignalError` if the signals cannot be used.
+    If `BayesEstimator` does not average over draws, the mixture has the mean and covariance of its
+    estimate, up to the sampling error of the mean. The result is None if there is no position.
+    Raises `SignalError` if the signals cannot be used.
     """
     modes = estimator.posterior(received.reshape(len(received), -1)).modes
     if modes is None:

@@ -327,7 +327,7 @@ class FailureModel:
 
     def _predicted(self, values: np.ndarray, columns: np.ndarray, whitening: Whitening,
                    n_failed: int) -> np.ndarray:
-        """Return the marginal log-likelihood after a step from columns [H, C, N_B, N_SB F]."""
+        """Predict the log-likelihood of H sets after a Newton step from columns [H, C, N_B, R]."""
         n = len(columns)
         white = np.matmul(np.moveaxis(columns, 2, 0), np.swapaxes(whitening.whitener, 2, 3))
         white = np.moveaxis(white, 0, 2).reshape(n, columns.shape[1], -1)

@@ -417,9 +417,9 @@ def _in_phase(outputs: np.ndarray, std: float) -> np.ndarray:
 class Alignment:
     """Estimates of the parameters that move the multipath, from the signals alone.
 
-    Offsets of carrier and timing move the signals out of the nulls of the multipath, so they must
-    be known before the search. The unknown position is represented by the covariance of the mean
-    signals over the region, `spread` of `tabulate`.
+    Offsets of carrier and timing move the multipath out of the nulls of its covariance, so they
+    must be known before the search. `spread`, from `tabulate`, is the covariance of the mean
+    signals over the region. It represents the unknown position.
     """
 
     def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:

@@ -41,7 +41,7 @@ class _Track:
     time_s: float
 
     def is_late(self, received: m.ReceivedSignals) -> bool:
-        """Return whether signals are from the same base station, but not from a later cycle."""
+        """Return whether the base station of the track sent these signals in no later cycle."""
         return received.sender == self.latest.sender and (
             received.cycle_id <= self.latest.cycle_id)
 

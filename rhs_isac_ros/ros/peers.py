@@ -40,7 +40,7 @@ _last_instance = 0
 
 
 def new_instance() -> int:
-    """Return an instance for a node that starts now [ns since 1970], unique in this process."""
+    """Return the instance of a node that starts now: its start [ns since 1970], made unique."""
     global _last_instance
     _last_instance = max(time.time_ns(), _last_instance + 1)
     return _last_instance

@@ -123,7 +123,7 @@ def check_distinct(
         parser: argparse.ArgumentParser, options: argparse.Namespace, unused: str = '') -> None:
     """Exit with a usage error if an output file is also an input or another output.
 
-    The option `unused` is ignored, because its default is not used.
+    `unused` names an option that has no effect, so that its default need not be distinct.
     """
     outputs, names = (output_file, picture_file), dict[Path, str]()
     # Inputs come first.
