@@ -21,8 +21,9 @@ def test_a_mean_has_the_interval_of_its_standard_error(squares):
 
 
 def test_measures_of_the_same_results_have_the_same_interval(squares):
-    (replicates,) = replicate(squares, 0)
-    assert measured(MEASURES['mse'], squares) == pytest.approx(replicates.interval(), rel=1e-6)
+    results = squares * [[0.5], [1.0], [1.5]]
+    (replicates,) = replicate(results, 0)
+    assert measured(MEASURES['mse'], results) == pytest.approx(replicates.interval(), rel=1e-6)
 
 
 def test_roots_and_quantiles(squares):

@@ -44,7 +44,9 @@ def test_comparisons_of_the_same_cases_are_paired():
 def test_differences_of_the_same_results_are_paired():
     results = np.random.default_rng(0).exponential(size=(3, 50))
     one, other = (replicate(results + shift, 0)[0] for shift in (0.5, 0.0))
-    assert one.minus(other).interval() == pytest.approx((0.5, 0.5, 0.5), abs=1e-5)
+    difference = one.minus(other)
+    assert difference.interval() == pytest.approx((0.5, 0.5, 0.5), abs=1e-5)
+    np.testing.assert_allclose(difference.by_member, 0.5, atol=1e-5)
 
 
 def test_the_interval_of_many_cases_is_that_of_their_standard_error():
