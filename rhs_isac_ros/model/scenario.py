@@ -321,6 +321,11 @@ class Scenario(Extensions, Table1):
         return sides if isinstance(sides, int) else sides[1]
 
     @property
+    def multipath_level_db(self) -> tuple[float, float]:
+        """Median and standard deviation of the level of a user's multipath [dB]."""
+        return self.multipath.level_db if self.multipath else (0.0, 0.0)
+
+    @property
     def n_elements(self) -> int:
         """Number of elements N_E."""
         return self.n_columns * self.n_rows

@@ -97,8 +97,7 @@ class Blocked:
     def __init__(self, scenario: Scenario) -> None:
         share = scenario.blocked_probability
         self.log_odds = math.log(share / max(1 - share, _MIN_PROBABILITY))
-        self._median_db, self._std_db = (
-            scenario.multipath.level_db if scenario.multipath else (0.0, 0.0))
+        self._median_db, self._std_db = scenario.multipath_level_db
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
                         prior: NuisancePrior) -> float:

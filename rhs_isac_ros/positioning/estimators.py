@@ -109,7 +109,7 @@ class SearchEstimator(abc.ABC):
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
         # Median level of the multipath of users in sight, and the share of a residual's deviation
         # that is due to the level.
-        median_db, std_db = scenario.multipath.level_db if scenario.multipath else (0.0, 0.0)
+        median_db, std_db = scenario.multipath_level_db
         self._level = 10**(median_db / 10)
         self._level_share = share_of_level(n_measurements, std_db)
         self._test = FitTest(n_measurements, self._level)

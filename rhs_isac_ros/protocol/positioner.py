@@ -220,8 +220,7 @@ class Positioner(Role):
         self._tracks = Tracks()
         # Users whose latest signals yielded no position, so that only changes are logged.
         self._lost: NewestDict[int, _Loss] = NewestDict(MAX_USERS)
-        self._residuals = ResidualWatch(
-            scenario.multipath.level_db if scenario.multipath else (0.0, 0.0))
+        self._residuals = ResidualWatch(scenario.multipath_level_db)
         # The last signals that were answered, and the messages of the answer.
         self._answered: tuple[m.ReceivedSignals, list[events.Action]] | None = None
 

@@ -170,6 +170,11 @@ def subscribe(
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False)))
 
 
+def log_dropped(node: Node, error: m.MessageError) -> None:
+    """Log the reason why a node drops a message, at most every ten seconds."""
+    node.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
+
+
 def subscribe_messages(
         node: Node, kinds: Iterable[type[m.Message]], sizes: Mapping[str, int] | None,
         on_message: Callable[[m.Message], None],
@@ -192,9 +197,6 @@ def subscribe_messages(
     exchange
         Quality of service of messages that are not latched.
     """
-    def log(error: m.MessageError) -> None:
-        node.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
-
     def receive(kind: type[m.Message], serialized: bytes) -> None:
         on_arrival(kind)
         try:
@@ -205,7 +207,7 @@ def subscribe_messages(
             if sizes is not None:
                 m.check(message, sizes)
         except m.MessageError as error:
-            (on_error or log)(error)
+            (on_error or functools.partial(log_dropped, node))(error)
             return
         on_message(message)
     for kind in kinds:

@@ -53,9 +53,9 @@ class Peers:
     once two polls in a row have found such a node, which then had time to discover this node.
     Nodes of unique roles also announce themselves periodically. A node that falls silent does not
     count, although it remains in the graph for some time, nor does its successor of the same name
-    until it has called `take_role`. Of two nodes with the same role, the
-    newer one serves. Endpoints are logged if they cannot exchange messages, because one requests a
-    quality of service that the other does not offer.
+    until it has called `take_role`. Of two nodes with the same role, the newer one serves.
+    Endpoints are logged if they cannot exchange messages, because one requests a quality of
+    service that the other does not offer.
 
     Parameters
     ----------
@@ -235,7 +235,6 @@ class Peers:
     def _announce(self, publisher: Publisher) -> None:
         """Announce this node periodically until it ends."""
         while not self._closed:
-            self._changed.clear()
             try:
                 publisher.publish(convert.to_bytes(
                     self._presences.own, self._node.get_clock().now().nanoseconds, frame=''))
@@ -247,6 +246,7 @@ class Peers:
                 self._node.get_logger().error(
                     f'others may miss this node: {topics.PRESENCE}: {error}', once=True)
             self._changed.wait(PERIOD_S)
+            self._changed.clear()
 
     def _receive(self, content: bytes) -> None:
         try:

@@ -309,8 +309,7 @@ class CycleObserver(Node):
         try:
             self._on_message(convert.from_bytes(kind, message))
         except m.MessageError as error:
-            logger = self.get_logger()  # type: ignore[no-untyped-call]
-            logger.warning(f'dropped: {error}', throttle_duration_sec=10.0)
+            endpoints.log_dropped(self, error)
 
     def _on_message(self, message: m.Message) -> None:
         self.observe(message, time.monotonic())

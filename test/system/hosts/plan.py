@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterable
 from rhs_isac_ros.protocol.presences import SILENCE_S
 from rhs_isac_ros.ros.roster import ROSTER
 
-_ELSEWHERE = ('bs', 'rhs_controller', 'channel', 'positioner', 'transmission', 'user')
-HOSTS: dict[str, tuple[str, ...]] = {
-    'base_station': ('bs', *(name for name in ROSTER if name not in _ELSEWHERE)),
+_OTHERS: dict[str, tuple[str, ...]] = {
     'surface': ('rhs_controller',),
     'channel': ('channel',),
     'positioner': ('positioner', 'transmission'),
     'users': ('user',),
 }
+HOSTS = {'base_station': tuple(
+    name for name in ROSTER if name not in sum(_OTHERS.values(), ())), **_OTHERS}
 # Host of the observer, which is never disconnected.
 OBSERVER = 'observer'
 SWITCH = 'switch'
