@@ -80,12 +80,12 @@ class Presences:
                   for scenario_id in ended), *self._choose(present)]
 
     def silent(self) -> set[str]:
-        """Return the names of known nodes of which no instance announces a role.
+        """Return the names of nodes that have announced a role, and do not announce it any more.
 
         A node that was restarted after a crash has no role yet, although the graph still contains
         the publishers and subscriptions of its predecessor.
         """
-        return {other.node for other, _ in self._known.values()} - {
+        return {other.node for other, _ in self._known.values() if other.role} - {
             other.node for other in self._present() if other.role}
 
     def _present(self) -> list[Presence]:

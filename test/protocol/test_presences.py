@@ -89,6 +89,9 @@ def test_a_restarted_node_is_silent_until_it_has_a_role(presences):
     assert presences.silent() == {'/channel'}
     presences.add(other(node='/channel', role='channel'), NOW_NS, 2.1)
     assert presences.silent() == set()
+    # A node that starts for the first time has no predecessor.
+    presences.add(other(age_s=1, node='/optimizer', role=''), NOW_NS, 2.1)
+    assert presences.silent() == set()
 
 
 def test_nodes_without_a_role_do_not_supersede():
