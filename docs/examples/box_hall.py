@@ -1,13 +1,13 @@
 """Propagation paths in an empty rectangular hall, computed with the image method.
 
 The surface is on the wall x = -0.05 m of a concrete hall of 20 x 14 x 5 m. Antennas are vertically
-polarised and have no pattern. Walls, floor and ceiling reflect specularly, up to two times. The
-script writes the paths of users on a raster, and a survey of users at random positions:
+polarised and have no pattern. Paths have up to two specular reflections from walls, floor and
+ceiling. The script writes the paths of users on a raster, and a survey at random positions:
 
     python3 docs/examples/box_hall.py hall_paths.npz hall_multipath.npz
 
-With a folder as its only argument, it writes the files for ``scripts/benchmark channels``, of a
-narrower and lower hall.
+With a folder as its only argument, it writes the files of a narrower and lower hall for
+``scripts/benchmark channels``.
 """
 
 import dataclasses
@@ -25,16 +25,16 @@ from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, PathChannel, Scenario, simula
 HALL = np.array([[-0.05, -7.0, -2.0], [19.95, 7.0, 3.0]])
 NARROW_HALL = np.array([[-0.05, -5.2, -1.5], [24.0, 5.6, 1.8]])
 F0_HZ = 2.75e9
-# Relative permittivity and conductivity of concrete, ITU-R P.2040, and the number of reflections.
+# Complex permittivity of concrete by ITU-R P.2040, and the maximum number of reflections.
 PERMITTIVITY = 5.24 - 1j * 0.0462 * (F0_HZ / 1e9)**0.7822 * 17.98 / (F0_HZ / 1e9)
 MAX_ORDER = 2
-# Distance of the users on the raster, and their height relative to the surface [m].
+# Spacing of the raster, and height of its users relative to the centre of the surface [m].
 RASTER_M, HEIGHT_M = 0.5, -0.5
 N_SURVEY = 100
 
 
 def trace(users: np.ndarray, hall: np.ndarray = HALL, max_order: int = MAX_ORDER) -> PathChannel:
-    """Return the paths of users, float64 [N, 3] [m], in a hall with two corners, [2, 3] [m]."""
+    """Compute the paths of users, [N, 3] [m], in a hall between two corners, [2, 3] [m]."""
     low, high = hall
     orders = [order for order in itertools.product(range(-max_order, max_order + 1), repeat=3)
               if sum(map(abs, order)) <= max_order]
@@ -57,14 +57,14 @@ def trace(users: np.ndarray, hall: np.ndarray = HALL, max_order: int = MAX_ORDER
 
 
 def raster(scenario: Scenario) -> np.ndarray:
-    """Return users on a raster in the region of interest, float64 [N, 3] [m]."""
+    """Return the positions of a raster in the region of interest, float64 [N, 3] [m]."""
     low, high = scenario.roi_bounds_m
     x, y = (np.arange(low[axis], high[axis] + 1e-9, RASTER_M) for axis in (0, 1))
     return np.array([(a, b, HEIGHT_M) for a, b in itertools.product(x, y)])
 
 
 def main(paths_file: str, multipath_file: str) -> None:
-    """Write both files."""
+    """Write the paths of the raster and the multipath of a survey to two files."""
     scenario, codebook = Scenario(), Codebook.load(default_codebook_file())
     rng = np.random.default_rng(0)
     trace(raster(scenario)).save(paths_file)
@@ -75,7 +75,7 @@ def main(paths_file: str, multipath_file: str) -> None:
 
 
 def write_scene(folder: Path) -> None:
-    """Write the files of the narrow hall for the benchmark."""
+    """Write the files of the narrow hall for the benchmark to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
     for name, n, max_order in (('empty_test', 300, 0), ('hall_test', 300, MAX_ORDER),

@@ -1,4 +1,4 @@
-"""A node that replaces ``channel`` and drives hardware."""
+"""A node that replaces ``channel`` and controls a real radio."""
 
 import dataclasses
 import itertools
@@ -10,17 +10,17 @@ from rhs_isac_ros.protocol.role import NewestDict, Role
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
-# Maximum number of configurations and of unanswered pilots kept; older cycles have ended.
+# Maximum number of configurations and of unanswered pilots; older ones belong to ended cycles.
 _MAX_PENDING = 256
 
 
 class Radio(Role):
     """Answers the pilots of a band with the signals that the receivers at the feeds measure.
 
-    `measure` takes a band, its configurations [F, N_E] and the pilots. In each frame, it
+    `measure` takes a band, its configurations [F, N_E] and the `Pilot` message. In each frame, it
     configures the surface and lets the user transmit. It returns the noisy signals at the feeds,
     complex [F, N_SB, K] [sqrt(W)].
-    `carry` takes data and returns the number of bits that were received.
+    `carry` transmits the data of a `Data` message and returns the number of received bits.
     """
 
     SENDS = (m.FeedSignals, m.Data)
@@ -63,7 +63,7 @@ class Radio(Role):
 
 
 class RadioNode(RoleNode):
-    """The node. It declares the parameters of ``channel`` but uses only ``scenario_file``."""
+    """The ROS node. It has the parameters of ``channel``, but uses only ``scenario_file``."""
 
     def __init__(self, measure, carry, **node_options):
         super().__init__('channel', 'radio', **node_options)

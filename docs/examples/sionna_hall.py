@@ -1,8 +1,8 @@
-"""From a hall, traced with Sionna RT, to the accuracy of the band plan in it.
+"""Trace a hall with Sionna RT, and measure the accuracy of the band plan in it.
 
-The script needs ``pip install sionna-rt`` and, on a CPU, LLVM 16 or newer, whose library
-``DRJIT_LIBLLVM_PATH`` names. It writes the paths of random users, surveys the hall with the first
-100 of them, and locates the others:
+The script needs ``pip install sionna-rt``. On a CPU, it also needs LLVM 16 or newer, with the path
+of its library in ``DRJIT_LIBLLVM_PATH``. It writes the paths of random users to a file, surveys
+the hall with the first 100 users, and locates the others:
 
     DRJIT_LIBLLVM_PATH=/usr/lib/x86_64-linux-gnu/libLLVM.so.19.1 \
         python3 docs/examples/sionna_hall.py hall_paths.npz
@@ -26,9 +26,9 @@ from rhs_isac_ros.support.optional import optional_import
 CONFIG = Path(__file__).parents[2] / 'config'
 F0_HZ = 2.75e9
 N_SURVEY, N_TEST = 100, 300
-# Squared radius that contains 95 % of a Gaussian in three dimensions.
+# Squared Mahalanobis radius that contains 95 % of a Gaussian in three dimensions.
 REGION_RADIUS = 7.815
-# Users that are traced together, for which the tracer needs less than 3 GB of memory.
+# Number of users traced at a time; the tracer then needs less than 3 GB of memory.
 BATCH = 20
 # Centres and half sides of boxes [m]: a hall around the surface at the origin, and shelves.
 HALL = ((9.95, 0.0, 0.5), (10.0, 7.0, 2.5))
@@ -47,7 +47,7 @@ BOX = """<shape type="cube" id="elm-{0}">
 
 
 def scene_of(shelves: tuple) -> str:
-    """Return the description of the scene, a concrete hall with metal shelves."""
+    """Return the description of the scene, a concrete hall with metal shelves, as XML."""
     shapes = [BOX.format(number, sides, centre, 'metal' if number else 'concrete')
               for number, (centre, sides) in enumerate((HALL, *shelves))]
     parts = [MATERIAL.format('concrete'), MATERIAL.format('metal'), *shapes]
@@ -55,13 +55,13 @@ def scene_of(shelves: tuple) -> str:
 
 
 def is_outside(users: np.ndarray, shelves: tuple) -> np.ndarray:
-    """Return which users, float64 [N, 3] [m], are not inside a shelf, bool [N]."""
+    """Return whether each user, at float64 [N, 3] [m], is outside of all shelves, bool [N]."""
     inside = [(np.abs(users - centre) < sides).all(axis=1) for centre, sides in shelves]
     return ~np.any(inside, axis=0) if shelves else np.ones(len(users), bool)
 
 
 def trace(users: np.ndarray, shelves: tuple = ()) -> PathChannel:
-    """Return the paths of users, float64 [N, 3] [m], with up to three specular reflections."""
+    """Trace the paths of users, at float64 [N, 3] [m], with up to three specular reflections."""
     with optional_import('tracing a hall'):
         import sionna.rt as rt
     with tempfile.TemporaryDirectory() as folder:
@@ -84,7 +84,7 @@ def trace(users: np.ndarray, shelves: tuple = ()) -> PathChannel:
 
 
 def main(file: str, *options: str) -> None:
-    """Trace the hall, survey it and locate users."""
+    """Trace the hall, survey it, locate the other users and print their errors."""
     shelves = SHELVES if '--shelves' in options else ()
     scenario = Scenario.from_yaml(CONFIG / 'bandplan.yaml')
     codebook = Codebook.load(CONFIG / 'codebook_bandplan.yaml')

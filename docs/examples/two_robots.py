@@ -1,8 +1,8 @@
-"""Two robots in a simulation, and the poses in which a network locates them.
+"""Simulate two robots, and compare the poses that a network estimates with the true poses.
 
-Publishes what a simulator publishes: the time on /clock, the odometry of each robot at 20 Hz and,
-where tf2_msgs is installed, its transform on /tf. Prints the distance of each pose from the robot,
-and draws both:
+The script publishes the time on /clock, the odometry of each robot at 20 Hz and, if tf2_msgs is
+installed, its transform on /tf. It prints the error of each estimated pose, and draws the true and
+the estimated poses:
 
     python3 docs/examples/two_robots.py --poses 60 --picture robots.png
 """
@@ -27,12 +27,12 @@ except ImportError:
 
 STEP_S, ODOMETRY_S, BEGIN_S = 0.01, 0.05, 1000.0
 HEIGHT_M, RADIUS_M = 0.5, 2.0
-# Centre of the circle in the map [m] and speed [m/s] of each robot.
+# Centre x, y of each robot's circle in the map [m], and speed [m/s], negative if clockwise.
 ROBOTS = {1: (-2.5, 0.0, 1.0), 2: (2.5, -1.0, -0.7)}
 
 
 def drive(robot, now_s):
-    """Return position x, y [m] and heading [rad] of a robot in the map."""
+    """Return position x, y [m] and heading [rad] of a robot in the map at the time `now_s`."""
     x, y, speed = ROBOTS[robot]
     angle = speed / RADIUS_M * now_s
     return (x + RADIUS_M * math.cos(angle), y + RADIUS_M * math.sin(angle),
@@ -40,7 +40,7 @@ def drive(robot, now_s):
 
 
 class Simulation(Node):
-    """Publishes clock, odometry and transforms, and collects poses of each robot."""
+    """Publishes clock, odometry and transforms, and collects the poses of each robot."""
 
     def __init__(self, rate):
         super().__init__('simulation')
@@ -71,7 +71,7 @@ class Simulation(Node):
             place, turn = message.pose.pose.position, message.pose.pose.orientation
             place.x, place.y, place.z = x, y, HEIGHT_M
             turn.z, turn.w = math.sin(heading / 2), math.cos(heading / 2)
-            # In the frame of the robot, which looks ahead.
+            # In the frame of the robot, x points in the direction of travel.
             message.twist.twist.linear.x = abs(ROBOTS[robot][2])
             publisher.publish(message)
             if self._transforms:
@@ -93,7 +93,7 @@ class Simulation(Node):
 
 
 def draw(poses, path):
-    """Draw the way of each robot and its poses from above, with the wall of the surface."""
+    """Draw the true and estimated positions of each robot, and the surface, from above."""
     from rhs_isac_ros.support.pictures import (
         COLUMN_IN,
         look,
@@ -119,7 +119,7 @@ def draw(poses, path):
 
 
 def main():
-    """Run the simulation until each robot has its poses."""
+    """Run the simulation until each robot has the requested number of poses."""
     parser = argparse.ArgumentParser(description='Two robots in a simulation.')
     parser.add_argument('--rate', type=float, default=1.0, help='pace, relative to real time')
     parser.add_argument('--poses', type=int, default=0, help='poses of each robot; 0: endless')

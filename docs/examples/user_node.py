@@ -1,4 +1,4 @@
-"""A user that needs only rclpy and the messages: ``python3 docs/examples/user_node.py``."""
+"""A user node that needs only rclpy and the messages: ``python3 docs/examples/user_node.py``."""
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
@@ -25,7 +25,7 @@ class PlainUser(Node):
     def __init__(self, **options):
         super().__init__('plain_user', **options)
         self._cycle = 0
-        # A depth alone stands for reliable and volatile, as all of these topics are.
+        # A depth instead of a profile selects reliable and volatile, as these topics require.
         for kind, topic, callback in (
                 (Beacon, 'beacon', self._on_beacon), (Grant, 'grant', self._on_grant),
                 (PilotRequest, 'pilot_request', self._on_request), (Data, 'data', self._on_data)):

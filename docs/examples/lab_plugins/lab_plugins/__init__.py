@@ -1,1 +1,1 @@
-"""Plug-ins of a laboratory for rhs_isac_ros."""
+"""Example plug-ins for rhs_isac_ros."""

@@ -1,4 +1,4 @@
-"""A mobility: users that move on a circle."""
+"""A mobility: a user who moves on a circle."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ import numpy as np
 class Circle:
     """A circle of 2 m radius around the centre of the region, at constant speed.
 
-    With a `start`, the user begins at the point of the circle in that direction.
+    If `start` is given, the user begins at the point of the circle closest to it.
     """
 
     RADIUS_M = 2.0
@@ -21,7 +21,7 @@ class Circle:
         self._begin_s = None
 
     def state(self, now_s):
-        """Return position [m] and velocity [m/s]; the epoch of the clock is arbitrary."""
+        """Return position [m] and velocity [m/s], [3] each; the epoch of `now_s` is arbitrary."""
         if self._begin_s is None:
             self._begin_s = now_s
         angle = self._angle + self._rate * (now_s - self._begin_s)

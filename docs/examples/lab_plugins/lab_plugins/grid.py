@@ -1,4 +1,4 @@
-"""An estimator that weights a fixed set of positions: a short example, slow and coarse."""
+"""An estimator that weights a fixed set of positions: a short example, but slow and coarse."""
 
 import numpy as np
 from scipy.stats import qmc
@@ -22,7 +22,7 @@ class GridEstimator:
         self._means = means.reshape(len(means), -1)
 
     def estimate(self, received):
-        """Estimate the positions of received signals [..., N_B, N_SB F]."""
+        """Estimate the position for each phase of received signals, [..., N_B, N_SB F]."""
         return estimate_each(self._scenario, self._codebook, received, self._locate)
 
     def _locate(self, batch):
@@ -32,5 +32,5 @@ class GridEstimator:
             weights /= weights.sum()
             mean = weights @ self._points
             offsets = self._points - mean
-            # The third value would be the reason for returning no position.
+            # The third value is the reason if there is no position, and empty otherwise.
             yield mean, (weights[:, None] * offsets).T @ offsets + 1e-6 * np.eye(3), ''

@@ -11,7 +11,7 @@ def amplitude(angles):
 
 
 def slope(angles):
-    """Return the derivative. Without this function, it is computed by finite differences."""
+    """Return the derivative [1/rad]; it is optional, and finite differences are the default."""
     return np.where(np.cos(angles) > 0, -2 * np.sin(angles), 0.0)
 
 

@@ -6,16 +6,16 @@ from rhs_isac_ros.model import Impairment, Linear
 
 
 class PhaseNoise(Impairment):
-    """A phase that changes from frame to frame, through all bands of a cycle.
+    """A phase that changes from each frame to the next, through all bands of a cycle.
 
-    The strength is the standard deviation of the change between two frames [rad].
+    The strength is the standard deviation of the change from one frame to the next [rad].
     """
 
     def __init__(self, strength):
         self._std_rad = strength
 
     def linear(self, scenario):
-        """Return the exponent of each frame's phase, and the prior of a random walk."""
+        """Return an exponent for the phase of each frame, and the prior of a random walk."""
         shape = scenario.n_bands, scenario.n_subbands, scenario.n_frames
         patterns = np.zeros((scenario.n_bands * scenario.n_frames, *shape), complex)
         for number, pattern in enumerate(patterns):
