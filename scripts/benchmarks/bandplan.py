@@ -1,12 +1,12 @@
 """Positioning error with different band plans at equal spectrum, power and number of pilots.
 
-Problem: the phases of two bands 0.5 GHz apart repeat every 0.6 m of range. What is the gain of
-four bands chosen for the region, each with half as many frames? The estimator is the posterior
-mean. The 95 % region of an estimate is the ellipsoid of its covariance that contains 95 % of a
-Gaussian. How close does the coordinate search come to the best of all plans of a small raster?
+Problem: the phases of two bands 0.5 GHz apart repeat every 0.6 m of range. How much smaller is the
+error with four bands chosen for the region, each with half as many frames? How close does the
+coordinate search come to the best of all plans on a small raster? The estimator is the posterior
+mean. The 95 % region is the ellipsoid of its covariance that contains 95 % of a Gaussian.
 
---plan adds a plan, for example one with two bands that python3 -m rhs_isac_ros.codebook --spectrum
-2.5e9:3.0e9 --bands 2 --plan two.yaml --output codebook_two.yaml has chosen.
+--plan adds a plan, for example one with two bands, as chosen by python3 -m rhs_isac_ros.codebook
+--spectrum 2.5e9:3.0e9 --bands 2 --plan two.yaml --output codebook_two.yaml.
 """
 
 import os

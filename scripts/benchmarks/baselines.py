@@ -1,19 +1,19 @@
 """Positioning error of the surface beside that of other receivers, from the same pilots.
 
 Problem: the surface has K feeds and observes all its elements through them. How much accuracy
-does that cost, compared with receivers that are more expensive? All receive the same pilots, N_SB
-sub-bands in F frames of N_B bands, at the same positions:
+does that cost, compared with more expensive receivers? All of them receive the same pilots, N_SB
+sub-bands in F frames of N_B bands, from the same positions:
 
-* all elements: the signal of every element in every frame, a floor for any codebook;
-* fully digital: K antennas, at corners of the surface;
-* phased array: every element has a phase shifter, and a single radio-frequency chain or K of them,
-  each with phase shifters of its own. The phases are random, or matched to points that scan the
-  region, as for the directional codebook.
+* all elements: the signal of every element in every frame, whose error bounds all codebooks;
+* fully digital: K antennas at corners of the surface;
+* phased array: a single radio-frequency chain or K of them, each with a phase shifter for every
+  element. The phases are random, or matched to points that scan the region, as for the directional
+  codebook.
 
 Every weight of an element has the modulus sqrt(P_max / N_SB). Like the paper's propagation on the
 board, this does not conserve energy; it gives all receivers the same thermal noise for each
-element. The estimator is the posterior mean. Outputs of all elements are averaged over the frames,
-which is exact up to the decorrelation of the multipath within a phase.
+element. The estimator is the posterior mean. The receiver with all elements averages its outputs
+over the frames. This is exact except for the decorrelation of the multipath between the frames.
 """
 
 import os

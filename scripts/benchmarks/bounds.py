@@ -1,11 +1,11 @@
 """Mean squared error of the posterior mean beside the local and the global bound.
 
 Problem: the average Cramer-Rao bound ignores ambiguities of the range, so the error is up to
-fifteen times as large. How close is the global bound, which includes them, for several plans of
-bands and codebooks? The plans have the same spectrum, 2.5 to 3 GHz, and the same number of pilots.
-Codebooks of the plans with four bands are optimised with few steps. Errors are those of `bayes`,
-and intervals are twice the standard error. The bound and the errors use independent random
-numbers.
+fifteen times as large. How close to the error is the global bound, which includes ambiguities, for
+several band plans and codebooks? The plans have the same spectrum, 2.5 to 3 GHz, and the same
+number of pilots. Codebooks of the plans with four bands are optimised with few steps. Errors are
+those of `bayes`, and intervals are twice the standard error. The bound and the errors use
+independent random numbers.
 """
 
 import os

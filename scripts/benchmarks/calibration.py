@@ -1,15 +1,15 @@
 """Positioning with a surface whose errors a calibration has estimated.
 
 Problem: coefficients of the elements deviate and some elements have failed. A reference user sends
-pilots at known positions, and the calibration estimates the surface from the received
-signals. How large are the errors of fresh users with the calibration, compared with those before
-it, and with exact knowledge of the surface? The benchmark `robustness` reports the errors with a
-scenario that declares the deviations.
+pilots at known positions, and the calibration estimates the surface from the received signals. How
+large are the errors for other users after the calibration, compared with the errors before it, and
+with exact knowledge of the surface? The benchmark `robustness` reports the errors with a scenario
+that declares the deviations.
 
-Each surface has its own pilots; all surfaces share the fresh positions. Brackets contain 95 %
-intervals: of a bootstrap over surfaces and positions together for mean squared errors and their
-ratios, and Wilson's for shares. Mean squared errors are those of the fixes. The calibration
-assumes the declared distribution of surfaces, or with --silent its default distribution.
+Each surface has its own pilots; the positions of the other users are the same for all surfaces.
+Brackets contain 95 % intervals: for mean squared errors of fixes and their ratios, of a bootstrap
+over surfaces and positions together; for shares, Wilson's. The calibration assumes the declared
+distribution of surfaces, or with --silent the default distribution.
 """
 
 import os

@@ -1,16 +1,16 @@
 """Positioning on channels that a ray tracer computed, before and after a survey of the hall.
 
-Problem: the estimator assumes Gaussian multipath that three fields of the scenario declare, and a
-hall has walls. What does a survey at known positions gain? Signals follow the traced paths of
-users in an empty hall and in one with reflections; other users of the same hall are the survey.
-`calibration.survey` estimates the covariance of the multipath from 10 to 300 of these, drawn
-several times, each time with other thermal noise in all signals. The 95 % region of an estimate is
-the ellipsoid of its covariance that contains 95 % of a Gaussian; outside of it, an estimate is
-confidently wrong. Shares have Wilson's 95 % intervals over the users; of several surveys, the
-table lists the mean, and the range of the share in the region.
+Problem: the estimator assumes Gaussian multipath, as three fields of the scenario declare it, but
+in a hall, walls cause the multipath. How much does a survey at known positions help? Signals
+follow the traced paths of users in an empty hall and in one with reflections. From 10 to 300 other
+users of the same hall, `calibration.survey` estimates the covariance of the multipath. Surveys are
+drawn several times, each time with other thermal noise in all signals. The 95 % region of an
+estimate is the ellipsoid of its covariance that contains 95 % of a Gaussian; an estimate whose
+region does not contain the user is confidently wrong. Shares have Wilson's 95 % intervals over the
+users. For several surveys, the table lists means, and the range of the share in the region.
 
 With --blocked, a share of the users of the hall and of its surveys lacks the direct path. The
-estimator expects this of 10 % of the users, whatever the share.
+estimator always assumes that this is the case for 10 % of the users.
 
 The folder contains empty_test.npz, hall_test.npz and hall_survey.npz with propagation paths.
 """

@@ -2,8 +2,8 @@
 
 Problem: the average Cramer-Rao bound is a local measure. The phases of two bands repeat
 periodically in range, and a codebook with a low bound may leave such ranges indistinguishable.
-With which codebook are users located most accurately? All are evaluated with the same positions,
-multipath and noise, and with the posterior mean as the estimator.
+With which codebook are users located most accurately? All codebooks are evaluated with the same
+positions, multipath and noise. The estimator is the posterior mean.
 """
 
 import os

@@ -1,14 +1,14 @@
 """Duration of a protocol cycle, compared with that of its messages alone.
 
 Problem: a cycle is a chain of messages, each sent in response to the previous one, with the
-computations of the nodes in between. How much time does the network add to bare rclpy? The floor
-is the same number of hops, measured in the same run and with the same executor as ping-pong of a
-bare publisher and subscription: between two processes for a network whose nodes are processes, and
-between two nodes of one process for a network in one process. The messages alone are those that
-need no estimate and no beam, compared with as many hops. Ping-pong keeps both processes in the
-caches, and a cycle does not: the same messages between as many bare processes, with the same
-receivers and pauses, show how much of a cycle is not due to the nodes. The 10th percentile is less
-sensitive than the median to other programs on the machine.
+computations of the nodes in between. How much time does the network add to bare rclpy? The lower
+bound is a ping-pong with as many hops, between a bare publisher and subscription with the same
+executor, measured in the same run. If the nodes of the network are processes, it runs between two
+processes; otherwise, between two nodes of one process. Messages that need no estimate and no beam
+are also compared with as many hops. Unlike a cycle, a ping-pong keeps its processes in the cache.
+The messages of a cycle between bare processes, with the same receivers and pauses, therefore show
+how much of a cycle is not due to the nodes. The 10th percentile is less sensitive than the median
+to other programs on the machine.
 """
 
 import faulthandler

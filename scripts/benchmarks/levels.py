@@ -1,8 +1,8 @@
 """Average bound of codebooks for elements that can take only a few amplitudes.
 
-Problem: an element of a real surface has two, three or four amplitudes. How much of the average
-bound does a codebook lose if its continuous amplitudes are rounded to these levels, and how much
-if it is optimised for them? All codebooks are evaluated on the same held-out positions.
+Problem: an element of a real surface has two, three or four amplitudes. How much does the average
+bound grow if the continuous amplitudes of a codebook are rounded to these levels, and how much if
+the codebook is optimised for them? All codebooks are evaluated on the same held-out positions.
 """
 
 import os

@@ -2,10 +2,10 @@
 
 Problem: the estimator assumes the band plan, but the true value of one field is twice or half that
 of the plan (a level: 3 dB higher or lower; the refractive index: 0.2 %). How large do the errors
-become, and does `bounds.misspecified` predict them? The columns are the predicted root mean
-squared error, over the positions where the prediction is `valid`, and that of the estimator `ml`
-on simulated signals at the same positions, with the 95 % interval of the ratio of the mean squared
-errors from a bootstrap over the positions. Signals without a fix are left out.
+become, and does `bounds.misspecified` predict them? The table compares the predicted root mean
+squared error with that of the estimator `ml` on simulated signals, at the positions where the
+prediction is `valid`. The 95 % interval of the ratio of the mean squared errors is from a
+bootstrap over the positions. Signals without a fix are left out.
 """
 
 import os

@@ -5,8 +5,8 @@ of the value and its gradient cost, compared with automatic differentiation of t
 and with the matrix products that are unavoidable? (b) How long does each method take to reach an
 average bound of 0.0415 m^2 on held-out positions? (c) How do time and memory grow with the numbers
 of positions, elements and bands? (d) How much faster is the objective ambiguity on samples of its
-pairs than with all pairs in each step? (e) What do surfaces with up to 4096 elements and four
-bands need? Part (e) takes several minutes and is not run by default.
+pairs than with all pairs in each step? (e) How much time and memory do surfaces with up to 4096
+elements and four bands need? Part (e) takes several minutes and is not run by default.
 """
 
 import argparse

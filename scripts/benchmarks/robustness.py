@@ -1,26 +1,26 @@
 """Positioning when the signals deviate from the model: errors, coverage, fixes and warnings.
 
-Problem: real signals are not those of the model. How large are the errors, do the 95 % regions
+Problem: real signals deviate from the model. How large are the errors then, do the 95 % regions
 contain the user, how many phases have no fix, and would the residuals cause a warning? Each
 deviation is measured twice: with a scenario that omits it, and with a scenario that declares it,
-as an uncertainty or as the true value. Users outside of the region should have no fix.
+as an uncertainty or with its true value. Users outside the region should have no fix.
 
 The 95 % region of an estimate is the ellipsoid of its covariance that contains 95 % of a Gaussian.
-Brackets contain 95 % intervals: Wilson's for shares, and for mean squared errors the percentile
-bootstrap over surfaces, each of which serves five positions. The last column is the share of
-windows in which the monitor of the residuals warns; the windows are random draws of phases. The
-predicted error is that of fixes that are not possibly from outside of the region.
+Brackets contain 95 % intervals: Wilson's for shares, and for mean squared errors those of a
+percentile bootstrap over surfaces, each of which serves five positions. The last column is the
+share of windows, random draws of phases, in which the monitor of the residuals warns. The
+predicted error excludes fixes whose user may be outside the region.
 
 The time is the median of the CPU time of an estimate, on one core.
 
 With --pairs, the rows are all pairs of declarations instead, and some triples. Its JSON file
-holds a list `pairs` with the declarations, the shares in the region and without a fix [%], the
-mean squared error, and its ratio to the posterior; figures are triples of value and interval.
+contains a list `pairs` with the declarations, the shares in the region and without a fix [%], the
+mean squared error, and its ratio to that of the posterior; each figure is [value, low, high].
 
-With --reference N, the first N positions of each declared row are compared with the exhaustive
-posterior of the declared model, paired. Element errors have their covariance at every point there.
-Failed elements have no such sum: the reference of their rows is the same mixture with the true set
-and position among its hypotheses, so that the ratio covers only what the search misses.
+With --reference N, the first N positions of each declared row are compared in pairs with the
+exhaustive posterior of the declared model, in which element errors have their covariance at every
+point. Failed elements permit no such sum: their reference is the mixture of the estimator with the
+true set and position among its hypotheses, so the ratio covers only what the search misses.
 """
 
 import os

@@ -1,9 +1,9 @@
 """Quality of codebooks by number of samples, with Sobol points and with random points.
 
 Problem: the optimiser evaluates the region of interest only at samples, and overfits if there are
-too few. How good is the codebook on the whole region, after a fixed number of steps, depending on
-the number of samples and on how they are drawn? All codebooks are evaluated on the same held-out
-Sobol points.
+too few. How does the quality of the codebook on the whole region, after a fixed number of steps,
+depend on the number of samples and on how they are drawn? All codebooks are evaluated on the same
+held-out Sobol points.
 """
 
 import os

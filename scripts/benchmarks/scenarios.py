@@ -1,15 +1,15 @@
 """Positioning in scenarios from the literature: coverage, consistency, time and memory.
 
-Problem: does an estimator remain right at other wavelengths, apertures, bandwidths and regions
-than those of Table I? Each scenario of config/scenarios, and Table I, is measured in a process of
-its own, with users uniformly distributed over the region. The codebook is that of `optimize` with
-its default settings, or the directional one where a scenario is meant for it.
+Problem: does an estimator remain accurate and consistent at wavelengths, apertures, bandwidths and
+regions other than those of Table I? Each scenario of config/scenarios, and Table I, is measured in
+a separate process, with users uniformly distributed over the region. The codebook is the result of
+`optimize` with default settings, or a directional codebook if a scenario is meant for one.
 
 The 95 % region of an estimate is the ellipsoid of its covariance that contains 95 % of a Gaussian.
 NEES is the mean squared error normalised by the covariance, 3 for a consistent estimate. A mode
 is missed if the residual of the estimate exceeds that at the true position by more than 2. The
-claimed error is the root of the mean trace of the covariances. Shares have Wilson's 95 %
-intervals, other figures the percentile bootstrap's.
+claimed error is the root of the mean trace of the covariances. The 95 % intervals of shares are
+Wilson's; those of other figures are from a percentile bootstrap.
 """
 
 import os

@@ -2,9 +2,9 @@
 
 Problem: the capacity has many local maxima. A position error costs well under one per cent of it,
 so the loss can only be measured if the search finds nearly the global maximum everywhere. Four
-figures show this: the capacity relative to that of a plain search, one band after the other, and
-the CPU time of both; the capacity relative to that of a long multi-start optimisation, which
-shares nothing with the search but the objective; and the most negative loss, which occurs if the
+figures test this: the capacity relative to that of a plain search, one band after the other, and
+the CPU time of both; the capacity relative to that of a long multi-start optimisation, which only
+shares the objective with the search; and the most negative loss, which occurs if the
 beam for an estimate near the true position has a higher capacity there than the beam for that
 position itself.
 """

@@ -2,18 +2,18 @@
 
 Problem: users walk in straight lines between random positions of the region of interest, or stand
 still with --speed 0, and are located at a constant rate. Their multipath is correlated between
-cycles by Eq. (4), as in the channel node. How large are the errors of the track and those of
-single cycles, are the covariances consistent with them, and how much time does the track take
-beyond the estimate of a cycle?
+cycles by Eq. (4), as in the channel node. How large are the errors of the track and of estimates
+from single cycles? Are the covariances consistent with these errors? How much time does the track
+take in addition to the estimate of a cycle?
 
-Cycles within the first two seconds are not counted. The 95 % intervals are from resampling of the
+Cycles within the first two seconds are not counted. The 95 % intervals are from resampling the
 walks, because the cycles of a walk are not independent. The 95 % region of an estimate is the
 ellipsoid of its covariance that contains 95 % of a Gaussian. --bands and --frames replace bands
-and frames of the scenario, with a codebook that is not optimised unless --codebook names one.
+and frames of the scenario; the codebook is then random unless --codebook selects one.
 
---peer compares with the particle filter of Stone Soup (scripts/setup peers). It has the same
-likelihood and the same movement, and starts from particles that are drawn from the posterior of
-the first cycle.
+--peer adds the particle filter of Stone Soup (scripts/setup peers). It has the same likelihood and
+motion model as the track, and starts from particles that are drawn from the posterior of the first
+cycle.
 """
 
 import os

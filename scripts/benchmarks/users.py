@@ -1,6 +1,6 @@
 """Cycle rate and waiting times with few users and with many.
 
-Problem: a cycle serves one user. How much do other users slow it down, as separate processes or in
+Problem: a cycle serves one user. How much do other users slow it down, in separate processes or in
 one process? Networks with many users are compared with a network of few users, and with the hops
 of a cycle in bare rclpy, measured in the same run.
 """

@@ -3,7 +3,7 @@
 Problem: a user is somewhere in the region of interest of Table I. The base station estimates the
 position from the signals that a codebook yields, then steers the beam of band 1 there. How large
 are (a) the mean squared error of the position and (b) the capacity loss due to the error? The
-paper claims that, with its network, the optimised codebook has
+paper claims that, with its neural network, the optimised codebook has
 
 (1) a mean squared error 42 % below directional's and 69 % below random's,
 (2) a median capacity loss 82 % below directional's and 86 % below random's,

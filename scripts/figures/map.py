@@ -1,9 +1,9 @@
 """Maps of the positioning error and of its bounds over the region of interest.
 
-Problem: where in the region is the error of `bayes` large, and which bound shows it? The maps are
-the root of the average Cramer-Rao bound, the root mean squared error of the informed estimator of
-the global bound, and that of `bayes`, in squares of the horizontal plane, for several band plans:
-that of Table I, four equally and four unequally spaced bands, and the plans given with --plan.
+Problem: where in the region is the error of `bayes` large, and which bound shows it? In squares of
+the horizontal plane, the maps show the root of the average Cramer-Rao bound, and the root mean
+squared errors of `bayes` and of the informed estimator of the global bound. The band plans are
+Table I, four equally and four unequally spaced bands, and the plans given with --plan.
 
 A trial is a block of 250 positions of `bayes`. Codebooks are optimised against ambiguities.
 

@@ -1,9 +1,9 @@
 """Part (d) of the benchmark of the optimizer: the ambiguity objective on samples of the pairs.
 
 The reference evaluates all pairs in double precision in each step of L-BFGS-B, with 30
-corrections. Its speed is measured in the same run as that of the search on samples, in processor
-time. With the two bands of Table I, its final value is that of the shipped codebook, the result of
-3000 of its steps; with four bands, it is assumed to need as many evaluations.
+corrections. The processor times of the reference and of the search on samples are measured in the
+same run. With the two bands of Table I, the final value of the reference is that of the shipped
+codebook, the result of 3000 steps; with four bands, it is assumed to need as many evaluations.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The messages of a cycle between bare processes: the part of its duration that is not Python."""
+"""The messages of a cycle between bare processes, without the computations of the nodes."""
 
 import subprocess
 import sys

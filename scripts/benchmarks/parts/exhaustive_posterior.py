@@ -1,10 +1,10 @@
 """The posterior over the whole region of interest: a slow reference for all estimators.
 
-It is the likelihood of the estimators, evaluated at points of a Sobol sequence instead of modes.
-Without impairments, this is a sum over all points. Otherwise each phase draws some of the points,
-with probabilities that follow from a cheap profile over the nuisance parameters; their likelihood
-is divided by the probability of the draw, so that sums over points keep their expectation. It is
-integrated over the parameters numerically at all points that matter.
+The likelihood is that of the estimators, evaluated at points of a Sobol sequence instead of modes.
+Without impairments, moments are sums over all points. Otherwise, each phase draws some of the
+points, with probabilities that follow from a cheap profile over the nuisance parameters. The
+likelihood at these points is divided by the probability of the draw, so that sums keep their
+expectation, and integrated over the parameters numerically where it matters.
 """
 
 from collections.abc import Callable, Sequence

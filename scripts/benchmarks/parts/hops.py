@@ -1,4 +1,4 @@
-"""The hops of a cycle as ping-pong in bare rclpy: the lower bound of its duration."""
+"""The hops of a cycle as ping-pong in bare rclpy: a lower bound on the duration of the cycle."""
 
 import subprocess
 import sys

@@ -1,8 +1,8 @@
 """Steering one band after the other, each from many random starts: slow, and easy to check.
 
-The plain reference for the time and the capacity of `steer`: 320 random pairs of waves are
-improved with all modes of the multipath, and the best four configurations, or the matched filter,
-ascend one after the other.
+This is the plain reference for the time and the capacity of `steer`. It improves 320 random pairs
+of waves with all modes of the multipath. The ascent then starts from the best four configurations,
+or from the matched filter, one after the other.
 """
 
 import functools
