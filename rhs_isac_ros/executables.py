@@ -1,7 +1,7 @@
 """Entry points of the executables, which install signal handlers before any slow import.
 
-Importing ROS, NumPy and the nodes takes a moment, and a signal in that time would print a
-traceback. These handlers end the process with exit code 0 instead, as a later signal does.
+Importing ROS, NumPy and the nodes takes a moment. A signal during the import would print a
+traceback, so the handlers end the process with exit code 0, as a later signal does.
 """
 
 import importlib
@@ -61,7 +61,7 @@ def _what_provides(missing: str) -> str:
 
 
 def _join_network(name: str) -> None:
-    """Start discovery for a node, so that it runs while the modules of the node are imported."""
+    """Start the discovery of other nodes, which runs while the modules of a node are imported."""
     arguments = sys.argv[1:]
     if EXECUTABLES[name] != 'nodes' or arguments[:1] not in ([], ['--ros-args']):
         return
@@ -75,7 +75,7 @@ def _join_network(name: str) -> None:
 
 
 def _end_with_parent() -> None:
-    """Make the kernel send SIGTERM to this process when the parent dies, if so requested.
+    """Make the kernel send SIGTERM to this process when its parent dies, if `PARENT_ID` is set.
 
     The parent may have several threads, so it cannot arrange this between fork and exec.
     """
@@ -91,7 +91,7 @@ def _end_with_parent() -> None:
 
 
 def print_error(error: object, program: str = '') -> None:
-    """Print an error as argparse does, after the name of the program (default: this process)."""
+    """Print an error in the format of argparse; the default `program` is this process."""
     if not program:
         spec = getattr(sys.modules['__main__'], '__spec__', None)
         program = (f'python3 -m {spec.name.removesuffix(".__main__")}' if spec
@@ -105,8 +105,8 @@ def exit_code_of(
     """Run a main function, handle the standard streams, and return the exit code.
 
     The code is the result of `main` (0 for None); 0 if the reader of the output closes it early,
-    as ``head`` does; 1 if the output cannot be written; 2 after one of the `errors`, whose
-    messages are for the user.
+    as ``head`` does; 1 if the output cannot be written; or 2 if `main` raises one of the `errors`,
+    whose message is then printed.
     """
     # If a standard stream is closed, the next file that opens would take its descriptor.
     for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):

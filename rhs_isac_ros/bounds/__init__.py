@@ -1,4 +1,4 @@
-"""Local and global bounds of positioning, and gradients of the local ones."""
+"""Local and global bounds on positioning errors, and gradients of the local bounds."""
 
 from rhs_isac_ros.bounds.average import AverageCrlb, average_crlb
 from rhs_isac_ros.bounds.fisher import crlb, crlb_of, fisher_information

@@ -1,6 +1,6 @@
 """Averages of losses that depend on a codebook through quadratic forms, with gradients.
 
-The average Cramer-Rao bound is one example. `by_radiation` is the gradient
+The average Cramer-Rao bound is one example. In this module, `by_radiation` is the gradient
 d/dRe(T_i) + i d/dIm(T_i) of an objective, complex128 [N_B, N_SB F, N_E].
 """
 
@@ -46,7 +46,7 @@ Loss = Callable[[slice, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Gradient(NamedTuple):
-    """An average and its gradients.
+    """An average loss and its gradients with respect to a codebook.
 
     `by_analog` is d/dC, float64 [N_B, F, N_E]; `by_digital` is d/dRe(S) + i d/dIm(S), complex128
     [N_B, N_SB, F, K].
@@ -69,7 +69,7 @@ class Combination(NamedTuple):
         return whitened[:, self.sources] * self.scale[band, :, None]
 
     def backward(self, band: int, weighted: np.ndarray, n_rows: int) -> np.ndarray:
-        """Convert gradients by the rows, [n, G, R], to gradients by the source rows, [n, S, R]."""
+        """Propagate gradients from the rows, [n, G, R], back to the source rows, [n, S, R]."""
         gathered = np.zeros((len(weighted), n_rows, weighted.shape[2]), complex)
         for row, (source, scale) in enumerate(zip(self.sources, self.scale[band], strict=True)):
             gathered[:, source] += np.conj(scale) * weighted[:, row]
@@ -92,7 +92,7 @@ class Average:
         Rows of the form, if they differ from the rows of the source.
     """
 
-    #: An estimate of the surface that is treated as exact; None for the scenario's elements.
+    #: An estimate of the surface that is treated as exact; None for the declared elements.
     surface: SurfaceEstimate | None = None
 
     @one_blas_thread
@@ -138,7 +138,7 @@ class Average:
 
     def _blocks(self, evaluation: Evaluation
                 ) -> Iterator[tuple[slice, list[np.ndarray], np.ndarray, np.ndarray]]:
-        """Yield blocks, their whitened means [n, G, N_SB F] by band, and results of the loss."""
+        """Yield a block, its whitened means [n, G, N_SB F] by band, and the results of `Loss`."""
         for block in self.rows.blocks():
             whitened = [evaluation.whitened(block, i) for i in range(self.scenario.n_bands)]
             if self._combination:
@@ -163,8 +163,8 @@ class AverageCrlb(Average):
     """Average bound at fixed positions, float64 [N, 3] [m], for evaluation with many codebooks.
 
     Nuisance parameters, errors of the elements and `region_prior` are treated as in `crlb`.
-    `tolerance` is that of `Average`. `tick` is called repeatedly while the rows are computed; an
-    exception ends the computation.
+    `tolerance` is the same as in `Average`. `tick` is called repeatedly while the rows are
+    computed, and may raise an exception to end the computation.
     """
 
     def __init__(self, scenario: Scenario, positions: np.ndarray, tolerance: float = 0.0, *,
@@ -270,7 +270,7 @@ def _by_error(scenario: Scenario, radiation: np.ndarray, covariance_terms: np.nd
 def _through_term(
         scenario: Scenario, codebook: Beamforming, constant: np.ndarray | float,
         slope: np.ndarray | float, by_radiation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gradients through (constant + slope C) * (S B); constant and slope may be [N_E]."""
+    """Return the gradients by C and S through a term (constant + slope C) * (S B)."""
     beams = AppliedBeams(np.conj(constant + slope * codebook.analog), codebook.digital)
     return (gradient_analog(scenario, codebook, np.conj(slope) * by_radiation),
             gradient_digital(scenario, beams, by_radiation))

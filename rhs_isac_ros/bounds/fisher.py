@@ -20,11 +20,12 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
          region_prior: bool = False) -> np.ndarray:
     """Implements Eq. (11). Cramer-Rao lower bound on the mean squared positioning error.
 
-    Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2]; infinite if the
-    signals do not determine the position. Declared nuisance parameters are unknown, with their
-    distributions as priors: the result is then the hybrid bound. Errors of the elements add their
-    covariance, averaged over the region. `region_prior` adds the region of interest as a Gaussian
-    prior of covariance size^2 / 12. Raises ValueError if `positions` is not a finite [N, 3] array.
+    Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2]; a bound is infinite
+    if the signals do not determine the position. Declared nuisance parameters are unknown, with
+    their distributions as priors: the result is then the hybrid bound. Errors of the elements add
+    their covariance, averaged over the region. `region_prior` adds the region of interest as a
+    Gaussian prior of covariance size^2 / 12. Raises ValueError if `positions` is not a finite
+    [N, 3] array.
     """
     return crlb_of(MeasurementModel(scenario, codebook), positions, region_prior=region_prior)
 
@@ -32,7 +33,7 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
 @one_blas_thread
 def crlb_of(model: MeasurementModel, positions: np.ndarray, *,
             region_prior: bool = False) -> np.ndarray:
-    """Compute `crlb` for a model; all calls share its whitener."""
+    """Compute `crlb` for a measurement model, whose whitener all calls share."""
     information = without_nuisance(joint_information_of(model, positions)).information
     if region_prior:
         information = information + region_information(model.scenario)
@@ -87,8 +88,7 @@ def fisher_information(model: MeasurementModel, positions: np.ndarray) -> np.nda
 def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
     """Compute the information about position and nuisance parameters, without any prior.
 
-    Returns float64 [N, 3 + Q, 3 + Q]. The prior of the scaled nuisance parameters is standard
-    normal.
+    Returns float64 [N, 3 + Q, 3 + Q], for Q nuisance parameters scaled to unit variance.
     """
     positions = checked_positions(positions)
     patterns = nuisance_of(model.scenario).scaled_patterns

@@ -1,15 +1,15 @@
 """A bound on the mean squared error that includes ambiguities: the error of an informed estimator.
 
 The position is uniform in the region of interest; q = (r, u, v) are its range and direction
-cosines. No estimator has a smaller mean squared error than the posterior mean. The error is
-smaller still if q modulo a lattice is also known, because the position is then one of M known
-points. With the whitened differences d_k = L^-1 (mu(p_k) - mu(p)), Lambda = L L^H, and
-white noise n of unit covariance, the log-likelihood of point k relative to the true one is -d_k^H
-d_k + 2 Re(d_k^H n). The error of the informed estimator is therefore an M-ary average over n,
-which is drawn at random. This extends the Ziv-Zakai bound (Bell, Steinberg, Ephraim and Van Trees,
+cosines. No estimator has a smaller mean squared error than the posterior mean. An informed
+estimator, which is also given q modulo a lattice, has a smaller error still: only M points
+remain for the position. With the whitened differences d_k = L^-1 (mu(p_k) - mu(p)),
+Lambda = L L^H, and white noise n of unit covariance, the log-likelihood of point k relative to the
+true one is -d_k^H d_k + 2 Re(d_k^H n). The error of the informed estimator is therefore an average
+over n, which is drawn at random. Of two points, the wrong one is likelier with probability
+Q(sqrt(d^H d / 2)). This extends the Ziv-Zakai bound (Bell, Steinberg, Ephraim and Van Trees,
 Extended Ziv-Zakai lower bound for vector parameter estimation, IEEE Trans. Inf. Theory 43 (2),
-1997) from pairs of hypotheses to all hypotheses at once. Of two points, the wrong one is chosen
-with probability Q(sqrt(d^H d / 2)).
+1997) from pairs of hypotheses to all hypotheses at once.
 
 The finer the lattice, the tighter the bound. Steps of one to two local standard deviations lose
 little, because even such coarse samples of a Gaussian have almost its exact variance.
@@ -35,7 +35,7 @@ _STEPS = np.array([2.4, 1.2, 1.2])
 _MIN_STEPS = 24
 # Largest number of lattice points in the box around the region; beyond it, steps grow.
 _MAX_POINTS = 2_000_000
-# Number of phases that share an offset of the lattice, and number evaluated at a time.
+# Number of positioning phases that share an offset of the lattice, and number evaluated at a time.
 _PER_OFFSET = 512
 _BLOCK = 16
 # Points whose log-likelihood is lower than the true point's by more than this have no effect.
@@ -50,7 +50,7 @@ class GlobalBound(NamedTuple):
     """Bound on the mean squared error of any estimator, for a uniform prior on the region."""
 
     value: float  #: The bound [m^2].
-    standard_error: float  #: Standard error of its Monte-Carlo average [m^2].
+    standard_error: float  #: Standard error of `value`, a Monte-Carlo average [m^2].
     positions: np.ndarray  #: Positions of the simulated phases, float64 [n, 3] [m].
     squared_errors: np.ndarray  #: Squared errors of the informed estimator, float64 [n] [m^2].
     #: Factor by which the limit on the number of lattice points has enlarged the steps; 1 if the
@@ -85,11 +85,11 @@ def global_bound(
 
 
 class _Lattice:
-    """The points of a lattice in (r, u, v) inside the region of interest; it contains `point`.
+    """Points, inside the region of interest, of a lattice in (r, u, v) that contains `point`.
 
     Along a ray, the mean signals of a band are a carrier times a smooth function of the range,
     which is interpolated between Chebyshev nodes. All ranges of a ray then cost one product of
-    small matrices. Rays without a likely point, whatever the phases of the carriers, cost nothing.
+    small matrices. Rays on which no phases of the carriers make a point likely are skipped.
     """
 
     def __init__(self, model: MeasurementModel, steps: np.ndarray, point: np.ndarray) -> None:
@@ -147,7 +147,7 @@ class _Lattice:
         self._best_prior = np.max(self._prior, axis=1)
 
     def phases(self, n: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
-        """Draw true points and signals; yield position [3], posterior variance, squared error."""
+        """Draw points and signals; yield each position, posterior variance and squared error."""
         model = self._model
         # Systematic sampling spreads the points evenly over the region.
         shares = np.cumsum(np.exp(self._prior - self._prior.max()))

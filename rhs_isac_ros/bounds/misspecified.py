@@ -7,7 +7,7 @@ the expected curvature of the assumed log-likelihood at p*, and B the covariance
 under the true covariance (Fortunati, Gini, Greco and Richmond, Performance bounds for parameter
 estimation under misspecified models, IEEE Signal Processing Magazine 34 (6), 2017; for
 reconfigurable surfaces: Zheng, Chen, Ballal, Valkama, Wymeersch and Al-Naffouri, arXiv
-2204.12783). If both models are the same, this is the Cramer-Rao bound.
+2204.12783). If both models are the same, this covariance is the Cramer-Rao bound.
 """
 
 from typing import NamedTuple
@@ -39,7 +39,7 @@ _MAX_AMBIGUITY, _MIN_BORDER, _MAX_NONLINEARITY = 0.01, 3.0, 0.25
 
 
 class Misspecified(NamedTuple):
-    """Errors of the maximum-likelihood estimator of an assumed model under a true one."""
+    """Errors of the maximum-likelihood estimator of an assumed model under the true model."""
 
     bias: np.ndarray  #: Pseudo-true position minus true position, float64 [N, 3] [m].
     covariance: np.ndarray  #: Covariance about the pseudo-true position, [N, 3, 3] [m^2].
@@ -73,7 +73,7 @@ def misspecified(
     places = _pseudo_true(assumed, positions, target)
     mean, slopes = assumed.mean_and_jacobian(places, whitened=True)
     residual = target - mean
-    # L^-1 of the assumed model turns the true covariance into W Lambda W^H.
+    # The whitener W of the assumed model turns the true covariance into W Lambda W^H.
     white = np.matmul(assumed.whitener @ true.covariance(), adjoint(assumed.whitener))
     gradients = 2 * np.einsum('nair,irs,nbis->nab', slopes.conj(), white, slopes,
                               optimize=True).real
@@ -138,7 +138,7 @@ def _bending(model: MeasurementModel, places: np.ndarray, residual: np.ndarray) 
 
 def _is_valid(model: MeasurementModel, places: np.ndarray, bias: np.ndarray,
               covariance: np.ndarray, residual: np.ndarray, white: np.ndarray) -> np.ndarray:
-    """Return whether the local description holds, bool [N]."""
+    """Return whether the bias and covariance describe the estimator, bool [N]."""
     low, high = model.scenario.roi_bounds_m
     reach = _MIN_BORDER * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     valid = ((places - reach >= low) & (places + reach <= high)).all(axis=1)
@@ -167,8 +167,8 @@ def _is_valid(model: MeasurementModel, places: np.ndarray, bias: np.ndarray,
 
 def _ambiguities(model: MeasurementModel, place: np.ndarray, mean: np.ndarray,
                  residual: np.ndarray, white: np.ndarray, covariance: np.ndarray) -> float:
-    """Bound the squared error from other ranges in the same direction [m^2]."""
-    # A sum over maxima: squared distance times the probability of being likelier than the truth.
+    """Bound the squared error [m^2] from confusion with other ranges in the same direction."""
+    # The sum over maxima of squared distance times probability of being likelier than the truth.
     from scipy.special import ndtr
 
     scenario = model.scenario
@@ -180,7 +180,7 @@ def _ambiguities(model: MeasurementModel, place: np.ndarray, mean: np.ndarray,
     points = points[((low <= points[:, None] * direction)
                      & (points[:, None] * direction <= high)).all(axis=1)]
     means, slopes = model.mean_and_jacobian(points[:, None] * direction, whitened=True)
-    # The maximum of an ambiguity is beside the ray.
+    # The maximum of an ambiguity lies beside the ray.
     information = _curvature(slopes) / 2 + np.diag([_MAX_OFFSET_M**-2] * 3)
     gradient = _projections(slopes, mean + residual - means)
     offset = step_to_maximum(information, gradient)

@@ -2,8 +2,8 @@
 
 The phases of the bands may be unknown: theta = A z, with standard normal z. The distance between
 two signals is then the minimum over z of ``sum_i 2 |a_i exp(i theta_i) - b_i|^2 + |z|^2``. For
-small deviations, it agrees with the marginal Fisher information. For large ones, it vanishes if
-the signals differ only in the phases of their bands.
+close positions, it agrees with the marginal Fisher information. If the signals differ only in the
+phases of their bands, at most the cost ``|z|^2`` of the phases remains. It vanishes as A grows.
 """
 
 import copy
@@ -32,9 +32,9 @@ class PairwiseErrorCost(Average):
     cost is the average of ``|p - p'|^2 Q(sqrt(q / 2))``, in m^2 like the bound. In its quadratic
     form, the difference h(p) - h(p') replaces the derivative of Eq. (12). If the scenario declares
     unknown phases, the form is minimised over them; other nuisance parameters are not included.
-    Pairs have positions, float64 [N, 3] [m], and weights, float64 [N]. `tolerance` and `tick` are
-    those of `AverageCrlb`. Raises ValueError if an argument has a wrong shape or is not finite,
-    there are no pairs, or a weight is negative.
+    The arguments contain positions, float64 [N, 3] [m], and weights, float64 [N], of N pairs.
+    `tolerance` and `tick` are the same as in `AverageCrlb`. Raises ValueError if a shape is wrong,
+    a position is not finite, a weight is negative or NaN, or there are no pairs.
     """
 
     def __init__(
@@ -75,8 +75,8 @@ class PairwiseErrorCost(Average):
 
         For this codebook, the cost of the sample is an unbiased estimate of the cost of all pairs.
         For similar codebooks, the estimate is close, because a few very similar pairs contribute
-        most of the cost. Evaluations are in single precision. Raises ValueError if n is not from 1
-        to the number of pairs, or if the rows are not compressed.
+        most of the cost. Samples are evaluated in single precision. Raises ValueError if n is not
+        from 1 to the number of pairs, or if the rows are not compressed.
         """
         total = len(self._costs)
         if not 1 <= n <= total:
@@ -100,7 +100,7 @@ class PairwiseErrorCost(Average):
         return sample
 
     def _confusion(self, block: slice, forms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return costs times Q(sqrt(q / 2)) [n], and negative slopes in the forms [n, G, G]."""
+        """Return costs times Q(sqrt(q / 2)) [n], and their negative derivatives [n, G, G]."""
         from scipy.special import ndtr
 
         squares, slopes = self._squares(forms)
@@ -139,7 +139,7 @@ def best_phases(products: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, n
     curvature = np.einsum('bq,nb,bp->nqp', scales, magnitude, scales) + np.eye(scales.shape[1])
     inverse = np.linalg.inv(curvature)
     candidates = []
-    # For small deviations, the minimum is near 0; for large ones, near the angles of the products.
+    # If A is small, the minimum is near 0; if A is large, it is near the angles of the products.
     for z in (np.zeros((len(products), scales.shape[1])), angle @ np.linalg.pinv(scales).T):
         for _ in range(_STEPS):
             slope = (magnitude * np.sin(z @ scales.T - angle)) @ scales + z

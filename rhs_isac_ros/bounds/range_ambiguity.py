@@ -1,9 +1,9 @@
 """Confusion of ranges at which the signals have similar phases in all bands.
 
 If two ranges differ by a lag r, the phases of a carrier f_i differ by 2 pi f_i r / v_0. The range
-ambiguity function is the mismatch sum_i w_i (1 - cos(2 pi f_i r / v_0)). Its minima are the lags
-that are hard to distinguish from 0. The function depends only on the frequencies, so many band
-plans can be compared in little time.
+ambiguity function is the mismatch sum_i w_i (1 - cos(2 pi f_i r / v_0)), with weights w_i of the
+bands. Its minima are the lags that are hard to distinguish from 0. The function depends on nothing
+but the frequencies, so many band plans can be compared in little time.
 """
 
 import numpy as np
@@ -26,12 +26,12 @@ _BLOCK = 128
 
 def range_confusion_error(
         frequencies_hz: np.ndarray, energies: np.ndarray, max_lag_m: float) -> np.ndarray:
-    """Estimate the squared error from confusing ranges for many band plans, float64 [P] [m^2].
+    """Estimate the squared error from confusing ranges for each of P band plans, float64 [m^2].
 
     Each minimum r of the mismatch has the weight w = (1 - r / r_max) Q(sqrt(q / 2)), with
     q = 2 E sum_i (1 - cos(2 pi f_i r / v_0)) / N_B. The factor 1 - r / r_max is the share of the
     positions for which the lag stays inside the region. The estimate is sum w r^2 / (1/2 + sum w),
-    averaged over energies E: the mean of r^2 over the confused ranges and the true one.
+    the mean of r^2 over the confused ranges and the true one, averaged over the energies E.
 
     Takes the centre frequencies of each plan, float64 [P, N_B] [Hz], the energies E of the
     whitened mean signals of all bands at some positions, float64 [N], and r_max [m].
@@ -134,7 +134,7 @@ def _is_minimum(mismatch: np.ndarray) -> np.ndarray:
 
 
 def _refined(mismatch: np.ndarray, plan: np.ndarray, lag: np.ndarray) -> np.ndarray:
-    """Return minima [n], refined by parabolas through their neighbours and at least 0."""
+    """Return minima [n], refined by parabolas through their neighbours and not below 0."""
     before, at, after = (mismatch[plan, lag + step] for step in (-1, 0, 1))
     lowest = at - (after - before)**2 / (8 * (before - 2 * at + after))
     return np.maximum(lowest, 0.0)

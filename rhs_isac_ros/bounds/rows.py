@@ -2,7 +2,7 @@
 
 A row is a linear function of the line-of-sight gains of one band, such as their derivative with
 respect to a coordinate, or their difference between two positions. Its mean is the same function
-of the mean signals, as in Eq. (13). Most of the time of an objective goes into whitened means.
+of the mean signals, as in Eq. (13). An objective spends most of its time on whitened means.
 """
 
 import copy
@@ -40,7 +40,7 @@ MIN_TOLERANCE = 1e-7
 
 
 def no_tick() -> None:
-    """Do nothing."""
+    """Do nothing; this is the default `Tick`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,8 +70,8 @@ class RowSource:
 class MeasurementRows:
     """Rows of all items and bands, as coefficients of basis vectors.
 
-    The sub-bands of a band form J groups of S. Their bases are complex128 [J, S, N_E, R], or None
-    if the coefficients are the rows themselves, with S = 1 and R = N_E.
+    The sub-bands of a band form J groups of S. The bases of the groups are complex128
+    [J, S, N_E, R], or None if the coefficients are the rows themselves, with S = 1 and R = N_E.
     """
 
     def __init__(self, source: RowSource, n_groups: int, width: int = 0) -> None:
@@ -106,7 +106,7 @@ class MeasurementRows:
 
 
 class Evaluation:
-    """Whitened means for one measurement model and the sums for its gradient, in blocks."""
+    """Whitened means for one measurement model, and sums for a gradient, in blocks of items."""
 
     def __init__(self, rows: MeasurementRows, model: MeasurementModel) -> None:
         self._rows, self._whitener = rows, model.whitener
@@ -120,7 +120,7 @@ class Evaluation:
             for band, radiation in enumerate(model.radiation)]
         self._weights = [[np.zeros_like(one) for one in filters] for filters in self._filters]
         self._last = [np.empty(0)] * len(self._whitener)
-        # Sums over weighted whitened means times whitened means.
+        # Sums of products of weighted whitened means and whitened means.
         self._products = np.zeros_like(self._whitener)
 
     def _filter(self, means: np.ndarray, band: int, pattern: np.ndarray | None) -> np.ndarray:
@@ -194,7 +194,7 @@ def rows_within(source: RowSource, tolerance: float) -> MeasurementRows:
     """Return rows within a relative error, compressed as in `CompressedRows`.
 
     If the tolerance is 0, the rows are exact. A small number of rows that would need a large basis
-    is stored in single precision instead.
+    is not compressed, but stored in single precision.
     """
     if tolerance == 0:
         return ExactRows(source)
@@ -247,7 +247,7 @@ class ExactRows(MeasurementRows):
 
 
 class CompressedRows(MeasurementRows):
-    """Rows as coefficients in a basis: less memory, and one large matrix product per band.
+    """Rows as coefficients in a basis, for less memory and one large matrix product per band.
 
     The rows of all positions and sub-bands in a region span, to a given accuracy, far fewer
     dimensions than there are elements and sub-bands. A randomised range finder with a fixed seed
@@ -328,7 +328,7 @@ def _compress(rows_of: Callable[[slice], np.ndarray], every: list[slice], n_rows
 
 def _project(rows_of: Callable[[slice], np.ndarray], chosen: Sequence[slice],
              basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients [n, R] of rows, and of the nonzero rows scaled to length 1."""
+    """Return coefficients [n, R] of the rows, and of the nonzero rows scaled to unit length."""
     coefficients, norms = [], []
     for block in chosen:
         rows = rows_of(block)
@@ -355,7 +355,7 @@ def _missing(relative: np.ndarray) -> float:
 
 def _sketch(
         rows_of: Callable[[slice], np.ndarray], chosen: Sequence[slice], size: int) -> np.ndarray:
-    """Return an orthonormal basis of random combinations of the rows, scaled to unit length."""
+    """Return an orthonormal basis of random mixtures of the rows, each of unit length."""
     rng = streams.generator(0, streams.SKETCH, size)
     mixtures = np.zeros(())
     for block in chosen:

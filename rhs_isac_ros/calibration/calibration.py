@@ -30,13 +30,13 @@ class CalibrationError(ValueError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Calibration:
-    """An estimate of a surface.
+    """An estimate of a surface, the scenario to which it applies, and a record of its origin.
 
     Raises CalibrationError if sizes disagree or a number is not finite.
     """
 
     surface: SurfaceEstimate  #: The estimate, as used by estimators, bounds and beams.
-    scenario_id: str  #: `Scenario.id` of its scenario, without the files of a hall.
+    scenario_id: str  #: `Scenario.id` of this scenario without its hall files.
     #: Record of the calibration: ``pilots``, their number; ``codebooks``, their ids; ``prior`` of
     #: the elements; ``scenario``, the fields that differ from Table I; ``rounds`` of the
     #: estimation, and whether it ``converged``; ``version``.
@@ -100,7 +100,7 @@ class Calibration:
 
 def calibrate(scenario: Scenario, pilots: Sequence[Pilots],
               prior: SurfacePrior | None = None) -> Calibration:
-    """Estimate a surface from pilots; see `estimate_surface`."""
+    """Estimate a surface from pilots with `estimate_surface`; add the scenario and a record."""
     prior = prior or prior_of(scenario)
     changes: list[float] = []
     surface = estimate_surface(scenario, pilots, prior, lambda _, change: changes.append(change))
@@ -131,7 +131,7 @@ def load_surface(path: str, scenario: Scenario) -> SurfaceEstimate | None:
 
 
 def report(calibration: Calibration, scenario: Scenario) -> str:
-    """Describe failed elements, the largest errors, and the bands, with standard deviations."""
+    """Describe failed elements, largest errors and band gains, each with a standard deviation."""
     surface, about = calibration.surface, calibration.about
     n = scenario.n_elements
     std = surface.std()

@@ -1,6 +1,6 @@
 """Estimation of the surface from pilots of a reference user at known positions.
 
-The mean signals are linear in gains and offsets of the elements, and in the gain of a band.
+The mean signals are linear in the gains and offsets of the elements, and in the gain of each band.
 Multipath and thermal noise are the noise of this linear model. Their covariance also contains the
 multipath that leaks through the errors of the elements. As the estimates improve, less multipath
 leaks, and the nulls of the beams, where errors are visible, gain weight. The estimation therefore
@@ -96,7 +96,7 @@ def estimate_surface(
 
 
 def initial_values(nuisance: Nuisance, white: np.ndarray, white_mean: np.ndarray) -> np.ndarray:
-    """Estimate, one by one, the values [N, Q] that only rotate whole bands; others are 0."""
+    """Estimate, one by one, the values [N, Q] that only rotate whole bands; other values are 0."""
     values = np.zeros((len(white), len(nuisance)))
     outputs = np.sum(np.conj(white_mean) * white, axis=2)
     for q in np.flatnonzero(nuisance.phases.any(axis=0)):
@@ -139,7 +139,7 @@ def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
 
 
 def _change(before: Posterior, after: Posterior, n_bands: int) -> float:
-    """Return the largest change in standard deviations; band parameters are already changes."""
+    """Return the largest change, in standard deviations; band parameters are already changes."""
     moved = np.abs(after.complex_mean() - before.complex_mean())
     moved[-n_bands:] = np.abs(after.complex_mean()[-n_bands:])
     std = np.sqrt(np.maximum(np.diagonal(after.complex_covariance()).real, 1e-300))
@@ -157,7 +157,7 @@ def _result(posterior: Posterior, band_gains: np.ndarray) -> SurfaceEstimate:
 
 
 class PilotStatistics:
-    """Information in pilots about the parameters, given the covariance of the noise.
+    """Information in pilots about a surface, given the covariance of the noise.
 
     The P = 2 N_E + N_B parameters are gains and offsets of the elements, and relative errors of
     the bands' gains. Declared nuisance parameters have different values for each pilot. Each round
@@ -174,10 +174,10 @@ class PilotStatistics:
 
     def evaluate(self, gains: np.ndarray, mean: np.ndarray, covariance: np.ndarray
                  ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the information [2 P, 2 P] and shift [2 P], for real and then imaginary parts.
+        """Compute the `information` [2 P, 2 P] and `shift` [2 P] for `surface_posterior`.
 
         The model is linearised about the band gains `gains`, complex128 [N_B]. `mean` and
-        `covariance` describe gains and offsets of the elements, [2 N_E] and [2 N_E, 2 N_E].
+        `covariance` describe the gains and offsets of elements, [2 N_E] and [2 N_E, 2 N_E].
         """
         size = self._size
         normal, product = np.zeros((size, size), complex), np.zeros(size, complex)
@@ -214,7 +214,7 @@ class PilotStatistics:
 
     def _linearised(self, part: '_Block', signals: np.ndarray, key: tuple[int, int]
                     ) -> tuple[np.ndarray, np.ndarray]:
-        """Improve nuisance values of a block; return linearised signals and whitened slopes."""
+        """Improve a block's nuisance values; return linearised signals and whitened slopes."""
         values = self._values.get(key)
         if values is None:
             values = initial_values(self._nuisance, part.whiten(signals), part.whiten(part.mean))

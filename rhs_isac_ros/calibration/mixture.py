@@ -41,7 +41,7 @@ class SurfacePrior:
 
 
 class Posterior(NamedTuple):
-    """Gaussian approximation of a posterior, over real and then imaginary parts."""
+    """Gaussian approximation of a posterior, with all real parts before the imaginary parts."""
 
     # For the P = 2 N_E + N_B gains, offsets and band gains: float64 [2 P] and [2 P, 2 P].
     mean: np.ndarray
@@ -99,14 +99,14 @@ def surface_posterior(information: np.ndarray, shift: np.ndarray, prior: Surface
         total_covariance += weight * (
             other_covariance - covariance + (1 - weight) * np.outer(difference, difference))
     if other.sum() > 1:
-        # The correction for each element assumes that the other elements do not change.
+        # The correction for each element assumes that the states of all others do not change.
         values, vectors = np.linalg.eigh(total_covariance)
         total_covariance = vectors * np.maximum(values, 0.0) @ vectors.T
     return Posterior(total_mean, total_covariance, state, np.where(state, 1 - other, other))
 
 
 class _Search:
-    """Evidence of the states of all elements, and moments given the states."""
+    """Search for the states of all elements by their evidence; posterior given the states."""
 
     def __init__(self, information: np.ndarray, shift: np.ndarray, prior: SurfacePrior,
                  band_rms: np.ndarray) -> None:
@@ -142,14 +142,14 @@ class _Search:
         return covariance @ self._shift[indices], (covariance + covariance.T) / 2
 
     def moments(self, failed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean [2 P] and the covariance [2 P, 2 P] given the states."""
+        """Return the posterior mean [2 P] and covariance [2 P, 2 P] given the states."""
         indices = self._indices(failed)
         mean, covariance = np.zeros(2 * self._size), np.zeros((2 * self._size, 2 * self._size))
         mean[indices], covariance[np.ix_(indices, indices)] = self._solve(indices)
         return mean, covariance
 
     def climb(self, failed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Flip states while the evidence grows; return them and the log odds of further flips."""
+        """Flip states while the evidence grows; return states and log odds of further flips."""
         log_odds = self._log_odds(failed)
         for _ in range(4 * self._n_elements):
             best = int(np.argmax(log_odds))
@@ -160,7 +160,7 @@ class _Search:
         return failed, log_odds
 
     def _log_odds(self, failed: np.ndarray) -> np.ndarray:
-        """Return log odds [N_E] of each element's other state, given the states of the rest."""
+        """Return the log odds [N_E] of each element's other state, given all other states."""
         active, inactive = self._indices(failed), self._indices(~failed)
         mean, covariance = self._solve(active)
         # Real and imaginary part of each element [N_E, 2].
@@ -188,7 +188,7 @@ class _Search:
 
     def _log_evidence(
             self, indices: np.ndarray, curvature: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Return the log evidence for two parameters of each element against their absence."""
+        """Return the log evidence [N_E] of two parameters per element, relative to having none."""
         precision, mean = self._precision[indices], self._mean[indices]
         best = step_to_maximum(curvature, gradient)
         exponents = np.log(precision) + gradient * best - precision * mean**2

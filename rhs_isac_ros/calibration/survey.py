@@ -7,7 +7,7 @@ nu, whose mean L_0 is the covariance that three fields declare, the posterior me
 
 The fields and nu maximise the evidence. L is close to the declared covariance for few positions,
 and to the sample covariance for many. If the multipath consists of a few strong paths, it is not
-Gaussian, and with t = 1 positioning errors would exceed the bound. Each position is therefore left
+Gaussian, and positioning errors would exceed the bound with t = 1. Each position is therefore left
 out in turn, and t is chosen so that 95 % of the positions lie in the 95 % region of the local
 bound, and 99 % pass the test of the residual.
 
@@ -42,10 +42,10 @@ from rhs_isac_ros.support.threads import one_blas_thread
 # pass their test.
 COVERAGE = 0.95
 _PASSING = 0.99
-# Inflation of a survey without positions, and its weight in positions. It is a margin for small
-# surveys, for which the quantiles above are uncertain.
+# Inflation t without positions, and the weight of this value, in positions. It is a margin for
+# small surveys, in which the quantiles above are uncertain.
 _INFLATION, _INFLATION_WEIGHT = 1.8, 40
-# Likewise for the standard deviation of the level of users in sight [dB].
+# Standard deviation of the level of users in sight [dB], with the same weight.
 _LEVEL_STD_DB = 1.2
 # Surveys with fewer positions, or a smaller span along a side of the region, cause a warning.
 MIN_POSITIONS = 20
@@ -71,8 +71,8 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
     """Estimate the covariance of the multipath from signals at known positions.
 
     `positions`, float64 [N, 3] [m], should be spread over the region of interest; `received` are
-    complex128 [N, N_B, N_SB F], sub-band-major. Multipath fields of the scenario are only starting
-    points; declared impairments are estimated for each position. The result is a value of the
+    complex128 [N, N_B, N_SB F], sub-band-major. The search starts at the multipath fields of the
+    scenario; declared impairments are estimated for each position. The result is a value of the
     field `Scenario.multipath`, and its `about` contains the expected coverage.
 
     Raises ValueError if a shape is wrong, a number is not finite, or there is no position. Warns
@@ -142,7 +142,7 @@ class _Fit(NamedTuple):
     # Residuals of all positions, complex128 [N, N_B, R]; and whether there is a direct path [N].
     residuals: np.ndarray
     in_sight: np.ndarray
-    # Sum over the prior and the positions in sight, complex128 [N_B, R, R].
+    # `weight` times the declared covariance, plus e e^H of all residuals e in sight, [N_B, R, R].
     total: np.ndarray
 
 
@@ -164,7 +164,7 @@ def _fitted(fields: Scenario, pilots: Pilots, surface: Surface | None) -> _Fit:
 
 
 def _residuals(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
-    """Return signals without the likeliest impairments and without their mean, [N, N_B, R]."""
+    """Remove the likeliest impairments and the mean from the pilots; return [N, N_B, R]."""
     nuisance, mean = nuisance_of(model.scenario), model.mean(pilots.positions)
     values = initial_values(nuisance, model.whiten(pilots.received), model.whiten(mean))
     for _ in range(_ALIGNMENT_STEPS if len(nuisance) else 0):
@@ -255,8 +255,8 @@ def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
               in_sight: np.ndarray, total: np.ndarray, weight: float) -> np.ndarray:
     """Mark positions that probably have a direct path, given all other positions, bool [N].
 
-    Without a direct path, signals are multipath of an unknown level. With one, the level of the
-    multipath varies as among the positions that are `in_sight`. `total`, complex128 [N_B, R, R],
+    Without a direct path, signals are multipath of an unknown level. With a direct path, its level
+    varies as among the positions that are `in_sight`. `total`, complex128 [N_B, R, R],
     is the sum over these positions and the prior, and has the given `weight`.
     """
     whitener = np.linalg.inv(np.linalg.cholesky(total))
@@ -280,7 +280,7 @@ def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
 
 
 def _inflation(distances: np.ndarray, energies: np.ndarray, n_measurements: int) -> float:
-    """Return t, including the margin for small surveys."""
+    """Return the inflation t, including the margin for small surveys."""
     most = max(1.0, float(energies.mean()) / n_measurements,
                float(np.quantile(distances, COVERAGE)) / _radius(),
                float(np.quantile(energies, _PASSING)) / energy_limit(n_measurements))

@@ -21,7 +21,7 @@ def adjoint(matrices: np.ndarray) -> np.ndarray:
 
 def mixture_weights(log_weights: np.ndarray, axis: int | tuple[int, ...] = -1
                     ) -> tuple[np.ndarray, np.ndarray]:
-    """Normalise weights along an axis; return them and the logarithm of their original sum."""
+    """Normalise weights given as logarithms; return them and the log of their original sum."""
     highest = log_weights.max(axis=axis, keepdims=True)
     weights = np.exp(log_weights - highest)
     total = weights.sum(axis=axis, keepdims=True)

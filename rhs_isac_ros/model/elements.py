@@ -7,14 +7,14 @@ coefficient has the mean (1 - p) c + p / 2 and, between two frames, the covarian
 
     s^2 E[x_q] E[x_q'] + (1 + s^2) (p / 12 + p (1 - p) (1/2 - c_q) (1/2 - c_q')).
 
-This is a sum of at most three terms, each a product of one factor per frame. Elements are
-independent. Signals are treated as circular. Failures also cause a pseudo-covariance, but its
-terms, one for each element, differ in phase and largely cancel.
+This is a sum of at most three terms. Each term is the product of two factors, one for each frame.
+Elements are independent. Signals are treated as circular: failures also cause a pseudo-covariance,
+but its terms, one for each element, differ in phase and largely cancel.
 
 An estimated coefficient is ``gain c + offset``: the offset of a working element is 0, as is the
 gain of a failed one. All signals of a band are also multiplied by a gain of its receive chain.
-The mean signals are therefore linear in the elements and in the gain of each band, and their
-errors have a covariance in closed form.
+The mean signals are therefore linear in the gains and offsets of the elements, and in the gain of
+each band, so the covariance of their errors has a closed form.
 """
 
 import dataclasses
@@ -35,18 +35,18 @@ from rhs_isac_ros.model.multipath import (
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import AppliedBeams, Beamforming, feed_weights
 
-# Quadrature nodes along each side of the region of interest. Few are enough, because the carrier
-# cancels in the product of the gains in two sub-bands.
+# Quadrature nodes along each side of the region of interest. A few suffice, because the carrier
+# cancels in the product of the gain in one sub-band and the conjugate gain in another.
 _ROI_NODES = 8
 # Base-2 logarithm of the number of quasi-random positions over which covariances are averaged.
 _LOG2_NODES = 7
 # Number of positions evaluated at a time.
 _BLOCK = 32
 
-# Slope in the configuration and offset of coefficients, numbers or [N_E]; gains of the bands.
+# Slope of the coefficients in c, and their offset, numbers or [N_E]; and gains of the bands.
 Response: TypeAlias = tuple[np.ndarray | float, np.ndarray | float, np.ndarray | float]
-# Function of a band and positions, float64 [N, 3] [m], that returns the errors of the signals on
-# the direct path per unit of R white numbers, complex128 [N, N_SB F, R].
+# Function of a band and positions, float64 [N, 3] [m]. It returns matrices E, complex128
+# [N, N_SB F, R]; the errors of the direct-path signals are E z, with R white numbers z.
 DirectErrors = Callable[[int, np.ndarray], np.ndarray]
 
 
@@ -83,11 +83,11 @@ class SurfaceModel:
         return AppliedBeams(self.applied(beams.analog), band_gains * beams.digital)
 
     def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
-        """Return the covariance [N_B, N_SB F, N_SB F] of multipath errors, and `DirectErrors`."""
+        """Return the covariance of multipath errors, [N_B, N_SB F, N_SB F], and `DirectErrors`."""
         raise NotImplementedError
 
     def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
-        """Compute the covariance due to errors, complex128 [N_B, N_SB F, N_SB F] [W].
+        """Compute the covariance that element errors add, complex128 [N_B, N_SB F, N_SB F] [W].
 
         It is an average over the region of interest, and includes the errors of the direct path
         and of the multipath.
@@ -102,7 +102,7 @@ class SurfaceModel:
 
     def error_covariance_at(
             self, scenario: Scenario, beams: Beamforming, positions: np.ndarray) -> np.ndarray:
-        """Compute `error_covariance` at single positions [N, 3] [m], [N, N_B, N_SB F, N_SB F]."""
+        """Compute `error_covariance` at each position [N, 3]; return [N, N_B, N_SB F, N_SB F]."""
         scattered, direct = self.errors(scenario, beams)
         covariance = np.repeat(scattered[None], len(positions), axis=0)
         for band in range(scenario.n_bands):
@@ -126,7 +126,7 @@ class ElementErrors(SurfaceModel):
 
     @property
     def response(self) -> Response:
-        """The actual coefficients."""
+        """The actual slopes and offsets; the bands have the gain 1."""
         return self.gains * np.isnan(self.stuck), self.gains * np.nan_to_num(self.stuck), 1.0
 
 
@@ -143,7 +143,7 @@ class DeclaredElements(SurfaceModel):
 
     @property
     def response(self) -> Response:
-        """The coefficients averaged over surfaces."""
+        """The slopes and offsets averaged over surfaces; the bands have the gain 1."""
         share = self._scenario.failed_element_share
         return 1 - share, share / 2, 1.0
 
@@ -156,7 +156,7 @@ class DeclaredElements(SurfaceModel):
         return np.stack(covariance)
 
     def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
-        """Return the errors; see `SurfaceModel.errors`."""
+        """Return the errors of multipath and direct path; see `SurfaceModel.errors`."""
         # [N_B, N_SB F, T, N_E]
         radiation = np.moveaxis(error_radiation(scenario, beams), 0, 2)
         n_bands, n_rows, n_terms, n_elements = radiation.shape
@@ -200,7 +200,7 @@ class SurfaceEstimate(SurfaceModel):
         return self.failed_probability > 0.5
 
     def std(self) -> np.ndarray:
-        """Return the standard deviation of each row of `factor`, float64 [2 N_E + N_B]."""
+        """Return the standard deviation of each parameter of `factor`, float64 [2 N_E + N_B]."""
         return np.sqrt(np.sum(np.abs(self.factor)**2, axis=1))
 
     @property
@@ -209,7 +209,7 @@ class SurfaceEstimate(SurfaceModel):
         return self.gains, self.offsets, self.band_gains
 
     def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
-        """Return the errors; see `SurfaceModel.errors`."""
+        """Return the errors of multipath and direct path; see `SurfaceModel.errors`."""
         radiation = element_radiation(scenario, beams)
         of_elements, of_bands = np.split(self.factor, [2 * scenario.n_elements])
         scattered = scattered_errors(scenario, radiation, of_elements @ np.conj(of_elements.T))
@@ -244,8 +244,8 @@ def draw_surface(scenario: Scenario, rng: np.random.Generator) -> ElementErrors:
 def error_terms(scenario: Scenario) -> list[tuple[float, float]]:
     """Return the factors of the coefficients' covariance, as constants and slopes in c.
 
-    The covariance of an element's coefficient between two frames is a sum over T terms: one for
-    errors, and two more if elements can fail. Each term is a product of one factor per frame.
+    The covariance of an element's coefficient between two frames is a sum of T terms: one for
+    relative errors, and two if elements can fail. A term is the product of one factor per frame.
     """
     rms, share = scenario.element_error_rms, scenario.failed_element_share
     spread = np.sqrt((1 + rms**2) * share)
@@ -256,7 +256,7 @@ def error_terms(scenario: Scenario) -> list[tuple[float, float]]:
 
 
 def error_radiation(scenario: Scenario, beams: Beamforming) -> np.ndarray:
-    """Compute the factors of `error_terms` times S B, complex128 [T, N_B, N_SB F, N_E]."""
+    """Multiply `feed_weights` by the factors of `error_terms`; return [T, N_B, N_SB F, N_E]."""
     factors = np.array([constant + slope * beams.analog
                         for constant, slope in error_terms(scenario)])
     return (factors.reshape(-1, *beams.analog.shape)[:, :, None]
@@ -300,7 +300,7 @@ def direct_design(scenario: Scenario, radiation: np.ndarray, band: int,
                   positions: np.ndarray) -> np.ndarray:
     """Compute the derivative of a band's mean signals with respect to gains and offsets.
 
-    Returns complex128 [N, N_SB F, 2 N_E] for the weights of `element_radiation`.
+    Takes the weights of `element_radiation`. Returns complex128 [N, N_SB F, 2 N_E].
     """
     los = los_gain(scenario, positions, band)
     by_measurement = np.repeat(np.concatenate([los, los], axis=-1), scenario.n_frames, axis=1)
@@ -309,7 +309,7 @@ def direct_design(scenario: Scenario, radiation: np.ndarray, band: int,
 
 def scattered_errors(
         scenario: Scenario, radiation: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Compute the covariance [W] of the multipath signals that errors of the elements cause.
+    """Compute the covariance [W] that errors of the elements cause through the multipath.
 
     Takes the weights of `element_radiation` and the covariance of gains and offsets, complex128
     [2 N_E, 2 N_E]. Returns complex128 [N_B, N_SB F, N_SB F].

@@ -1,4 +1,4 @@
-"""Values of a scenario from outside: arrays read from a file, or an object from a plug-in."""
+"""Scenario values that come from elsewhere: arrays read from a file, or objects of plug-ins."""
 
 import abc
 import functools
@@ -10,7 +10,7 @@ import numpy as np
 
 
 class External(abc.ABC):
-    """A scenario value, written as origin and digest; equal digests mean equal values."""
+    """A scenario value from a file or plug-in; values with the same digest are equal."""
 
     origin: str  #: Path of the file, or name of the plug-in; empty for other values.
     # For error messages: the kind of value, and the values that a scenario accepts.

@@ -2,8 +2,8 @@
 
 The boresight of the elements is the x axis, and the user's antenna points in the opposite
 direction. The line between an element and the user therefore makes the same angle theta with both
-boresights: cos theta = x / d, with the user's distances x from the plane of the surface and d from
-the element.
+boresights: cos theta = x / d, where x and d are the user's distances from the plane of the surface
+and from the element.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ class PatternError(ValueError):
 class GainPattern(External):
     """Amplitude gain that depends only on the angle from the boresight.
 
-    Patterns whose gains agree to seven digits are equal, even if they use different functions.
+    Patterns whose gains agree to seven digits compare equal, even with different functions.
     Raises PatternError if a function fails, or returns a wrong shape, complex values or values out
     of range.
 

@@ -6,23 +6,22 @@ import numpy as np
 
 from rhs_isac_ros.model.arrays import mixture_weights
 
-# Standard deviation of the level of multipath without a direct path [dB].
+# Standard deviation of the multipath level of a user without a direct path [dB].
 BLOCKED_STD_DB = 10.0
-# Share of valid signals that each test of the energy of one phase may reject.
+# Share of valid signals that a test of the energy of a positioning phase may reject.
 FALSE_ALARM = 1e-9
 
 
 class Marginal(NamedTuple):
-    """Gaussian of the first n of n + Q unknowns, with the others at their maximum."""
+    """Quadratic log-likelihood of the first n of n + Q unknowns, maximised over the other Q."""
 
     # Schur complement of the information [N, n, n], and gradient of the log-likelihood [N, n].
     information: np.ndarray
     gradient: np.ndarray
-    # How the maximum over the others moves with the first n [N, Q, n], and the step to it [N, Q].
+    # Derivative of the maximising Q unknowns by the first n [N, Q, n], and step to them [N, Q].
     regression: np.ndarray
     offset: np.ndarray
-    # Logarithm of the integral over the others relative to the maximum [N], without the factors
-    # 2 pi.
+    # Log of the integral over the Q unknowns relative to the maximum [N], without factors of 2 pi.
     log_volume: np.ndarray
 
 
@@ -39,10 +38,10 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
     """Average the likelihood of Gaussian numbers over their level, a log-normal power.
 
     `energy`, float64 [N], is the energy of n complex numbers relative to their variance at 0 dB.
-    Returns the logarithm of the average, float64 [N], relative to the density of zeros at 0 dB.
+    Returns the logarithm of the average, float64 [N], relative to the likelihood of zeros at 0 dB.
     """
     std = np.log(10) / 10 * std_db
-    # The likelihood of n numbers has a width of n**-0.5 in the level, which the grid resolves.
+    # As a function of the level, the likelihood has a width of n**-0.5, which the grid resolves.
     normal = np.linspace(-4, 4, 2 * int(np.ceil(4 * std * np.sqrt(n))) + 61)
     level, prior = np.log(10) / 10 * median_db + std * normal, -normal**2 / 2
     exponents = -energy[:, None] * np.exp(-level) - n * level + prior
@@ -50,10 +49,10 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
 
 
 def share_of_level(n: float, std_db: float) -> float:
-    """Return the share, from 0 to 1, of the variance of a log energy that is due to its level.
+    """Return the share, from 0 to 1, of the variance of a log energy that an unknown level causes.
 
-    The energy is that of n complex Gaussian numbers whose unknown level is a log-normal power. If
-    an energy deviates from its median, this share of the deviation is attributed to the level.
+    The energy is the sum over n complex Gaussian numbers whose common level is a log-normal power.
+    If an energy deviates from its median, this share of the deviation is attributed to the level.
     """
     variance = float(np.log(10) / 10 * std_db)**2
     return variance / (variance + 1 / n)
@@ -82,7 +81,8 @@ def step_to_maximum(information: np.ndarray, gradient: np.ndarray) -> np.ndarray
 def marginalise(information: np.ndarray, gradient: np.ndarray, n: int = 3) -> Marginal:
     """Integrate over all but the first n unknowns, by Laplace's method.
 
-    Takes information, float64 [N, n + Q, n + Q], and gradient, [N, n + Q], of a log-likelihood.
+    Takes the information, float64 [N, n + Q, n + Q], and the gradient, float64 [N, n + Q], of a
+    log-likelihood.
     """
     if information.shape[1] == n:
         n_points = len(gradient)

@@ -1,7 +1,7 @@
 """Positions of the elements and feeds, frequencies of the sub-bands, and polar coordinates.
 
 The polar coordinates (r, u, v) of a position are its range and two direction cosines. The position
-is r (w, u, v) with w = sqrt(1 - u^2 - v^2), in front of the surface.
+is in front of the surface, at r (w, u, v) with w = sqrt(1 - u^2 - v^2).
 """
 
 import functools
@@ -107,9 +107,9 @@ def polar_bounds(bounds: np.ndarray) -> np.ndarray:
 
 
 def region_information(scenario: Scenario) -> np.ndarray:
-    """Return the information of a Gaussian as wide as the region, float64 [3, 3] [1/m^2].
+    """Return the information of a Gaussian prior as wide as the region, float64 [3, 3] [1/m^2].
 
-    Its variances, size^2 / 12, equal those of the uniform distribution.
+    Its variances, size^2 / 12, equal the variances of the uniform distribution.
     """
     shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
     return np.diag(12 / np.maximum(scenario.roi_size_m, _NO_EXTENT * shortest)**2)

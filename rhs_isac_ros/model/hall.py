@@ -3,12 +3,12 @@
 Let g be the Gaussian gains of the elements in all measurements of a band. Three fields of the
 scenario declare their covariance C_0. A survey with the radiation matrix T replaces the covariance
 L_0 of its signals, T g + noise, by the measured covariance L, and keeps the distribution of g
-given the signals. Apart from the noise, the result has the smallest Kullback-Leibler divergence
-from C_0 among all covariances of g that give the signals the covariance L:
+given the signals. If the noise is negligible, the result has the smallest Kullback-Leibler
+divergence from C_0 among all covariances of g that give the signals the covariance L:
 
     C = C_0 + C_0 T^H M T C_0    with    M = L_0^-1 (L - L_0) L_0^-1.
 
-C also gives the covariance of the signals for any other beams, and of single elements.
+C determines the covariance of the signals for any other beams and for single elements.
 
 Paths come from a ray tracer, for example. A path is a spherical wave from a virtual source, such
 as the mirror image of the user in a wall. Its gain is the line-of-sight gain to this source,
@@ -71,9 +71,9 @@ class MultipathEstimate(ArrayFile):
     excess: np.ndarray  #: M_i, complex128 [N_B, N_SB F, N_SB F] [1/W].
     conditions: dict[str, Any]  #: Fields of the survey's scenario that the covariance depends on.
     #: Record of the survey: numbers of ``positions`` with a direct path and of ``blocked`` ones;
-    #: ``prior_weight`` nu; ``inflation`` t; ``level_std_db``, the standard deviation of the power
-    #: among users [dB]; ``coverage``, the expected share of positions in the 95 % region, with its
-    #: interval; ``warnings``; ``codebook``, its id; ``version``.
+    #: ``prior_weight`` in positions; ``inflation`` of the covariance; ``level_std_db``, the
+    #: standard deviation of the power among users [dB]; ``coverage``, the expected share of
+    #: positions in the 95 % region, and its interval; ``warnings``; ``codebook`` id; ``version``.
     about: dict[str, Any] = dataclasses.field(default_factory=dict)
     origin: str = ''
 
@@ -137,8 +137,8 @@ class PathChannel(ArrayFile):
     """
 
     users: np.ndarray  #: Positions, float64 [N, 3] [m], in the frame of the scenario.
-    #: Amplitudes at the centre of the surface and at the frequency `f0`, for antennas without gain
-    #: and without the phase of the distance, complex128 [N, P]; c / (4 pi f0 d) in free space.
+    #: Amplitudes at the centre of the surface and at the frequency `f0`, complex128 [N, P]. They
+    #: omit the phase of the distance d and the gain of antennas: c / (4 pi f0 d) in free space.
     a: np.ndarray
     src: np.ndarray  #: Virtual sources, float64 [N, P, 3] [m]; the user for the direct path.
     n: np.ndarray  #: Number of reflections, int [N, P]; 0: direct path, -1: missing path.
@@ -178,9 +178,9 @@ class PathChannel(ArrayFile):
         """Convert paths of Sionna RT, as its `PathSolver` returns them.
 
         Users are the transmitters, and the only receiver is at the surface's centre, with axes
-        like the scenario's. Both have one isotropic antenna. All reflections are specular, and
-        the frequency of the scene is `f0` [Hz]. Paths from behind the surface are removed. Raises
-        ArchiveError if there are several receivers or antennas, or the result is not valid.
+        like the scenario's. Each device has one isotropic antenna. All reflections are specular,
+        and the frequency of the scene is `f0` [Hz]. Paths from behind the surface are removed.
+        Raises ArchiveError if there are several receivers or antennas, or the result is invalid.
         """
         a = np.array(paths.a[0]) + 1j * np.array(paths.a[1])
         if a.ndim != 5 or (*a.shape[:2], a.shape[3]) != (1, 1, 1):
@@ -217,7 +217,7 @@ class PathChannel(ArrayFile):
 
     @functools.cached_property
     def sources(self) -> np.ndarray:
-        """Sources in full precision, float64 [N, P, 3] [m]; the user for a direct path."""
+        """Virtual sources in full precision, float64 [N, P, 3] [m]; the user for a direct path."""
         missing, direct = (self.a == 0)[..., None], (self.n == 0)[..., None]
         return np.where(missing | direct, self.users[:, None], self.src)
 

@@ -4,7 +4,7 @@ Given the position, the elements of the surface (see `elements`) and a few Gauss
 signals of a cycle are Gaussian. Each of the numbers is a nuisance parameter x with an exponent P:
 the signals are multiplied by ``exp(x P)``. A real exponent is a gain in nepers, an imaginary one a
 phase. The factor applies to the direct path and to the multipath, but not to the thermal noise.
-The exponential wraps phases, so a phase whose standard deviation is a whole turn is uniform.
+The exponential wraps phases: with a standard deviation of a whole turn, a phase is nearly uniform.
 
 Simulation, estimators, bounds and calibration depend only on the interface `Impairment`. A new
 impairment is a plug-in of the group ``rhs_isac_ros.impairments``, or a `Factor` in `BUILT_IN` with
@@ -49,7 +49,7 @@ class Linear(NamedTuple):
 
 
 class Impairment:
-    """An impairment of the signals.
+    """Base class of impairments: random values that change the gain and phase of the signals.
 
     A subclass defines `linear`. Its values are Gaussian unless it overrides `values`; estimators
     and bounds always assume the Gaussian prior of `linear`. `scope` states how often values are
@@ -71,8 +71,8 @@ class Exponents:
     """Standard normal parameters z with exponents P: signals contain the factor exp(z P)."""
 
     scaled_patterns: np.ndarray  #: The exponents P, complex128 [Q, N_B, N_SB F].
-    #: Parameters that change the measurements of one band relative to each other, and so move the
-    #: multipath out of the nulls of its covariance, bool [Q].
+    #: Whether a parameter changes measurements of the same band relative to each other, and so
+    #: moves the multipath out of the nulls of its covariance, bool [Q].
     moves_multipath: np.ndarray
 
     def __len__(self) -> int:
@@ -86,9 +86,9 @@ class Exponents:
     def derivatives(self, divided: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Return the derivatives of signals with respect to z, [N, Q, N_B, N_SB F].
 
-        Takes signals after `divide`, and their mean. Parameters that move the multipath act on the
-        received multipath, so their derivatives contain the signals, and differ between
-        positioning phases. The derivatives of other parameters contain the mean.
+        Takes signals after `divide`, and their mean. A parameter that moves the multipath acts on
+        the received multipath, so its derivative contains the signals, and differs between
+        positioning phases. The derivative with respect to any other parameter contains the mean.
         """
         moves = self.moves_multipath[:, None, None]
         return self.scaled_patterns * np.where(moves, divided[:, None], mean[:, None])
@@ -99,9 +99,9 @@ class Nuisance(Exponents):
 
     The parameters are x = L z with standard normal z. Bounds and estimators use z, which is
     dimensionless. `patterns` and `scaled_patterns`, complex128 [Q, N_B, N_SB F], are the exponents
-    per unit of x and of z. `needs_search`, bool [Q], repeats the flag of `Linear`. `phases`,
-    float64 [N_B, Q], is the phase of each band per unit of z, and 0 for every z that does more
-    than rotate the phases of whole bands.
+    per unit of x and of z. `needs_search`, bool [Q], is the flag of `Linear` for each parameter.
+    `phases`, float64 [N_B, Q], is the phase of each band per unit of z; it is 0 for every
+    parameter that does more than rotate the phases of whole bands.
     """
 
     def __init__(self, scenario: Scenario, parts: Sequence[Linear]) -> None:
@@ -143,7 +143,7 @@ def _shape(scenario: Scenario) -> tuple[int, int]:
 
 @dataclasses.dataclass(frozen=True)
 class Factor(Impairment):
-    """An impairment with independent values, whose standard deviation is a scenario field."""
+    """An impairment with independent values; a scenario field is their standard deviation."""
 
     field: str
     # Function that returns the exponents per unit of the values.
@@ -192,10 +192,10 @@ def nuisance_of(scenario: Scenario) -> Nuisance:
 def draw_factors(
         scenario: Scenario, n: int, user: np.random.Generator, cycle: np.random.Generator
 ) -> np.ndarray | None:
-    """Draw the factors of the signals of n users and cycles, complex128 [n, N_B, N_SB F].
+    """Draw the factors of n signals, each of one user in one cycle, complex128 [n, N_B, N_SB F].
 
-    `user` and `cycle` generate the values of the respective scope. Values of a built-in impairment
-    do not depend on which others are declared. Returns None if no impairment is declared.
+    `user` and `cycle` are the generators of the values of each `Scope`. Values of a built-in
+    impairment do not depend on the other declarations. Returns None if no impairment is declared.
     """
     declared = impairments_of(scenario)
     if not declared:
@@ -217,11 +217,11 @@ def draw_factors(
 def draw_impairments(
         scenario: Scenario, n: int, rng: np.random.Generator
 ) -> tuple[ElementErrors | None, np.ndarray | None]:
-    """Draw a surface, and the factors of the signals of n phases, complex128 [n, N_B, N_SB F].
+    """Draw a surface, and the factors of n positioning phases, complex128 [n, N_B, N_SB F].
 
-    Each phase has a new user. Either result is None if the scenario does not declare it. The
-    numbers come from children of the generator, so that the multipath and noise drawn from `rng`
-    itself do not depend on the declared impairments.
+    Each phase has a new user. The surface is None if no errors of elements are declared, and the
+    factors are None if no impairment is. The numbers come from children of the generator, so that
+    the multipath and noise drawn from `rng` itself do not depend on the declarations.
     """
     if not has_errors(scenario) and not impairments_of(scenario):
         return None, None

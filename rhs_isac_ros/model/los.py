@@ -1,7 +1,7 @@
 """Line-of-sight gains of the elements and their derivatives with respect to the user's position.
 
-`positions`, float64 [N, 3] [m], belong to users, and `band` is an index from 0. A function that
-takes positions raises ValueError if the shape is wrong or a value is not finite.
+`positions`, float64 [N, 3] [m], are positions of users, and `band` is an index from 0. Public
+functions except `los_waves` raise ValueError if positions have a wrong shape or are not finite.
 """
 
 from collections.abc import Iterator, Sequence
@@ -66,7 +66,7 @@ def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
 
 def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
              weights: np.ndarray) -> np.ndarray:
-    """Sum `los_gain` in n bands over elements with weights [n, N_SB, N_E]; return [n, N, N_SB]."""
+    """Sum `los_gain` with weights [n, N_SB, N_E] over elements in n bands; return [n, N, N_SB]."""
     waves = los_waves(scenario, checked_positions(positions), bands, slopes=False)
     scaled = weights / subband_frequencies_hz(scenario)[list(bands), :, None]
     return np.stack([(gain @ row[..., None])[..., 0].T
@@ -182,7 +182,7 @@ def _amplitude(
 
 
 def _phasors(phases: np.ndarray) -> np.ndarray:
-    """Compute exp(i phase) by a table and a Taylor series, three times as fast as `np.exp`.
+    """Compute exp(i phase) from a table and a Taylor series, three times as fast as `np.exp`.
 
     The error is below 1e-15, or below the rounding of a large phase.
     """

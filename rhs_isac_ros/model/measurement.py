@@ -109,7 +109,7 @@ def simulate_received(
 def receive_feeds(
         scenario: Scenario, codebook: Beamforming, feeds: np.ndarray,
         rng: np.random.Generator | None) -> np.ndarray:
-    """Combine the feed signals of a phase by Eq. (7), complex128 [N_B, N_SB, F].
+    """Combine the feed signals of a positioning phase by Eq. (7), complex128 [N_B, N_SB, F].
 
     `feeds` are the signals at the feeds, complex128 [N_B, F, N_SB, K]. `rng` draws the thermal
     noise; it is None if the signals already contain noise.
@@ -134,7 +134,7 @@ def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
 
 
 def position_blocks(scenario: Scenario, n: int) -> list[slice]:
-    """Split n positions into blocks, which limits the memory for their line-of-sight gains."""
+    """Split n positions into blocks, to limit the memory for their line-of-sight gains."""
     return blocks(
         n, max(min(_BLOCK, _MAX_GAINS // (scenario.n_subbands * scenario.n_elements)), 1))
 
@@ -142,12 +142,12 @@ def position_blocks(scenario: Scenario, n: int) -> list[slice]:
 class MeasurementModel:
     """Distribution of the received signals for one scenario and beamforming.
 
-    Immutable. Construction computes only the radiation matrices; the factors of the covariance
-    and the weights of `mean_and_jacobian` are computed at first use, or by `prepare`.
+    Instances are immutable. The constructor computes only the radiation matrices; `prepare` or the
+    first use computes the factors of the covariance and the weights of `mean_and_jacobian`.
 
     Methods take positions of the user, float64 [N, 3] [m], and raise ValueError if the shape is
-    wrong or a value is not finite. Measurements are sub-band-major. Raises ValueError if the
-    beamforming or the surface does not have the sizes of the scenario.
+    wrong or a value is not finite. Measurements are sub-band-major. The constructor raises
+    ValueError if the beamforming or the surface does not have the sizes of the scenario.
 
     Parameters
     ----------
@@ -204,12 +204,12 @@ class MeasurementModel:
 
     @functools.cached_property
     def whitener(self) -> np.ndarray:
-        """L_i^-1, lower triangular, complex128 [N_B, N_SB F, N_SB F], read-only."""
+        """Inverse of `root`, lower triangular, complex128 [N_B, N_SB F, N_SB F], read-only."""
         return read_only(np.linalg.inv(self.root))
 
     @one_blas_thread
     def prepare(self, jacobian: bool = False) -> 'MeasurementModel':
-        """Compute the whitener in advance, and on request the weights of `mean_and_jacobian`."""
+        """Compute the whitener and, with `jacobian`, weights of the Jacobian; return the model."""
         _ = self.whitener
         if jacobian:
             _ = self._weights
@@ -347,7 +347,7 @@ class ElementSums:
     def terms(self, positions: np.ndarray, slopes: bool = True) -> np.ndarray:
         """Compute the mean and the terms of its derivative, complex128 [N_B, N, 1 + G, N_SB F].
 
-        Row 0 is the mean. Other rows, to be multiplied by `weights`, are omitted without `slopes`.
+        Row 0 is the mean. The other rows, which `weights` multiplies, are omitted unless `slopes`.
         """
         n, (n_bands, n_subbands, _, n_frames) = len(positions), self._frames.shape
         n_terms = 2 + len(self._axes) + self._has_pattern if slopes else 1

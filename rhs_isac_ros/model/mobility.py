@@ -16,7 +16,7 @@ KINDS = ('static', 'waypoints', 'random_walk')
 
 
 class Mobility(Protocol):
-    """Path of a user."""
+    """Path of a user: position and velocity as functions of time."""
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the position, float64 [3] [m], and velocity, float64 [3] [m/s].
@@ -27,7 +27,7 @@ class Mobility(Protocol):
 
 
 class Leg(NamedTuple):
-    """Part of a path between two times, with a first position [3] [m] and a velocity [3] [m/s]."""
+    """Straight part of a path between two times: first position [3] [m], velocity [3] [m/s]."""
 
     origin: np.ndarray
     velocity: np.ndarray
@@ -40,7 +40,7 @@ class StraightMobility(Mobility, Protocol):
     """Path of straight legs; a subclass only needs to define `leg`."""
 
     def leg(self, now_s: float) -> Leg:
-        """Return the leg at a time; the times of all calls must not decrease."""
+        """Return the leg at a time; the times of successive calls must not decrease."""
         ...
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -119,7 +119,7 @@ class Waypoints:
 
 
 class RandomWalk(StraightMobility):
-    """A user that walks in straight lines between random positions of the region of interest.
+    """A user that walks in straight lines between random positions in the region of interest.
 
     The first position is random, unless it is given as `start`, float64 [3] [m].
     """
@@ -172,9 +172,9 @@ def make_plugin(
         start: Sequence[float] | None = None) -> Mobility:
     """Create a mobility from a plug-in, an entry point of the group `plugins.MOBILITIES`.
 
-    The plug-in is called with the other arguments, like `RandomWalk`. If `start` is None, the
-    plug-in chooses the first position. Raises PluginError if there is no such plug-in, or if it
-    does not return a mobility.
+    The plug-in is called with the arguments of `RandomWalk`. If `start` is None, the plug-in
+    chooses the first position. Raises PluginError if there is no such plug-in, or if it does not
+    return a mobility.
     """
     mobility: Mobility = plugins.make(plugins.MOBILITIES, name, scenario, speed_mps, rng, start)
     if not callable(getattr(mobility, 'state', None)):

@@ -34,18 +34,17 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
     """Implements Eq. (2). Covariance of the multipath gains, as the fields declare it.
 
     The power-angle profile is a product of two Laplacians with the spread `angular_spread_deg`,
-    centred on `multipath_direction_deg`. It is normalised over the half space in front of the
-    surface and weighted by a gain pattern of the elements. Its total is the mean line-of-sight
-    power in the region of interest times ``multipath_to_los_db``; the paper leaves this scale
-    open. Returns V_i, complex128 [N_B, N_E, N_E]; `declared_covariance` needs less memory for many
-    elements.
+    centred on `multipath_direction_deg`. Its total over the half space in front of the surface is
+    the mean line-of-sight power in the region of interest, plus ``multipath_to_los_db``; the paper
+    leaves this scale open. The power gain of the elements then weights the profile. Returns V_i,
+    complex128 [N_B, N_E, N_E]; for many elements, `declared_covariance` needs less memory.
     """
     return _matrix(_lattice(scenario), scenario)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SpatialCovariance:
-    """V_i of Eq. (2) in a form for fast products, for one band or for several on a leading axis.
+    """V_i of Eq. (2), stored for fast products, for one band or for several on a leading axis.
 
     The declared covariance of two elements depends only on their offset on the lattice, so a
     product with V_i is a convolution. For few elements, a matrix is as fast. A measured covariance
@@ -85,7 +84,7 @@ class SpatialCovariance:
             total, matrix=read_only(self.matrix + np.matmul(adjoint(factor), through)))
 
     def scatter(self, weights: np.ndarray) -> np.ndarray:
-        """Multiply weights of the elements, complex128 [..., N_E], by V_i; same shape."""
+        """Multiply weights of elements, complex128 [..., N_E], by V_i; the shape is unchanged."""
         rows = weights.reshape(*self.power.shape[:-1], -1, weights.shape[-1])
         result = np.empty(rows.shape, complex)
         if self.matrix is None:
@@ -152,7 +151,7 @@ def _matrix(lattice: np.ndarray, scenario: Scenario) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def _lattice(scenario: Scenario) -> np.ndarray:
-    """Compute V_i by lattice offset, [N_B, 2 rows - 1, 2 columns - 1], with 0 in the middle."""
+    """Compute V_i by lattice offset, [N_B, 2 rows - 1, 2 columns - 1]; offset 0 is central."""
     is_even = [not angle for angle in scenario.multipath_direction_deg]
     lattice = np.empty((scenario.n_bands, 2 * scenario.n_rows - 1, 2 * scenario.n_columns - 1),
                        complex)
@@ -322,7 +321,7 @@ def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray | None, np.n
 
 def draw_multipath(
         scenario: Scenario, band: int, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw multipath gains h^MP of n independent phases, complex128 [n, N_SB F, N_E]."""
+    """Draw multipath gains h^MP of n positioning phases, complex128 [n, N_SB F, N_E]."""
     spatial, over_rows = multipath_factors(scenario)[band]
     n_draws = over_rows.shape[1]
     if spatial is None:
@@ -353,10 +352,10 @@ def _draw_plane_waves(
 
 @functools.lru_cache(maxsize=16)
 def _stretches(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Compute A and T V_0 of each band, which turn declared gains g into g + C_0 T^H A T g.
+    """Compute A and T V_i of each band; g + C_0 T^H A T g then has the measured covariance.
 
-    With the covariance S of the signals T g and R = S^(1/2), the covariance described in `hall`
-    requires R A R = (1 + R M R)^(1/2) - 1.
+    Here, g are gains with the declared covariance C_0, and S is the covariance of the signals T g.
+    With R = S^(1/2), the covariance in `hall` requires R A R = (1 + R M R)^(1/2) - 1.
     """
     assert scenario.multipath
     radiation, stretches = scenario.multipath.radiation, []
@@ -385,7 +384,7 @@ def _fields(scenario: Scenario) -> Scenario | MultipathEstimate:
 
 def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase: float
                         ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute angles and normalised weights of a Laplacian [n]; if even, of its positive half."""
+    """Compute n angles and normalised weights of a Laplacian; if even, of its positive half."""
     nodes, weights = gauss_legendre(_ANGLE_NODES)
     mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)
     angles, density = [], []
@@ -404,7 +403,7 @@ def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase
 
 
 def square_root(matrix: np.ndarray) -> np.ndarray:
-    """Return R with R R^H = matrix, without eigenvalues at the level of rounding."""
+    """Return R with R R^H = matrix; eigenvalues at the level of rounding are dropped."""
     values, vectors = np.linalg.eigh(matrix)
     keep = values > values[-1] * len(values) * np.finfo(float).eps
     return read_only(vectors[:, keep] * np.sqrt(values[keep]))

@@ -350,7 +350,7 @@ class Scenario(Extensions, Table1):
     def sample_positions(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw positions from the region of interest, float64 [n, 3] [m].
 
-        Positions are uniform. With a channel file, they are positions of its users.
+        Positions are uniform; with a channel file, they are drawn from the positions of its users.
         """
         if self.channel:
             return self.channel.users[rng.integers(len(self.channel.users), size=n)]
@@ -359,7 +359,7 @@ class Scenario(Extensions, Table1):
 
 
 def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) -> None:
-    """Raise ValueError unless the array has the shape `symbols`, keys of `Scenario.sizes`."""
+    """Raise ValueError unless the shape is `symbols`, keys of `Scenario.sizes` like ``F N_E``."""
     expected = tuple(scenario.sizes[symbol] for symbol in symbols.split())
     if np.shape(array) != expected:
         listed = ', '.join(symbols.split())

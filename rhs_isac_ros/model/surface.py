@@ -1,4 +1,4 @@
-"""The surface: from the signals at its elements to the feeds and to the base station."""
+"""The surface: propagation from its elements to the feeds, and combining at the base station."""
 
 import functools
 from typing import NamedTuple, Protocol

@@ -28,7 +28,7 @@ class ArgumentParser(argparse.ArgumentParser):
 
 class HelpFormatter(
         argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
-    """Shows defaults, and keeps the line breaks of the description and of the epilog."""
+    """A formatter that shows defaults and keeps line breaks of the description and epilog."""
 
 
 def _number(declared: Field) -> Callable[[str], Any]:

@@ -1,4 +1,4 @@
-"""The declaration of a value, with uniform texts about expected values.
+"""Declarations of values: type, unit and range, with uniform texts about expected values.
 
 Fields of scenarios and messages, settings of roles, ROS parameters and arguments of commands are
 declared in this way.
@@ -18,9 +18,9 @@ class ParameterError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """Declaration of a value."""
+    """Declaration of a value: its type, its unit, and its range or choices."""
 
-    kind: type  #: ``bool``, ``int``, ``float`` or ``str``, or ``list`` for numbers.
+    kind: type  #: ``bool``, ``int``, ``float``, ``str``, or ``list`` for a list of numbers.
     text: str = ''  #: Description.
     unit: str = ''
     low: float = -math.inf  #: Range of numbers, inclusive.

@@ -13,8 +13,8 @@ from typing import Any, BinaryIO
 import numpy as np
 import yaml
 
-# Maximum size of the arrays of an archive, and of a YAML file, which takes up to 240 times as much
-# memory as its size [bytes].
+# Maximum sizes [bytes] of the arrays of an archive, and of a YAML file. Reading a YAML file takes
+# up to 240 times as much memory as its size.
 _MAX_BYTES, _MAX_YAML_BYTES = 2**28, 2**24
 # Maximum depth of the lists and mappings of a YAML file.
 _MAX_YAML_DEPTH = 16
@@ -78,7 +78,7 @@ def read_yaml(path: str | Path) -> Any:
         if len(data) > _MAX_YAML_BYTES:
             raise ValueError(f'more than {_MAX_YAML_BYTES} bytes')
         text, depth = data.decode(), 0
-        # In the C loader, deep nesting would end the process.
+        # In the C loader, deep nesting would crash the process.
         for event in yaml.parse(text, _LOADER):
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
@@ -94,7 +94,7 @@ def read_yaml(path: str | Path) -> Any:
 
 def write_archive(path: str | Path, arrays: Mapping[str, np.ndarray | float],
                   about: Mapping[str, Any]) -> None:
-    """Write arrays and a description that JSON can represent to NumPy's format ``.npz``."""
+    """Write arrays and a JSON-compatible description to a file of NumPy's format ``.npz``."""
     content: dict[str, Any] = {**arrays, 'about': json.dumps(about)}
     write_whole(path, lambda stream: np.savez(stream, **content))
 
@@ -103,7 +103,7 @@ def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np
     """Read the arrays of a file of NumPy's format ``.npz``.
 
     With `names`, the result is empty unless the file has exactly these arrays, apart from
-    ``about``, and does not compress them: compressed arrays may be far larger than the file.
+    ``about``, and stores them uncompressed; compressed arrays may be far larger than the file.
     Raises ArchiveError if the file cannot be read, is damaged, or contains more than 256 MiB.
     """
     try:
@@ -117,7 +117,7 @@ def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np
             if sum(member.file_size for member in members) > _MAX_BYTES:
                 raise ValueError('more than 256 MiB of arrays')
             return {key: file[key] for key in found}
-    # Reading verifies the checksum of every array. The shape of an array may be anything.
+    # Reading verifies the checksum of every array. A header may declare any shape.
     except (OSError, ValueError, EOFError, NotImplementedError, SyntaxError, KeyError, MemoryError,
             OverflowError, RecursionError, zipfile.BadZipFile) as error:
         reason = ' '.join(str(error).split())

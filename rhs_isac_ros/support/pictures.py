@@ -43,10 +43,10 @@ _METADATA: dict[str, dict[str, Any]] = {
 
 
 class Look(NamedTuple):
-    """How to draw one of several series.
+    """Colour, marker, line style and hatch of one of several series.
 
     The colours of Okabe and Ito remain distinct for colour-blind readers. Markers, line styles and
-    hatches also differ in greyscale.
+    hatches remain distinct in greyscale, too.
     """
 
     colour: str
@@ -76,8 +76,8 @@ def look(index: int) -> Look:
 def paper_style(purpose: str = 'drawing') -> Iterator[None]:
     """Draw in the style of the paper inside the block, whatever the user's settings are.
 
-    Can also be used as a decorator. Without Matplotlib, a MissingLibraryError is raised, whose
-    message begins with `purpose`.
+    It can also be used as a decorator. If Matplotlib is not installed, it raises
+    MissingLibraryError with a message that begins with `purpose`.
     """
     with optional_import(purpose, extra='plot'):
         import matplotlib
@@ -101,14 +101,14 @@ def new_figure(width_in: float, height_in: float) -> Any:
 def new_panels(
         width_in: float, height_in: float, n_rows: int, n_columns: int,
         **sharing: bool) -> tuple[Any, Any, Any]:
-    """Return a new figure, and the panels and the axes that `add_panels` adds to it."""
+    """Return a new figure, its panels, and the axes for its legend; see `add_panels`."""
     figure = new_figure(width_in, height_in)
     return figure, *add_panels(figure.add_gridspec(1, 1)[0], n_rows, n_columns, **sharing)
 
 
 def add_panels(
         place: Any, n_rows: int, n_columns: int, **sharing: bool) -> tuple[Any, Any]:
-    """Add panels in a grid; return them, an array of axes, and axes above them for a legend.
+    """Add a grid of panels; return the panels, an array of axes, and axes above for a legend.
 
     `place` is a Matplotlib `SubplotSpec`; `sharing` may contain ``sharex`` and ``sharey``.
     """
@@ -133,7 +133,7 @@ def label_decades(axis: Any) -> None:
 
 
 def picture_format(path: str | Path) -> str:
-    """Return the format of the suffix of `path`, or raise ValueError."""
+    """Return the picture format that the suffix of `path` specifies, or raise ValueError."""
     kind = Path(path).suffix.lower().removeprefix('.')
     if kind not in PICTURE_FORMATS:
         raise ValueError(f'{str(path)!r}, expected a file name that ends in '
@@ -142,7 +142,7 @@ def picture_format(path: str | Path) -> str:
 
 
 def write_picture(path: str | Path, figure: Any) -> None:
-    """Write a figure of Matplotlib atomically, in the format of the suffix of `path`.
+    """Write a Matplotlib figure atomically, in the format that the suffix of `path` specifies.
 
     Identical figures give identical files. Raises OSError if the file cannot be written, and
     ValueError if the suffix is not one of `PICTURE_FORMATS`.

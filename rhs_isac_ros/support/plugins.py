@@ -1,4 +1,4 @@
-"""Plug-ins of other installed packages: entry points of their metadata."""
+"""Plug-ins: entry points in the metadata of other installed packages."""
 
 from importlib import metadata
 from typing import Any
@@ -20,7 +20,7 @@ def names(group: str) -> tuple[str, ...]:
 
 
 def describe(group: str, name: str) -> str:
-    """Describe all entry points with a name for an error: group, name, object and package."""
+    """Return a text for errors about a plug-in: group, name, object and package of each match."""
     return ' and '.join(sorted(
         f'entry point {group}: {name} = {point.value} of {point.dist.name if point.dist else "?"}'
         for point in metadata.entry_points(group=group, name=name)))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 @contextlib.contextmanager
 def progress_bar(total: int, unit: str, *, quiet: bool = False, line_every: int = 1
                  ) -> Iterator[Callable[[int, str], None] | None]:
-    """Yield a function that shows a number of completed units and a text; None if `quiet`.
+    """Yield a function that shows the number of completed units and a text; None if `quiet`.
 
     Without tqdm, the function prints a line every `line_every` units.
     """

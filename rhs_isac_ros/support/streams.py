@@ -10,7 +10,7 @@ import numpy as np
 def generator(seed: int, stream: int, *key: int) -> np.random.Generator:
     """Create a generator that yields the same sequence for the same arguments.
 
-    `stream` is one of the constants of this module. Further non-negative integers, such as user
-    and cycle, distinguish the uses of a stream.
+    `stream` is one of the constants of this module. The non-negative integers `key`, such as the
+    numbers of a user and a cycle, distinguish the uses of a stream.
     """
     return np.random.default_rng([seed, stream, *key])

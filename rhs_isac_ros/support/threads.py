@@ -1,9 +1,9 @@
 """Threads of the numerical functions of the package.
 
 Most matrix products here are so small that the threads of BLAS spend more time waiting for each
-other than computing; if another process occupies a core, a call takes up to fifty times as long.
-Public functions therefore run BLAS with one thread (`one_blas_thread`), and large tasks are
-divided into blocks that run side by side (`map_blocks`).
+other than computing. If another process occupies a core, a call takes up to fifty times as long as
+with one thread. Public functions therefore run BLAS with one thread (`one_blas_thread`). Large
+tasks are divided into blocks, which run in parallel (`map_blocks`).
 """
 
 import contextlib
@@ -20,7 +20,7 @@ from threadpoolctl import ThreadpoolController
 
 _Item = TypeVar('_Item')
 _Result = TypeVar('_Result')
-# A BLAS library in threadpoolctl, which has no types.
+# A BLAS library in threadpoolctl, which has no type annotations.
 _Library: TypeAlias = Any
 
 
@@ -29,7 +29,7 @@ class _OneBlasThread(contextlib.ContextDecorator):
 
     The number of threads is a setting of the process: the first caller to enter changes it, and
     the last one to leave restores it unless it was changed in between. In libraries that use
-    OpenMP, each thread has a setting, which every caller changes and restores.
+    OpenMP, each thread has its own setting, so every calling thread changes and restores one.
     """
 
     def __init__(self) -> None:
@@ -96,7 +96,7 @@ class _OneBlasThread(contextlib.ContextDecorator):
 
 
 def _limit(libraries: Iterable[_Library]) -> list[tuple[_Library, int]]:
-    """Set libraries to one thread; return the libraries that had more, with their numbers."""
+    """Set libraries to one thread; return those that had more, with their former numbers."""
     saved = [(library, number) for library in libraries
              if (number := library.get_num_threads() or 1) > 1]
     for library, _ in saved:
