@@ -48,7 +48,7 @@ def __getattr__(name: str) -> Callable[[], int]:
 
 
 def _what_provides(missing: str) -> str:
-    """Return what to install or build to provide a missing top-level module."""
+    """Return a description of the software that provides a missing top-level module."""
     # pip also installs the executables on systems without ROS.
     if importlib.util.find_spec('rclpy') is None:
         return 'ROS 2 Jazzy, which is not sourced or not installed (no module rclpy)'
@@ -61,7 +61,7 @@ def _what_provides(missing: str) -> str:
 
 
 def _join_network(name: str) -> None:
-    """Start the discovery of other nodes, which runs while the modules of a node are imported."""
+    """Join the network early, so that discovery runs while the modules of a node are imported."""
     arguments = sys.argv[1:]
     if EXECUTABLES[name] != 'nodes' or arguments[:1] not in ([], ['--ros-args']):
         return

@@ -232,7 +232,7 @@ def quadratic_gradients(
         covariance_terms: np.ndarray, n_items: int) -> tuple[np.ndarray, np.ndarray]:
     """Compute the gradients of an average, as in `Gradient`, from the sums over n items.
 
-    The sums are those of `Evaluation.sums` for all bands, complex128 [N_B, N_SB F, N_E] and
+    The sums are results of `Evaluation.sums` for all bands, complex128 [N_B, N_SB F, N_E] and
     [N_B, N_SB F, N_SB F].
     """
     scenario = model.scenario

@@ -20,12 +20,11 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
          region_prior: bool = False) -> np.ndarray:
     """Implements Eq. (11). Cramer-Rao lower bound on the mean squared positioning error.
 
-    Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2]; a bound is infinite
-    if the signals do not determine the position. Declared nuisance parameters are unknown, with
-    their distributions as priors: the result is then the hybrid bound. Errors of the elements add
-    their covariance, averaged over the region. `region_prior` adds the region of interest as a
-    Gaussian prior of covariance size^2 / 12. Raises ValueError if `positions` is not a finite
-    [N, 3] array.
+    Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2]; infinite where the
+    signals do not determine the position. Declared nuisance parameters are unknown, with their
+    distributions as priors: the result is then the hybrid bound. Errors of the elements add their
+    covariance, averaged over the region. `region_prior` adds the region of interest as a Gaussian
+    prior of covariance size^2 / 12. Raises ValueError if `positions` is not a finite [N, 3] array.
     """
     return crlb_of(MeasurementModel(scenario, codebook), positions, region_prior=region_prior)
 

@@ -62,7 +62,7 @@ class GlobalBound(NamedTuple):
 def global_bound(
         scenario: Scenario, codebook: Beamforming, rng: np.random.Generator,
         n_phases: int = 2048) -> GlobalBound:
-    """Compute the bound from the posterior of `n_phases` random positioning phases.
+    """Compute the bound from the posteriors of `n_phases` random positioning phases.
 
     The bound holds for a synchronised user: nuisance parameters of the scenario are not included.
     Raises ValueError if `n_phases` is less than 2.
@@ -89,7 +89,7 @@ class _Lattice:
 
     Along a ray, the mean signals of a band are a carrier times a smooth function of the range,
     which is interpolated between Chebyshev nodes. All ranges of a ray then cost one product of
-    small matrices. Rays on which no phases of the carriers make a point likely are skipped.
+    small matrices. Rays on which no point is likely, for any phases of the carriers, are skipped.
     """
 
     def __init__(self, model: MeasurementModel, steps: np.ndarray, point: np.ndarray) -> None:

@@ -71,7 +71,7 @@ class PairwiseErrorCost(Average):
     def sample(
             self, codebook: Beamforming, n: int, rng: np.random.Generator
     ) -> 'PairwiseErrorCost':
-        """Draw n of the pairs, with a probability that grows with their cost.
+        """Return the cost of n of the pairs, drawn with probabilities that grow with their cost.
 
         For this codebook, the cost of the sample is an unbiased estimate of the cost of all pairs.
         For similar codebooks, the estimate is close, because a few very similar pairs contribute

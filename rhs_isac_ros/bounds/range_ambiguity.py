@@ -1,9 +1,9 @@
 """Confusion of ranges at which the signals have similar phases in all bands.
 
 If two ranges differ by a lag r, the phases of a carrier f_i differ by 2 pi f_i r / v_0. The range
-ambiguity function is the mismatch sum_i w_i (1 - cos(2 pi f_i r / v_0)), with weights w_i of the
-bands. Its minima are the lags that are hard to distinguish from 0. The function depends on nothing
-but the frequencies, so many band plans can be compared in little time.
+ambiguity function is the mismatch sum_i w_i (1 - cos(2 pi f_i r / v_0)), with equal weights w_i.
+Its minima are the lags that are hard to distinguish from 0. The function depends only on the
+frequencies, so many band plans can be compared in little time.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ _BLOCK = 128
 
 def range_confusion_error(
         frequencies_hz: np.ndarray, energies: np.ndarray, max_lag_m: float) -> np.ndarray:
-    """Estimate the squared error from confusing ranges for each of P band plans, float64 [m^2].
+    """Estimate the squared error from confusing ranges for P band plans, float64 [P] [m^2].
 
     Each minimum r of the mismatch has the weight w = (1 - r / r_max) Q(sqrt(q / 2)), with
     q = 2 E sum_i (1 - cos(2 pi f_i r / v_0)) / N_B. The factor 1 - r / r_max is the share of the
@@ -62,13 +62,13 @@ def range_confusion_error(
 
 def range_confusion_error_of(
         model: MeasurementModel, positions: np.ndarray, rng: np.random.Generator) -> float:
-    """Estimate the squared error from confusing ranges with a codebook [m^2].
+    """Estimate the squared error from confused ranges for one codebook [m^2].
 
-    This is the error of the posterior mean if the user is at one of N positions, float64 [N, 3]
-    [m], or at a position that can be confused with it. The lags are the minima of the mismatch
-    along the line of sight. Signals are made as similar as possible by a small displacement of the
-    confused position, to first order, and by declared unknown phases. Noise is drawn several times
-    for each position.
+    This is the error of the posterior mean over a true position and the positions that can be
+    confused with it, averaged over N true positions, float64 [N, 3] [m]. The lags are the minima
+    of the mismatch along the line of sight. Signals are made as similar as possible by a small
+    displacement of the confused position, to first order, and by declared unknown phases. Noise is
+    drawn several times for each position.
     """
     positions = checked_positions(positions)
     scenario = model.scenario
@@ -134,7 +134,7 @@ def _is_minimum(mismatch: np.ndarray) -> np.ndarray:
 
 
 def _refined(mismatch: np.ndarray, plan: np.ndarray, lag: np.ndarray) -> np.ndarray:
-    """Return minima [n], refined by parabolas through their neighbours and not below 0."""
+    """Refine minima by parabolas through their neighbours; return at least 0 for each [n]."""
     before, at, after = (mismatch[plan, lag + step] for step in (-1, 0, 1))
     lowest = at - (after - before)**2 / (8 * (before - 2 * at + after))
     return np.maximum(lowest, 0.0)

@@ -355,7 +355,7 @@ def _missing(relative: np.ndarray) -> float:
 
 def _sketch(
         rows_of: Callable[[slice], np.ndarray], chosen: Sequence[slice], size: int) -> np.ndarray:
-    """Return an orthonormal basis of random mixtures of the rows, each of unit length."""
+    """Return an orthonormal basis of random mixtures of rows that are scaled to unit length."""
     rng = streams.generator(0, streams.SKETCH, size)
     mixtures = np.zeros(())
     for block in chosen:

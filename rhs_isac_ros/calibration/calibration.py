@@ -36,7 +36,7 @@ class Calibration:
     """
 
     surface: SurfaceEstimate  #: The estimate, as used by estimators, bounds and beams.
-    scenario_id: str  #: `Scenario.id` of this scenario without its hall files.
+    scenario_id: str  #: `Scenario.id` without channel and multipath files.
     #: Record of the calibration: ``pilots``, their number; ``codebooks``, their ids; ``prior`` of
     #: the elements; ``scenario``, the fields that differ from Table I; ``rounds`` of the
     #: estimation, and whether it ``converged``; ``version``.

@@ -106,7 +106,7 @@ def surface_posterior(information: np.ndarray, shift: np.ndarray, prior: Surface
 
 
 class _Search:
-    """Search for the states of all elements by their evidence; posterior given the states."""
+    """Search for the likeliest states of all elements; moments given the states."""
 
     def __init__(self, information: np.ndarray, shift: np.ndarray, prior: SurfacePrior,
                  band_rms: np.ndarray) -> None:

@@ -1,7 +1,8 @@
 """Covariance of the multipath in one hall from signals at known positions.
 
 The residuals of N positions have the sample covariance S. With an inverse Wishart prior of weight
-nu, whose mean L_0 is the covariance that three fields declare, the posterior mean is
+nu, whose mean L_0 is the covariance declared by three fields of the scenario, the posterior mean,
+inflated by t, is
 
     L = t (nu L_0 + N S) / (nu + N).
 
@@ -71,9 +72,9 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
     """Estimate the covariance of the multipath from signals at known positions.
 
     `positions`, float64 [N, 3] [m], should be spread over the region of interest; `received` are
-    complex128 [N, N_B, N_SB F], sub-band-major. The search starts at the multipath fields of the
-    scenario; declared impairments are estimated for each position. The result is a value of the
-    field `Scenario.multipath`, and its `about` contains the expected coverage.
+    complex128 [N, N_B, N_SB F], sub-band-major. The multipath fields of the scenario affect only
+    the start of the search; declared impairments are estimated for each position. The result is a
+    value of the field `Scenario.multipath`, and its `about` contains the expected coverage.
 
     Raises ValueError if a shape is wrong, a number is not finite, or there is no position. Warns
     with SurveyWarning if there are fewer than `MIN_POSITIONS` positions, or if they span less than
@@ -256,8 +257,8 @@ def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     """Mark positions that probably have a direct path, given all other positions, bool [N].
 
     Without a direct path, signals are multipath of an unknown level. With a direct path, its level
-    varies as among the positions that are `in_sight`. `total`, complex128 [N_B, R, R],
-    is the sum over these positions and the prior, and has the given `weight`.
+    varies as among the positions that are `in_sight`. `total`, complex128 [N_B, R, R], is the sum
+    over these positions and the prior, and has the given `weight`.
     """
     whitener = np.linalg.inv(np.linalg.cholesky(total))
     with_path = np.einsum('irs,nis->nir', whitener, residuals)

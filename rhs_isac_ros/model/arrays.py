@@ -47,7 +47,7 @@ def digest(*arrays: np.ndarray) -> str:
 
 def check_arrays(owner: Any, shapes: Mapping[str, tuple[int, ...]],
                  error: type[ValueError] = ValueError) -> None:
-    """Raise `error` unless the attributes of `owner` are finite and have these shapes."""
+    """Raise `error` unless the attributes in `shapes` are finite and have the given shapes."""
     for name, shape in shapes.items():
         array = getattr(owner, name)
         if np.shape(array) != shape:

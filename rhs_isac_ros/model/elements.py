@@ -200,12 +200,12 @@ class SurfaceEstimate(SurfaceModel):
         return self.failed_probability > 0.5
 
     def std(self) -> np.ndarray:
-        """Return the standard deviation of each parameter of `factor`, float64 [2 N_E + N_B]."""
+        """Return standard deviations of gains, offsets and band gain errors, [2 N_E + N_B]."""
         return np.sqrt(np.sum(np.abs(self.factor)**2, axis=1))
 
     @property
     def response(self) -> Response:
-        """The expected coefficients and gains of the bands."""
+        """The expected gains and offsets of the elements, and gains of the bands."""
         return self.gains, self.offsets, self.band_gains
 
     def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
@@ -245,7 +245,7 @@ def error_terms(scenario: Scenario) -> list[tuple[float, float]]:
     """Return the factors of the coefficients' covariance, as constants and slopes in c.
 
     The covariance of an element's coefficient between two frames is a sum of T terms: one for
-    relative errors, and two if elements can fail. A term is the product of one factor per frame.
+    relative errors, and two if elements can fail. Each is a product of two factors, one per frame.
     """
     rms, share = scenario.element_error_rms, scenario.failed_element_share
     spread = np.sqrt((1 + rms**2) * share)

@@ -18,7 +18,8 @@ class Marginal(NamedTuple):
     # Schur complement of the information [N, n, n], and gradient of the log-likelihood [N, n].
     information: np.ndarray
     gradient: np.ndarray
-    # Derivative of the maximising Q unknowns by the first n [N, Q, n], and step to them [N, Q].
+    # Derivative of the maximising Q unknowns with respect to the first n, [N, Q, n], and the step
+    # from the current Q unknowns to the maximising ones, [N, Q].
     regression: np.ndarray
     offset: np.ndarray
     # Log of the integral over the Q unknowns relative to the maximum [N], without factors of 2 pi.
@@ -26,7 +27,7 @@ class Marginal(NamedTuple):
 
 
 def energy_limit(n: int, probability: float = FALSE_ALARM) -> float:
-    """Return the energy that n complex normals of unit variance exceed with `probability`."""
+    """Return the energy that n complex normal numbers of variance 1 exceed with `probability`."""
     # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
     from scipy.special import gammainccinv
 
@@ -51,7 +52,7 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
 def share_of_level(n: float, std_db: float) -> float:
     """Return the share, from 0 to 1, of the variance of a log energy that an unknown level causes.
 
-    The energy is the sum over n complex Gaussian numbers whose common level is a log-normal power.
+    The energy belongs to n complex Gaussian numbers, whose common level is a log-normal power.
     If an energy deviates from its median, this share of the deviation is attributed to the level.
     """
     variance = float(np.log(10) / 10 * std_db)**2

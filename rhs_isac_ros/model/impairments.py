@@ -194,7 +194,7 @@ def draw_factors(
 ) -> np.ndarray | None:
     """Draw the factors of n signals, each of one user in one cycle, complex128 [n, N_B, N_SB F].
 
-    `user` and `cycle` are the generators of the values of each `Scope`. Values of a built-in
+    The generators `user` and `cycle` draw the values of the two scopes. Values of a built-in
     impairment do not depend on the other declarations. Returns None if no impairment is declared.
     """
     declared = impairments_of(scenario)

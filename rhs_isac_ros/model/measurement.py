@@ -286,9 +286,9 @@ class MeasurementModel:
     def sample(self, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Draw signals of independent phases, one at each position, complex128 [N, N_B, N_SB F].
 
-        The distribution is that of `simulate_received`, including declared impairments and channel
-        files. Multipath and noise are drawn together, with the covariance Lambda_i. This is a
-        hundred times as fast as drawing the gain of every element.
+        The signals have the same distribution as in `simulate_received`, including declared
+        impairments and channel files. The multipath is drawn from the covariance of its signals,
+        which is a hundred times as fast as drawing the gain of every element.
         """
         scenario = self.scenario
         surface, factors = draw_impairments(scenario, len(positions), rng)
@@ -347,7 +347,7 @@ class ElementSums:
     def terms(self, positions: np.ndarray, slopes: bool = True) -> np.ndarray:
         """Compute the mean and the terms of its derivative, complex128 [N_B, N, 1 + G, N_SB F].
 
-        Row 0 is the mean. The other rows, which `weights` multiplies, are omitted unless `slopes`.
+        Row 0 is the mean. The other rows, which `weights` multiplies, exist only with `slopes`.
         """
         n, (n_bands, n_subbands, _, n_frames) = len(positions), self._frames.shape
         n_terms = 2 + len(self._axes) + self._has_pattern if slopes else 1

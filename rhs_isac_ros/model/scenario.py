@@ -359,7 +359,7 @@ class Scenario(Extensions, Table1):
 
 
 def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) -> None:
-    """Raise ValueError unless the shape is `symbols`, keys of `Scenario.sizes` like ``F N_E``."""
+    """Raise ValueError unless the shape of the array is `symbols`, keys of `Scenario.sizes`."""
     expected = tuple(scenario.sizes[symbol] for symbol in symbols.split())
     if np.shape(array) != expected:
         listed = ', '.join(symbols.split())

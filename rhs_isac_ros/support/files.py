@@ -30,7 +30,7 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
     """Write a file atomically: write a temporary file, then rename it to `path`.
 
     The content may be a callable that writes it to a binary stream. Raises OSError if the file
-    cannot be written; an existing file is left as it was.
+    cannot be written; an existing file is then left unchanged.
     """
     path = Path(path)
     # Files of `tempfile` would have narrower permissions than other new files.

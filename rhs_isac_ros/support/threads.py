@@ -29,7 +29,7 @@ class _OneBlasThread(contextlib.ContextDecorator):
 
     The number of threads is a setting of the process: the first caller to enter changes it, and
     the last one to leave restores it unless it was changed in between. In libraries that use
-    OpenMP, each thread has its own setting, so every calling thread changes and restores one.
+    OpenMP, each thread has its own setting, which every calling thread changes and restores.
     """
 
     def __init__(self) -> None:
