@@ -196,7 +196,7 @@ def _choose_bands(
                   file=sys.stderr)
 
     def write_and_search(scenario: Scenario) -> OptimizeResult:
-        # If the search does not finish, its codebook belongs to the plan in this file.
+        # The codebook of an unfinished search belongs to the plan in this file.
         _save_plan(options.plan, scenario)
         return search(scenario)
 
@@ -221,7 +221,7 @@ def _in_ghz(frequencies_hz: Sequence[float]) -> str:
 
 
 def _partial(output: Path) -> Path:
-    """Return the file that holds an unfinished search."""
+    """Return the file for the result of an unfinished search."""
     return output.with_name(output.name + '.part')
 
 

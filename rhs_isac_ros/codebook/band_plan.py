@@ -1,9 +1,9 @@
 """Choice of the centre frequencies together with the codebook.
 
-Frequencies lie on a raster. Band plans are compared in three stages of growing cost: by the range
-ambiguity function, in closed form, for all plans or along a coordinate search; by short codebook
-optimisations for a few different plans; and by full optimisations for the best of these. The last
-two stages compare the expected squared error with the codebook.
+A band plan consists of centre frequencies on a raster. Plans are compared in three stages of
+growing cost. The first evaluates the range ambiguity function in closed form, for all plans or
+along a coordinate search. The second optimises codebooks briefly for a few different plans, and
+the third fully for the best plans. The last two stages compare expected squared errors.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ _STARTS = 8
 
 
 def raster(spectrum_hz: Sequence[tuple[float, float]], raster_hz: float) -> np.ndarray:
-    """Return the possible centre frequencies, ascending, float64 [n] [Hz]."""
+    """Return the frequencies of the raster in the spectrum, ascending, float64 [n] [Hz]."""
     if not 0 < raster_hz < math.inf:
         raise ValueError(f'raster: {raster_hz:g} Hz, expected a positive number')
     if not spectrum_hz:
@@ -48,9 +48,9 @@ def screen(
         max_exhaustive: int = MAX_EXHAUSTIVE) -> tuple[np.ndarray, np.ndarray]:
     """Return plans with low errors, ascending float64 [P, N_B] [Hz], and the errors [P].
 
-    If there are at most `max_exhaustive` plans, all are returned. Otherwise, coordinate searches
-    from several starts move one frequency at a time to the best one of the raster, and their
-    results are returned.
+    If there are at most `max_exhaustive` plans, this function returns all that have the gap.
+    Otherwise, it returns the results of coordinate searches from several starts, which move one
+    frequency at a time to the best one of the raster.
     """
     if math.comb(len(frequencies_hz), n_bands) > max_exhaustive:
         return _coordinate_search(frequencies_hz, n_bands, gap_hz, errors, rng)
@@ -63,7 +63,7 @@ def _coordinate_search(
         frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
         errors: Callable[[np.ndarray], np.ndarray], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Search from random plans that respect the gap, and from the lowest frequencies."""
+    """Search from random plans with the gap, and from the plan of `first_fit`; see `screen`."""
     drawn = np.sort([rng.choice(frequencies_hz, n_bands, replace=False)
                      for _ in range(_STARTS)], axis=1)
     first = first_fit(frequencies_hz, n_bands, gap_hz)
@@ -86,12 +86,12 @@ def _coordinate_search(
 
 
 def has_gap(plans: np.ndarray, gap_hz: float) -> np.ndarray:
-    """Mark the ascending plans that have the gap between all bands, up to rounding, bool [P]."""
+    """Mark ascending plans whose bands are at least the gap apart, up to rounding, bool [P]."""
     return np.all(np.diff(plans, axis=1) >= gap_hz * (1 - 1e-9), axis=1)
 
 
 def first_fit(frequencies_hz: np.ndarray, n_bands: int, gap_hz: float) -> np.ndarray | None:
-    """Return the plan with the lowest frequencies that have the gap, or None."""
+    """Return the plan with the gap and the lowest frequencies, or None if no plan has the gap."""
     plan: list[float] = []
     for frequency in frequencies_hz:
         if not plan or frequency - plan[-1] >= gap_hz * (1 - 1e-9):
@@ -102,19 +102,19 @@ def first_fit(frequencies_hz: np.ndarray, n_bands: int, gap_hz: float) -> np.nda
 
 
 DEFAULT_RASTER_HZ = 10e6
-# Energies of a codebook relative to a random one. The screening proposes plans for each: with more
-# energy, wider plans are better. At 8 and above, the plans would confuse directions more often,
-# which the screening does not consider.
+# Signal energies with an optimised codebook, relative to a random codebook. The screening proposes
+# plans for each, because wider plans are better with more energy. Plans for 8 and above would
+# confuse directions more often, which the screening does not consider.
 _ENERGY_LEVELS = (2.0, 3.0, 4.0)
-# Number of plans with a codebook, and positions and steps of their optimisations.
+# Number of plans with a short optimisation, and its number of positions and of steps.
 _CANDIDATES = 6
 _SHORT_POSITIONS, _SHORT_STEPS = 64, 200
-# Number of candidates with a full optimisation, and largest ratio of their errors to the lowest.
+# Largest number of full optimisations, and largest ratio of a candidate's error to the lowest.
 _FINALISTS, _MAX_RATIO = 3, 1.25
-# A later candidate replaces the best one if its error is lower by this factor, two standard errors
-# of the global bound.
+# A later candidate replaces the best one if the ratio of their errors is below this number. Its
+# difference from 1 is two standard errors of the global bound.
 _BETTER = 0.95
-# Phases of the global bound after a short optimisation, and after a full one.
+# Numbers of phases in the global bound after a short optimisation, and after a full one.
 _SHORT_PHASES, _PHASES = 1024, 4096
 # Positions at which energies and errors are averaged, and number of quantiles of the energies.
 _POSITIONS, _QUANTILES = 256, 16
@@ -152,9 +152,9 @@ def best_of(
     """Optimise codebooks for the first candidates, and return the plan with the lowest error.
 
     The candidates are in ascending order of their errors. The first one is chosen unless the error
-    of another is clearly lower; candidates with much larger errors are skipped. If a `search` for
-    a codebook is interrupted, the best plan so far is returned. `report` is called with each
-    optimised candidate, which has its new error.
+    of another is clearly lower; candidates with much larger errors are skipped. `search` optimises
+    a codebook; if it is interrupted, the best plan so far is returned. After each
+    optimisation, `report` is called with the candidate and its new error.
     """
     best: BandPlan | None = None
     for candidate in candidates[:_FINALISTS]:
@@ -182,9 +182,9 @@ def choose_bands(
 
     `spectrum_hz` are intervals of centre frequencies, including their ends. `raster_hz` is the
     spacing of frequencies from the low end of each interval. `min_gap_hz` is the smallest distance
-    between two frequencies, by default the width of a band. Returns the plans for which codebooks
-    were compared, the best one first; `report` is called with each. Raises ValueError if an
-    argument is out of range, or no plan has the gap.
+    between two frequencies, by default the width of a band. `report` is called with each plan for
+    which a codebook was optimised. Returns these plans, the best one first. Raises ValueError if
+    an argument is out of range, or no plan has the gap.
     """
     if n_bands < 1 or scenario.n_bands * scenario.n_frames % n_bands:
         raise ValueError(
@@ -222,7 +222,7 @@ def _proposals(
         scenario: Scenario, frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
         difference_hz: float, rng: np.random.Generator
 ) -> list[tuple[tuple[float, ...], float]]:
-    """Return plans, taken alternately from the energy levels, with their screening errors."""
+    """Return plans with their screening errors, taking plans from each energy level in turn."""
     spread = np.linspace(frequencies_hz[0], frequencies_hz[-1], n_bands)
     energies = _energies(with_bands(scenario, spread.tolist()))
     low, high = scenario.roi_bounds_m
@@ -249,9 +249,9 @@ def expected_error(
         scenario: Scenario, codebook: Codebook, seed: int = 0, n_phases: int = 2048) -> float:
     """Estimate the mean squared error with a codebook [m^2].
 
-    The estimate is the global bound, a few percent below the error. If the scenario declares
-    nuisance parameters, which this bound ignores, the estimate is instead the average local bound
-    with the region as prior, plus the squared error from confusing ranges.
+    Without nuisance parameters, the estimate is the global bound, a few percent below the error.
+    With nuisance parameters, which the global bound ignores, it is the average local bound with
+    the region as prior, plus the squared error from confusing ranges.
     """
     rng = streams.generator(seed, streams.PLANS, 1)
     if not len(nuisance_of(scenario)):
@@ -263,7 +263,7 @@ def expected_error(
 
 
 def _energies(scenario: Scenario) -> np.ndarray:
-    """Return quantiles of the energy of the whitened mean over the region, float64 [n]."""
+    """Return quantiles over the region of the whitened mean signal's energy, float64 [n]."""
     rng = streams.generator(0, streams.PLANS, 2)
     model = MeasurementModel(scenario, random_codebook(scenario, rng))
     whitened = model.whiten(model.mean(scenario.sample_positions(_POSITIONS, rng)))

@@ -1,4 +1,4 @@
-"""The codebook: the beamforming of surface and base station in a positioning phase.
+"""The codebook: the beamforming of the surface and the base station in a positioning phase.
 
 `Codebook` reads and writes ROS parameters and files; `Provenance` describes an optimisation.
 """
@@ -28,7 +28,7 @@ from rhs_isac_ros.support.files import read_yaml, write_whole
 PARAMETER_NODE = '/**/optimizer'
 # Relative tolerance of the power constraint.
 _POWER_TOLERANCE = 1e-6
-# Tolerance of amplitudes if elements have levels.
+# Absolute tolerance of amplitudes that must equal one of the levels.
 _LEVEL_TOLERANCE = 1e-9
 
 
@@ -40,13 +40,13 @@ class CodebookError(ValueError):
 class Codebook:
     """Analog and digital beamforming of a positioning phase.
 
-    Raises CodebookError if an array has the wrong number of dimensions or entries that are not
-    finite, the sizes disagree, or a configuration is outside [0, 1].
+    Raises CodebookError if an array has the wrong number of dimensions or an entry that is not
+    finite, if the sizes of the arrays disagree, or if an entry of `analog` is outside [0, 1].
     """
 
     analog: np.ndarray  #: Configurations C, float64 [N_B, F, N_E], each entry in [0, 1].
     digital: np.ndarray  #: Combining vectors S, complex128 [N_B, N_SB, F, K] [sqrt(W)].
-    average_crlb_m2: float = math.nan  #: Measured average bound; NaN if unknown.
+    average_crlb_m2: float = math.nan  #: Bound averaged over sampled positions, or NaN.
     provenance: str = ''  #: Origin of the codebook; see `Provenance`.
 
     def __post_init__(self) -> None:
@@ -87,8 +87,8 @@ class Codebook:
     def check(self, scenario: Scenario) -> None:
         """Raise CodebookError if the codebook does not fit a scenario.
 
-        Sizes and the power of each frame must be as in the scenario, and configurations must
-        consist of its amplitude levels.
+        The sizes and the power of each frame must match the scenario. If the scenario has
+        amplitude levels, every amplitude must equal one of them.
         """
         with translated(ValueError, CodebookError):
             check_shape('analog', self.analog, 'N_B F N_E', scenario)
@@ -106,7 +106,7 @@ class Codebook:
                 f'amplitude_levels = {scenario.amplitude_levels} levels from 0 to 1')
 
     def to_parameters(self) -> dict[str, Any]:
-        """Return ROS parameters by name, ``codebook.*``: plain strings, floats and lists."""
+        """Return ROS parameters ``codebook.*`` by name: strings, floats and lists of numbers."""
         return {
             'codebook.id': self.id,
             'codebook.shape': list(self.shape),
@@ -119,7 +119,7 @@ class Codebook:
 
     @classmethod
     def from_parameters(cls, parameters: dict[str, Any]) -> 'Codebook':
-        """Create a codebook from the parameters of `to_parameters`.
+        """Create a codebook from ROS parameters as returned by `to_parameters`.
 
         ``codebook.id`` may be empty or missing. Raises CodebookError if a parameter is missing or
         malformed, or the id does not match the content.
@@ -155,7 +155,7 @@ class Codebook:
 
     @classmethod
     def load(cls, path: str | Path) -> 'Codebook':
-        """Read a ROS 2 parameter file, or raise CodebookError if it has no valid codebook."""
+        """Read a ROS 2 parameter file; raise CodebookError unless it contains a valid codebook."""
         with translated(ValueError, CodebookError):
             content = read_yaml(path)
         for node in content.values() if isinstance(content, dict) else ():
@@ -168,7 +168,7 @@ class Codebook:
 
 
 def _number(parameters: dict[str, Any], name: str) -> float:
-    """Return a numeric parameter, NaN if it is missing, or raise CodebookError."""
+    """Return a parameter, or NaN if it is missing; raise CodebookError if it is not a number."""
     value = parameters.get(f'codebook.{name}', math.nan)
     try:
         if not isinstance(value, bool):
@@ -180,7 +180,7 @@ def _number(parameters: dict[str, Any], name: str) -> float:
 
 
 def _array(parameters: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a list parameter as a float64 array of this shape, or raise CodebookError."""
+    """Return a list parameter as a float64 array; raise CodebookError unless it fits `shape`."""
     values = parameters.get(f'codebook.{name}', ())
     if isinstance(values, str):
         # ``ros2 param load`` sends a list as text if it contains a number such as 1e-05.
@@ -219,25 +219,25 @@ class Provenance:
     seed: int
     sampling: str
     positions: int  #: Number of positions.
-    scenario: dict[str, Any]  #: Fields that differ from Table I.
+    scenario: dict[str, Any]  #: Fields of the scenario that differ from Table I.
     version: str = __version__
     calibration: str = ''  #: Id of the calibration, if any.
-    steps: int = 0  #: Total, including the runs that were resumed, as is `evaluations`.
-    evaluations: int = 0
-    value_m2: float = math.nan  #: The objective.
+    steps: int = 0  #: Number of steps, including those of resumed runs.
+    evaluations: int = 0  #: Number of evaluations, including those of resumed runs.
+    value_m2: float = math.nan  #: Lowest value of the objective.
     reason: str = ''
 
     def to_text(self) -> str:
-        """Return a description of a result in one line, for `Codebook.provenance`."""
+        """Return the provenance as one line of text, for `Codebook.provenance`."""
         fields = dataclasses.asdict(self)
         if not self.calibration:
             del fields['calibration']
         return encode(fields)
 
     def resumed(self, text: str) -> 'Provenance':
-        """Return the provenance of an earlier result, to resume it.
+        """Parse the provenance of an earlier result that this optimisation continues.
 
-        Raises ValueError unless it comes from an optimisation with the same arguments.
+        Raises ValueError unless the text describes an optimisation with the same arguments.
         """
         earlier = Provenance.parse(text)
         if earlier is None:
@@ -259,9 +259,9 @@ class Provenance:
             return None
 
 
-# ``ros2 param load`` parses each value of a file as YAML a second time. A string such as ``{seed:
-# 0}`` then becomes a mapping, which it cannot send, but a string that is plain in YAML is
-# preserved. Such a string needs no quotes, and its only separators are single spaces, so ``, ``
+# ``ros2 param load`` parses each value of a file as YAML a second time. It cannot send a string
+# such as ``{seed: 0}``, which then becomes a mapping, but it preserves strings that need no quotes
+# in YAML. The strings that match `_WORDS` need none. Single spaces separate their words, so ``, ``
 # can separate the fields.
 _WORDS = re.compile(r'[A-Za-z][\w.+-]*( [\w.+-]+)*', re.ASCII)
 # Values of JSON that look like words.
@@ -270,14 +270,14 @@ _NOTE = 'note='
 
 
 def encode(fields: Mapping[str, Any]) -> str:
-    """Return fields as ``name=value, name=value``, where a value is plain words or JSON."""
+    """Return fields as ``name=value, name=value``; each value is JSON unless it is plain words."""
     return ', '.join(
         f'{name}={value if _is_bare(value) else _to_json(value)}'
         for name, value in fields.items())
 
 
 def decode(text: str) -> dict[str, Any]:
-    """Return the fields of a text from `encode`, or raise ValueError."""
+    """Return the fields of a text that `encode` returned, or raise ValueError."""
     pairs = [part.partition('=') for part in text.split(', ')]
     if not all(name and separator for name, separator, _ in pairs):
         raise ValueError(f'{text!r}, expected name=value, name=value')
@@ -285,16 +285,16 @@ def decode(text: str) -> dict[str, Any]:
 
 
 def to_parameter(text: str) -> str:
-    """Return a text in a form that YAML parses as the same string."""
+    """Return a text, encoded if parsing it as YAML would change it."""
     if not text or _parse_yaml(text) == text and not text.startswith(_NOTE):
         return text
     return _NOTE + _to_json(text)
 
 
 def from_parameter(text: str) -> str:
-    """Return the original text of a string from `to_parameter`.
+    """Return the original text of a string that `to_parameter` returned.
 
-    Mappings written by versions up to 0.1.0 are converted to the text of `encode`.
+    A mapping, which versions up to 0.1.0 wrote, is converted to the format of `encode`.
     """
     legacy = _parse_yaml(text) if text.startswith('{') else None
     if isinstance(legacy, dict):
@@ -318,7 +318,7 @@ def _is_bare(value: Any) -> bool:
 
 
 def _parse_yaml(text: str) -> Any:
-    """Return the value of a text in YAML; None if it is invalid."""
+    """Parse a text as YAML; return None if it is invalid."""
     try:
         return yaml.safe_load(text)
     # PyYAML raises ValueError for impossible dates and RecursionError for deep nesting.

@@ -1,8 +1,8 @@
 """Optimisation methods: each minimises a `Search` and returns the reason for stopping.
 
-The default is L-BFGS-B. It uses samples of the pairs if there are many, and ends with exchanges of
-amplitudes if the elements have discrete levels. The alternating, direct and genetic methods are
-described in the paper and its references.
+The default is L-BFGS-B. If an objective has many pairs, it evaluates samples of them. If the
+elements have discrete levels, it ends with exchanges of amplitudes. The alternating, direct and
+genetic methods are described in the paper and its references.
 """
 
 import itertools
@@ -34,8 +34,8 @@ def run_lbfgs(
         on_step: Callable[[], None], memory: int = _MEMORY) -> Any:
     """Minimise a function that returns its value and gradient, with SciPy's L-BFGS-B.
 
-    The steps do not depend on the unit of the positive values; `fun` and `jac` of the
-    `OptimizeResult` are relative to the first value. `on_step` is called after each step.
+    The values must be positive; their unit does not affect the steps. In the `OptimizeResult`,
+    `fun` and `jac` are relative to the first value. `on_step` is called after each step.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import minimize
@@ -63,7 +63,7 @@ FEWEST_PAIRS = 4096
 # Pairs and steps of each round; the last round is repeated. The first steps change the codebook,
 # and with it the important pairs, the most. Later steps need a more accurate objective.
 _ROUNDS = (2048, 200), (4096, 600)
-# Number of corrections. With more, products with them would take longer than an evaluation.
+# Number of corrections. With more corrections, their products would take longer than evaluations.
 _SAMPLED_MEMORY = 100
 # Scale of the combining vectors, to which the objective is more sensitive than to configurations.
 _DIGITAL_SCALE = 0.3
@@ -132,13 +132,13 @@ _MAX_FAILURES = 64
 
 
 def minimize_levels(search: Search) -> str:
-    """Minimise over levels of the amplitudes, and return the reason for stopping.
+    """Minimise over amplitudes with L discrete levels, and return the reason for stopping.
 
     The first of three phases treats amplitudes as continuous. The second adds the penalty
-    sin^2(pi (L - 1) c), which is zero at the L levels, with growing weight: amplitudes move to the
-    levels while all other variables adapt. The third exchanges single amplitudes for neighbouring
-    levels, in the order of the gradient, while this lowers the objective. L-BFGS-B minimises over
-    continuous variables.
+    sin^2(pi (L - 1) c) for each amplitude c, which is zero at the levels. Its weight grows, and
+    amplitudes move to the levels while all other variables adapt. The third moves single
+    amplitudes to neighbouring levels, those with the largest gradient first, as long as this
+    lowers the objective. L-BFGS-B minimises over continuous variables.
     """
     share = _PENALISED / len(_WEIGHTS)
     variables, left = search.start, search.max_steps
@@ -168,7 +168,7 @@ def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int)
 
 
 def _exchange(search: Search, variables: np.ndarray, max_steps: int) -> str:
-    """Exchange single amplitudes while this lowers the objective; return why the search stops."""
+    """Exchange amplitudes while this lowers the objective; return the reason for stopping."""
     levels = _top_level(search)
     variables = np.array(variables)
     variables[:search.n_analog] = np.rint(variables[:search.n_analog] * levels) / levels
@@ -189,8 +189,8 @@ def _sweep(search: Search, variables: np.ndarray, max_exchanges: int
            ) -> tuple[np.ndarray, int, int, int]:
     """Exchange amplitudes in the order of the expected decrease.
 
-    Returns the variables, and the numbers of exchanges, of failures since the last exchange, and
-    of amplitudes with a level in the direction of descent.
+    Returns the variables and three numbers: of exchanges, of failed attempts since the last
+    exchange, and of amplitudes with a level in the direction of descent.
     """
     levels = _top_level(search)
     value, gradient = search.value_and_gradient(variables)
@@ -241,7 +241,7 @@ def minimize_interior_point(
 
     This is the interior-point algorithm of Byrd, Hribar and Nocedal that the paper cites, with a
     trust region and conjugate gradients. `start`, float64 [n], contains all variables; `free`,
-    bool [n], marks those to change. Returns the best point evaluated, including `start`.
+    bool [n], marks the free ones. Returns the best of `start` and all evaluated points.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import BFGS, Bounds, minimize
@@ -263,7 +263,7 @@ def minimize_interior_point(
     steps = evaluations = 0
 
     def on_iteration(_: np.ndarray, state: Any) -> bool:
-        """Count iterations that moved; SciPy also reports the start and each new barrier."""
+        """Count iterations with a step; SciPy also reports the start and each new barrier."""
         nonlocal steps, evaluations
         if steps < max_steps and state.nfev > max(evaluations, 1):
             steps, evaluations = steps + 1, state.nfev
@@ -318,15 +318,15 @@ def minimize_direct(search: Search) -> str:
     return f'{search.max_steps} steps at most'
 
 
-# Default of the implementation in the paper, for more than five variables.
+# Default of the implementation that the paper uses, for more than five variables.
 _POPULATION = 200
 
 
 def minimize_genetic(search: Search) -> str:
     """Minimise with pymoo's genetic algorithm; each step is a generation.
 
-    Only the direction of a combining vector matters, so its unscaled parts are searched within
-    [-1, 1]. The first generation contains the start. Raises MissingLibraryError without pymoo.
+    Only the direction of a combining vector matters, so its real and imaginary parts are confined
+    to [-1, 1]. The first generation contains the start. Raises MissingLibraryError without pymoo.
     """
     with optional_import("method 'genetic'", extra='genetic'):
         from pymoo.algorithms.soo.nonconvex.ga import GA

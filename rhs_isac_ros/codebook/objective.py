@@ -1,9 +1,9 @@
 """Objectives of the codebook optimisation, and the samples of the region that they average over.
 
-The arguments of an objective are a scenario, sampled positions, float64 [N_sam, 3] [m], a
-generator and `tick`. It raises ValueError unless the positions are a finite [N, 3] array with at
-least one row. It calls `tick` repeatedly during computations that do not depend on the codebook;
-`tick` can end them with an exception.
+Each objective is a function of a scenario, sampled positions, float64 [N_sam, 3] [m], a generator
+and `tick`. It raises ValueError unless the positions are a finite [N, 3] array with at least one
+row. During computations that do not depend on the codebook, it calls `tick` repeatedly, which may
+end them with an exception.
 """
 
 import dataclasses
@@ -19,8 +19,8 @@ from rhs_isac_ros.model.geometry import element_interval_m
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 
-# Relative error of the rows of an objective. The error of its value is then below 0.1 %, far less
-# than the sampling error, and the gradient is exact for this value.
+# Relative error of the rows (see `bounds.rows`) of an objective. The error of the objective is
+# then below 0.1 %, far less than the sampling error. The gradient is exact for the value returned.
 ROW_TOLERANCE = 3e-5
 # Number of confusable positions for each sampled position: large, because a few close pairs
 # dominate the mean.
@@ -40,7 +40,7 @@ def average_bound(
 def nuisance(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
         tick: Tick = no_tick) -> Average:
-    """Objective [m^2]: average bound with unknown phases of the bands and the region as prior.
+    """Objective [m^2]: average bound with unknown band phases and with the region as prior.
 
     Even a known phase would determine the range only up to whole wavelengths, so phases are
     treated as unknown. With the region as prior, positions that the signals do not determine
@@ -67,7 +67,7 @@ def error(
         tick: Tick = no_tick) -> Average:
     """Objective [m^2]: the cost of `ambiguity`, weighted almost as in the mean squared error.
 
-    Pairs extend farther across the line of sight than those of `ambiguity`, up to the far side
+    Across the line of sight, pairs extend farther than in `ambiguity`, up to the far side
     lobes. Their weights grow with the volumes that they represent (`confusable_volumes`). With the
     volumes themselves as weights, the cost would be proportional to the union bound on the mean
     squared error.
@@ -110,7 +110,7 @@ _LAGS_PER_WAVELENGTH = 64
 NEAR, WIDE = (0.03, 0.3), (0.03, 0.6)
 # Share of pairs that differ only in direction.
 _ZERO_LAG_FRACTION = 0.3
-# Limit of rounding errors of lags in radians, and of squared displacements in beam widths.
+# Limit of rounding errors: of lags in radians, and of squared displacements in beam widths.
 _ROUNDING = 1e-7
 # Number of attempts to draw a position inside the region.
 _MAX_DRAWS = 200
@@ -119,14 +119,14 @@ _MAX_DRAWS = 200
 def draw_confusable(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
         scales: tuple[float, float] = NEAR) -> np.ndarray:
-    """For each position, float64 [N, 3] [m], draw another one in the region with similar signals.
+    """Draw a position with similar signals for each of N positions, both float64 [N, 3] [m].
 
     Two positions are hard to distinguish if their ranges differ by about a whole number of
     wavelengths in every band. Range lags are therefore drawn with a density proportional to
-    exp(-sum_i (1 - cos 2 pi f_i lag / v_0)). For some of the positions, the lag is 0: these
-    pairs differ only in direction. Across the line of sight, displacements range from well below
-    the beam width up to the side lobes. `scales` are the limits of the log-uniform scale of this
-    displacement, in widths of the narrowest beam.
+    exp(-sum_i (1 - cos 2 pi f_i lag / v_0)), with the centre frequencies f_i and the speed of
+    light v_0. Some lags are 0, so that the pair differs only in direction. Displacements across
+    the line of sight range from well below the beam width up to the side lobes. Their scale is
+    log-uniform; `scales` are its limits, in widths of the narrowest beam.
     """
     low, high = scenario.roi_bounds_m
     lags, density = _lag_density(scenario)
@@ -150,9 +150,9 @@ def confusable_volumes(
     """Compute the volumes that positions from `draw_confusable` represent, float64 [N].
 
     The volumes are reciprocal densities of the draws, so that weighted sums over the draws are
-    integrals over the region. Their unit is proportional to the volume of the posterior of the
-    true position: if the amplitude of the signals is inversely proportional to the range r, this
-    volume grows as r^5.
+    integrals over the region. Each volume is divided by r^5, where r is the range of the position
+    in `positions`. The volume of the posterior of this position is proportional to r^5 if the
+    amplitude of the signals is inversely proportional to r.
     """
     # Lags of zero represent all lags below a phase of one radian.
     shortest = SPEED_OF_LIGHT_MPS / (2 * np.pi * max(scenario.center_frequencies_hz))
@@ -185,7 +185,7 @@ def _displaced(scenario: Scenario, positions: np.ndarray, lags: np.ndarray,
     transverse -= sight * np.sum(transverse * sight, axis=1, keepdims=True)
     lags = lags * rng.choice([-1, 1], size=n)
     moved = positions + free * transverse
-    # Coordinates without extent remain unchanged; the other ones are scaled to fit the range.
+    # Coordinates in which the region has no extent remain unchanged; the others are scaled to fit.
     wanted = ranges[:, 0] + lags
     within = np.sqrt(np.maximum(wanted**2 - np.sum(moved[:, ~free]**2, axis=1), 0))
     within = np.copysign(within, wanted) / np.linalg.norm(moved[:, free], axis=1)

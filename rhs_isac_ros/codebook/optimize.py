@@ -28,7 +28,7 @@ from rhs_isac_ros.model.surface import on_levels
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.threads import one_blas_thread
 
-# Number of Sobol points; they are as good as 1200 independent positions.
+# Number of Sobol points; this number is as good as 1200 independent positions.
 DEFAULT_POSITIONS = 256
 # Reason for stopping after Ctrl-C.
 INTERRUPTED = 'interrupted'
@@ -37,8 +37,8 @@ INTERRUPTED = 'interrupted'
 class Method(NamedTuple):
     """An optimisation method with its default limit on update steps.
 
-    `minimize` takes a `Search` and returns the reason for stopping. It is None if the result of
-    the method is its start.
+    The function `minimize` takes a `Search` and returns the reason for stopping. It is None for a
+    method that returns the start unchanged.
     """
 
     minimize: Callable[[Search], str] | None
@@ -74,13 +74,12 @@ def optimize(
         keep: Callable[[OptimizeResult], None] | None = None) -> OptimizeResult:
     """Find a codebook that minimises an objective.
 
-    If the scenario has ``amplitude_levels``, the methods ``lbfgs``, by `minimize_levels`, and
-    ``genetic`` optimise configurations over these levels. After a KeyboardInterrupt, the best
-    codebook so far is returned. Raises ValueError if a name is unknown, a number or the
-    positions are out of range, `resume` was made with other arguments, the calibration belongs to
-    another scenario, or the signals do not determine the positions; MissingLibraryError if the
-    method needs a library that is not installed; and CodebookError if `start` does not fit the
-    scenario.
+    If the scenario has ``amplitude_levels``, only ``genetic`` and ``lbfgs``, which then uses
+    `minimize_levels`, can optimise configurations. After a KeyboardInterrupt, the best codebook so
+    far is returned. Raises ValueError if a name is unknown, a number or the positions are out of
+    range, `resume` was made with other arguments, the calibration belongs to another scenario, or
+    the signals do not determine the positions. Raises MissingLibraryError if the method needs a
+    missing library, and CodebookError if `start` does not fit the scenario.
 
     Parameters
     ----------
@@ -91,7 +90,7 @@ def optimize(
         One of `METHODS`.
     objective
         One of `OBJECTIVES`: ``crlb``, the average bound; ``ambiguity``, the confusion of distant
-        positions, which a local bound ignores; ``error``, the same, weighted almost as in the
+        positions, which a local bound ignores; ``error``, this confusion weighted almost as in the
         mean squared error; or ``nuisance``, the bound with unknown phases of the bands and the
         region as prior.
     sampling
@@ -111,8 +110,8 @@ def optimize(
         Maximum number of evaluations of the objective; by default unlimited.
     progress
         Called after each step and, during the set-up of the objective, once a second with an
-        infinite value. An exception ends the optimisation; KeyboardInterrupt during the set-up
-        returns the start.
+        infinite value. An exception from `progress` ends the optimisation; with a
+        KeyboardInterrupt during the set-up, the result is the start.
     keep
         Called at most every ten seconds with the result so far.
     """
@@ -187,13 +186,13 @@ def optimize(
 def check_start(codebook: Codebook, scenario: Scenario) -> None:
     """Raise CodebookError if a search for a scenario cannot start from a codebook.
 
-    Amplitudes may be continuous, because a search over levels also begins with such amplitudes.
+    Amplitudes may be continuous, because even a search over levels begins with such amplitudes.
     """
     codebook.check(dataclasses.replace(scenario, amplitude_levels=0))
 
 
 def _minimizer(problem: Problem, method: str) -> Callable[[Search], str]:
-    """Return the function of a method; raise ValueError if it needs continuous amplitudes."""
+    """Return a method's function; raise ValueError if it cannot optimise discrete amplitudes."""
     levels = problem.scenario.amplitude_levels
     if levels and method == 'lbfgs':
         return minimize_levels
@@ -230,7 +229,7 @@ def _run(search: Search, minimize: Callable[[Search], str]) -> str:
 
 
 class _Report:
-    """Progress callback that also works during the set-up, and calls `keep` periodically."""
+    """Progress callback, also for the set-up, that calls `keep` at most every ten seconds."""
 
     _TICK_S, _KEEP_S = 1.0, 10.0
 

@@ -21,7 +21,7 @@ from rhs_isac_ros.support.pictures import (
     paper_style,
 )
 
-# Number of points along each axis of the map of the bound, and of azimuths of a beam.
+# Number of points along each axis of the map of the bound, and number of azimuths of a beam.
 _N_MAP_POINTS = 60
 _N_AZIMUTHS = 361
 # Number of panels of beams side by side.
@@ -58,8 +58,8 @@ def beam_powers(
         scenario: Scenario, codebook: Codebook, band: int) -> tuple[np.ndarray, np.ndarray]:
     """Return azimuths, float64 [n] [rad], and the received powers, float64 [F, n] [W].
 
-    The user is at the height and horizontal distance of the centre of the region of interest. The
-    powers are those of the middle sub-band.
+    The powers apply to the middle sub-band and to a user at the height and the horizontal distance
+    of the centre of the region of interest.
     """
     azimuths = np.linspace(-np.pi / 2, np.pi / 2, _N_AZIMUTHS)
     x, y, z = scenario.roi_center_m

@@ -14,11 +14,11 @@ from rhs_isac_ros.model.surface import on_levels
 
 
 class Problem:
-    """Implements Eq. (16). Problem P1: average bound, fixed power, configurations in [0, 1].
+    """Implements Eq. (16). Problem P1: minimise an average bound over codebooks of fixed power.
 
     Solvers operate on one real vector: the configurations, then the real and the imaginary parts
-    of unscaled combining vectors. Scaling these to P_max eliminates the power constraint; solvers
-    observe the bounds of the configurations.
+    of unscaled combining vectors. `unpack` scales the combining vectors to P_max, which eliminates
+    the power constraint. Solvers must keep the configurations in [0, 1].
     """
 
     def __init__(self, scenario: Scenario, objective: Average) -> None:
@@ -58,7 +58,7 @@ class Problem:
         return cost.rows.n_items if isinstance(cost, PairwiseErrorCost) else 0
 
     def sample(self, variables: np.ndarray, n_pairs: int, rng: np.random.Generator) -> 'Problem':
-        """Return the problem with a sample of the pairs; see `PairwiseErrorCost.sample`."""
+        """Return the problem with pairs drawn at `variables`; see `PairwiseErrorCost.sample`."""
         cost = self.objective
         assert isinstance(cost, PairwiseErrorCost)
         return Problem(self.scenario, cost.sample(self.unpack(variables), n_pairs, rng))
@@ -69,7 +69,7 @@ class Problem:
 
     def value_and_gradient(
             self, variables: np.ndarray, *, relaxed: bool = False) -> tuple[float, np.ndarray]:
-        """Return the objective [m^2] of `unpack` and its gradient, shaped like `variables`."""
+        """Return the objective [m^2] and its gradient, shaped like `variables` from `pack`."""
         _, raw, norm = self._split(variables)
         value, by_analog, by_digital = self.objective(self.unpack(variables, relaxed=relaxed))
         # Scaling to a fixed norm removes the component of the gradient along `raw`.
@@ -79,7 +79,7 @@ class Problem:
             [by_analog.ravel(), by_raw.real.ravel(), by_raw.imag.ravel()])
 
     def _split(self, variables: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return configurations, unscaled combining vectors, and their norm in each frame."""
+        """Return configurations, unscaled combining vectors, and the vectors' norm per frame."""
         analog = np.clip(variables[:self.n_analog], 0.0, 1.0).reshape(self._analog_shape)
         real, imag = np.split(variables[self.n_analog:], 2)
         raw = (real + 1j * imag).reshape(self._digital_shape)
@@ -89,7 +89,7 @@ class Problem:
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """Steps and evaluations so far, the lowest objective, and the time since the start."""
+    """Numbers of steps and evaluations so far, lowest objective, and time since the start."""
 
     step: int
     evaluations: int
@@ -104,10 +104,10 @@ class BudgetSpent(Exception):
 class Search:
     """The objective that a method minimises, with a count of evaluations and the best point.
 
-    Each method defines its own update steps. `done` are the steps and evaluations of the search
-    that is resumed, which count towards the limits. `start`, float64 [n], is the first point;
-    `max_steps` is the number of steps that remain; `best` is the point with the lowest objective,
-    `value_m2`; and `history` is the progress after each step, beginning with the start.
+    Each method defines its own update steps. `done` contains the numbers of steps and evaluations
+    of a resumed search, which count towards the limits. The attribute `start`, float64 [n], is the
+    first point, and `max_steps` is the number of steps that remain. The lowest objective so far,
+    at the point `best`, is `value_m2`. `history` has an entry for the start and for each step.
     """
 
     def __init__(
@@ -125,9 +125,9 @@ class Search:
         self._last: tuple[np.ndarray, float, np.ndarray] | None = None
 
     def begin(self) -> float:
-        """Evaluate the start [m^2] and record it as the first entry of the history.
+        """Evaluate the objective [m^2] at the start, the first entry of the history.
 
-        When a search is resumed, this evaluation does not count: the earlier search has made it.
+        In a resumed search, this evaluation does not count, because the earlier search made it.
         """
         if self._evaluations:
             self._evaluations -= 1
@@ -158,17 +158,17 @@ class Search:
         return self._last[1:]
 
     def relaxed_value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
-        """Evaluate with continuous amplitudes; the point does not become the best one."""
+        """Evaluate with continuous amplitudes; never record the point as the best one."""
         self._count()
         return self.problem.value_and_gradient(variables, relaxed=True)
 
     def sample(
             self, variables: np.ndarray, n_pairs: int
     ) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
-        """Return an estimate of `value_and_gradient` from a sample of the pairs at a point.
+        """Return a function that estimates `value_and_gradient` from pairs drawn at a point.
 
-        The points evaluated do not become the best one. The estimate also raises BudgetSpent if no
-        evaluation would be left for the final point.
+        The function never records a point as the best one. It raises BudgetSpent if no evaluation
+        would be left for the final point.
         """
         problem = self.problem.sample(variables, n_pairs, self.rng)
 

@@ -1,8 +1,8 @@
 """Codebooks without optimisation: random ones, and focused beams that scan the region of interest.
 
-Both are benchmarks of the paper, whose optimisation starts from them. The paper does not specify
-the focal points. `SCANS` contains three interpretations, functions that return focal points,
-float64 [F, N_B, 3] [m]. The frames of the first two alternate between points below and above
+Both are benchmarks of the paper, whose optimisation starts from the random ones. The paper does
+not specify the focal points. `SCANS` contains three interpretations: functions that return focal
+points, float64 [F, N_B, 3] [m]. In the first two, frames alternate between points below and above
 mid-height, because beams that are all symmetric in height could not distinguish up from down.
 """
 
@@ -19,8 +19,8 @@ from rhs_isac_ros.model.surface import matched_configuration, on_levels, onboard
 def random_codebook(scenario: Scenario, rng: np.random.Generator) -> Codebook:
     """Draw random configurations: the paper's `Random`, and the start of its optimisation.
 
-    C is uniform in [0, 1], or rounded to the levels of the elements; every entry of S is
-    sqrt(P_max / (K N_SB)).
+    The entries of C are uniform in [0, 1] and rounded to the amplitude levels, if any. Every entry
+    of S is sqrt(P_max / (K N_SB)).
     """
     sizes = scenario.sizes
     analog = on_levels(scenario, rng.uniform(size=[sizes[s] for s in ('N_B', 'F', 'N_E')]))
@@ -35,8 +35,8 @@ def directional_codebook(
     """Focus each of the N_B F frames on a point of a scan: the paper's `Directional`.
 
     The configuration follows the holographic principle. The weights of each sub-band are the
-    matched filter of the resulting feed signals, with equal power in all sub-bands. `rng` is
-    unused, as the codebook is deterministic. `scan` is one of `SCANS`. Raises ValueError if the
+    matched filter of the resulting feed signals, with equal power in all sub-bands. The codebook
+    is deterministic, so `rng` is unused. `scan` is one of `SCANS`. Raises ValueError if the
     scan is unknown, or a gain pattern of the scenario is zero at a focal point.
     """
     if scan not in SCANS:
@@ -76,8 +76,8 @@ def width_points_per_band(scenario: Scenario) -> np.ndarray:
 def grid_points(scenario: Scenario) -> np.ndarray:
     """Return a grid of F points across width and height, the same in each band.
 
-    The number of rows is the largest divisor of F up to its square root: four frames make a grid
-    of 2 x 2 points.
+    The number of rows is the largest divisor of F that does not exceed the square root of F. Four
+    frames, for example, form a grid of 2 x 2 points.
     """
     n_frames = scenario.n_frames
     rows = max(n for n in range(1, n_frames + 1) if n_frames % n == 0 and n * n <= n_frames)
@@ -91,7 +91,7 @@ SCANS: Mapping[str, Callable[[Scenario], np.ndarray]] = {
 
 
 def _points(scenario: Scenario, across: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Place points at fractions of width and height, which broadcast to [F, N_B], at mid-depth."""
+    """Place points at mid-depth, at fractions of width and height that broadcast to [F, N_B]."""
     low, high = scenario.roi_bounds_m
     points = np.tile((low + high) / 2, (scenario.n_frames, scenario.n_bands, 1))
     points[..., 1] = low[1] + (high[1] - low[1]) * across
