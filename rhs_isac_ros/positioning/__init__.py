@@ -1,10 +1,10 @@
 """Estimators of the user's position from the received signals.
 
 `make_estimator` creates an estimator for a scenario and a codebook: an object with the interface
-of `Estimator`, whose method ``estimate`` takes received signals and returns an `Estimate`. Its
-class is in `ESTIMATORS` below, or another package provides it as an entry point of
-`plugins.ESTIMATORS`. `simulate_pairs` draws signals for trials, and a `Tracker` combines
-successive positioning phases of a moving user.
+of `Estimator`, whose method ``estimate`` takes received signals and returns an `Estimate`. The
+classes of estimators are listed in `ESTIMATORS` below, and other packages may provide more as
+entry points of `plugins.ESTIMATORS`. `simulate_pairs` draws signals for trials, and a `Tracker`
+combines successive positioning phases of a moving user.
 
 The modules, in reading order:
 
@@ -58,9 +58,9 @@ def make_estimator(
     `REGION_ESTIMATORS` take the options of `SearchEstimator`. `neural` requires ``model_file``, a
     `Network` or its file. Plug-ins define their own options.
 
-    Raises ValueError if there is no estimator of that name, PluginError if a plug-in cannot be
-    loaded, fails, or does not return an estimator, ModelError if a model cannot be read or was
-    trained for another codebook or scenario, and CodebookError if the codebook does not fit the
+    Raises ValueError if there is no estimator of that name; PluginError if a plug-in cannot be
+    loaded, fails, or does not return an estimator; ModelError if a model cannot be read or was
+    trained for another codebook or scenario; and CodebookError if the codebook does not fit the
     scenario.
     """
     if name in ESTIMATORS:
@@ -81,8 +81,8 @@ def make_estimator(
 def file_options(name: str, table_folder: Path, model_file: str | Path) -> dict[str, Any]:
     """Return the options of `make_estimator` that specify the files of an estimator.
 
-    The table folder is for `bayes` and `ml`; the model file is for `neural` and, unless empty,
-    for plug-ins.
+    The estimators `bayes` and `ml` take the table folder. The model file goes to `neural` and,
+    unless it is empty, to plug-ins.
     """
     if name == NeuralEstimator.name or (name not in ESTIMATORS and model_file):
         return {'model_file': model_file}

@@ -1,9 +1,9 @@
 """Alternatives to a user in the region with a direct path: a user outside, or a blocked one.
 
-Each alternative has prior odds and an evidence, the likelihood averaged over its own unknowns. Its
-probability follows from a comparison with the evidence for a user in the region. If the
-probability exceeds a limit, there is no fix. The limit for a user outside is high: the prior odds
-are even although most users are inside, and those users should not lose their fixes.
+Each alternative has prior odds and an evidence, the likelihood averaged over its own unknowns. A
+comparison with the evidence for a user in the region gives the probability of the alternative. If
+the probability exceeds a limit, there is no fix. The limit for a user outside is high, because the
+prior odds are even although most users are inside, and these users should not lose their fixes.
 """
 
 import math
@@ -41,8 +41,8 @@ _MIN_APERTURES = 4.0
 _MAX_RANGE_FACTOR = 3.0
 _RANGE_RATIO = 1.15
 # Phase error of a template at the edge of the aperture at which the next direction takes over, and
-# largest number of templates. The error grows where this number would be exceeded: large apertures
-# distinguish more directions than a comparison of two hypotheses needs.
+# largest number of templates. If this number would be exceeded, larger errors are accepted: large
+# apertures distinguish more directions than a comparison of two hypotheses needs.
 _DIRECTION_RAD = 0.25
 _MAX_TEMPLATES = 40_000
 # Quadrature over the gain: spacing [nepers], and reach in standard deviations.
@@ -65,7 +65,7 @@ class Alternative(Protocol):
 
     name: str  # `Estimate` has the field ``<name>_probability``.
     reason: str  # Why there is no fix.
-    limit: float  # Largest probability at which there is a fix, without other alternatives.
+    limit: float  # Largest probability at which there is a fix, if this is the only alternative.
     log_odds: float  # Logarithm of the prior odds relative to a user inside and in sight.
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
@@ -88,8 +88,8 @@ class Blocked:
 
     A survey inflates the covariance of the multipath, and the level differs among users in sight.
     The evidence for a user in sight is computed with the inflated covariance, under which weak
-    residuals are improbable. The evidence for a blocked user is therefore divided by the factor by
-    which an average over the levels would change the evidence for a user in sight.
+    residuals are improbable. An average over the levels would correct this evidence by a factor.
+    Instead of this correction, the evidence for a blocked user is divided by the same factor.
     """
 
     name, reason, limit = 'blocked', 'blocked', BLOCKED_LIMIT
@@ -101,7 +101,7 @@ class Blocked:
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
                         prior: NuisancePrior) -> float:
-        """Compute the evidence from the energies of the signals; see `Alternative`."""
+        """Compute the log evidence from the energies of the signals; see `Alternative`."""
         energy = np.array([residual, np.sum(np.abs(whitened)**2)])
         # The gain of the user is part of the level.
         std_db = math.hypot(BLOCKED_STD_DB, self._std_db, _DB_PER_NEPER * prior.gain_std)
@@ -160,8 +160,8 @@ class Outside:
     Range ambiguities repeat every few wavelengths, so signals from outside often fit some position
     in the region. The prior is uniform in range and solid angle, up to a multiple of the region's
     farthest range. The carrier phases of the bands turn within centimetres of range. The average
-    over these phases has a closed form: the product over the bands of ``I_0(2 |t_i^H y_i|)``. All
-    other factors are smooth, so the coarse grid of `tabulate_outside` suffices.
+    over these phases has a closed form: the product over the bands of ``I_0(2 |t_i^H y_i|)``, with
+    templates t_i and signals y_i. All other factors are smooth, so a coarse grid suffices.
     """
 
     name, reason, limit = 'outside', 'position outside of the region', OUTSIDE_LIMIT
@@ -181,7 +181,7 @@ class Outside:
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
                         prior: NuisancePrior) -> float:
-        """Compute the evidence, which does not depend on phases; see `Alternative`."""
+        """Compute the log evidence, which does not depend on carrier phases; see `Alternative`."""
         gain = np.zeros(1)
         if prior.gain_std:
             n_points = 2 * int(np.ceil(_GAIN_REACH * prior.gain_std / _GAIN_STEP)) + 3
@@ -192,7 +192,10 @@ class Outside:
                 + prior.log_evidence_of_aligned(aligned))
 
     def log_evidence(self, whitened: np.ndarray, scales: Iterable[float] = (1.0,)) -> np.ndarray:
-        """Average ``exp(-|s y - t|^2)`` over the prior for each scale s; return the logarithms."""
+        """Return the log of the mean of ``exp(-|s y - t|^2)`` over the prior for each scale s.
+
+        The signals y are `whitened`, and t is the whitened mean for a user outside.
+        """
         filtered, energy = self._filter(whitened), float(np.sum(np.abs(whitened)**2))
         # At any range, the log-likelihood is highest if the outputs of all bands are in phase.
         bound = (np.sum(filtered, axis=0)**2 / self._node_energy).max(axis=0)
@@ -236,7 +239,7 @@ def describe_doubts(estimate: object) -> str:
 
 
 def rejection(alternative: Alternative, probability: float) -> str:
-    """Return the reason if an alternative with this probability rules out a fix, or ''."""
+    """Return the reason why an alternative of this probability rules out a fix; '' if not."""
     if probability <= alternative.limit:
         return ''
     return (f'{alternative.reason}: probability {probability:.6g}, expected at most '
@@ -290,7 +293,7 @@ def _prior(scenario: Scenario, ranges: np.ndarray, directions: np.ndarray) -> np
 
 
 def _template_ranges(scenario: Scenario, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the template ranges [T] [m], and the index of one for each range of the grid, [R].
+    """Return template ranges [T] [m], and the index of a template range for each grid range, [R].
 
     The phase error of a template is due to the curvature of the wavefront, proportional to 1 / r,
     and to the delay across the sub-bands, proportional to r.

@@ -31,7 +31,7 @@ from rhs_isac_ros.positioning.estimate import Estimate
 # For the variance, the approximation is less accurate.
 FALSE_WARNING = 1e-6
 FALSE_SPREAD_WARNING = 1e-7
-# Probability of the latest residuals at which a warning ends. It is high, so that a small
+# Probabilities of the latest residuals at which a warning ends. They are high, so that a small
 # deviation does not cause one warning after another.
 RETURN = 0.9
 SPREAD_RETURN = 0.5
@@ -43,8 +43,8 @@ MIN_FIXES = 10
 # not Gaussian cause both.
 _TOLERANCE = 0.5
 _SPREAD_TOLERANCE = 0.15
-# Deviations are limited to this many standard deviations, so that no single signal causes a
-# warning, and their squares to this value, so that a few signals do not dominate.
+# Limits of a residual's deviation, in standard deviations, and of its square. The first keeps a
+# single signal from causing a warning, and the second keeps a few signals from dominating.
 _MAX_DEVIATIONS = 6.0
 _MAX_SQUARE = 9.0
 # Subjects with which reasons begin.
@@ -54,7 +54,7 @@ _RESIDUAL = 'residual energy at the best position'
 LEVEL = 'level of the multipath or of the users'
 SPREAD = 'spread of delays, angles or levels'
 # Relative variance of the residuals, in units of its value in the model, above which a wrong level
-# does not explain them: nearly three standard errors over a full window.
+# does not explain the residuals: nearly three standard errors over a full window.
 _MAX_DISPERSION = 1.2
 
 
@@ -105,18 +105,18 @@ def _excess(subject: str, value: float, limit: float) -> str:
 
 
 class InnovationTest:
-    """Mean and variance of the energy of the last residuals, compared with the expectation.
+    """A test of whether the energies of the latest residuals have the expected mean and variance.
 
     Twice an energy has approximately a chi-square distribution; `Estimate.expected_residual` is
     half its mean. With a measured covariance, the energy is also multiplied by the level of the
-    multipath, a log-normal power with the median and the standard deviation `level_db`. Users at
-    rest, or in one part of the hall, do not change their level, so all residuals may have the
-    same. Raises ValueError if the window is shorter than `MIN_RETURN`, because no warning could
-    then end.
+    multipath, a log-normal power with the median and the standard deviation `level_db`. The level
+    does not change for users at rest, or in one part of the hall, so it may be the same in all
+    residuals. Raises ValueError if the window is shorter than `MIN_RETURN`, because then no
+    warning could end.
     """
 
-    #: Whether the residuals deviate from the model. It becomes True when their mean or variance
-    #: over the window is improbable, and False when both are probable for the last `MIN_RETURN`.
+    #: Whether the residuals deviate from the model. It is set when their mean or variance over the
+    #: window is improbable, and reset when both are probable for the latest `MIN_RETURN` ones.
     drifts: bool
 
     def __init__(
@@ -172,7 +172,7 @@ class InnovationTest:
 
     @property
     def spread(self) -> float:
-        """Variance of the energy about its expectation, relative to the model; NaN if empty."""
+        """Variance of the energy relative to its value in the model; NaN without residuals."""
         total = _Residual.total(self._residuals)
         return total.square / len(self._residuals) if self._residuals else np.nan
 
@@ -184,8 +184,8 @@ class _Residual(NamedTuple):
     energy: float
     expected: float
     square: float  # Square of the normalised deviation.
-    # Variances of the energy and of the square without the part that is due to the level, and the
-    # standard deviations due to the level, which all residuals may have in common.
+    # Variances of the energy and of the square, apart from the level, and the standard deviations
+    # due to the level, which all residuals may have in common.
     own_variance: float
     own_square_variance: float
     common_std: float
@@ -220,11 +220,11 @@ class _Residual(NamedTuple):
 
 def diagnose(estimates: Collection[Estimate], deviates: bool,
              level_std_db: float = 0.0) -> dict[str, str]:
-    """Return texts for the diagnostics from the estimates of the latest cycles.
+    """Return diagnostic values, as text by key, from the estimates of the latest cycles.
 
     ``probability.<alternative>`` is the mean probability of an alternative. ``no_fix.share`` and
-    ``no_fix.cause`` exist if there are cycles without a fix. `deviates` states whether the
-    residuals deviate from the scenario, in which case the probabilities are wrong.
+    ``no_fix.cause`` exist if there are cycles without a fix. `deviates` is whether the residuals
+    deviate from the scenario, in which case the probabilities are wrong.
     """
     values = {}
     probabilities = [probabilities_of(one) for one in estimates]
@@ -244,14 +244,14 @@ def diagnose(estimates: Collection[Estimate], deviates: bool,
 
 def _cause(estimates: Collection[Estimate], subject: str, deviates: bool,
            level_std_db: float) -> str:
-    """Return the likely cause, given the most frequent subject of the reasons."""
+    """Return the likely cause of missing positions, given the most frequent `subject`."""
     residual, expected = np.array([
         (one.residual, one.expected_residual) for one in estimates
         if one.residual > 0 and one.expected_residual > 0]).reshape(-1, 2).T
     is_alternative = subject in {kind.reason for kind in ALTERNATIVES}
     if len(residual) < MIN_FIXES or is_alternative and not deviates:
         return subject
-    # The energy of n complex measurements has the relative variance 1 / n, beside that of levels.
+    # The energy of n complex measurements has the relative variance 1 / n; levels add to it.
     n = float(np.mean(expected))
     shape = n * (1 - share_of_level(n, level_std_db))
     dispersion = float(shape * np.var(np.log(residual / expected)))

@@ -2,13 +2,14 @@
 
 Signals below the noise fit positions in thousands of beams and range steps. A search for all modes
 would be slow, and the modes are not Gaussian. Directions are therefore drawn in cells of the grid,
-and the likelihood is integrated along the range. This is importance sampling: cells are drawn with
-probabilities that follow from bounds of their likelihood, and the weight of a draw is its integral
-divided by the probability of its cell. The weights determine the number of effective draws. While
-this number is too small, further rounds of draws also follow the weights found so far. Each round
-is unbiased, because its probabilities do not depend on its own draws. Later rounds have larger
-weights (Owen and Zhou, The square root rule for adaptive importance sampling, ACM Transactions on
-Modeling and Computer Simulation, 2020). Peaks of strong signals are too narrow for this method.
+and the likelihood is integrated along the range. This is importance sampling: the probability of
+drawing a cell follows from a bound of its likelihood, and the weight of a draw is its integral
+divided by this probability. Peaks of strong signals are too narrow for this method.
+
+The weights determine the effective number of draws. While this number is too small, further rounds
+of draws also follow the weights found so far. Each round is unbiased, because its probabilities do
+not depend on its own draws. Later rounds have larger weights (Owen and Zhou, The square root rule
+for adaptive importance sampling, ACM Trans. on Modeling and Computer Simulation, 2020).
 """
 
 from typing import NamedTuple
@@ -28,18 +29,18 @@ from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.grid import Query, TemplateTable, Windows
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution
 
-# Draws per round, largest number of rounds, and sufficient number of effective draws. The inverse
-# of the last is the relative increase of the mean squared error.
+# Draws per round, largest number of rounds, and sufficient effective number of draws. The inverse
+# of this effective number is the relative increase of the mean squared error.
 _N_DRAWS = 500
 _MAX_ROUNDS = 12
 _N_EFFECTIVE = 150.0
-# Share of further draws that follow the bounds instead of the weights.
+# Share of the draws in further rounds that follow the bounds instead of the weights.
 _SHARE_OF_BOUNDS = 0.7
 # Exponent of the bounds of the likelihood, below 1 so that cells with low bounds are drawn, too.
 _POWER = 0.8
 # Range windows are omitted if their log-likelihood is below the best average by more than this.
 _MARGIN = 12.0
-# Smallest number of range steps per wavelength; a Gaussian peak gets one per two deviations.
+# Smallest number of range steps per wavelength. A narrow peak has one per two standard deviations.
 _MIN_STEPS = 8
 # Number of range steps to evaluate at a time.
 _BLOCK = 1 << 20
@@ -63,7 +64,7 @@ class _Rays(NamedTuple):
 
 
 class DrawnPosterior:
-    """The posterior of positions without nuisance parameters, from the table alone."""
+    """The posterior of positions without nuisance parameters, computed from the table alone."""
 
     def __init__(self, scenario: Scenario, table: TemplateTable) -> None:
         self._table, resolution = table, Resolution.of(scenario)
@@ -81,7 +82,7 @@ class DrawnPosterior:
         self._log_volume = np.log(volume) + self._log_area
 
     def of(self, query: Query, phase: int) -> Fit | None:
-        """Draw positions for one phase of a query; return None if too few draws are effective."""
+        """Draw positions for a phase; return None if their effective number stays too small."""
         probability = bounds = self._probabilities(query, phase)
         cells, log_weights, parts, total_share = np.empty(0, int), np.empty(0), [], 0.0
         for n_rounds in range(1, _MAX_ROUNDS + 1):
@@ -118,7 +119,7 @@ class DrawnPosterior:
             energy - best, query.signals[0].size + float(weights @ rays.average) - best, 0.0)
 
     def _probabilities(self, query: Query, phase: int) -> np.ndarray:
-        """Approximate the share of each cell in the posterior, as if phases were random."""
+        """Approximate each cell's share of the posterior, as if carrier phases were random."""
         # The average of exp(2 A cos(phase)) is nearly exp(2 A) / sqrt(1 + 4 pi A).
         n_bands, bound = len(self._wavenumbers), query.bound[phase]
         amplitude = (bound + self._table.energy) / (2 * n_bands)
@@ -128,7 +129,7 @@ class DrawnPosterior:
         return shares / shares.sum()
 
     def _rays(self, query: Query, phase: int, cells: np.ndarray, places: np.ndarray) -> _Rays:
-        """Integrate along K directions, given by cells [K] and relative places in them, [K, 2]."""
+        """Integrate along K directions, given by cells [K] and positions within them [K, 2]."""
         directions = np.empty((len(cells), 3))
         directions[:, 1:] = self._low[cells] + places * self._extent[cells]
         directions[:, 0] = _boresight(directions[:, 1:])

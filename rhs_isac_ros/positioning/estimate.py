@@ -72,9 +72,9 @@ class Estimator(Protocol):
         """Estimate positions from received signals; raise `SignalError` if they are unusable.
 
         The signals are complex128 [N_B, N_SB F], or [N, N_B, N_SB F] for N positions,
-        sub-band-major; the estimate has a leading dimension N if the signals have one. Estimates
-        of a batch may differ from estimates of single phases; one in a thousand differs by more
-        than five hundredths of a standard deviation.
+        sub-band-major; the estimate has a leading dimension N if the signals have one. An
+        estimate in a batch may differ from the estimate of the same phase alone. One in a thousand
+        differs by more than five hundredths of a standard deviation.
         """
         ...
 
@@ -82,9 +82,9 @@ class Estimator(Protocol):
 def estimate_each(
         scenario: Scenario, codebook: Codebook, received: np.ndarray,
         locate: Callable[[np.ndarray], Iterable[Located]]) -> Estimate:
-    """Check received signals, locate every phase, and match the result to the signals' shape.
+    """Check received signals, locate every phase, and return an estimate of matching shape.
 
-    `locate` yields the values of `Located` for each phase of checked signals [N, N_B, N_SB F]. If
+    `locate` takes checked signals, [N, N_B, N_SB F], and yields a `Located` for each phase. If
     the reason is not empty, mean and covariance are ignored. Raises SignalError if the shape is
     wrong, a value is not finite, or a magnitude exceeds 1000.
     """

@@ -73,16 +73,16 @@ _DOUBT_LIMIT = 0.05
 class SearchEstimator(abc.ABC):
     """Estimator based on the modes of the posterior, with a uniform prior over the region.
 
-    Signals that the model cannot explain at the best mode give no fix; see `diagnosis`. If the
-    scenario has a `blocked_probability`, users may lack the direct path; see `alternatives`.
-    Tables are kept in `table_folder` between runs.
+    If the model cannot explain the signals even at the best mode, there is no fix; see
+    `diagnosis`. If the scenario has a `blocked_probability`, users may lack the direct path; see
+    `alternatives`. Tables are kept in `table_folder` between runs.
 
     Parameters
     ----------
     reject_outside
-        Whether the user may also be outside of the region. If this is almost certain
-        (`alternatives.OUTSIDE_LIMIT`), there is no fix. Otherwise the estimate contains its
-        probability, and position and covariance apply to a user inside.
+        Whether the user may also be outside of the region. If the probability of this exceeds
+        `alternatives.OUTSIDE_LIMIT`, there is no fix. Otherwise, the estimate contains the
+        probability, and its position and covariance apply to a user inside.
     surface
         Knowledge of the surface, such as a calibration; see `MeasurementModel`.
     progress
@@ -107,8 +107,8 @@ class SearchEstimator(abc.ABC):
         if scenario.blocked_probability:
             self._alternatives.append(Blocked(scenario))
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
-        # Median level of the multipath of users in sight, and the share of a residual's deviation
-        # that is due to the level.
+        # Median multipath level of users in sight, and the share of a residual's deviation that
+        # is due to the level.
         median_db, std_db = scenario.multipath_level_db
         self._level = 10**(median_db / 10)
         self._level_share = share_of_level(n_measurements, std_db)
@@ -179,7 +179,7 @@ class SearchEstimator(abc.ABC):
 
     def _search(self, signals: Signals, aligned: np.ndarray, draws: bool
                 ) -> list[tuple[Fit, Modes | None]]:
-        """Find the posterior of each phase and its modes; None if draws replace too many modes."""
+        """Find the posterior and modes of each phase; the modes are None after draws."""
         likelihood, fits = self._likelihood, dict[int, tuple[Fit, Modes | None]]()
         extra = self._failures.search_margin if self._failures else 0.0
 
@@ -235,7 +235,7 @@ class SearchEstimator(abc.ABC):
             yield fit, select(modes, slice(start, end))
 
     def _judge(self, fit: Fit, whitened: np.ndarray, aligned: np.ndarray) -> Located:
-        """Return the position of one phase or the reason for its absence."""
+        """Return the position of one phase, or the reason why there is none."""
         log_weights = np.array([fit.log_evidence, *(
             one.log_odds + one.log_evidence_of(
                 whitened, aligned, fit.residual, self._likelihood.nuisance)
@@ -291,7 +291,7 @@ class BayesEstimator(SearchEstimator):
 
 
 class MlEstimator(SearchEstimator):
-    """The most likely position in the region, with the inverse curvature as its covariance."""
+    """The most likely position in the region; the covariance is the inverse of the curvature."""
 
     name, averages = 'ml', False
 
@@ -316,11 +316,11 @@ class WeightedModes(NamedTuple):
 
 @one_blas_thread
 def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> WeightedModes | None:
-    """Compute the modes for the signals of one phase, complex128 [N_B, N_SB F] or [N_B, N_SB, F].
+    """Compute the mixture of modes for one phase, complex128 [N_B, N_SB F] or [N_B, N_SB, F].
 
-    If `BayesEstimator` does not average over draws, the mixture has the mean and covariance of its
-    estimate, up to the sampling error of the mean. The result is None if there is no position.
-    Raises `SignalError` if the signals cannot be used.
+    The mixture has the mean and covariance that `BayesEstimator` estimates, up to the sampling
+    error of the mean, unless `BayesEstimator` averages over draws. The result is None if there is
+    no position. Raises `SignalError` if the signals cannot be used.
     """
     modes = estimator.posterior(received.reshape(len(received), -1)).modes
     if modes is None:

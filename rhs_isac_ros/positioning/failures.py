@@ -1,15 +1,15 @@
 """Modes of the posterior as a mixture over sets of failed elements.
 
 `DispersedLikelihood` replaces the mixture by one Gaussian for each number of failures. It ignores
-what the signals reveal about the set, although even a single failure is far above the nulls of the
-multipath. Here, sets with a substantial weight are found by adding elements to the most probable
-sets, one at a time.
+what the signals reveal about the set of failed elements, although the effect of even a single
+failure is far above the nulls of the multipath. This module finds the sets with a substantial
+weight by adding elements to the most probable sets, one at a time.
 
 A failed element is stuck at an amplitude that is uniform in [0, 1]. If its amplitude is treated as
 Gaussian, with mean 1/2 and variance 1/12, the signals are Gaussian. In the direct path, the
-amplitude is one more unknown in which the mean is linear; in the multipath, its variance adds to
-the covariance. The search for sets uses the average covariance of the elements' errors, and the
-likelihood of a set uses their covariance at each point.
+amplitude is one more unknown, in which the mean is linear. In the multipath, the variance of the
+amplitude adds to the covariance. The search for sets uses the average covariance of the elements'
+errors, and the likelihood of a set uses their covariance at each point.
 """
 
 import dataclasses
@@ -42,21 +42,21 @@ from rhs_isac_ros.positioning.search import Modes, ascend, predict
 
 # Largest expected number of failures for which sets are searched.
 _MAX_EXPECTED = 2.0
-# Probability that the residual of an intact surface exceeds the usual residual, and number of
-# modes from which the search for sets starts if the observed residual does not exceed it.
+# Probability that the residual of an intact surface exceeds `usual_residual`, and number of modes
+# from which the search for sets starts if the observed residual does not exceed this limit.
 _UNUSUAL = 0.01
 _N_USUAL = 2
-# If it does: number of points of the table besides the modes, their margin, and number of sites.
+# If it does: largest number of grid points besides the modes, their margin, and number of sites.
 _MAX_POINTS = 64
 _POINT_MARGIN = 30.0
 _N_SITES = 64
-# Factor of the share of further failures while sets are ordered; number of hypotheses to extend.
+# Factor of the share of further failures while sets are ranked; number of hypotheses to extend.
 _REMAINDER = 0.3
 _N_EXTENDED = 16
 # Number of sets to try at all sites.
 _N_SETS = 4
 # Hypotheses are dropped if their log-probability is below the best by more than these margins,
-# before and during the exact steps. Largest number to keep, and number of exact steps.
+# before and during the exact steps. Largest number of them to keep, and number of exact steps.
 _MARGIN = 9.0
 _FIRST_MARGIN = 27.0
 _MAX_HYPOTHESES = 48
@@ -112,7 +112,7 @@ class FailedElements:
     def refine(self, modes: Modes, signals: Signals) -> tuple[Modes, list['FailedSet']]:
         """Return modes of one phase for all probable sets, and the likelihoods of the sets.
 
-        Takes the modes found without sets, and the signals of the phase, N = 1.
+        Takes the modes found without regard to sets, and the signals of the phase, N = 1.
         """
         search = self._search(modes, signals)
         values, best = search.values, max(search.values.values())
@@ -137,7 +137,7 @@ class FailedElements:
 class Surface(NamedTuple):
     """A surface with failed elements."""
 
-    scattered: np.ndarray  # T V, complex128 [N_B, N_SB F, N_E].
+    scattered: np.ndarray  # Radiation times multipath covariance, complex128 [N_B, N_SB F, N_E].
     # Covariance of the signals, given the amplitudes in the direct path, [N_B, N_SB F, N_SB F].
     covariance: np.ndarray
 
@@ -152,7 +152,7 @@ class Whitening(NamedTuple):
     @classmethod
     def of(cls, covariance: np.ndarray, prior: NuisancePrior, parent: 'Whitening | None' = None
            ) -> 'Whitening':
-        """Factorise covariances [N_B, H, N_SB F, N_SB F]; use a parent's information."""
+        """Factorise covariances [N_B, H, N_SB F, N_SB F]; a parent provides the information."""
         roots = np.linalg.cholesky(covariance)
         whitener = np.linalg.inv(roots)
         return cls(whitener, log_determinant(roots).sum(axis=0), parent.information if parent
@@ -174,13 +174,13 @@ class Site:
     def elements(self) -> tuple[np.ndarray, np.ndarray]:
         """Effects of the failure of each element, computed at first use.
 
-        They are the change of the columns, complex128 [N_E, 4 + Q, N_B, N_SB F], and the
-        derivative of the mean with respect to the scaled amplitude, complex128 [N_E, N_B, N_SB F].
+        They are the change of `columns`, complex128 [N_E, 4 + Q, N_B, N_SB F], and the derivative
+        of the mean with respect to the normalised amplitude, complex128 [N_E, N_B, N_SB F].
         """
         return self.model.elements_at(self.point)
 
     def columns_of(self, failed: Failed) -> tuple[np.ndarray, np.ndarray]:
-        """Return the columns for a surface with failed elements, and for their amplitudes."""
+        """Return the columns with failed elements, and the columns for the amplitudes of these."""
         if not failed:
             return self.columns, self.columns[:0]
         changes, amplitudes = self.elements
@@ -235,8 +235,8 @@ class FailureModel:
         self.usual_residual = energy_limit(int(np.prod(likelihood.model.shape)), _UNUSUAL)
         intact = dataclasses.replace(scenario, failed_element_share=0.0)
         self._model = MeasurementModel(intact, codebook).prepare(jacobian=True)
-        # Weights of the elements' direct paths, [N_E, N_B, N_SB F]: their change by a failure, and
-        # the weight per standard deviation of a failed element's amplitude.
+        # Weights of the elements' direct paths, [N_E, N_B, N_SB F]: change due to a failure, and
+        # change per standard deviation of a failed element's amplitude.
         weights = np.matmul(codebook.digital, onboard_matrix(scenario))
         self._shift, self.amplitudes = (
             np.ascontiguousarray(np.moveaxis(one.reshape(self._model.radiation.shape), 2, 0))
@@ -313,9 +313,9 @@ class FailureModel:
     def weigh_extensions(self, failed: Failed, site: Site, remainder: float = 0.0) -> np.ndarray:
         """Compute the log-probability of `weigh` if one more element fails, float64 [N_E].
 
-        The other elements are assumed to fail with the declared share times `remainder`, which
-        adds to the covariance. An element that explains part of the signals then has a higher
-        value than one that imitates the sum of several failures.
+        The other elements are assumed to fail with the declared share times `remainder`; these
+        failures add to the covariance. An element that explains part of the signals then has a
+        higher value than an element that imitates the sum of several failures.
         """
         extended, (columns, own) = self._extensions_of(failed, remainder), site.columns_of(failed)
         changes, amplitudes = site.elements
@@ -347,7 +347,7 @@ class FailureModel:
         return self._extensions[failed, remainder]
 
     def _growth(self, surface: Surface, elements: slice = slice(None)) -> np.ndarray:
-        """Return the change of a surface's covariance by each failure, [N_E, N_B, S, S]."""
+        """Return the change of a surface's covariance due to each failure, [N_E, N_B, S, S]."""
         shift, spread = self._shift[elements], self.amplitudes[elements]
         power = np.diagonal(self._spatial, axis1=1, axis2=2).real.T[elements, :, None]
         cross = np.moveaxis(surface.scattered[..., elements], 2, 0) + power / 2 * shift
@@ -360,9 +360,9 @@ class FailureModel:
 class FailureSearch:
     """Search for sets of failed elements at several sites, for the signals of one phase.
 
-    Sets grow by one element at a time. Extended sets are ordered by a likelihood that admits a few
-    more failures; see `FailureModel.weigh_extensions`. Otherwise, if two elements have failed, the
-    first one added would often be a third element that imitates the sum of both.
+    Sets grow by one element at a time. Extended sets are ranked by a likelihood that admits a few
+    more failures; see `FailureModel.weigh_extensions`. If it did not, and two elements had failed,
+    the first element added would often be a third one that imitates the sum of both.
 
     Growth ends when all new sets are less probable than the best set by a margin, but not before
     the deviance of some hypothesis is as low as usual.
@@ -381,7 +381,7 @@ class FailureSearch:
         return max(self.values, key=lambda key: self.values[key])
 
     def explains(self, keys: list[Key]) -> bool:
-        """Return whether the deviance of a hypothesis is no higher than usual."""
+        """Return whether the deviance of any of these hypotheses is no higher than usual."""
         return any(self._deviances[key] <= self._model.usual_residual for key in keys)
 
     def add(self, points: np.ndarray, values: np.ndarray, failed: Failed = ()) -> list[Key]:
@@ -429,7 +429,7 @@ class FailureSearch:
         return sorted(keys, key=lambda key: -self.values[key])
 
     def _weigh_children(self, parents: list[Key], remainder: float = 0.0) -> list[Key]:
-        """Return the sets with one more element, the most probable first."""
+        """Return the hypotheses with one more failed element, the most probable first."""
         children: dict[Key, float] = {}
         # In this order, the covariances of a set are computed once.
         for failed, index in sorted(parents):

@@ -71,13 +71,13 @@ def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None =
              ) -> dict[str, np.ndarray]:
     """Compute the arrays of a `TemplateTable`, for G templates and C pairs of template and cell.
 
-    They are ``filters``, the conjugate templates, complex64 [N_B, N_SB, G, F]; ``slope_filters``,
-    their derivatives with respect to (r [m], u, v), complex64 [N_B, N_SB, G, 3, F]; ``energy`` of
-    the whitened means, float32 [C]; ``energy_slope``, its derivative, float32 [C, 3];
-    ``curvature`` of the log-likelihood, float64 [C, 3, 3]; ``spread``, the mean of the outer
-    products of the whitened means, and ``whitener``, inverse Cholesky factors of the covariance,
-    complex128 [N_B, N_SB F, N_SB F]; and ``normal``, points that represent a standard Gaussian,
-    float64 [128, 3].
+    The arrays are ``filters``, the conjugate templates, complex64 [N_B, N_SB, G, F];
+    ``slope_filters``, their derivatives with respect to (r [m], u, v), complex64 [N_B, N_SB, G, 3,
+    F]; ``energy`` of the whitened means, float32 [C]; ``energy_slope``, its derivative, float32
+    [C, 3]; ``curvature`` of the log-likelihood, float64 [C, 3, 3]; ``spread``, the mean of the
+    outer products of the whitened means, and ``whitener``, inverse Cholesky factors of the
+    covariance, complex128 [N_B, N_SB F, N_SB F]; and ``normal``, points that represent a standard
+    Gaussian, float64 [128, 3].
     """
     grid, (n_bands, n_rows) = lay_grid(model.scenario), model.shape
     points = grid.points
@@ -132,7 +132,7 @@ def standard_normal(n: int) -> np.ndarray:
 class TemplateTable:
     """Fast evaluation of the log-likelihood over the whole region of interest.
 
-    `arrays` is the result of `tabulate`; `normal`, `spread` and `energy` become attributes.
+    `arrays` is the result of `tabulate`; its `normal`, `spread` and `energy` become attributes.
     """
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
@@ -173,7 +173,7 @@ class TemplateTable:
         self._fine = np.ascontiguousarray(phase.T.astype(np.complex64))
 
     def _turns(self, ranges_m: np.ndarray) -> np.ndarray:
-        """Return conjugate means over conjugate templates at ranges [R], [N_B, N_SB, R]."""
+        """Return ratios of conjugate means to conjugate templates at ranges, [N_B, N_SB, R]."""
         return np.exp(1j * self._wavenumbers[..., None] * ranges_m) / ranges_m
 
     def starts(self, whitened: np.ndarray, prior: NuisancePrior, margin: float,
@@ -182,9 +182,9 @@ class TemplateTable:
 
         `whitened` are the signals of N phases, complex128 [N, N_B, N_SB F], without offsets of
         carrier and timing. `margin` is the negative logarithm of the share of the posterior that
-        may be left out. The points of a phase do not depend on the other phases. If very many
-        cells of a phase with weak signals are relevant, `draw` is called with the query and the
-        phase's row in it; the phase has no points if `draw` returns True.
+        may be left out. The points of a phase do not depend on the other phases. If a phase has
+        weak signals and very many relevant cells, `draw` is called with the query and the phase's
+        row in it. If `draw` returns True, the phase has no points.
         """
         n = max(1, _N_OUTPUTS // (len(self.energy) * len(self._wavenumbers)))
         parts = []
@@ -264,7 +264,7 @@ class TemplateTable:
         return points
 
     def _bound(self, query: 'Query') -> np.ndarray:
-        """Bound the log-likelihood in all cells by outputs added in phase, float32 [N, C]."""
+        """Bound the log-likelihood in all cells, as if all bands were in phase, float32 [N, C]."""
         grid, outputs = self.grid, query.outputs
         amplitude = np.empty((len(outputs), len(grid.node)), np.float32)
         turns = np.swapaxes(self._cell_turns, 1, 2)
@@ -283,10 +283,7 @@ class TemplateTable:
         return np.stack(bounds) - self.energy
 
     def _peaks_of(self, phases: np.ndarray, cells: np.ndarray, query: 'Query') -> '_Peaks':
-        """Find all peaks along the range in (template, cell) pairs [K].
-
-        Phases [K] are in ascending order.
-        """
+        """Find all peaks along the range in (template, cell) pairs [K] of ascending phases [K]."""
         grid, outputs, prior = self.grid, query.outputs, query.prior
         pair, window = self._windows_of(cells)
         phases, cells = phases[pair], cells[pair]
@@ -334,7 +331,7 @@ class TemplateTable:
             np.zeros(len(step)) if gain is None else gain[step, column], at_peak)
 
     def _windows_of(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the windows of pairs [K]: the index of each window's pair and its own, [W]."""
+        """List the W windows of pairs [K]: index of each window's pair, and of the window, [W]."""
         ranges = self.grid.cell[cells]
         counts = self._n_windows[ranges]
         pair = np.repeat(np.arange(len(cells)), counts)
@@ -345,8 +342,8 @@ class TemplateTable:
                 ) -> 'Windows':
         """Evaluate range windows of (template, cell) pairs [K] in directions (u, v), [K, 2].
 
-        Means change linearly with the offset from the template's direction, and energies
-        quadratically.
+        Means are approximated as linear in the offset from the template's direction, and energies
+        as quadratic.
         """
         grid, curvature = self.grid, self._curvature[cells][:, 1:, 1:]
         node, slope, cell_m = grid.node[cells], self._energy_slope[cells], self._cell_ranges(cells)
@@ -406,7 +403,7 @@ class TemplateTable:
 
     def _loss_outside(self, phases: np.ndarray, points: np.ndarray, cells: np.ndarray,
                       value: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Return the likelihood loss of moves into the region, [P]; inf for unlikely points."""
+        """Return the log-likelihood lost by moves into the region, [P]; inf if unlikely."""
         inside = is_inside(to_positions(points), self._bounds)
         result = np.where(inside, 0.0, np.inf)
         best = np.full(phases.max(initial=0) + 1, -np.inf)
@@ -454,7 +451,7 @@ class _Peaks(NamedTuple):
     """P peaks along the range."""
 
     phases: np.ndarray  # Phase of each, int [P].
-    cell: np.ndarray  # Index of the pair of the grid, int [P].
+    cell: np.ndarray  # Index of the (template, cell) pair, int [P].
     range_m: np.ndarray  # Float64 [P] [m].
     value: np.ndarray  # Log-likelihood, float32 [P].
     gain: np.ndarray  # Most likely gain [nepers], float64 [P].
@@ -471,9 +468,9 @@ def first_of_each(phases: np.ndarray) -> np.ndarray:
 def heaviest(phases: np.ndarray, value: np.ndarray, margin: float | np.ndarray) -> np.ndarray:
     """Mark the points that contain almost all of the weight of their phase, bool [M].
 
-    `phases`, int [M], are in ascending order; log-likelihoods `value`, float64 [M], are in
-    descending order within each phase.
-    `margin` is the negative logarithm of the share that may be left out, a number or [M].
+    `phases`, int [M], are in ascending order. The log-likelihoods `value`, float64 [M], are in
+    descending order within each phase. `margin`, a number or an array [M], is the negative
+    logarithm of the share that may be left out.
     """
     firsts = first_of_each(phases)
     counts = np.diff(firsts, append=len(phases))
@@ -486,11 +483,11 @@ def heaviest(phases: np.ndarray, value: np.ndarray, margin: float | np.ndarray) 
 
 def separate(phases: np.ndarray, points: np.ndarray, radii: np.ndarray,
              curvature: np.ndarray | None = None) -> np.ndarray:
-    """Choose the points that do not belong to the mode of a better point.
+    """Mark the points that do not belong to the mode of a better point, bool [M].
 
-    `phases`, int [M], are in ascending order; the best of the points (r [m], u, v), float64 [M,
-    3], of a phase comes first. An ellipsoid with the `radii` [3] around a mode contains no other
-    mode. Given the curvature [M, 3, 3] of the log-likelihood, broad modes extend further.
+    `phases`, int [M], are in ascending order. The `points` (r [m], u, v), float64 [M, 3], of each
+    phase begin with the best one. An ellipsoid with the `radii` [3] around a mode contains no
+    other mode. Given the curvature [M, 3, 3] of the log-likelihood, broad modes extend further.
     """
     from scipy.spatial import cKDTree
 
@@ -500,7 +497,7 @@ def separate(phases: np.ndarray, points: np.ndarray, radii: np.ndarray,
     if curvature is not None:
         variance = np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2) / radii**2
         reach = float(np.clip(np.sqrt(_SAME_MODE * variance.max()), 1.0, _MAX_REACH))
-    # Move different phases far away from each other.
+    # Move points of different phases far away from each other.
     scaled[:, 0] += phases * (2 * reach + np.ptp(scaled[:, 0]))
     better, worse = cKDTree(scaled).query_pairs(reach, output_type='ndarray').T
     if curvature is not None:
@@ -509,7 +506,7 @@ def separate(phases: np.ndarray, points: np.ndarray, radii: np.ndarray,
         close |= np.einsum('kp,kpq,kq->k', offset, curvature[worse], offset) < _SAME_MODE
         worse, better = worse[close], better[close]
     previous = ~chosen
-    # Each round settles at least one more point, because only better points matter. A few rounds
+    # Only better points matter to a point, so each round settles at least one more. A few rounds
     # suffice.
     while (chosen != previous).any():
         previous = chosen

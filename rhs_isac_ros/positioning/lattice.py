@@ -1,8 +1,8 @@
 """The lengths over which signals from the region differ, and the grid that follows from them.
 
 The lengths follow from wavelength, aperture, bandwidth and region. The grid of the search has as
-many points as there are distinguishable positions. Closer points share one evaluation of the
-model.
+many points as there are distinguishable positions. Points that are closer together share one
+evaluation of the model.
 """
 
 import functools
@@ -37,7 +37,7 @@ _SHARED_RAD = 0.05
 # Radii of an ellipsoid around a mode that contains no other mode, in wavelengths and radians.
 _SEPARATION_WAVELENGTHS = 0.37
 _SEPARATION_RAD = 0.57
-# Steps and radii in range, in cells, if the phases of the bands contain no information about it.
+# Steps and radii in range, in cells, if the phases of the bands do not constrain the range.
 _COARSE_CELLS = 0.75
 # Largest value of `Resolution.direction`. It applies to apertures below a few wavelengths, where
 # the gains of elements and of the user also change with the direction.
@@ -93,7 +93,7 @@ class Resolution(NamedTuple):
         return float(np.prod(self.bounds_m[1] - self.bounds_m[0]))
 
     def cell_width_m(self, range_m: float) -> float:
-        """Return the interval of ranges in which delays and amplitudes hardly change."""
+        """Return the width of a range cell, in which delays and amplitudes hardly change [m]."""
         return min(2 * _AMPLITUDE_ERROR * range_m, 2 * PHASE_ERROR * self.delay_m)
 
     def step_limits(self, is_coarse: bool) -> np.ndarray:
@@ -101,7 +101,7 @@ class Resolution(NamedTuple):
         return self._radii(is_coarse, _STEP_WAVELENGTHS, _STEP_RAD)
 
     def separation(self, is_coarse: bool) -> np.ndarray:
-        """Return the radii in (r [m], u, v) of an ellipsoid around a single mode, [3]."""
+        """Return the radii in (r [m], u, v) of an ellipsoid that contains only one mode, [3]."""
         return self._radii(is_coarse, _SEPARATION_WAVELENGTHS, _SEPARATION_RAD)
 
     def _radii(self, is_coarse: bool, wavelengths: float, radians: float) -> np.ndarray:
@@ -129,15 +129,15 @@ def subband_wavenumbers(scenario: Scenario) -> np.ndarray:
 
 
 class Grid(NamedTuple):
-    """Templates and range cells that cover ranges and directions."""
+    """Templates and range cells that cover the ranges and directions of the region."""
 
     nodes: np.ndarray  # Points (r [m], u, v) of the templates, float64 [G, 3].
     ranges_m: np.ndarray  # Centres of the range cells, float64 [R].
     widths_m: np.ndarray
-    node: np.ndarray  # Template of each pair that belongs to the grid, int [C].
-    cell: np.ndarray  # Range cell of each pair, int [C].
-    # Slices of templates, range cells and pairs, for each range of the templates. The pairs of a
-    # segment are a subset of all combinations of its templates and range cells.
+    node: np.ndarray  # Index of the template of each pair in the grid, int [C].
+    cell: np.ndarray  # Index of the range cell of each pair, int [C].
+    # Slices of templates, range cells and pairs, one segment for each range of the templates. The
+    # pairs of a segment are a subset of all combinations of its templates and range cells.
     segments: list[tuple[slice, slice, slice]]
 
     @property

@@ -8,7 +8,7 @@ constant, ``-|W (y exp(-z P) - mu(p))|^2 - 2 Re(sum z P) - log det Lambda`` with
 Lambda^-1``.
 
 A `Conditional` evaluates the log-likelihood and its derivatives for one state of the surface.
-Search, posterior and tracks use only `Conditional`, whatever the impairments are.
+The search, the posterior and the tracker use only a `Conditional`, whatever the impairments are.
 """
 
 import dataclasses
@@ -45,7 +45,7 @@ _MIN_GAIN_STD = 1e-9
 # Numbers of failures to average over: smallest probability of each, and how many at most.
 _MIN_PROBABILITY = 1e-5
 _MAX_COUNTS = 12
-# Up to this share of the whitened energy, errors of an estimated surface ignore the position.
+# Up to this share of the whitened energy, errors of an estimated surface have one covariance.
 _MIN_ERROR_SHARE = 0.05
 
 
@@ -59,8 +59,8 @@ class Signals(NamedTuple):
 class Local(NamedTuple):
     """The log-likelihood of M points (r [m], u, v) with nuisance parameters, and its derivatives.
 
-    `information` is the expected information. Noise in observed curvatures would spoil the
-    marginal, in which the curvatures of range and phase nearly cancel.
+    `information` is the expected information, not the observed curvature. In the marginal, the
+    curvatures of range and phase nearly cancel, and noise would spoil their difference.
     """
 
     value: np.ndarray  # Logarithm of likelihood and prior of the parameters, float64 [M].
@@ -73,7 +73,7 @@ class Conditional(Protocol):
     """The likelihood given one state of the surface."""
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate points [M, 3] with parameters [M, Q], given the signals of one or M phases."""
+        """Evaluate the likelihood at points [M, 3] and parameters [M, Q] for one or M phases."""
         ...
 
 
@@ -164,13 +164,13 @@ class NuisancePrior(Exponents):
         return -(values**2 @ self.precision / 2 + values @ self.volume)
 
     def log_evidence_of_aligned(self, aligned: np.ndarray) -> float:
-        """Return the log integral over parameters that move the multipath, near `aligned`."""
+        """Return the log integral over the parameters that move the multipath, near `aligned`."""
         (moves,) = np.nonzero(self.moves_multipath)
         curvature = self.information[np.ix_(moves, moves)] + np.diag(self.precision[moves])
         return float(-self.precision @ aligned**2 - np.linalg.slogdet(curvature)[1]) / 2
 
     def amplitude(self, outputs: np.ndarray) -> np.ndarray:
-        """Sum the bands' matched-filter outputs, [N_B, ...], after their likeliest rotations."""
+        """Sum the bands' matched-filter outputs, [N_B, ...], after their most likely rotations."""
         if not self.relative_phase_std_rad:
             return _in_phase(outputs.sum(axis=0), float(self.phase_std_rad[0]))
         parts = [_in_phase(output, float(std))
@@ -181,9 +181,9 @@ class NuisancePrior(Exponents):
                   ) -> tuple[np.ndarray, np.ndarray]:
         """Maximise the log-likelihood, without the template's energy, over the gain.
 
-        If signals with the whitened energy ``|y|^2`` are multiplied by h, the log-likelihood at
-        the amplitude A, of any shape, is ``-h^2 |y|^2 + 2 h A + 2 n log h``. Returns its maximum
-        and the gain [nepers]. If the gain is known, the maximum does not include the energy.
+        If signals y are multiplied by h, the log-likelihood at the amplitude A, of any shape, is
+        ``-h^2 |y|^2 + 2 h A + 2 n log h`` plus the prior of the gain; n is `n_rows`. Returns its
+        maximum and the gain [nepers]. If the gain is known, the maximum omits the energy.
         """
         if not self.gain_std:
             return 2 * amplitude, np.zeros(1)
@@ -210,7 +210,7 @@ class NuisancePrior(Exponents):
 
 
 class Likelihood:
-    """The likelihood with one covariance, averaged over the region and over surfaces."""
+    """The likelihood with a single covariance, an average over the region and over surfaces."""
 
     def __init__(self, scenario: Scenario, codebook: Codebook,
                  surface: Surface | None = None) -> None:
@@ -227,13 +227,13 @@ class Likelihood:
         return Signals(received, self.model.whiten(received))
 
     def whitened(self, values: np.ndarray, signals: Signals) -> np.ndarray:
-        """Whiten signals after removing the factors of parameters [M, Q], [M, N_B, N_SB F]."""
+        """Divide signals by the factors of parameters [M, Q]; whiten them, [M, N_B, N_SB F]."""
         if not len(self.nuisance):
             return signals.whitened
         return self.model.whiten(self.nuisance.divide(signals.received, values))
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate points; see `Conditional.local`."""
+        """Evaluate the likelihood at points; see `Conditional.local`."""
         n, white = len(points), whiten(self.model, *self._means(points))
         mean, whitened = white[:, 0], self.whitened(values, signals)
         columns = [(whitened - mean).reshape(n, 1, -1), white[:, 1:].reshape(n, 3, -1)]
@@ -244,8 +244,8 @@ class Likelihood:
         return assemble(self.nuisance, values, np.concatenate(columns, axis=1))
 
     def settle(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
-        """Replace uniform phases of all bands, in parameters [M, Q], by the most likely ones."""
-        # A step in range turns the phases many times.
+        """Replace uniform band phases in parameters [M, Q] by the most likely phases."""
+        # A step in range rotates these phases by many turns.
         if not self.nuisance.is_coarse:
             return values
         outputs, change = self.outputs(points, values, signals), np.zeros_like(values)
@@ -262,11 +262,11 @@ def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
              information_of_covariance: np.ndarray | None = None, n_linear: int = 0) -> Local:
     """Combine whitened columns into the likelihood and its derivatives at parameters [M, Q].
 
-    `white`, complex128 [M, C, n], are the whitened `NuisancePrior.columns`. Without the last Q,
-    the gradient uses derivatives of the mean, and predicts at most a decrease of the energy to 0.
+    `white`, complex128 [M, C, n], contains the whitened `NuisancePrior.columns`. If the last Q are
+    absent, the gradient uses derivatives of the mean, and never predicts an energy below 0.
     `information_of_covariance`, float64 [Q, Q], is the information of the covariance about the
-    parameters; by default, the average covariance is used. `n_linear` is the number of further
-    standard normal parameters in which the mean is linear; they are integrated out.
+    parameters, by default that of the average covariance. `n_linear` is the number of further
+    standard normal parameters, in which the mean is linear; they are integrated out.
     """
     n, end = 3 + len(prior), 4 + len(prior) + n_linear
     expected, observed = np.ascontiguousarray(white[:, 1:end]), white[:, end:]
@@ -313,8 +313,8 @@ class DispersedLikelihood:
     """The likelihood with the covariance of element errors at each position.
 
     Errors of the direct path are stronger for near users. A surface has a whole number k of failed
-    elements, and their covariance is k / E[k] times the average. The likelihood is averaged over
-    k, and its value is relative to `Likelihood`.
+    elements, and the covariance of their errors is k / E[k] times the average. The likelihood is
+    averaged over k, and its value is relative to `Likelihood`.
     """
 
     def __init__(self, likelihood: Likelihood) -> None:
@@ -337,7 +337,7 @@ class DispersedLikelihood:
 
     @classmethod
     def of(cls, likelihood: Likelihood) -> 'DispersedLikelihood | None':
-        """Return the likelihood for a model, or None if errors are absent or negligible."""
+        """Return this likelihood for a model, or None if element errors are negligible."""
         model = likelihood.model
         if model.elements.is_exact:
             return None
@@ -350,7 +350,7 @@ class DispersedLikelihood:
         return cls(likelihood)
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate points; see `Conditional.local`."""
+        """Evaluate the likelihood at points; see `Conditional.local`."""
         prior, states = self._base.nuisance, []
         columns = prior.columns(values, signals.received, *self._means(points))
         for roots, offset, information in zip(
@@ -361,9 +361,9 @@ class DispersedLikelihood:
         return _average_of(states)
 
     def _roots_at(self, points: np.ndarray) -> list[np.ndarray]:
-        """Return Cholesky factors at points for each number of failures."""
+        """Return Cholesky factors of the covariance at points for each number of failures."""
         # Numerical integration evaluates many parameters at the same points. Another thread may
-        # replace the attribute at any time.
+        # replace `_latest` at any time.
         latest = self._latest
         if latest is None or points is not latest[0]:
             positions = to_positions(points)
@@ -376,7 +376,7 @@ class DispersedLikelihood:
 
 
 def _average_of(states: list[Local]) -> Local:
-    """Average likelihoods; the residual is that of the most probable state."""
+    """Average the likelihoods of states; take the residual from the most probable state."""
     value = np.stack([one.value for one in states])
     weights, log_total = mixture_weights(value, axis=0)
     residual = np.stack([one.residual for one in states])
@@ -388,7 +388,7 @@ def _average_of(states: list[Local]) -> Local:
 
 
 def _failure_counts(n_elements: int, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return numbers of failures relative to the mean, and the logs of their probabilities."""
+    """Return numbers of failures divided by the mean, and the logs of their probabilities."""
     if share == 0:
         return np.zeros(1), np.zeros(1)
     from scipy.stats import binom
@@ -403,7 +403,7 @@ def _failure_counts(n_elements: int, share: float) -> tuple[np.ndarray, np.ndarr
 
 
 def _in_phase(outputs: np.ndarray, std: float) -> np.ndarray:
-    """Return the real part of outputs after the likeliest rotation, less half its prior cost."""
+    """Return the real parts after the most likely rotation, less half its cost in the prior."""
     if std == 0:
         return outputs.real
     magnitude: np.ndarray = np.abs(outputs)
@@ -419,7 +419,7 @@ class Alignment:
 
     Offsets of carrier and timing move the multipath out of the nulls of its covariance, so they
     must be known before the search. `spread`, from `tabulate`, is the covariance of the mean
-    signals over the region. It represents the unknown position.
+    signals over the region, and accounts for the unknown position.
     """
 
     def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:

@@ -1,9 +1,9 @@
 """The paper's estimator: a network with one hidden layer, its file, its use and its training.
 
 The paper mentions "256 nodes" in its description of Fig. 4; they are taken to be the units of the
-hidden layer. The paper does not specify the rest. This implementation uses the real and imaginary
-parts of the signals, or their magnitudes, as inputs, the ReLU activation, the squared position
-error as the loss, and Adam with a learning rate of 10^-3. The 10^5 simulated pairs are split
+hidden layer. The paper does not specify the rest. Here, the inputs are the real and imaginary
+parts of the signals, or their magnitudes. The activation is ReLU, the loss is the squared position
+error, and the optimiser is Adam with a learning rate of 10^-3. The 10^5 simulated pairs are split
 7 : 1.5 : 1.5 for training, validation and test. If the validation error has not decreased for
 some epochs, the batch size grows, which reduces the noise of the steps. Training stops after the
 largest batches, and the weights of the best epoch are used.
@@ -37,7 +37,7 @@ _BATCH_SIZES = (128, 1024, 8192)
 _LEARNING_RATE = 1e-3
 # Epochs without improvement before the batch size grows.
 _PATIENCE_EPOCHS = 4
-# Percentage of the pairs before the validation set, and before the test set.
+# Percentages of the pairs at which the validation set and the test set begin.
 _VALIDATION_PERCENT, _TEST_PERCENT = 70, 85
 _FORMAT = 1
 # Arrays of a network with D inputs and H hidden units.
@@ -101,7 +101,7 @@ class Network:
         return hidden @ self.w_out + self.b_out + self.center
 
     def save(self, path: str | Path) -> None:
-        """Write an ``.npz`` file; if this raises `OSError`, an existing file is kept."""
+        """Write an ``.npz`` file, or raise `OSError` and keep an existing file."""
         write_archive(path, {key: getattr(self, name) for name, key in _KEYS.items()},
                       {'format': _FORMAT, 'inputs': self.inputs, **self.about})
 
@@ -120,10 +120,10 @@ class Network:
 class NeuralEstimator:
     """Positions from a trained network, all with the covariance of the validation residuals.
 
-    The network cannot test whether signals fit its position. Only signals weaker than noise, or
-    stronger than any position could explain, give no position. Raises CodebookError if the
-    codebook does not fit the scenario, and ModelError if the model cannot be read or was trained
-    for another codebook or scenario.
+    The network cannot test whether signals fit the position it computes. It rejects only signals
+    that are weaker than noise, or stronger than any position could explain. Raises CodebookError
+    if the codebook does not fit the scenario, and ModelError if the model cannot be read or was
+    trained for another codebook or scenario.
     """
 
     name = 'neural'
@@ -235,7 +235,7 @@ def train(
 def _fit(
         regressor: Any, inputs: np.ndarray, targets: np.ndarray, max_epochs: int,
         after_epoch: Callable[[int], float]) -> tuple[int, float]:
-    """Train for at most `max_epochs` epochs, and keep the best weights; return epoch and error."""
+    """Train up to `max_epochs` epochs; keep the best weights, return their epoch and error."""
     best_weights: tuple[list[np.ndarray], list[np.ndarray]] = [], []
     best_mse, best_epoch, reference_epoch = np.inf, 0, 0
     sizes = [min(size, len(inputs)) for size in _BATCH_SIZES]

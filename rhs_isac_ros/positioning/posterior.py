@@ -1,10 +1,10 @@
 """The posterior of a position: weighted samples of its modes, in the region of interest.
 
-A mode is a Gaussian, and its samples inside the region have equal weights, unless the phases of
-the bands are unknown. Then only delays, amplitudes and the curvature of the wavefront determine
-the range. A mode extends over metres, across which the log-likelihood is not quadratic and the
-volume element changes. The samples then serve as a proposal: each is weighted by the posterior
-relative to the mixture of all Gaussians, so modes may overlap.
+A mode is usually Gaussian, and its samples inside the region have equal weights. If the phases of
+the bands are unknown, only delays, amplitudes and the curvature of the wavefront determine the
+range. A mode then extends over metres, across which the log-likelihood is not quadratic and the
+volume element changes. Its samples become a proposal: each is weighted by the posterior relative
+to the mixture of all Gaussians, so modes may overlap.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ _LIKELY_MARGIN = 20.0
 # the average over the range nearly removes this phase.
 _SPACING = 1.5
 _N_COMMON = 8
-# Standard deviation above which a wrapped phase is uniform. Below it, wraps by one turn suffice.
+# Standard deviation of a nearly uniform wrapped phase. Below it, wraps by one turn suffice.
 _MAX_STD_RAD = 3.0
 
 
@@ -61,7 +61,7 @@ class Samples(NamedTuple):
 def draw_samples(modes: Modes, normal: np.ndarray, bounds: np.ndarray) -> Samples:
     """Represent the modes by samples, for a uniform prior between the bounds [2, 3] of the region.
 
-    `normal`, float64 [S, 3], are points that represent a standard Gaussian.
+    `normal`, float64 [S, 3], contains points that represent a standard Gaussian.
     """
     points, curvature, roi_offset = modes.points, modes.curvature, modes.roi_offset
     starts = first_of_each(modes.phases)
@@ -118,7 +118,7 @@ class WeightedSamples(NamedTuple):
         return self.sums(shares * values)
 
     def sums(self, values: np.ndarray) -> np.ndarray:
-        """Add values of the modes, float64 [M, ...], for each phase, [N, ...]."""
+        """Add up values of the modes, float64 [M, ...], for each phase, [N, ...]."""
         return np.add.reduceat(values, self.starts)
 
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
@@ -135,7 +135,7 @@ def draw_broad_samples(
         signals: Signals, modes: Modes, normal: np.ndarray) -> Samples:
     """Represent the modes of one phase by samples with the weights of the posterior.
 
-    `conditionals` are the likelihoods of the states of the surface.
+    `conditionals` contains the likelihood for each state of the surface.
     """
     bounds = likelihood.resolution.bounds_m
     samples = draw_samples(modes, _SPREAD * normal, bounds)
@@ -182,14 +182,14 @@ class BandPhases:
     Compared with uniform phases, the likelihood of a position has one more factor per band: the
     density of the phase of the matched filter's output, which is a wrapped normal distribution
     broadened by noise. Along the range, the product of these factors oscillates with the carriers,
-    far faster than the rest of the posterior. It is averaged over one wavelength around each
-    sample.
+    far faster than the rest of the posterior. The product is therefore averaged over one
+    wavelength around each sample.
     """
 
     def __init__(self, likelihood: Likelihood) -> None:
         prior = likelihood.nuisance
         self._std = prior.relative_phase_std_rad
-        # Whether the search has left out information; otherwise, there are no factors.
+        # Whether the search has ignored this information; if not, there are no factors.
         self.is_informative = prior.is_coarse and self._std <= UNIFORM_STD_RAD
         if not self.is_informative:
             return
@@ -203,10 +203,10 @@ class BandPhases:
         self._common, self._log_weights = _common_phase(np.sqrt(shared))
 
     def factors(self, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Multiply the factors at P positions, and average over a wavelength of range.
+        """Multiply the bands' factors at P positions, and average over one wavelength of range.
 
-        `outputs`, [N_B, P], come from the matched filters. Returns the logarithm of the result,
-        and the mean offset in range [m], [P].
+        `outputs`, [N_B, P], are the outputs of the matched filters. Returns the logarithm of the
+        average, and the mean offset in range [m], [P] each.
         """
         all_turns = self._wavenumbers[:, None, None] * self._ranges_m[:, None] + self._common
         log_factor = np.zeros((outputs.shape[1], *all_turns.shape[1:]))
@@ -218,7 +218,7 @@ class BandPhases:
         return log_total, weights.sum(axis=2) @ self._ranges_m
 
     def _broadened(self, magnitude: np.ndarray) -> np.ndarray:
-        """Return the standard deviation of the phase of outputs of these magnitudes."""
+        """Return the standard deviation of the phase of noisy outputs with these magnitudes."""
         # Noise gives the phase a von Mises density, which is approximated by the wrapped normal
         # density with the same first harmonic.
         from scipy.special import i0e, i1e

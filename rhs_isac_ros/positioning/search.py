@@ -1,8 +1,8 @@
 """The modes of the posterior: found on the grid, refined by Gauss-Newton steps.
 
-Steps maximise over position and nuisance parameters together. Around a mode, the posterior is
-treated as Gaussian (Laplace's method): the marginal of the position has the Schur complement of
-the information, and the mass of the mode contains the determinant of the parameters' information.
+Each step moves the position and the nuisance parameters together. Around a mode, the posterior is
+treated as Gaussian (Laplace's method). The information about the position is then a Schur
+complement, and the mass of the mode contains the determinant of the parameters' information.
 """
 
 from collections.abc import Callable
@@ -22,8 +22,8 @@ from rhs_isac_ros.positioning.grid import (
 )
 from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Local, Signals
 
-# Negative logarithms of the share of the posterior that modes may leave out: on the grid, which is
-# accurate to one Gauss-Newton step, and after exact steps.
+# Negative logarithms of the share of the posterior that discarded modes may have: on the grid,
+# which is accurate to one Gauss-Newton step, and after exact steps.
 GRID_MARGIN = 8.0
 EXACT_MARGIN = 7.0
 # A mode has converged when its last step gained less log-likelihood than this.
@@ -77,9 +77,9 @@ def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
     """Find the modes with a substantial weight in the posterior of each of N phases.
 
     Each phase has at least one mode, and the most likely mode comes first. `aligned`, float64
-    [N, Q], are the parameters that follow from the signals alone; the others are 0. `extra_margin`
-    admits modes that are less likely than usual. With `draw`, phases may have no modes, as
-    `TemplateTable.starts` describes; the result is None if no phase has any.
+    [N, Q], contains the parameters that follow from the signals alone, and 0 for the others.
+    `extra_margin` admits modes that are less likely than usual. With `draw`, phases may have no
+    modes, as `TemplateTable.starts` describes; the result is None if no phase has any.
     """
     starts = grid.starts(likelihood.whitened(aligned, signals), likelihood.nuisance,
                          GRID_MARGIN + extra_margin, draw)
@@ -93,8 +93,8 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
            n_steps: int, margin: float = EXACT_MARGIN, state: int = 0) -> Modes:
     """Take Gauss-Newton steps from points to the modes of the posterior.
 
-    `conditional` is the likelihood for the state of the surface with the number `state`. Modes
-    that are less likely than the best of their phase, by more than the margin, are dropped.
+    `conditional` is the likelihood for the state of the surface with the number `state`. A mode is
+    dropped if it is less likely than the best mode of its phase by more than the margin.
     """
     def step(starts: Starts, moves: bool = True) -> tuple[Modes, np.ndarray]:
         return _step(conditional, likelihood, starts, select(signals, starts.phases), state,
@@ -137,7 +137,7 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
 
 def _step(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
           state: int, moves: bool = True) -> tuple[Modes, np.ndarray]:
-    """Take one scoring step, or none without `moves`; also return the gain in likelihood, [M]."""
+    """Take a scoring step, or none without `moves`; also return the log-likelihood gains, [M]."""
     points = starts.points
     values = likelihood.settle(points, starts.values, signals)
     local = conditional.local(points, values, signals)
@@ -163,7 +163,7 @@ def predict(local: Local, likelihood: Likelihood) -> np.ndarray:
 
 
 def _newton(local: Local, likelihood: Likelihood) -> tuple[Marginal, np.ndarray, np.ndarray]:
-    """Return the marginal, the limited step of all unknowns [M, 3 + Q], and its rise [M]."""
+    """Return the marginal, the limited step [M, 3 + Q], and the log-likelihood that it gains."""
     marginal = marginalise(local.information, local.gradient)
     limits = likelihood.resolution.step_limits(likelihood.nuisance.is_coarse)
     whole = np.clip(
@@ -178,7 +178,7 @@ def _newton(local: Local, likelihood: Likelihood) -> tuple[Marginal, np.ndarray,
 def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float) -> np.ndarray:
     """Return indices of the probable, separate modes of each phase, the most likely first."""
     # The likelihood of a mode is a prediction, and may be arbitrarily wrong before convergence.
-    # Before the last step, it is known; the highest known likelihood therefore limits the best.
+    # The likelihood before the last step is known, and its maximum limits the best prediction.
     value = modes.roi_log_likelihood + np.maximum(gain, 0)
     order = np.lexsort((-modes.roi_log_likelihood, modes.phases))
     phases = modes.phases[order]

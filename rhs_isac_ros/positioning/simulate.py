@@ -7,8 +7,8 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.threads import map_blocks
 
-# Pairs that share a random generator and all matrix products. Another size would change the pairs
-# of every seed.
+# Number of pairs that share a random generator and all matrix products. Another number would
+# change the pairs of every seed.
 _CHUNK = 512
 
 

@@ -33,8 +33,8 @@ def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = 
     """Load the table of a model from a folder, or compute it and store it there.
 
     The result contains the arrays of `tabulate` and `tabulate_outside`. If they come from a
-    folder, they are read-only and mapped into memory. Without a folder, the table is kept only in
-    memory; if the folder cannot be written, the table is kept there with a `RuntimeWarning`.
+    folder, they are read-only and mapped into memory. Without a folder, or with a `RuntimeWarning`
+    if the folder cannot be written, the table is kept only in memory. During the computation,
     `progress` is called with the completed share.
     """
     if folder is None:
@@ -69,7 +69,7 @@ def table_key(model: MeasurementModel, codebook_id: str) -> str:
 
 def _write(path: Path, key: str, table: Mapping[str, np.ndarray]) -> None:
     """Write a table atomically, and delete the least recently used tables."""
-    # The file has one record: key and digest, then the arrays. Wide numbers come first, so that
+    # The file has one record: key, digest and arrays. Arrays of wide numbers come first, so that
     # all arrays are aligned.
     names = sorted(table, key=lambda name: -table[name].real.itemsize)
     dtype = np.dtype([('key', 'S32'), ('digest', 'S32')]
@@ -89,7 +89,7 @@ def _write(path: Path, key: str, table: Mapping[str, np.ndarray]) -> None:
 
 
 def _read(path: Path, key: str) -> Mapping[str, np.ndarray] | None:
-    """Map a table into memory; None if the file is missing, damaged or of another key."""
+    """Map a table into memory; return None if the file is missing, damaged or has another key."""
     try:
         record = np.load(path, mmap_mode='r', allow_pickle=False)
         names = record.dtype.names or ()

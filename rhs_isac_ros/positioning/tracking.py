@@ -1,9 +1,9 @@
 """The track of a user over successive positioning phases.
 
-The signals of a phase often fit several positions, 0.6 m apart in range with Table I. The tracker
-keeps all of them, as a mixture of Gaussians over position and velocity, until the movement over
-several phases decides between them. Velocities are assumed to drift at random, with sudden turns.
-Coordinates are described in `coordinates`.
+With Table I, the signals of a phase often fit several positions, 0.6 m apart in range. The tracker
+keeps all these positions, as a mixture of Gaussians over position and velocity, until the movement
+over several phases decides between them. Velocities are assumed to drift at random, with sudden
+turns. The module `coordinates` describes the coordinates.
 """
 
 import dataclasses
@@ -43,8 +43,8 @@ MAX_GAP_S = 10.0
 _LOSS_RATE_HZ = 1e-3
 # Smallest share of a component inside the region.
 _MIN_INSIDE = 0.02
-# Phases with a smaller share of new information do not update the track: if the likelihood is
-# raised to a small power, its modes overlap, and their sum no longer equals it.
+# Phases with a smaller share of new information do not update the track. The share is an exponent
+# of the likelihood; with a small one, modes overlap, and the likelihood is no longer their sum.
 _MIN_SHARE = 0.25
 # Components with a smaller weight do not contribute to the estimate.
 _MIN_LOG_WEIGHT = -9.0
@@ -57,8 +57,8 @@ _PAIR_MARGIN = 18.0
 _N_EXACT = 16
 # Squared Mahalanobis distance below which two updates of a component are the same maximum.
 _SAME_MAXIMUM = 1.0
-# Log-likelihood of a mode that the search has missed, relative to the best mode: the search finds
-# all modes above it.
+# Log-likelihood of a mode that the search has missed, relative to the best mode. The search finds
+# all modes above this value.
 _FLOOR = -EXACT_MARGIN
 # Bounds of the intervals, as shares of the time between two phases, for which turns are modelled
 # separately. A single interval would make the position after an early turn too unlikely, because
@@ -136,7 +136,7 @@ def _merge(mixture: Mixture, group: np.ndarray, n_groups: int) -> Mixture:
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """A random velocity, the same in all directions, with sudden turns.
+    """A random velocity with sudden turns; its distribution is the same in all directions.
 
     Between turns, the velocity is an Ornstein-Uhlenbeck process: over times much shorter than
     `memory_s`, it is constant up to noise. At a turn, which may also be a stop or a start, it is
@@ -216,7 +216,7 @@ class Motion:
 
 
 def _moved(mixture: Mixture, reach_s: float, decay: float, noise: np.ndarray) -> Mixture:
-    """Move by `reach_s` times the velocities, scale these by `decay`, and add noise [2, 2]."""
+    """Move by `reach_s` times the velocity, scale velocities by `decay`, and add noise [2, 2]."""
     points = mixture.means[:, :3]
     velocities = np.matmul(jacobian(points), mixture.means[:, 3:, None])
     positions = to_positions(points) + reach_s * velocities[..., 0]
@@ -258,7 +258,7 @@ class Tracker:
     prediction. Positions are inside the region of interest.
 
     The attribute `estimator` may be replaced between phases, for example for another codebook. The
-    estimates contain this estimator's probabilities that the user is outside or blocked.
+    probabilities that the user is outside or blocked come from this estimator.
     """
 
     def __init__(self, estimator: SearchEstimator, motion: Motion | None = None) -> None:
@@ -270,11 +270,11 @@ class Tracker:
 
     @one_blas_thread
     def update(self, time_s: float, received: np.ndarray) -> TrackEstimate:
-        """Estimate position and velocity at the time [s] of a phase, from this and earlier ones.
+        """Estimate position and velocity at the time [s] of a phase, also from earlier phases.
 
         Takes signals, complex128 [N_B, N_SB F]; raises `SignalError` if they are unusable. If the
-        phase is not later than the last one, its position follows from its signals alone, and the
-        track does not change.
+        phase is not later than the previous one, its position follows from its own signals alone,
+        and the track does not change.
         """
         posterior = self.estimator.posterior(received)
         if posterior.modes is None:
@@ -332,8 +332,8 @@ class Tracker:
         blocked, outside = np.nan_to_num([
             estimate.blocked_probability, estimate.outside_probability])
         if blocked:
-            # Signals without a direct path contain no information. The probability is relative to
-            # that of a user anywhere in the region.
+            # Signals without a direct path contain no information. The odds are relative to a user
+            # anywhere in the region.
             odds = share * np.log(blocked / max(1 - blocked - outside, 1e-12))
             weight = np.logaddexp.reduce(lost.log_weights) + odds
             parts.append(predicted.weighted(weight))
@@ -388,10 +388,10 @@ def update(
         signals: Signals) -> Mixture:
     """Return the product of a predicted mixture and the likelihood of a phase, not normalised.
 
-    Every mode updates every component. Each component also remains without an update, in case the
+    Every mode updates every component. Each component is also kept without an update, in case the
     search has missed an unlikely mode inside it that is as wide as the best one. `share`, from 0
-    to 1, is the exponent of the likelihood; it is below 1 if the multipath resembles that of the
-    previous phase. The heaviest pairs are evaluated with `likelihood`, unless it is None.
+    to 1, is the exponent of the likelihood; it is below 1 if the multipath resembles the previous
+    phase's. The heaviest pairs of mode and component are evaluated with `likelihood`, if given.
     """
     spread = np.linalg.inv(modes.curvature) / share
     offsets = modes.points[:, None] - predicted.means[:, :3]
@@ -404,7 +404,7 @@ def update(
     updated = _shifted(select(predicted, component)._replace(log_weights=flat[order]),
                        precision[mode, component], offsets[mode, component])
     if likelihood is not None:
-        # The pairs are in the order of their weights.
+        # The heaviest pairs come first.
         head = np.arange(min(_N_EXACT, len(order)))
         exact = _exact_update(
             select(predicted, component[head]), updated.means[head, :3], share, likelihood,
@@ -420,7 +420,7 @@ def update(
 def _exact_update(
         predicted: Mixture, points: np.ndarray, share: float, likelihood: Likelihood,
         signals: Signals) -> Mixture:
-    """Update each component with the likelihood expanded at a point (r, u, v), [C, 3]."""
+    """Update each component with the likelihood expanded at its own point (r, u, v), [C, 3]."""
     value, gradient, curvature, _ = likelihood.local(
         points, np.zeros((len(points), 0)), signals)
     step = step_to_maximum(curvature, gradient)
@@ -447,7 +447,7 @@ def _is_first(updated: Mixture, component: np.ndarray) -> np.ndarray:
 def _evidence(
         offsets: np.ndarray, predicted: np.ndarray, spread: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Integrate a Gaussian density [...] times a Gaussian with the maximum 1.
+    """Integrate the product of a Gaussian density and a Gaussian with the maximum 1.
 
     Takes the differences of the means, float64 [..., 3], and both covariances. Returns the
     logarithm, float64 [...], and the precision of the offset, float64 [..., 3, 3].
