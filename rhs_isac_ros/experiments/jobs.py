@@ -38,7 +38,7 @@ class Job:
 
 
 class JobResult(NamedTuple):
-    """The result of a job as JSON in `text`, or its error; and the package version that ran it."""
+    """The result of a job as JSON in `text`, or its error, with the package version used."""
 
     job: Job
     text: str = ''
@@ -88,8 +88,8 @@ def run_locally(
 ) -> Generator[JobResult, None, None]:
     """Run jobs in single-threaded processes on this machine; yield each result when it is ready.
 
-    There are `n_jobs` processes: -1 means one per core; 1 runs all jobs in this process. Closing
-    the generator ends the processes. Before joblib 1.4, results are in the order of the jobs.
+    If `n_jobs` is -1, there is one process per core; if it is 1, all jobs run in this process.
+    Closing the generator ends the processes. Before joblib 1.4, results have the jobs' order.
     """
     with optional_import('running jobs', extra='experiments'):
         import joblib
@@ -114,7 +114,7 @@ def run_locally(
                 # Joblib warns about lost jobs, which are abandoned deliberately here.
                 warnings.simplefilter('ignore', UserWarning)
                 results.close()
-            # If the interpreter ended while a thread of the pool releases a semaphore, the
+            # If the interpreter ended while a thread of the pool was releasing a semaphore, the
             # resource tracker of joblib would report a leak.
             for thread in set(threading.enumerate()) - threads_before:
                 thread.join(_THREAD_TIMEOUT_S)
@@ -125,9 +125,9 @@ def run_on_cluster(
 ) -> Generator[JobResult, None, None]:
     """Run jobs on the Dask cluster of a scheduler; yield each result when it is ready.
 
-    Closing the generator cancels pending jobs. `distributed` is used directly: through joblib,
-    jobs for a cluster with a single thread run in this process, and the run never ends if a worker
-    dies.
+    Closing the generator cancels pending jobs. This function uses `distributed` directly, because
+    joblib would run the jobs of a cluster with a single thread in this process, and would never
+    return if a worker died.
     """
     with optional_import('running jobs on a Dask cluster', extra='experiments'):
         from distributed import Client, as_completed
@@ -176,7 +176,7 @@ def run_jobs(
     is stored as soon as it is available, in a file in `folder`. After an interruption or an error,
     the same call resumes the experiment. `n_jobs` jobs run in parallel on this machine, by default
     one per core; `dask` is the address of the scheduler of a Dask cluster to use instead. If
-    stderr is a terminal, it shows a progress bar with the label.
+    stderr is a terminal, a progress bar with the label appears there.
 
     Raises JobError if a job fails or its worker has another version of this package,
     ConnectionError if the cluster does not respond, OSError if a result cannot be read or stored,

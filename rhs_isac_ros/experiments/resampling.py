@@ -17,14 +17,14 @@ class Replicates(NamedTuple):
     A member is a repetition, such as another training or another random codebook.
     """
 
-    #: The statistic, then its replicates, which resample cases and members, float64
+    #: The statistic, followed by its replicates, which resample cases and members, float64
     #: [1 + replicates]; NaN where a replicate has no result.
     values: np.ndarray
-    by_member: np.ndarray  #: Likewise, but the replicates resample only the members.
+    by_member: np.ndarray  #: Like `values`, but the replicates resample only members.
     n_members: int
 
     def minus(self, other: 'Replicates') -> 'Replicates':
-        """Return the difference from another statistic of the same results."""
+        """Return this statistic minus another one of the same members and cases."""
         return Replicates(
             self.values - other.values, self.by_member - other.by_member, self.n_members)
 
@@ -47,13 +47,13 @@ class Replicates(NamedTuple):
 
 
 def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -> list[Replicates]:
-    """Return the mean of results, or quantiles, with replicates over cases and members.
+    """Return the mean or quantiles of results, each with replicates over cases and members.
 
     `results` are float64 [members, cases], NaN where a member has no result for a case. Of M
     members, M - 1 are drawn with replacement, which makes the variance of the replicates unbiased
     (Rao and Wu, Resampling inference with complex survey data, 1988). A single member contributes
-    no variance. Use different seeds for different members. Results with the same number of cases
-    share the resampled cases. Quantiles are from 0 to 1; by default, the mean is computed.
+    no variance. Use different seeds for different sets of members. Results with the same number of
+    cases share the resampled cases. `quantiles` are from 0 to 1; if empty, return the mean.
     """
     if results.ndim != 2 or not np.isfinite(results).any():
         raise ValueError(f'results: shape {results.shape}, expected [members, cases] with a '
@@ -109,10 +109,10 @@ def _interval(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
               ) -> tuple[float, float, float]:
     """Return the first value, and the 95 % interval of the other values, its replicates.
 
-    With few members, the percentiles are too close together. They are moved apart by the ratio of
-    the quantiles of Student's t and of the normal distribution, with Satterthwaite's degrees of
-    freedom. Each part contains the replicates due to the members of one sample, and the number of
-    members. The scale is logarithmic if all replicates are positive.
+    With few members, the percentiles are too close to the statistic. Their distances from it are
+    multiplied by the ratio of the quantiles of Student's t and the normal distribution, with
+    Satterthwaite's degrees of freedom. Each part contains the replicates due to the members of one
+    sample, and the number of members. The scale is logarithmic if all replicates are positive.
     """
     with np.errstate(invalid='ignore'):
         if all(np.nanmin(array) > 0 for array in (values, *(part for part, _ in parts))):
@@ -124,7 +124,7 @@ def _interval(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
 
 def _spread(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
             ) -> tuple[float, float, float]:
-    # Division by zero gives infinite ratios, between which percentiles must not interpolate.
+    # Division by zero yields infinite ratios, between which percentiles must not interpolate.
     low, high = np.nanpercentile(values[1:], _INTERVAL, method='inverted_cdf')
     total = np.nanvar(values[1:])**2
     uncertain = sum(np.nanvar(part[1:])**2 / (n - 1) for part, n in parts if n > 1)

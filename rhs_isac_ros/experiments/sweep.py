@@ -53,7 +53,7 @@ _RADIUS = float(chdtri(3, 0.05))
 _MAX_COARSENESS = 3.0
 # Largest relative error of the power without scaling, smaller than that in `Codebook.check`.
 _POWER_TOLERANCE = 1e-9
-# Families of quantities that a job computes. Of the last three, each includes the previous ones.
+# Families of quantities that a job computes. LOSS includes CAPACITY, which includes ERROR.
 CRLB, BOUND, ERROR, CAPACITY, LOSS = 'crlb', 'bound', 'error', 'capacity', 'loss'
 _QUANTITIES = {
     CRLB: ('crlb_m2',), BOUND: ('bound_m2',), ERROR: ('squared_error_m2', 'inside', 'fix'),
@@ -83,10 +83,10 @@ def with_power(codebook: Codebook, power_w: float) -> Codebook:
 
 def design(scenario: Mapping[str, Any], kind: str, seed: int, objective: str = '',
            steps: int = 0) -> dict[str, Any]:
-    """Make a codebook of one of `KINDS`, as a job, and return its parameters.
+    """Run a job: make a codebook of one of `KINDS`, and return its ROS parameters.
 
-    `scenario` has the fields that differ from Table I. `objective` and `steps` apply to an
-    optimisation only.
+    `scenario` contains the fields that differ from Table I. `objective` and `steps` apply only to
+    an optimisation.
     """
     world = Scenario(**scenario)
     if kind == DIRECTIONAL:
@@ -104,7 +104,7 @@ def design(scenario: Mapping[str, Any], kind: str, seed: int, objective: str = '
 
 def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, Any], seed: int,
              first: int, n: int, estimator: str = '') -> dict[str, list[float]]:
-    """Compute a family of quantities at positions `first` to ``first + n``, as a job.
+    """Run a job: compute a family of quantities at `n` positions, beginning with number `first`.
 
     The seed determines the sequence of positions, which is the same for all scenarios with the
     same region. Each list of the result has one value per position.
@@ -151,7 +151,7 @@ def _estimator(name: str, scenario: str, codebook: str) -> Estimator:
 
 
 def _initialise_sobol() -> None:
-    """Create a Sobol sequence, because SciPy reads its table at first use without a lock."""
+    """Create a Sobol sequence, because SciPy loads a table at its first use without a lock."""
     with _FIRST_SOBOL:
         qmc.Sobol(1)
 
@@ -190,7 +190,7 @@ class Sweep:
     base: Scenario  #: Scenario with the values that are not varied.
     settings: Sequence[Setting]  #: Result of `settings_of`.
     measures: Sequence[str]  #: Keys of `MEASURES`.
-    n_positions: int = 2000  #: Per setting; settings with the same region have the same positions.
+    n_positions: int = 2000  #: Per setting; region and seed determine the positions.
     seed: int = 0  #: Seed of positions, signals and codebooks.
     objective: str = 'ambiguity'  #: Objective of an optimisation.
     steps: int = 300  #: Maximum number of steps of an optimisation.
@@ -232,7 +232,7 @@ class Sweep:
         return dataclasses.replace(self.base, **taken)
 
     def designs(self, setting: Setting) -> list[Job]:
-        """Return the jobs that make the codebooks of a setting; none if the codebook is a file."""
+        """Return the jobs that make a setting's codebooks; none if the codebook is a file."""
         if setting.codebook not in KINDS:
             return []
         arguments: dict[str, Any] = {
@@ -254,7 +254,7 @@ class Sweep:
             for first in range(0, self.n_positions, BLOCK)] for family in families(quantities)}
 
     def codebooks(self, setting: Setting, made: Mapping[str, Mapping[str, Any]]) -> list[Codebook]:
-        """Return the codebooks of a setting from the results of their jobs, by name."""
+        """Return the codebooks of a setting; `made` contains the results of jobs by job name."""
         books = [Codebook.from_parameters(dict(made[job.name])) for job in self.designs(setting)]
         return [_fitted(book, setting)
                 for book in books or [self._files[setting.codebook]]]
@@ -262,7 +262,7 @@ class Sweep:
 
 def run_sweep(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = None
               ) -> list[Point]:
-    """Run a sweep by `run_blocks`; return the measures of each setting, with their intervals."""
+    """Run a sweep with `run_blocks`; return the measures of each setting, with their intervals."""
     return [Point(results.setting, name,
                   measured(MEASURES[name], results.quantities[MEASURES[name].quantity]),
                   tuple(codebook.id for codebook in results.codebooks))
@@ -319,7 +319,7 @@ def _fitted(codebook: Codebook, setting: Setting) -> Codebook:
 
 def _stacked(blocks: Sequence[Mapping[str, Sequence[Job]]],
              found: Mapping[str, Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """Return the quantities by name, [codebooks, positions], from the results of blocks."""
+    """Return quantities by name, [codebooks, positions], from the job results in `found`."""
     return {quantity: np.array([
         np.concatenate([found[job.name][quantity] for job in of_codebook[family]])
         for of_codebook in blocks])

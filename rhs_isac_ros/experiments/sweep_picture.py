@@ -1,4 +1,4 @@
-"""The picture of a sweep: a panel for each measure, and intervals at all points."""
+"""The picture of a sweep: panels of measures, with an interval at each point."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -21,8 +21,8 @@ from rhs_isac_ros.support.pictures import (
 
 # Heights of a row of panels, of the legend, and of an additional line of labels.
 _PANEL_IN, _LEGEND_IN, _LINE_IN = 2.2, 0.4, 0.13
-# Largest ratio of positive values on a linear scale, and units to which it applies; values in
-# other units always have a linear scale.
+# Largest ratio of positive values on a linear scale, and units to which this limit applies. Values
+# in other units always have a linear scale.
 _WIDE = 8.0
 _LOGARITHMIC = ('m', 'm²')
 # Up to this ratio, a logarithmic axis has labels within decades.
@@ -48,8 +48,8 @@ def draw(axes: Sequence[Axis], points: Sequence[Point],
          panels: Sequence[Sequence[str]]) -> Any:
     """Draw points, and return the `matplotlib.figure.Figure`.
 
-    The first axis is the x axis of the panels, the second has one line per value, and each
-    combination of the others has a row of panels. `panels` lists the measures of each column.
+    The first axis is the x axis of the panels. The second has one line per value, and each
+    combination of the others' values has a row of panels. `panels` lists the measures by column.
     """
     first, *others = [axis.ordered() for axis in axes]
     lines, rows = others[:1], others[1:]
@@ -110,10 +110,10 @@ def draw_panel(panel: Any, first: Axis, others: Sequence[Axis], points: Sequence
 
 def add_legend(place: Any, panels: Sequence[Any], lines: Sequence[Axis],
                joined: Sequence[Sequence[str]] = ()) -> None:
-    """Draw one legend for all panels, which have the same lines, in the separate axes `place`.
+    """Draw one legend for all panels, which have the same lines, in separate axes, `place`.
 
-    `lines` are the axes that the lines distinguish. `joined` lists the measures of each panel with
-    several measures.
+    `lines` contains the axes of the sweep that the lines distinguish. `joined` lists the measures
+    of each panel with several measures.
     """
     found: dict[str, Any] = {}
     for panel in panels:
@@ -145,7 +145,7 @@ def _text(axis: Axis, value: Any) -> str:
 
 
 def is_geometric(values: Sequence[float]) -> bool:
-    """Return whether the ratios of ascending values vary less than their differences."""
+    """Return whether the ratios between successive values vary less than the differences."""
     if len(values) < 3 or min(values) <= 0:
         return False
     steps, ratios = np.diff(values), np.diff(np.log(values))
@@ -154,7 +154,7 @@ def is_geometric(values: Sequence[float]) -> bool:
 
 
 def _set_scale(panel: Any, values: Sequence[float]) -> None:
-    """Make the x axis logarithmic if the values, apart from a leading zero, are geometric."""
+    """Make the x axis logarithmic if its values, apart from a leading 0, are `is_geometric`."""
     if is_geometric(values):
         panel.set_xscale('log')
     elif values[0] == 0 and is_geometric(values[1:]):
@@ -173,8 +173,8 @@ def _scale(unit: str, values: Sequence[float]) -> tuple[float, str]:
 def _lines(others: Sequence[Axis], points: Sequence[Point], names: Sequence[str]) -> list[_Line]:
     """Return the lines of a panel.
 
-    Values of the other axes differ in colour and marker, measures in line style and fill. With a
-    single measure, the values also differ in line style.
+    The values of `others` differ in colour and marker, and the measures differ in line style and
+    fill. With a single measure, the values also differ in line style.
     """
     keys = list(dict.fromkeys(_key(point, others) for point in points))
     lines = []

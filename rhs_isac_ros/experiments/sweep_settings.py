@@ -16,7 +16,7 @@ from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.scenario import checked
 from rhs_isac_ros.support.threads import one_blas_thread
 
-# Replaces infinity: larger than every finite result; its square root and its half are finite.
+# Finite substitute for infinity, larger than any finite result.
 _INFINITE = 1e300
 
 
@@ -28,7 +28,7 @@ class Measure(NamedTuple):
     unit: str
     quantile: float | None = None  #: From 0 to 1; None for the mean.
     root: bool = False  #: Whether to take the square root of the statistic.
-    share: bool = False  #: Whether the quantity is 0 or 1, and the measure its share in per cent.
+    share: bool = False  #: Whether the quantity is 0 or 1, and the measure is the share of 1 [%].
 
 
 MEASURES: Mapping[str, Measure] = {
@@ -64,9 +64,9 @@ class Interval(NamedTuple):
 def measured(measure: Measure, results: np.ndarray) -> Interval:
     """Return a measure of results, float64 [codebooks, positions], with its interval.
 
-    The interval is a bootstrap over codebooks and positions. A share has Wilson's interval if
-    there is one codebook, or if all results are equal and the bootstrap would have no width. If a
-    result is NaN, the value is NaN; if a mean is infinite, the interval is NaN.
+    The interval comes from a bootstrap over codebooks and positions. A share has Wilson's interval
+    if there is one codebook, or if all results are equal, which would leave the bootstrap no
+    width. If a result is NaN, so are value and ends; if a mean is infinite, only the ends are NaN.
     """
     if np.isnan(results).any():
         return Interval(np.nan, np.nan, np.nan)
@@ -124,7 +124,7 @@ NAMES = (*FIELDS, CODEBOOK, ESTIMATOR)
 class Axis(NamedTuple):
     """Values of a field, or of several fields that vary together, as one tuple per step.
 
-    Pictures show the first field.
+    Pictures are labelled with the first field.
     """
 
     fields: tuple[str, ...]
@@ -158,7 +158,7 @@ class Axis(NamedTuple):
 class Setting(NamedTuple):
     """One combination of values, and the scenario with these values.
 
-    `varied` contains the values by name; `codebook` is a kind or a file.
+    `varied` contains the values by name; `codebook` is a kind of codebook, or a file.
     """
 
     varied: Mapping[str, Any]

@@ -15,7 +15,7 @@ from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import onboard_matrix
 
-# The reciprocals of larger gains are finite.
+# Gains above this limit have finite reciprocals.
 _MIN_GAIN = 1e-300
 
 
@@ -23,8 +23,8 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
     """Divide power [W] among channels so that the sum of log(1 + gain * share) is highest.
 
     The gains are relative to noise, float64 [..., N] [1/W]; each row is a separate problem. The
-    shares, float64 [..., N] [W], are not negative and add up to `power_w` in each row. The shares
-    in a row without a positive gain are equal.
+    shares, float64 [..., N] [W], are not negative and add up to `power_w` in each row. If no gain
+    in a row is positive, its shares are equal.
     """
     n = gains.shape[-1]
     if n == 1:
@@ -86,7 +86,7 @@ class BandLink:
                    scenario.noise_power_w, scenario.max_power_w, fixed)
 
     def at_subbands(self, subbands: np.ndarray) -> 'BandLink':
-        """Return the links in some sub-bands, with their share of the power."""
+        """Return the links in a subset of the sub-bands, with their share of the power."""
         share = len(subbands) / self.los.shape[-2]
         return dataclasses.replace(
             self, onboard=self.onboard[..., subbands, :, :], los=self.los[..., subbands, :],
@@ -95,8 +95,8 @@ class BandLink:
     def best_digital(self, analog: np.ndarray) -> np.ndarray:
         """Return the best digital part for configurations, complex128 [..., N_SB, K] [sqrt(W)].
 
-        It consists of principal eigenvectors of the channels' correlation matrices at the feeds,
-        with the power divided by water-filling.
+        For each sub-band, it is the principal eigenvector of the channels' correlation matrix at
+        the feeds. Water-filling divides the power.
         """
         gains, directions = np.linalg.eigh(self.correlations(*self.feeds(analog)))
         power = water_filling(gains[..., -1] / self.noise_power_w, self.power_w)
@@ -154,7 +154,7 @@ def representative_subbands(
         scenario: Scenario, max_drift_rad: float, max_count: int) -> np.ndarray:
     """Return indices of evenly spread sub-bands, at most `max_count`.
 
-    Unless `max_count` is too small, the phases of the elements drift apart by at most
+    Unless `max_count` is too small for this, the phases of the elements drift apart by at most
     `max_drift_rad` from one of these sub-bands to the next.
     """
     elements, feeds = element_positions(scenario), feed_positions(scenario)

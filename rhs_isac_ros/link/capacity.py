@@ -54,9 +54,9 @@ def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray)
 @one_blas_thread
 def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray,
                     blocked: np.ndarray | None = None) -> np.ndarray:
-    """Compute the capacity over the paths of a channel file; without a file, `capacity`.
+    """Compute the capacity over the paths of the scenario's channel file.
 
-    With a channel file, `blocked`, bool [N], marks the users without a direct path.
+    `blocked`, bool [N], marks users without a direct path. Without a file, return `capacity`.
     """
     if not scenario.channel:
         return capacity(scenario, beam, positions)
@@ -88,9 +88,9 @@ def posterior_points(
     The quadrature is a product of Gauss-Hermite rules along the principal axes of the covariance,
     exact for polynomials up to the fifth degree in each axis. An axis without variance has one
     node. All weights are positive, so an average of capacities lies between the smallest and the
-    largest of them. Nodes closer to the surface than both the region of interest and the mean are
-    moved out to the closer of the two. Otherwise, a tail of the Gaussian at or behind the surface
-    would contribute impossible capacities.
+    largest of them. A node may be closer to the surface than both the region of interest and the
+    mean. It is then moved out to the closer of the two, because a tail of the Gaussian at or
+    behind the surface would contribute impossible capacities.
 
     Only the symmetric part of the covariance is used; negative variances count as 0. Returns
     positions, float64 [n, 3] [m], and weights with the sum 1, float64 [n]. Raises ValueError if
@@ -110,7 +110,7 @@ def posterior_points(
 
 @functools.lru_cache(maxsize=8)
 def _standard_rule(varies: tuple[bool, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nodes [n, 3] and weights [n] for a Gaussian of unit variance along some axes."""
+    """Return nodes [n, 3] and weights [n] for a Gaussian with unit variance along some axes."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(_N_NODES)
     weights = weights / weights.sum()
     rule = list(zip(nodes, weights, strict=True))
@@ -130,7 +130,7 @@ def _radiation(scenario: Scenario, beam: Beam) -> np.ndarray:
 
 
 def _rate(scenario: Scenario, power_w: np.ndarray) -> np.ndarray:
-    """Sum the rates [bit/s] over sub-bands, the last axis of the received power [W]."""
+    """Sum rates [bit/s] over sub-bands, which are the last axis of the received power [W]."""
     snr = power_w / scenario.noise_power_w
     return scenario.subband_width_hz * np.log2(1 + snr).sum(axis=-1)
 

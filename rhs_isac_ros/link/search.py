@@ -1,4 +1,4 @@
-"""Search for configurations from which an ascent starts, in all bands at once."""
+"""Search for configurations from which the ascent of `steering` starts, in all bands at once."""
 
 import functools
 from typing import NamedTuple
@@ -11,13 +11,13 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
 
-# Largest share of the multipath power that modes may omit, and largest number of modes. The later
-# ascent includes all of the power.
+# Largest share of the multipath power that the modes may omit, and largest number of modes. The
+# ascent that follows includes all of the power.
 _MAX_OMITTED, _MAX_MODES = 0.02, 256
 # Relative accuracy of the powers of the modes.
 _MODE_TOLERANCE = 1e-3
-# If the phases of sub-bands drift apart by more than this over the surface, the sub-bands are
-# searched separately, up to a limited number.
+# If the phases of sub-bands drift apart by more than this over the surface, the search treats the
+# sub-bands separately, up to this number of them.
 _MAX_DRIFT_RAD = 1.0
 _MAX_SUBBANDS = 16
 # Number of random starts, and number that remains after the first step.
@@ -32,7 +32,7 @@ _N_KEPT = 12
 # Number of configurations for the multipath alone, and of steps that lead to them.
 _N_SCATTERED = 8
 _N_SCATTERED_STEPS = 8
-# Configurations whose capacities differ by a smaller share count as one.
+# Configurations whose capacities differ by a smaller share than this count as one.
 _MIN_DIFFERENCE = 1e-6
 # Limits of the amplitudes relative to the noise.
 _AMPLITUDES = (1e-3, 1e4)
@@ -57,16 +57,16 @@ class Tables(NamedTuple):
 
 def candidate_configurations(
         tables: Tables, link: BandLink, index: int | slice | list[int], n: int) -> np.ndarray:
-    """Find configurations of high capacity, float64 [N_B, n, N_E], each entry 0 or 1.
+    """Find n configurations of high capacity per band, float64 [N_B, n, N_E] of zeros and ones.
 
     By the holographic principle, a configuration enables the elements at which a wave on the
     board, s B, is in phase with a wave in the air, G w. The waves in the air are the line of sight
     and the modes of the multipath, the columns of G. The search improves waves and configuration
     in turn: the best pair of waves for a configuration belongs to the largest singular value of
     B diag(c) G. It begins with fixed waves on the board, spread over all directions, and at first
-    includes only the line of sight, for which the best wave on the board is known. The best of
-    these configurations, those for the multipath alone, and the matched filter are then improved
-    with the strongest modes, and the best results with all modes.
+    includes only the line of sight, for which the best wave on the board is known. It then adds
+    configurations for the multipath alone and the matched filter to the best of these. All are
+    improved with the strongest modes, and the best results with all modes.
 
     `index` selects the bands of the link from the tables. The configurations of a band are in no
     particular order, and some may be equal.
@@ -129,7 +129,7 @@ def _modes(scenario: Scenario) -> np.ndarray:
 
 
 def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest eigenvalues with eigenvectors, in the order of `numpy.linalg.eigh`."""
+    """Return the largest eigenvalues, in ascending order, and their eigenvectors."""
     from scipy.sparse.linalg import LinearOperator, eigsh
 
     pairs = []

@@ -1,4 +1,4 @@
-"""Steering: the beam of the highest capacity at a position, and the choice of its band."""
+"""Steering: the beam with the highest capacity at a position, and the choice of its band."""
 
 import dataclasses
 import math
@@ -26,19 +26,19 @@ _MIN_GAIN = 1e-9
 
 
 def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Increase the capacity of configurations until no step increases it.
+    """Improve configurations until no step increases their capacity.
 
     Each round finds the best digital part, and then a better configuration for it. The received
     power is convex in the configuration, so it lies above its linear model at any point. The
     vertex of the box [0, 1]^N_E in the direction of the gradient therefore receives more power,
     unless the point is that vertex. The capacity usually, but not always, increases with the
-    power. If the vertex does not increase the capacity, the round moves a single element, the one
-    that increases the capacity most, to an end of its range. The capacity never falls below its
+    power. If the vertex does not increase the capacity, the round moves a single element to an end
+    of its range: the element that increases the capacity most. The capacity never falls below its
     value at the start.
 
-    Takes links of several bands, and starts, float64 [N_B, n, N_E], each entry in [0, 1]. Returns
-    configurations of the same shape and range, and their capacities [nat/symbol] summed over the
-    sub-bands, float64 [N_B, n].
+    Takes links of several bands, and initial configurations `analog`, float64 [N_B, n, N_E], with
+    entries in [0, 1]. Returns configurations of the same shape and range, and their capacities
+    [nat/symbol] summed over the sub-bands, float64 [N_B, n].
     """
     # Power received from each element for unit radiation, float64 [N_B, 1, N_SB, N_E].
     spread = np.abs(link.los)**2 + link.spatial.power[:, None]
@@ -71,7 +71,7 @@ class _Point(NamedTuple):
     vertex: np.ndarray  # Vertex in the direction of the gradient, float64 [N_B, n, N_E].
     snr: np.ndarray  # Signal-to-noise ratios, float64 [N_B, n, N_SB].
     slope: np.ndarray  # Derivatives of the ratios, float64 [N_B, n, N_SB, N_E].
-    curvature: np.ndarray  # Coefficient of the square of an element's change, of the same shape.
+    curvature: np.ndarray  # Coefficient of the square of an element's change, like `slope`.
 
     @classmethod
     def at(cls, link: BandLink, spread: np.ndarray, analog: np.ndarray) -> '_Point':
@@ -94,7 +94,7 @@ class _Point(NamedTuple):
         return cls(analog, np.log1p(snr).sum(axis=-1), vertex, snr, slope, curvature)
 
     def element_step(self, link: BandLink) -> tuple[np.ndarray, np.ndarray]:
-        """Return the configurations after the best change of one element, and its gain [nat]."""
+        """Return the configurations with the best change of one element, and the gains [nat]."""
         # Axes: end, band, start, sub-band, element.
         steps = np.stack([-self.analog, 1 - self.analog])[:, :, :, None] * ~link.fixed
         # The power is quadratic in each element, so this is exact; only rounding can make it
@@ -116,7 +116,7 @@ class _Point(NamedTuple):
 
 # Number of ascents in each band.
 _N_ASCENTS = 2
-# Largest drift of phases between the sub-bands of an ascent, and largest number of these
+# Largest drift of phases from one sub-band of an ascent to the next, and largest number of these
 # sub-bands.
 _MAX_DRIFT_RAD = 0.05
 _MAX_SUBBANDS = 64
@@ -154,9 +154,9 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
     """Find a beam that maximises Eq. (10) for a user at a position, float64 [3] [m].
 
     A search from many starts, including the matched filter, proposes configurations. The best few
-    are improved together with the digital part. Amplitudes are 0 or 1, which exist for any number
-    of amplitude levels. The power over all sub-bands is P_max. The beam is deterministic. Bands
-    are counted from 0. A calibrated surface applies its own coefficients to the configuration.
+    are improved together with the digital part. Amplitudes are 0 or 1, which are valid for any
+    number of amplitude levels. The power over all sub-bands is P_max. The beam is deterministic.
+    Bands are counted from 0. A calibrated surface applies its coefficients to the configuration.
     Raises ValueError if the position is not a finite [3] array, or the band is out of range.
     """
     return steer_bands(scenario, position, [band], surface)[0]
@@ -165,7 +165,7 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
 def steer_bands(
         scenario: Scenario, position: np.ndarray, bands: Sequence[int],
         surface: SurfaceEstimate | None = None) -> list[Beam]:
-    """Find the beams of `steer` for several bands, which takes little longer than for one."""
+    """Find the beams of `steer` for several bands, in little more time than for one band."""
     if not len(bands):
         raise ValueError('bands: none, expected at least one')
     for band in bands:
@@ -199,12 +199,12 @@ def applied_beam(beam: Beam, surface: SurfaceEstimate | None) -> Beam:
 def choose_beam(
         scenario: Scenario, mean: np.ndarray, covariance: np.ndarray | None = None,
         bands: Sequence[int] | None = None, surface: SurfaceEstimate | None = None) -> Choice:
-    """Steer a beam in each band to the mean position, and choose that of highest mean capacity.
+    """Steer a beam in each band to the mean position; choose the one of highest mean capacity.
 
     The posterior is Gaussian, with the mean, float64 [3] [m], and the covariance, float64 [3, 3]
     [m^2]; without a covariance, the position is exact. The capacity at the mean position alone
     would mislead: a stronger but narrower beam may lose more capacity to the positioning error
-    than it gains. `bands` are counted from 0, and all by default; in a tie, the first band is
+    than it gains. `bands` are counted from 0, by default all; in a tie, the first band is
     chosen. Raises ValueError if `mean` or `covariance` has a wrong shape or is not finite, there
     is no band, or a band is out of range.
     """
@@ -224,8 +224,8 @@ def capacity_report(
         surface: SurfaceEstimate | None = None) -> CapacityReport:
     """Compare a beam with the beam that `choose_beam` finds for the true position.
 
-    Both beams transmit over the paths of a channel file, if the scenario has one. The search for a
-    beam ends slightly below the maximum. With an accurate estimate, the loss may therefore be
+    If the scenario has a channel file, both beams transmit over its paths. The search for a beam
+    ends slightly below the maximum. With an accurate position estimate, the loss may therefore be
     negative, typically by less than a tenth of a per cent. `bands` and `surface` are passed to
     `choose_beam`. Raises ValueError if the position is not a finite [3] array, or the beam does
     not fit the scenario.
