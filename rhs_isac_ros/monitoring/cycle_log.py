@@ -78,7 +78,7 @@ class CycleRecord(CycleTimes):
 
     @property
     def truth(self) -> m.GroundTruth | None:
-        """True position from the node whose user was located; None if unknown."""
+        """True position, as sent by the node of the located user; None if unknown."""
         instance = self.estimate.user_instance if self.estimate else 0
         return next((truth for sender, truth in reversed(self.truths.items())
                      if m.same_instance(sender, instance)), None)

@@ -46,7 +46,7 @@ class Overview:
 
     `phase` is the phase of the base station, or `RESTING` between cycles. `codebook_id` belongs to
     the latest signals. `users` holds the latest complete cycle of each user by id, and `nodes` the
-    status of each node by name; both are limited in number, because they come from messages.
+    status of each node by name. Both are limited in size, because the keys come from messages.
     """
 
     def __init__(self) -> None:
@@ -195,7 +195,7 @@ class SceneState:
     def discard_stale(self, before_s: float) -> list[int]:
         """Discard users without a message since `before_s` [s], and return their ids.
 
-        Also discard a beam of the same age, or a beam to one of these users.
+        Also discard the beam if it is as old, or if it is directed to one of these users.
         """
         stale = [user for user, state in self.users.items() if state.updated_s < before_s]
         for user in stale:
@@ -221,7 +221,7 @@ class SceneState:
 
     @property
     def shown_user(self) -> UserState | None:
-        """The user of the latest beam if its cycle has an estimate, or of the latest estimate."""
+        """User of the latest beam, or of the latest estimate if the cycle of the beam has none."""
         state = self.users.get(self.beam.user) if self.beam else None
         if state and state.estimate and self.beam and (
                 state.estimate.cycle_id == self.beam.cycle_id):

@@ -72,10 +72,10 @@ Sample: TypeAlias = tuple[str, float, Series]
 
 
 class Charts:
-    """Computes the samples of the charts."""
+    """Computes the samples of the charts from the cycles and reports of a network."""
 
     def __init__(self) -> None:
-        # Known global bounds on the root mean square [m], by the id of the codebook.
+        # Known global bounds on the root mean square error [m], by the id of the codebook.
         self.bounds_m: dict[str, float] = {}
         self._drawn: set[str] = set()
         self._square_m2 = 0.0
@@ -160,7 +160,7 @@ def mode_axes() -> tuple[Lines, Points]:
 
 
 def mode_bars(user: int, found: WeightedModes, origin: np.ndarray) -> Lines:
-    """Return the modes as bars in the colour of a user; `origin` has the range error 0."""
+    """Return modes as bars at their range errors relative to `origin`, in the colour of a user."""
     errors = np.linalg.norm(found.positions, axis=1) - np.linalg.norm(origin)
     return Lines(tuple(_line(error, HEIGHT_M * probability) for error, probability in zip(
         errors.tolist(), found.probabilities.tolist(), strict=True)),
@@ -168,7 +168,7 @@ def mode_bars(user: int, found: WeightedModes, origin: np.ndarray) -> Lines:
 
 
 def mode_estimate(position: np.ndarray, origin: np.ndarray) -> Lines:
-    """Return an estimate, float64 [3] [m], as a white line; `origin` has the range error 0."""
+    """Return an estimate, float64 [3] [m], as a white line at its range error from `origin`."""
     error = float(np.linalg.norm(position) - np.linalg.norm(origin))
     return Lines((_line(error, HEIGHT_M),), (1.0, 1.0, 1.0), _LINE_WIDTH)
 
@@ -202,7 +202,7 @@ class NetworkView:
                 Entry(0, f'{MODES}/grid', grid), Entry(0, f'{MODES}/labels', labels)]
 
     def add(self, message: m.Message, now_s: float) -> list[Entry]:
-        """Add a message whose type is in `RECEIVES`; it arrived at `now_s` [s]."""
+        """Add a message of a type in `RECEIVES`, which arrived at `now_s` [s]; return entries."""
         cycle = self._count(message.cycle_id)
         if isinstance(message, cycle_log.RECEIVES):
             self._log.add(message, now_s)
@@ -214,7 +214,7 @@ class NetworkView:
         return [*entries, *self._ended()]
 
     def add_report(self, node: str, report: Report) -> list[Entry]:
-        """Add the report of a node."""
+        """Add the report of a node, and return entries for its count of dropped messages."""
         count = sum(NodeStatus(report, 0.0).counts('dropped').values())
         return [*self._charts.entries(self._count(0), self._charts.dropped(node, count))]
 

@@ -109,7 +109,7 @@ class RoleStatistics:
         return Report(True, summary, values)
 
     def _codebook_ids(self, in_use: str) -> dict[str, str]:
-        """Return the ids of the codebook in use (or first offered) and of a pending codebook."""
+        """Return the ids of the codebook in use (or else the latest one) and of a pending one."""
         if not self._codebook_id:
             return {}
         if in_use in ('', self._codebook_id):

@@ -31,7 +31,7 @@ class Points(NamedTuple):
 
 
 class Ellipsoids(NamedTuple):
-    """Ellipsoids; `half_sizes_m` contains the semi-axes, float64 [N, 3].
+    """Ellipsoids; `half_sizes_m` contains the lengths of the semi-axes, float64 [N, 3].
 
     The unit quaternions, float64 [N, 4] (x, y, z, w), rotate the coordinate axes to the semi-axes.
     """
@@ -73,7 +73,7 @@ class Picture(NamedTuple):
 
 
 class Series(NamedTuple):
-    """The name and the style, a line or dots, of the numbers on a path."""
+    """The name and the style of a series: a line or dots for the numbers of a path."""
 
     name: str
     colour: Colour
@@ -137,7 +137,7 @@ _MAX_GREY = 255
 
 
 def user_colour(user: int) -> Colour:
-    """Return the colour of a user."""
+    """Return the colour of a user; consecutive users have very different hues."""
     return colorsys.hsv_to_rgb(_HUE_STEP * user % 1.0, 0.8, 0.9)
 
 
@@ -166,7 +166,7 @@ def axes_95(covariance_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def region(scenario: Scenario) -> Boxes:
-    """Return the region of interest."""
+    """Return the outline of the region of interest."""
     return Boxes(np.array([scenario.roi_center_m]), np.maximum(
         [scenario.roi_size_m], 2 * _MIN_HALF_SIZE_M) / 2, np.array([_GREY]), solid=False)
 
@@ -258,7 +258,7 @@ def traced(scenario: Scenario, message: m.GroundTruth) -> Lines:
 def track(
         user: int, positions: Iterable[np.ndarray], velocity: np.ndarray,
         covariance_m2: np.ndarray) -> tuple[Lines, Ellipsoids]:
-    """Return a track, extended by the motion in the next second, and the 95 % ellipsoid.
+    """Return a track, extended by the motion in the next second, and its latest 95 % ellipsoid.
 
     The positions, float64 [3] [m] each, end with the latest one.
     """

@@ -42,7 +42,7 @@ class _Goal:
 
 
 class LocateServer:
-    """Serves the action ``locate`` from the messages that the base station sends and receives.
+    """Serves the action ``locate``, based on messages that the base station sends and receives.
 
     `request` asks the base station to serve a user; `pose` converts an estimate to a pose.
     """
@@ -182,7 +182,7 @@ class BsNode(RoleNode[BaseStation]):
         self._locate = self._make_locate()
 
     def dispatch(self, event: events.Event) -> None:
-        """Pass an event to the role, and an estimate or a missing fix to the action ``locate``."""
+        """Pass an event to the role, and a `PositionEstimate` or `NoFix` also to ``locate``."""
         super().dispatch(event)
         if self._locate and isinstance(event, m.PositionEstimate | m.NoFix):
             self._locate.observe(event)
@@ -223,7 +223,7 @@ class BsNode(RoleNode[BaseStation]):
 
 
 def _cycle_from_clock() -> int:
-    """Return the milliseconds since 1970 as a cycle id, unused because a cycle takes over 1 ms."""
+    """Return the milliseconds since 1970, an unused cycle id, as every cycle takes over 1 ms."""
     return time.time_ns() // 1_000_000
 
 

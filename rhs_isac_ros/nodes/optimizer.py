@@ -40,8 +40,8 @@ class GroupParameterService(ParameterService):
     """Parameter services of a node with a group of parameters that can only be set together.
 
     The service ``set_parameters`` of rclpy, which ``ros2 param load`` uses, sets parameters one by
-    one. Here, it sets either all or none of the parameters in a request whose names begin with
-    `prefix`. Create the node with ``start_parameter_services=False``.
+    one. Here, it sets the parameters whose names begin with `prefix` together: all those in a
+    request, or none. Create the node with ``start_parameter_services=False``.
     """
 
     def __init__(self, node: Node, prefix: str) -> None:
@@ -67,7 +67,7 @@ class GroupParameterService(ParameterService):
 
 
 def ros_parameters(values: Mapping[str, Any]) -> list[Parameter]:
-    """Convert a mapping of names to values into parameters."""
+    """Convert a mapping from names to values into ROS parameters."""
     return [Parameter(name, value=value) for name, value in values.items()]
 
 

@@ -54,7 +54,7 @@ class PositionerNode(RoleNode[Positioner]):
     def make_settings(self, values: types.SimpleNamespace) -> PositionerSettings:
         """Return the settings; raise ParameterError if a file or a plug-in cannot be loaded.
 
-        Whether a model fits the codebook is only checked when the estimator is built.
+        A model is checked against the codebook only when the estimator is built.
         """
         settings: PositionerSettings = super().make_settings(values)
         calibrated_surface(values, self.scenario)
@@ -137,7 +137,7 @@ class PositionerNode(RoleNode[Positioner]):
             self.subscribe()
 
     def publish(self, message: m.Message) -> bool:
-        """Publish a message, an estimate also as a pose; return whether the message was sent."""
+        """Publish a message, and an estimate also as a pose; return whether it was published."""
         is_published = super().publish(message)
         if is_published and isinstance(message, m.PositionEstimate):
             publishers = self._pose, *self._user_poses.publishers(message.user)

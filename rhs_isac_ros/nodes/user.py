@@ -29,7 +29,7 @@ _MAX_AGE_S = 5.0
 class RobotMobility:
     """Mobility of a robot: the latest position, extrapolated with the velocity.
 
-    `source` describes the origin of the positions. A position is valid for `timeout_s`.
+    `source` describes the origin of the positions. A position is valid for `timeout_s` [s].
     """
 
     def __init__(self, node: Node, frame: Frame, source: str, timeout_s: float) -> None:
@@ -40,7 +40,7 @@ class RobotMobility:
         self._position, self._velocity = np.full(3, np.nan), np.zeros(3)
 
     def put(self, stamp_ns: int, position: np.ndarray, velocity: np.ndarray) -> None:
-        """Store a position [3] [m] and a velocity [3] [m/s] in `frame`; stamp 0 means now."""
+        """Store a position [3] [m] and a velocity [3] [m/s] in `frame`; a stamp of 0 means now."""
         self._error = ''
         self._arrived_s = time.monotonic()
         self._stamp_ns = stamp_ns or self._clock.now().nanoseconds
@@ -139,7 +139,7 @@ def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> Robo
 
 
 class UserNode(RoleNode[User]):
-    """One or many users of the network."""
+    """The ROS node of one or more users."""
 
     # The mobility of the robot, if the user is a robot.
     _robot: RobotMobility | None = None

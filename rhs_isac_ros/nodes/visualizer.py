@@ -43,7 +43,7 @@ def marker(
         stamp: Time) -> Marker:
     """Convert a shape to a marker; ellipsoids, meshes and outlined boxes are translucent.
 
-    A marker has one place and size, so only the first point or ellipsoid of a shape is drawn.
+    A sphere marker has one position and size, so only the first point or ellipsoid is drawn.
     """
     match shape:
         case shapes.Points():
@@ -87,7 +87,7 @@ def deletion(namespace: str, number: int, stamp: Time) -> Marker:
 
 
 def place(marker: Marker, frame: Frame) -> Marker:
-    """Express the pose of a marker in a frame, in place; its points are relative to the pose."""
+    """Convert the pose of a marker to a frame, in place; its points are relative to the pose."""
     marker.header.frame_id = frame.name
     marker.pose = frame.pose(marker.pose)
     return marker
@@ -138,7 +138,7 @@ def transform(
 
 
 class TransformPublisher:
-    """Publishes transforms if ``tf2_msgs``, which has no wheel, is installed (`available`).
+    """Publishes transforms; `available` is False if ``tf2_msgs``, which has no wheel, is missing.
 
     The constructor publishes the static transform of the surface.
     """

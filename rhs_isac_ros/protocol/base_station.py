@@ -51,10 +51,10 @@ class Cycle:
     """The state of one cycle, as known to the base station."""
 
     cycle_id: int
-    codebook: Codebook | None = None  # the latest one when the latest beacon was sent
+    codebook: Codebook | None = None  # latest codebook when the last beacon was sent
     attempt: int = 0  # number of beacons sent before the current one
     user: int = 0     # user that was granted the cycle; 0 before the grant
-    # Instance of the user in the grant; if unknown, the one in the first feed signals, or 0.
+    # Instance of the user, from the grant or else from the first feed signals; 0 if unknown.
     user_instance: int = 0
     # Instance of the channel that sent the first signals; 0 if unknown.
     channel: int = 0
@@ -89,7 +89,7 @@ reply_resumed = reply(True, 'resumed{waiting}')
 
 
 class BaseStation(StateMachine):
-    """The role of the base station.
+    """The role that runs the cycles: it invites, selects, locates and serves users.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ class BaseStation(StateMachine):
         self._missing = None
 
     def _skip_cycles(self, event: events.Resumed) -> None:
-        """Skip the ids of cycles that another base station has used."""
+        """Skip the cycle ids that another base station has used."""
         self._cycle.cycle_id = max(event.first_cycle_id - 1, self._cycle.cycle_id)
 
     def _store_settings(self, event: events.SettingsOffered) -> None:
@@ -293,7 +293,7 @@ class BaseStation(StateMachine):
 
     def _beacon_again(self, event: Timeout) -> None:
         """Send another beacon in the cycle, which invites more users if there are any."""
-        # If no user answers a beacon to all, the network may be at fault, so no user is removed.
+        # If nobody answers a beacon to all users, the network may be at fault: remove no user.
         if not self._users.all_invited:
             self._lose_absent()
         self._cycle.attempt += 1
@@ -359,7 +359,7 @@ class BaseStation(StateMachine):
                    n_frames=self._scenario.n_frames)
 
     def _store_signals(self, event: m.FeedSignals) -> None:
-        """Store the signals of a band; the first ones fix the instances of user and channel."""
+        """Store the signals of a band; the first signals set the instances of user and channel."""
         cycle = self._cycle
         cycle.user_instance = cycle.user_instance or event.user_instance
         cycle.channel = cycle.channel or event.sender
@@ -403,7 +403,7 @@ class BaseStation(StateMachine):
         self._users.remove(self._cycle.user)
 
     def _abandon(self, event: Timeout | m.NoFix) -> None:
-        """End the cycle without service; log this unless the outage is known."""
+        """End the cycle without service; log the outage unless it has been logged."""
         assert self.outcome
         cycle, reason = self._cycle, self.outcome.value
         self._end_cycle(reason)
@@ -430,7 +430,7 @@ class BaseStation(StateMachine):
         self._apply_settings(event)
 
     def _end_cycle(self, outcome: str) -> None:
-        """Report the end of a cycle; one without a fix counts as completed by its user."""
+        """Report the end of a cycle; a cycle without a fix counts as completed by its user."""
         self._users.end_cycle(
             self._cycle.user, self._cycle.began_s[m.Phase.BEACONING], self.now_s,
             completed=outcome in ('served', Outcome.NO_FIX.value))

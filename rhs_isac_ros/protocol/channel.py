@@ -32,12 +32,12 @@ _MAX_PENDING = 256
 class Fading:
     """Draws multipath gains, which are correlated over the cycles of a user.
 
-    The gains of a cycle are rho h + sqrt(1 - rho^2) w: h are the gains of the user's previous
-    cycle, rho is the correlation of Eq. (4) for the time between the two cycles, and w is a new
-    draw that depends only on the seed, the user, the cycle and the band. Every cycle has the
-    distribution of Eq. (2) to (4), and consecutive cycles have the correlation of Eq. (4), which
-    is negative for some intervals. Over several cycles, the correlation is the product of these
-    values. To obtain that of Eq. (4), a draw would need the gains of all earlier cycles.
+    The gains of a cycle are rho h + sqrt(1 - rho^2) w, where h are the gains of the user's
+    previous cycle, rho is the correlation of Eq. (4) for the time between the two cycles, and w is
+    a new draw that depends only on the seed, the user, the cycle and the band. In each cycle, the
+    gains have the distribution of Eq. (2) to (4). Two consecutive cycles have the correlation of
+    Eq. (4), which is negative for some intervals. Over several cycles, the correlations multiply,
+    unlike in Eq. (4). To satisfy Eq. (4), a draw would need the gains of all earlier cycles.
 
     If the scenario has a channel file, the file replaces the multipath, and the gains are 0.
     """
@@ -77,11 +77,11 @@ class Air:
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng, self._serial = rng, itertools.count()
-        # A heap of messages, each after its time of arrival [s] and a serial number to break ties.
+        # A heap of arrival times [s], serial numbers, which break ties, and messages.
         self.in_flight: list[tuple[float, int, m.Message]] = []
 
     def send(self, message: m.Message, impairments: Impairments, now_s: float) -> str:
-        """Send a message at `now_s` [s]; return the counter of its loss or duplication, or ''."""
+        """Send a message at `now_s` [s]; return 'emulated_loss', 'emulated_double' or ''."""
         # The number of draws is the same for each message, so that no outcome shifts later draws.
         loss, duplication, *delays = self._rng.random(4)
         if loss < impairments.loss_probability:
@@ -117,11 +117,11 @@ class _Cycle:
 
 
 class Channel(Role):
-    """The role of the channel.
+    """The role that emulates the radio channel, the surface and the loss of messages.
 
     It answers pilots once it has received the true position of the user and the configuration of
-    the surface, and data once it has also received the beam, in any order. The position applies to
-    the whole cycle, because messages take longer to cross the network than the signals that they
+    the surface, in any order. To answer data, it also needs the beam. The position applies to the
+    whole cycle, because messages take longer to cross the network than the signals that they
     emulate. Changed impairments take effect with the next cycle.
     """
 
@@ -148,7 +148,7 @@ class Channel(Role):
         self._serial = itertools.count()
 
     def _use(self, impairments: Impairments) -> None:
-        """Draw the surface from the seed alone, so that a failed element remains failed."""
+        """Apply impairments; the seed determines the surface, so failed elements stay failed."""
         self._deviating = impairments.applied_to(self._scenario)
         self._surface = (
             None if DeclaredElements(self._deviating).is_exact
@@ -159,7 +159,7 @@ class Channel(Role):
         return self._air.in_flight[0][0] if self._air.in_flight else None
 
     def status(self) -> Mapping[str, str]:
-        """Return the impairments in use and pending, by name."""
+        """Return the impairments in use and the pending ones, by name."""
         return self._settings.describe()
 
     def react(self, event: Event) -> None:

@@ -42,7 +42,7 @@ class StoodBy:
 
 @dataclasses.dataclass(frozen=True)
 class Resumed:
-    """The node serves again; another node may have used the ids below `first_cycle_id`."""
+    """The node serves again; another node may have used cycle ids below `first_cycle_id`."""
 
     first_cycle_id: int = 0
 
@@ -123,7 +123,7 @@ class RevertSettings:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PublishTrack:
-    """Publish the estimated position and velocity of a user that is tracked.
+    """Publish the estimated position and velocity of a tracked user.
 
     `stamp_ns` is the time of the measurement, as in `Message`.
     """
@@ -147,7 +147,7 @@ class Kind(enum.Enum):
 
 @enum.unique
 class Outcome(enum.Enum):
-    """A counted outcome; the value is the name of its counter."""
+    """An outcome that a role counts; the value is the name of the counter."""
 
     kind: Kind
 

@@ -20,7 +20,7 @@ class MessageError(ValueError):
 def array(
         dims: str, kind: type = float, low: float = -math.inf, high: float = math.inf,
         nan_allowed: bool = False) -> Any:
-    """Declare an array field, with an inclusive range for the entries of a real array.
+    """Declare an array field; `low` and `high` are inclusive limits of real entries.
 
     `dims` lists the dimensions, separated by spaces: numbers, or symbols of `Scenario.sizes` or
     `Message.own_sizes`. If `nan_allowed` is set, NaN stands for an unknown value.
@@ -31,7 +31,7 @@ def array(
 
 
 def index(symbol: str) -> Any:
-    """Declare a field for an index below the size `symbol` in `Scenario.sizes`."""
+    """Declare an index field, from 0 to one less than the size `symbol` in `Scenario.sizes`."""
     return dataclasses.field(metadata={'index_of': symbol})
 
 
@@ -52,10 +52,10 @@ def optional_float() -> Any:
 
 
 def check(message: 'Message', sizes: Mapping[str, int]) -> None:
-    """Check the arrays, indices and numbers of a message against the sizes of `Scenario.sizes`.
+    """Check the fields of a message against their declarations and the sizes of a scenario.
 
-    Raises MessageError if a shape or a size differs, an index or a number is out of range, or a
-    number is not finite.
+    Raises MessageError if a shape or a size is wrong, an index or a number is out of range, or a
+    number is not finite, except where NaN is allowed.
     """
     own = message.own_sizes(sizes)
     sizes = {**sizes, **own} if own else sizes
@@ -164,13 +164,13 @@ class Message:
     #: Instance of the node that sent the message: the time at which the node started, in
     #: nanoseconds since 1970; 0 if unknown, as in messages sent by hand.
     sender: int = 0
-    scenario_id: str = ''  #: `Scenario.id` of that node; empty if unknown.
+    scenario_id: str = ''  #: `Scenario.id` of the sending node; empty if unknown.
     #: Stamp of the header on the clock of the emulated world [ns]. Signals, and messages derived
     #: from them, carry the time of the measurement. If 0, the adapter inserts the current time.
     stamp_ns: int = 0
 
     def time_s(self, now_s: float) -> float:
-        """Return the time of the message [s], or `now_s` if it is unknown."""
+        """Return the stamp of the message [s], or `now_s` if the stamp is unknown."""
         return 1e-9 * self.stamp_ns if self.stamp_ns else now_s
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
@@ -196,9 +196,9 @@ MessageT = TypeVar('MessageT', bound=Message)
 
 
 def derive(kind: type[MessageT], source: object, **fields: Any) -> MessageT:
-    """Return a message with the cycle, user, band and codebook of a source, and further fields.
+    """Return a message of the class `kind` with the cycle, user, band and codebook of a source.
 
-    The source is a message, or an object with attributes of the same names; `fields` override it.
+    The source is a message, or an object with such attributes. `fields` adds or replaces fields.
     """
     shared = {name: getattr(source, name) for name in _SHARED
               if name in kind.__dataclass_fields__ and hasattr(source, name)}
@@ -273,7 +273,7 @@ class Pilot(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class FeedSignals(Message):
-    """Signals that arrive at the feeds from the pilots of a band."""
+    """Signals at the feeds of the surface, due to the pilots of a user in one band."""
 
     user: int = number(1, _LAST_USER)
     user_instance: int = 0
@@ -283,7 +283,7 @@ class FeedSignals(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class ReceivedSignals(Message):
-    """Combined signals of a positioning phase."""
+    """Signals of a positioning phase in all bands, combined over the feeds."""
 
     user: int = number(1, _LAST_USER)
     user_instance: int = 0
@@ -330,7 +330,7 @@ class Beam(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Data(Message):
-    """Payload of the transmission phase."""
+    """Number of bits offered or delivered in one direction of the transmission phase."""
 
     user: int = number(1, _LAST_USER)
     direction: Direction
@@ -341,7 +341,7 @@ class Data(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Capacity(Message):
-    """Capacity of the beam of a cycle."""
+    """Capacities of the beam in a cycle, and of a beam chosen for the true position."""
 
     user: int = number(1, _LAST_USER)
     codebook_id: str
@@ -408,7 +408,7 @@ class ProtocolState(Message):
 
 
 def started(instance: int) -> str:
-    """Describe the start of an instance for a log message."""
+    """Return the start time of an instance as text for a log message."""
     time = datetime.datetime.fromtimestamp(instance // 10**9, datetime.timezone.utc)
     return f'started {time:%Y-%m-%d %H:%M:%S} UTC'
 

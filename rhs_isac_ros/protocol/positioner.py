@@ -41,12 +41,12 @@ class _Track:
     time_s: float
 
     def is_late(self, received: m.ReceivedSignals) -> bool:
-        """Return whether the base station of the track sent these signals in no later cycle."""
+        """Return whether these signals, of the same base station, are not newer than `latest`."""
         return received.sender == self.latest.sender and (
             received.cycle_id <= self.latest.cycle_id)
 
     def may_continue(self, received: m.ReceivedSignals, now_s: float) -> bool:
-        """Return whether the user is the same instance, and the clock was not set back."""
+        """Return whether the user is the same instance, and the clock has not been reset."""
         return now_s >= self.time_s - MAX_GAP_S and m.same_instance(
             received.user_instance, self.latest.user_instance)
 
@@ -55,7 +55,7 @@ class Tracks:
     """One track for each user, derived from the signals alone.
 
     A track ends after a gap, when another instance of the user appears, or after thousands of
-    other users have been located. Signals that are not from a later cycle do not use or change it.
+    other users have been located. Signals no newer than a track neither use nor change it.
     """
 
     def __init__(self) -> None:
@@ -70,7 +70,7 @@ class Tracks:
             now_s: float) -> Estimate:
         """Estimate the position of a user from signals that were measured at `now_s` [s].
 
-        The result is a `TrackEstimate` if the signals belong to a track, which assumes the typical
+        If the signals continue a track, the result is a `TrackEstimate`. Tracks assume the typical
         speed `speed_mps`. Raises SignalError if the signals cannot be used.
         """
         signals = _stacked(received)
@@ -103,7 +103,7 @@ class ResidualWatch:
     """Compares residuals with the model, for all users together and for each user separately.
 
     If only one user deviates, for instance by an unknown gain, the mean over many users hardly
-    changes.
+    changes. `level_db` is as in `InnovationTest`.
     """
 
     def __init__(self, level_db: tuple[float, float] = (0.0, 0.0)) -> None:
@@ -114,7 +114,7 @@ class ResidualWatch:
         self._estimates: collections.deque[Estimate] = collections.deque(maxlen=WINDOW)
 
     def add(self, user: int, codebook_id: str, estimate: Estimate) -> tuple[str, bool]:
-        """Add an estimate; return a text if a warning begins or ends, and whether one begins."""
+        """Add an estimate; return a text if a warning begins or ends, and whether it begins."""
         if codebook_id != self._codebook_id:
             self.clear()
             self._codebook_id = codebook_id
@@ -138,9 +138,9 @@ class ResidualWatch:
     def status(self) -> dict[str, str]:
         """Return values for the diagnostics, including the result of `diagnose`.
 
-        ``residual.ratio`` and ``residual.spread`` are the mean and the variance of the energy of
-        the residuals relative to the expectation, ``residual.fixes`` is the number of fixes that
-        they cover, and ``warning.residual`` is the text of the current warning.
+        ``residual.ratio`` is the mean energy of the residuals relative to its expectation, and
+        ``residual.spread`` is the variance of the energy relative to the model. Both cover
+        ``residual.fixes`` fixes. ``warning.residual`` is the text of the current warning.
         """
         values = diagnose(self._estimates, bool(self._warning), self._level_db[1])
         if self._all.n_fixes:
@@ -164,7 +164,7 @@ def _deviation(prefix: str, monitor: InnovationTest) -> str:
 
 
 class _Loss(enum.Enum):
-    """Cause of signals without a position; the value is the log text of the recovery."""
+    """Reason why signals yield no position; the value is logged when they yield one again."""
 
     NO_FIX = 'has a position again'
     BLOCKED = 'is in sight again'
@@ -190,13 +190,13 @@ class _Built(NamedTuple):
 
 
 class Positioner(Role):
-    """The role of the positioner.
+    """The role that estimates the positions of users.
 
     The codebook id of the received signals selects the estimator. Estimators are built one at a
-    time in the background. Meanwhile, existing estimators remain in use, and the latest signals
-    without an estimator wait for it. New settings take effect once an estimator is built with
-    them; if this fails, the old estimator remains in use. Tracks, which the prior ``track``
-    requires, do not survive a restart. `stopwatch` returns a time [s], to measure latencies.
+    time in the background. Meanwhile, existing estimators remain in use; if the estimator for the
+    latest signals is still missing, the signals wait. New settings take effect once an estimator
+    is built with them; if the build fails, the old estimator remains in use. The tracks of the
+    prior ``track`` do not survive a restart. `stopwatch` returns a time [s], to measure latencies.
     """
 
     SENDS = (m.PositionEstimate, m.NoFix)
@@ -225,7 +225,7 @@ class Positioner(Role):
         self._answered: tuple[m.ReceivedSignals, list[events.Action]] | None = None
 
     def status(self) -> Mapping[str, str]:
-        """Return the settings and codebook in use, pending settings and the last failure."""
+        """Return the settings, the codebook in use, the last failure and the residuals."""
         failed = {'failed.estimator': self._failure} if self._failure else {}
         return (self._settings.describe() | failed | self._residuals.status()
                 | {'codebook_id': self._estimators.in_use})
@@ -253,7 +253,7 @@ class Positioner(Role):
                 self._receive(event, self.now_s)
 
     def _request(self, job: _Job) -> None:
-        """Request an estimator unless it exists; if another is being built, it comes next."""
+        """Request an estimator unless it exists; if another one is being built, queue the job."""
         built = self._estimators.get(job.codebook.id)
         if (built and job.equals(built.job)) or job.equals(self._building):
             self._next = None

@@ -41,11 +41,11 @@ class Presences:
     """Decides from the announcements of other nodes whether this node serves or stands by.
 
     A node announces itself periodically, and counts as gone when it falls silent. Among the nodes
-    with the same role and scenario, the one that started last serves, as with the fencing tokens
-    of leases: a restarted node serves at once, and an older node resumes when the newer one has
-    gone. Nodes with another scenario are reported and otherwise ignored.
+    with the same role and scenario, the node that started last serves. A restarted node therefore
+    serves at once, and an older node resumes when the newer one has gone. Nodes with another
+    scenario are reported and otherwise ignored.
 
-    `now_s` [s] is the time on a clock that stops while this node cannot receive announcements.
+    The times `now_s` [s] are on a clock that stops while this node cannot receive announcements.
     """
 
     def __init__(self, own: Presence) -> None:
@@ -70,7 +70,7 @@ class Presences:
                 *self.update(now_s)]
 
     def update(self, now_s: float) -> list[LogMessage]:
-        """Forget the conflicts with nodes that have gone, and choose the node that serves."""
+        """Forget conflicts with absent nodes, choose the serving node, and return log messages."""
         self._now_s = now_s
         present = self._present()
         ended = sorted(self._scenarios.keys() - {other.scenario_id for other in present})
@@ -80,10 +80,10 @@ class Presences:
                   for scenario_id in ended), *self._choose(present)]
 
     def silent(self) -> set[str]:
-        """Return the names of nodes that have announced a role, and do not announce it any more.
+        """Return the names of nodes that have announced a role, but no longer do so.
 
-        A node that was restarted after a crash has no role yet, although the graph still contains
-        the publishers and subscriptions of its predecessor.
+        They include a node that has been restarted after a crash and has not taken its role yet.
+        The graph still contains the publishers and subscriptions of its predecessor.
         """
         return {other.node for other, _ in self._known.values() if other.role} - {
             other.node for other in self._present() if other.role}

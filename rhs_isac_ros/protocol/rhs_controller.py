@@ -26,9 +26,9 @@ class State(enum.Enum):
 
 
 class RhsController(StateMachine):
-    """The role of the RHS controller.
+    """The role that applies configurations to the surface.
 
-    It holds the latest codebooks. The commands of the base station select the one to apply.
+    It keeps the latest codebooks. Each command of the base station selects a codebook and a band.
     """
 
     SENDS = (m.RhsConfiguration,)
@@ -49,7 +49,7 @@ class RhsController(StateMachine):
         self._unknown_logged = False
 
     def status(self) -> Mapping[str, str]:
-        """Return the codebook in use, as ``codebook_id``."""
+        """Return the id of the codebook in use, as ``codebook_id``."""
         return {'codebook_id': self._codebooks.in_use}
 
     # Guards
@@ -87,7 +87,7 @@ class RhsController(StateMachine):
         self._granted.put(event.cycle_id, event.user)
 
     def _apply_band(self, event: m.RhsCommand) -> None:
-        """Report the configurations of a band."""
+        """Report that the configurations of a band are applied."""
         self._cycle_id, self._unknown_logged = event.cycle_id, False
         applied = self._applied.get(event.cycle_id, set())
         self._applied.put(event.cycle_id, applied | {(event.band, event.codebook_id)})
@@ -95,7 +95,7 @@ class RhsController(StateMachine):
         self.send(m.derive(m.RhsConfiguration, event, mode=m.Mode.POSITIONING, analog=analog))
 
     def _apply_beam(self, event: m.Beam) -> None:
-        """Report the configuration of a beam."""
+        """Report that the configuration of a beam is applied."""
         self._beam_sender = event.sender
         self.send(m.derive(
             m.RhsConfiguration, event, mode=m.Mode.TRANSMISSION, analog=event.analog[None]))

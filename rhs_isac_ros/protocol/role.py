@@ -63,11 +63,11 @@ class Role:
             self.counters[outcome.value] += n
 
     def next_deadline(self) -> float | None:
-        """Return the time of the next `Timeout` on the clock of `handle` [s], or None."""
+        """Return the time of the next `Timeout` [s], on the same clock as `now_s`, or None."""
         return None
 
     def status(self) -> Mapping[str, str]:
-        """Return values for the diagnostics by name, such as ``parameter.policy``."""
+        """Return values for the diagnostics, by keys such as ``parameter.policy``."""
         return {}
 
 
@@ -100,14 +100,14 @@ _MAX_CODEBOOKS = 4
 
 
 class CodebookCache(NewestDict[str, Value]):
-    """Items by codebook id; the item that was taken last is in use and is never discarded."""
+    """A cache of items by codebook id, which never discards the item that was taken last."""
 
     def __init__(self) -> None:
         super().__init__(_MAX_CODEBOOKS)
         self.in_use = ''  # id of the codebook whose item is in use; empty at first
 
     def put(self, codebook_id: str, item: Value) -> int:
-        """Store an item as the newest; if there are too many, discard the oldest not in use."""
+        """Store an item; if there are too many, discard the oldest one that is not in use."""
         if self.in_use:
             super().put(self.in_use, self[self.in_use])
         return super().put(codebook_id, item)

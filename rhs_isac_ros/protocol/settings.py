@@ -21,9 +21,9 @@ REGION, TRACK = PRIORS = ('region', 'track')
 def setting(
         default: bool | int | float | str, text: str, *, dynamic: bool = True, **declared: Any
 ) -> Any:
-    """Declare a setting and its parameter; only a `dynamic` one may change while the node runs.
+    """Declare a setting with a ROS parameter, which may change at run time if it is `dynamic`.
 
-    `text` describes the setting. The keywords `declared` are further attributes of `Field`.
+    `text` describes the setting; `declared` contains further attributes of `Field`.
     """
     return dataclasses.field(default=default, metadata={
         'declared': Field(type(default), text, **declared), 'dynamic': dynamic})
@@ -108,7 +108,7 @@ def shown(value: Any) -> str:
 
 
 def _of_scenario(name: str) -> Any:
-    """Declare a setting that replaces a field of the scenario."""
+    """Declare a setting that overrides the scenario field `name`."""
     declared = Scenario.__dataclass_fields__[name].metadata['declared']
     first_sentence = declared.text.partition('. ')[0].rstrip('.')
     return setting(
@@ -120,7 +120,7 @@ def _of_scenario(name: str) -> Any:
 class Impairments:
     """Impairments of the air interface, and deviations of the signals from their model.
 
-    The values that replace fields of the scenario do so in the channel only.
+    Settings that override fields of the scenario affect only the channel.
     """
 
     loss_probability: float = setting(
@@ -145,7 +145,7 @@ class Impairments:
     failed_element_share: float = _of_scenario('failed_element_share')
 
     def applied_to(self, scenario: Scenario) -> Scenario:
-        """Return the scenario with its fields replaced by the values that are not negative."""
+        """Return the scenario, with fields overridden by the settings that are not negative."""
         known = {field.name for field in dataclasses.fields(Scenario)}
         values = dataclasses.asdict(self)
         return dataclasses.replace(scenario, **{
@@ -169,7 +169,7 @@ class PendingSettings(Generic[SettingsT]):
         return f'settings applied: {described}' if described else ''
 
     def describe(self) -> dict[str, str]:
-        """Return values in use as ``parameter.<name>`` and newer ones as ``pending.<name>``."""
+        """Return the values in use as ``parameter.<name>``, pending ones as ``pending.<name>``."""
         in_use = {f'parameter.{name}': shown(value) for name, value in vars(self.in_use).items()}
         return in_use | {f'pending.{name}': text for name, text in self._pending().items()}
 

@@ -1,4 +1,4 @@
-"""The role ``transmission``, which steers a beam towards the estimate and reports the capacity."""
+"""The role ``transmission``: steers a beam to an estimated position, and reports capacities."""
 
 import collections
 import math
@@ -23,15 +23,15 @@ from rhs_isac_ros.protocol.events import Event, Outcome
 from rhs_isac_ros.protocol.role import REMEMBERED_CYCLES, CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.settings import PendingSettings, TransmissionSettings
 
-# Fields of `Capacity` whose quartiles are the fields of `CapacityStatistics` with these names.
+# Fields of `Capacity`; `CapacityStatistics` contains their quartiles under the same names.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
 # Number of the latest reports in the statistics, limited in order to follow a changing network.
 _WINDOW = 1000
 # A report is computed once no message of a cycle has arrived for this time [s], so that it does
 # not delay a cycle if other roles run in the same process.
 _IDLE_S = 5e-3
-# Maximum time by which messages, or a true position that has not arrived, postpone a report [s],
-# and maximum number of postponed reports.
+# Maximum time [s] by which messages, or a missing true position, postpone a report, and maximum
+# number of postponed reports.
 _MAX_DELAY_S = 0.25
 _MAX_WAITING = 8
 
@@ -56,9 +56,9 @@ class _Waiting(NamedTuple):
 class Transmission(Role):
     """The role that steers the beam.
 
-    The true position affects only the reported capacities, never the beam. Computing a report
-    takes as long as computing a beam, so the role does it between cycles. `surface_of` returns the
-    surface in a calibration file, or None for an empty name.
+    The true position affects only the reported capacities, never the beam. A report takes as long
+    to compute as a beam, so reports are computed between cycles. `surface_of` takes the name of a
+    calibration file, and returns the surface in the file, or None for an empty name.
     """
 
     SENDS = (m.Beam, m.Capacity, m.CapacityStatistics)
@@ -71,7 +71,7 @@ class Transmission(Role):
         self._scenario, self._surface_of = scenario, surface_of
         self._settings = PendingSettings(settings or TransmissionSettings())
         self._codebooks: CodebookCache[None] = CodebookCache()
-        # Beams by cycle, true positions by cycle, user and instance, and cycles in the statistics.
+        # Beams, by cycle; true positions, by cycle, user and instance; cycles in the statistics.
         self._steered: NewestDict[int, _Steered] = NewestDict(REMEMBERED_CYCLES)
         self._truths: NewestDict[tuple[int, int, int], m.GroundTruth] = NewestDict(
             REMEMBERED_CYCLES + _MAX_WAITING)
@@ -125,7 +125,7 @@ class Transmission(Role):
         known = self._steered.get(estimate.cycle_id)
         is_other = known and not m.same_instance(known.estimate.sender, estimate.sender)
         if known and (is_other or m.same(known.estimate, estimate)):
-            # A copy of the estimate, or one from another positioner, gets the beam already chosen.
+            # A repeated estimate, or an estimate of another positioner, yields the same beam.
             self.count(Outcome.WRONG_INSTANCE if is_other else Outcome.DUPLICATE)
             self.send(known.beam)
             return
@@ -157,7 +157,7 @@ class Transmission(Role):
             self._waiting.append(_Waiting(steered, applied, self.now_s + _MAX_DELAY_S))
 
     def _report_next(self) -> None:
-        """Report on the first waiting beam whose true position is known, or else on the first."""
+        """Report on the first beam to a user of known true position, else on the first beam."""
         waiting = next(filter(self._truth_of, self._waiting), self._waiting[0])
         self._waiting.remove(waiting)
         steered, applied, _ = waiting
@@ -177,7 +177,7 @@ class Transmission(Role):
         self._summarize(report)
 
     def _truth_of(self, waiting: _Waiting) -> m.GroundTruth | None:
-        """Return the true position of the user whose position was estimated, if known."""
+        """Return the true position of the user to whom the beam is directed; None if unknown."""
         estimate = waiting.steered.estimate
         found = [truth for (cycle_id, user, instance), truth in self._truths.items()
                  if (cycle_id, user) == (estimate.cycle_id, estimate.user)

@@ -27,10 +27,10 @@ class State(enum.Enum):
 
 
 class User(StateMachine):
-    """The role of the users of a node, usually a single one.
+    """The role of the users of a node, which usually has only one user.
 
-    A cycle serves one user, so one state is enough for all of them. The node has an `instance`,
-    and ignores grants to other instances.
+    A cycle serves one user, so one state is enough for all users of the node. `instance`
+    identifies the node, which ignores grants to other instances.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class User(StateMachine):
         super().__init__(State.DISCONNECTED)
         self._step_s, self._beacon_s = step_s, beacon_s
         self.users, self._instance = tuple(sorted(mobilities)), instance
-        # By user: description of another node with the same number that is served in its place.
+        # Description of another node with the same number that is served instead, by user.
         self._conflicts: dict[int, str] = {}
         self._mobilities, self._world_s = mobilities, world_s
         self._crowd = Crowd([mobilities[user] for user in self.users])
@@ -67,7 +67,7 @@ class User(StateMachine):
         self._truths: NewestDict[tuple[int, int], m.GroundTruth] = NewestDict(REMEMBERED_CYCLES)
 
     def ground_truths(self, now_s: float) -> m.GroundTruths:
-        """Return the positions and velocities of all users at a time on the clock of `handle`."""
+        """Return the true positions and velocities of all users; `now_s` [s] is as in `handle`."""
         position, velocity = self._crowd.states(self._time_s(now_s))
         return m.GroundTruths(
             cycle_id=0, users=np.array(self.users), position=position, velocity=velocity)

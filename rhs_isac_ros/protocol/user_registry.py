@@ -11,11 +11,11 @@ import numpy as np
 from rhs_isac_ros.protocol import messages as m
 
 POLICIES = ('round_robin', 'first', 'random')
-# Highest number of a user, which bounds the memory whatever the acks contain.
+# Highest number of a user. It bounds the memory, whatever numbers the acks contain.
 MAX_USERS = 4096
 LAST_NUMBER = 2**32 - 1
 # Number of registered users that the first beacon of a cycle invites, and the factor by which each
-# further beacon increases it. It is small: a cycle serves one user, and each ack takes time.
+# further beacon increases it. The number is small: a cycle serves one user, and acks take time.
 INVITED, _EXTENSION = 8, 8
 # Number of consecutive beacons without an answer after which a user is removed, and of consecutive
 # incomplete cycles after which a senior loses this rank.

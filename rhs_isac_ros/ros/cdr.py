@@ -20,8 +20,7 @@ from rhs_isac_ros.protocol.messages import MessageError
 class Type(NamedTuple):
     """The encoding of a ROS type as a series of items, given by `wire`.
 
-    Each item is a number (a type code of `struct`), a string (``s``) or a sequence (``*I``,
-    ``*d``).
+    An item is a number (a type code of `struct`), a string (``s``) or a sequence (``*I``, ``*d``).
     """
 
     wire: tuple[str, ...]
@@ -90,8 +89,8 @@ _SIZES = {'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
 class _Run(NamedTuple):
     """Numbers of fixed size, followed by a string or a sequence of the type `tail`.
 
-    The layout of the numbers depends on their position in the message modulo 8. The `tail` of the
-    last run is empty.
+    `layouts` contains the layout of the numbers for each position in the message modulo 8. The
+    `tail` of the last run is empty.
     """
 
     layouts: tuple[struct.Struct, ...]
@@ -193,7 +192,7 @@ class Codec:
                                f'{error.reason}') from None
 
     def decode(self, data: bytes) -> Any:
-        """Decode bytes that begin with `HEADER`; the arrays do not share memory with them.
+        """Decode a message from bytes that begin with `HEADER`; its arrays are copies.
 
         Raises MessageError if the bytes end too early, an array does not fill its shape, or the
         value of an enumeration is undefined.
@@ -275,5 +274,5 @@ def _layout(numbers: str, start: int) -> struct.Struct:
 
 
 def _padding(position: int) -> int:
-    """Return the number of padding bytes before a number of eight bytes."""
+    """Return the number of padding bytes between a position and an eight-byte number."""
     return (len(HEADER) - position) % 8

@@ -144,7 +144,7 @@ def true_odometry(
 
 
 def _with_rotation(covariance: np.ndarray, variance: float) -> np.ndarray:
-    """Return the 36 entries of a covariance with independent rotations of equal variance."""
+    """Add independent rotations of equal variance to a covariance [3, 3]; return 36 entries."""
     both = variance * np.eye(6)
     both[:3, :3] = covariance
     return both.ravel()

@@ -15,7 +15,7 @@ _PERIOD_S = 1.0
 
 
 def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
-    """Convert the report of a node, with the full name `name`, to one status, OK or WARN."""
+    """Convert a report of the node with the full name `name` to one status, OK or WARN."""
     level = DiagnosticStatus.WARN if report.fault else DiagnosticStatus.OK
     values = [KeyValue(key=key, value=value) for key, value in report.values.items()]
     status = DiagnosticStatus(

@@ -171,7 +171,7 @@ def subscribe(
 
 
 def log_dropped(node: Node, error: m.MessageError) -> None:
-    """Log the reason why a node drops a message, at most every ten seconds."""
+    """Log the reason why a node drops a message, at most once every ten seconds."""
     node.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
 
 
@@ -218,8 +218,8 @@ def subscribe_messages(
 class UserTopics:
     """Publishers for each user, created on first use.
 
-    `kinds` contains the types by name of the topic, with ``{user}`` for the number of the user.
-    Its limit is `max_users`: numbers come from messages, and every topic slows down discovery.
+    `kinds` contains the type of each topic by its name, with ``{user}`` for the user's number.
+    The highest number is `max_users`: numbers come from messages, and topics slow down discovery.
     """
 
     def __init__(self, node: Node, kinds: Mapping[str, type], max_users: int) -> None:
@@ -272,7 +272,7 @@ class BackgroundWorker:
     def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
         """Queue a job; the thread that spins the node passes its result to `on_result`.
 
-        An exception in the job is raised there. The job is refused if its thread cannot start.
+        That thread also raises exceptions of the job. The job is refused if no worker can start.
         """
         def hand_over(future: Future[_Result]) -> None:
             self._done.append((future, on_result))

@@ -47,7 +47,7 @@ class Frame:
     name: str = MAP_FRAME
     # Prefix of the frames of the surface and the users: the namespace with a final slash, or ''.
     prefix: str = ''
-    # Position, float64 [3] [m], and quaternion x, y, z, w.
+    # Pose of the surface: position, float64 [3] [m], and quaternion x, y, z, w.
     origin: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
     orientation: np.ndarray = dataclasses.field(default_factory=lambda: np.array([0., 0., 0., 1.]))
 

@@ -185,7 +185,7 @@ CODEBOOK: Mapping[str, str] = {
 def declare(node: Node, executable: str) -> types.SimpleNamespace:
     """Declare the parameters of an executable, and return their values by name.
 
-    Raises ParameterError if a value has the wrong type, is out of range, or is not a choice.
+    Raises ParameterError if a value has the wrong type, is out of range, or is not allowed.
     """
     return types.SimpleNamespace(
         **{parameter.name: _declare_one(node, parameter) for parameter in NODES[executable]})
@@ -251,7 +251,7 @@ def _declare_one(node: Node, parameter: Parameter) -> Any:
 
 
 def settings_of(kind: type[Any], values: types.SimpleNamespace) -> Any:
-    """Return settings of the class `kind`, from the parameters with the names of its fields."""
+    """Return settings of the class `kind`, filled in from the parameters with the same names."""
     with translated(ValueError, ParameterError):
         return kind(**{field.name: getattr(values, field.name)
                        for field in dataclasses.fields(kind)})
@@ -265,7 +265,7 @@ def calibrated_surface(
 
 
 def scenario_of(values: types.SimpleNamespace) -> Scenario:
-    """Return the scenario in the file of the parameter ``scenario_file``."""
+    """Return the scenario in the file ``scenario_file``; Table I if the parameter is empty."""
     file = values.scenario_file
     return Scenario.from_yaml(file) if file else Scenario()
 

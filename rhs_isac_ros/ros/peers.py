@@ -51,11 +51,12 @@ class Peers:
 
     A role is missing if no node has all its `identifying_endpoints`. The role counts as present
     once two polls in a row have found such a node, which then had time to discover this node.
+
     Nodes of unique roles also announce themselves periodically. A node that falls silent does not
-    count, although it remains in the graph for some time, nor does its successor of the same name
-    until it has called `take_role`. Of two nodes with the same role, the newer one serves.
-    Endpoints are logged if they cannot exchange messages, because one requests a quality of
-    service that the other does not offer.
+    count, although it remains in the graph for some time. A restarted node of the same name counts
+    once it has called `take_role`. Of two nodes with the same role, the newer one serves.
+
+    Pairs of endpoints are logged if one requests a quality of service that the other lacks.
 
     Parameters
     ----------
@@ -142,7 +143,7 @@ class Peers:
         self._set_period(_POLL_S if busy else _IDLE_POLL_S)
 
     def _now_s(self) -> float:
-        """Return the time, not counting intervals in which this process stalled [s]."""
+        """Return the time [s], without the intervals in which this process stalled."""
         now_s = time.monotonic()
         if now_s - self._last_s > _IDLE_POLL_S + PERIOD_S:
             # Announcements that arrived meanwhile may still be waiting.
@@ -261,7 +262,7 @@ class Peers:
             self._set_period(_POLL_S)
 
     def _apply(self, changes: list[LogMessage]) -> None:
-        """Log changes of the known nodes, and serve or stand by."""
+        """Log changes of the known nodes, and call `on_rival` if the rival has changed."""
         logger = self._node.get_logger()
         for message in changes:
             # Two calls, because rclpy requires that a line of code always logs with one severity.

@@ -70,7 +70,7 @@ def claim_domain() -> str:
 def max_processes() -> int:
     """Return the number of nodes that this machine can run as separate processes.
 
-    If discovery limits the number, it leaves room for the process that observes the nodes.
+    If discovery limits the number, one participant is left for the process that observes them.
     """
     fields = dict(line.split(':') for line in
                   _MEMORY_FILE.read_text(encoding='ascii').splitlines())

@@ -232,8 +232,8 @@ def read_scenario(path: str | Path) -> Scenario | None:
 def _records(path: str | Path) -> Iterator[Any]:
     """Yield the records of a file and of its chunks, in the order of the file.
 
-    The readers of mcap would decompress a chunk of any size. Raises RecordingError if the file
-    cannot be read.
+    Unlike the readers of mcap, this function limits the size of a decompressed chunk. Raises
+    RecordingError if the file cannot be read.
     """
     with translated(MissingLibraryError, RecordingError), optional_import(
             'reading a recording', extra='recording'):
@@ -276,8 +276,8 @@ class CycleObserver(Node):
     """Collects the cycles of the network in its namespace, with times of `time.monotonic`.
 
     With a `recorder`, which the caller closes, the observer also records the topics of the
-    namespace. It then observes exactly the recorded messages of types in `cycle_log.RECEIVES`.
-    Without one, `receives`, `sizes` and `on_malformed` are arguments of `subscribe_messages`.
+    namespace, and collects the cycles from the recorded messages. Without a recorder, it passes
+    `receives`, `sizes` and `on_malformed` to `subscribe_messages`.
     """
 
     def __init__(

@@ -37,9 +37,9 @@ class CodebookClient:
     """Fetches the codebook from the parameters of the optimizer whenever it changes.
 
     A message on the latched topic announces the codebook and triggers a request to the parameter
-    service. If there are two optimizers, either may answer. The announced codebook, whose content
-    is verified by its id, therefore replaces a missing response or another codebook. `Presences`
-    selects the optimizer that announces. `codebook_id` is the id of the latest codebook, or ''.
+    service. If there are two optimizers, `Presences` selects the one that announces its codebook,
+    but either may respond. If the response differs or is missing, the announced codebook is used,
+    whose content is verified by its id. `codebook_id` is the id of the latest codebook, or ''.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class CodebookClient:
             self._on_codebook(codebook)
 
 
-# With simulated time, period of the checks whether a state of the emulated world has ended [s].
+# With simulated time, period of checking whether a state of the emulated world has ended [s].
 _WORLD_POLL_S = 0.002
 # Maximum number of senders with another scenario that are logged.
 _MAX_LOGGED = 16
@@ -131,7 +131,7 @@ class Clocks:
 
     The world follows the clock of ROS if the node uses simulated time, otherwise the steady clock.
     The clock of the roles follows the steady clock, except in states that belong to the world,
-    such as the rest between cycles; then it follows the world.
+    such as the rest between cycles. In such a state, it follows the world.
     """
 
     def __init__(self, node: Node) -> None:
@@ -278,7 +278,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 f'{self._codebook_client.codebook_id or "none"}')
 
     def set_lacking(self, text: str) -> None:
-        """Set the text about anything that the role lacks besides other roles; '' for nothing."""
+        """Set the description of a missing requirement that is not a role; '' if there is none."""
         if text != self._lacking:
             self._lacking = text
             # Before discovery, it is unknown which roles are missing.
@@ -321,7 +321,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             self.subscribe()
 
     def now_s(self) -> float:
-        """Return the time on the monotonic clock of the roles [s], which has no epoch."""
+        """Return the time on the monotonic clock of the roles [s], whose epoch is arbitrary."""
         return self.clocks.role_s(self._in_world())
 
     def _in_world(self) -> bool:

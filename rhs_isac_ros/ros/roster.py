@@ -25,7 +25,7 @@ from rhs_isac_ros.ros import topics
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Member:
-    """Declaration of a role."""
+    """Declaration of a role: its class, settings, topics and requirements."""
 
     role: Any = None  # class of the role, if it exchanges messages of the protocol
     settings: type | None = None  # dataclass of the settings that are parameters, if any
@@ -75,7 +75,7 @@ UNIQUE = tuple(name for name, member in ROSTER.items() if member.is_unique)
 
 
 def identifying_endpoints(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the topics that show that a role is present: published ones and subscribed ones.
+    """Return two tuples of topics, published and subscribed, that show that a role is present.
 
     Each tuple contains at most one topic, the first that no other role publishes or subscribes to.
     One is enough, because a node creates its publishers together, and likewise its subscriptions.

@@ -218,8 +218,8 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
 def entry(executable: str, make: Callable[[], Sequence[Node]]) -> Callable[..., int]:
     """Return the main function of an executable that has only ROS arguments.
 
-    The executable is a key of `NODES`. Its description is the part after the colon in the first
-    line of the docstring of `make`'s module.
+    `executable` is a key of `NODES`. The help text takes the description from the module in which
+    `make` is defined: the part after the colon in the first line of the docstring.
     """
     def main(args: Sequence[str] | None = None) -> int:
         arguments = sys.argv[1:] if args is None else list(args)

@@ -1,7 +1,7 @@
 """Joining the network: discovery by Fast DDS, and the enclave of SROS 2.
 
 Discovery takes a tenth of a second, and a second longer for each discovery message that is missed.
-It therefore starts before the modules of a node are imported; this module imports little.
+It therefore starts before the modules of a node are imported, and this module imports little.
 """
 
 import contextlib
@@ -50,7 +50,7 @@ def use_discovery_profile() -> None:
 
 
 def join(args: list[str]) -> None:
-    """Join the network with a hidden node; `args` is a command line, including the program."""
+    """Join the network with a hidden node; `args` is a command line with the program name."""
     use_discovery_profile()
     rclpy.init(args=prepare(args), signal_handler_options=SignalHandlerOptions.NO)
     with one_line():
@@ -149,7 +149,7 @@ def _check_enclave(enclave: str) -> None:
 
 @contextlib.contextmanager
 def one_line() -> Iterator[None]:
-    """Raise `SecurityError` in place of the error when DDS security refuses a node or endpoint."""
+    """Raise `SecurityError`, not a ROS error, if DDS security refuses a node or an endpoint."""
     try:
         with warnings.catch_warnings():
             # ROS warns when it destroys the incomplete node.

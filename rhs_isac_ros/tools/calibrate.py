@@ -52,10 +52,9 @@ _N_COMPARED = 200
 
 
 class PilotLog:
-    """Collects codebooks, and signals and true positions of one user, or of all users (user 0).
+    """Collects codebooks, and the signals and true positions of one user, or of all for user 0.
 
-    Unlike `CycleLog`, it includes cycles without a fix: before a calibration, there may be no
-    other cycles.
+    Unlike `CycleLog`, it keeps cycles without a fix, because a fix may require the calibration.
     """
 
     def __init__(self, user: int = 0) -> None:

@@ -112,7 +112,7 @@ def print_now(*values: object, end: str = '\n') -> None:
 
 
 def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> str:
-    """Return a table as text; `align` is ``<`` or ``>`` per column; heads may have line breaks."""
+    """Return a text table; `align` has ``<`` or ``>`` per column; heads may have line breaks."""
     lines = [*itertools.zip_longest(*(head.split('\n') for head in heads), fillvalue=''), *rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return '\n'.join('  '.join(
@@ -173,7 +173,7 @@ def recorded(
 ) -> Iterator[tuple[Any, float]]:
     """Yield the recorded messages of a network and their times [s], in order.
 
-    `kinds` contains classes of messages, `Codebook` or `Report`. A report is yielded in a pair
+    `kinds` may contain message classes, `Codebook` and `Report`. A report is yielded in a pair
     with the name of its node. Raises RecordingError if the file is not a recording, or a message
     is malformed or does not fit the scenario.
     """

@@ -83,8 +83,8 @@ def start_network(
     """Start each node of a network in a separate process; if `together`, the users share a node.
 
     Users walk at random at the scenario's maximum speed. Each parameter in `given` applies to all
-    nodes that have it; None selects its default. A scenario other than Table I also needs its
-    ``scenario_file``. With ``first_cycle=1``, cycles are reproducible for a seed.
+    nodes that have it; None selects its default. A scenario other than Table I must also be given
+    as ``scenario_file``. With ``first_cycle=1``, cycles are reproducible for a seed.
     """
     for role, member in ROSTER.items():
         known = {parameter.name for parameter in parameters.NODES[role]}
@@ -105,7 +105,7 @@ def watch(
         on_progress: Callable[[int, int], None]) -> str:
     """Spin an observer until it has received a number of complete cycles.
 
-    Whenever the number changes, `on_progress` is called with it and with the number to wait for.
+    Whenever their number changes, `on_progress` is called with this number and with `cycles`.
     Returns the error that ended the wait, or ''.
     """
     seen, changed_s = -1, time.monotonic()

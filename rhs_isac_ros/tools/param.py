@@ -47,7 +47,7 @@ def get(session: Session, options: argparse.Namespace) -> None:
 
 
 def set_value(session: Session, options: argparse.Namespace) -> None:
-    """Set a parameter."""
+    """Set a parameter to a YAML value."""
     parameter = Parameter(
         name=options.parameter_name, value=get_parameter_value(string_value=options.value))
     response = _call(session, _find(session, options),

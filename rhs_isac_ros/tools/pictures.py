@@ -22,8 +22,8 @@ _ERRORS_IN, _REST_IN, _VIEW_SHARE = 1.4, 1.9, 0.94
 _SCENE_IN = 5.7
 # Margin around region and surface [m]; maximum margin for ellipses, as a share of the region.
 _MARGIN_M, _CYCLES_MAX_MARGIN, _SCENE_MAX_MARGIN = 0.8, 0.4, 0.25
-# Relative height of the axes for the legend; the layout adds the height of the legend itself.
-# Before Matplotlib 3.7, the layout reserves no space for the legend of a figure.
+# Relative height of the axes for the legend; the layout adds the height of the legend itself. A
+# legend without axes would get no space from the layout before Matplotlib 3.7.
 _LEGEND_ROW = 0.001
 # Maximum number of cycles with a number in the view, and of users in each legend.
 _MAX_NUMBERS, _CYCLES_MAX_LABELS, _SCENE_MAX_LABELS = 60, 6, 8

@@ -70,7 +70,7 @@ class RepublisherNode(Node):
     `messages` contains the topic, the content and the time [s] of each message, sorted by time.
     `names` are the relative names of the topics. `rate` is the speed relative to the recording.
     `optimizer` receives the codebooks, or is None if another node provides them. `waits_for` is
-    the first topic without subscribers, or ''; `count` messages have been published.
+    the first topic without subscribers, or ''. `count` is the number of published messages.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class RepublisherNode(Node):
                     ros_parameters(codebook.to_parameters()))
 
     def check(self, end_s: float, timeout_s: float) -> None:
-        """Raise ToolError if another node publishes, or a topic has no subscriber by `end_s`."""
+        """Raise ToolError if a topic has another publisher, or no subscriber in time."""
         for name, publisher in self._message_publishers.items():
             if self.count_publishers(publisher.topic_name) > 1:
                 raise ToolError(f'{name}: already published by another node')

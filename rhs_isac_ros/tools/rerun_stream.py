@@ -46,7 +46,7 @@ class RerunStream:
         self._server: subprocess.Popen[bytes] | None = None
 
     def save(self, path: Path) -> None:
-        """Write to ``<name>.part``, which `close` renames; raise OSError if that is impossible."""
+        """Write to ``<name>.part``, which `close` renames; raise OSError if it is unwritable."""
         partial = path.with_name(f'{path.name}.part')
         self._files = partial, path
         # Rerun reports an unwritable file without its reason.
@@ -129,7 +129,7 @@ def _is_listening(host: str, port: int) -> bool:
 
 
 def blueprint() -> Any:
-    """Return the blueprint: the scene above modes and surface, beside the charts and the log."""
+    """Return the layout: the scene above modes and surface, beside the charts and the log."""
     import rerun.blueprint as rrb
 
     scene = rrb.Spatial3DView(

@@ -55,7 +55,7 @@ from rhs_isac_ros.tools.rerun_stream import RerunStream
 
 # Maximum number of codebooks, whose tables take some megabytes each.
 _MAX_CODEBOOKS = 32
-# Number of phases for a bound. With Table I, the root of the bound has a standard error of 2.4 %.
+# Number of positioning phases for a bound, whose root has a standard error of 2.4 % with Table I.
 _N_PHASES = 256
 # Time to wait for the first cycle before the reason for its absence is logged [s].
 _SILENCE_S = 5.0
@@ -70,9 +70,9 @@ _SWITCH_INTERVAL_S = 5e-4
 
 
 class Posteriors:
-    """Computes the posteriors of received signals, for the latest codebooks.
+    """Computes tracks and the modes of posteriors from signals, for the latest codebooks.
 
-    Messages do not contain the modes, because including them would lengthen every cycle.
+    The messages of a network do not contain the modes, which would lengthen every cycle.
     `surface` is as in `make_estimator`.
     """
 

@@ -34,7 +34,7 @@ _DIAGNOSTICS_TIMEOUT_S = 1.3
 
 
 def render(overview: Overview, now_s: float) -> 'RenderableType':
-    """Return the view at a time [s] on the clock of the overview, for a console of rich."""
+    """Return the view at `now_s` [s], a time as in `Overview.add`, for a console of rich."""
     from rich.console import Group
 
     return Group(_header(overview, now_s), _users(overview, now_s), _nodes(overview, now_s))
