@@ -34,7 +34,7 @@ ARGUMENTS = {
     'estimator': ('bayes', 'Position estimator.'),
     'params_file': ('', 'ROS parameter file for all nodes, which takes precedence over the other '
                         'arguments; empty: none.'),
-    'use_sim_time': ('false', 'Whether the world moves with the topic /clock.'),
+    'use_sim_time': ('false', 'Whether the emulated world follows the topic /clock.'),
     'visualizer': ('false', 'Whether to publish markers for RViz and Foxglove.'),
     'rviz': ('false', 'Whether to start the visualizer and RViz.'),
     'record': ('', 'Recording to write (MCAP file); empty: none.'),

@@ -191,7 +191,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                         help='namespace of the network')
     parser.add_argument('--users', type=integer(0, 1000), default=2, help='number of users')
     parser.add_argument('--robot', type=_robot, action='append', default=[], metavar='USER=TOPIC',
-                        help='user that is a robot, with the topic of its odometry, or tf')
+                        help='number of a user that is a robot, and its odometry topic or tf')
     parser.add_argument('--use-sim-time', action='store_true', help='permit /clock')
     options = parser.parse_args(arguments)
     robots = dict(options.robot)

@@ -88,9 +88,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add('--method', choices=sorted(METHODS), default='lbfgs', help='optimiser')
     add('--objective', choices=sorted(OBJECTIVES),
         help='crlb: the average bound; ambiguity: the confusion of distant positions, which a '
-             'local bound ignores; error: the same with weights close to the squared error; '
-             'nuisance: the bound with unknown phases of the bands and the region as prior; crlb '
-             'if omitted, or error with --spectrum')
+             'local bound ignores; error: this confusion, weighted almost as in the squared '
+             'error; nuisance: the bound with unknown phases of the bands and the region as '
+             'prior; crlb if omitted, or error with --spectrum')
     add('--sampling', choices=sorted(SAMPLINGS), default='sobol',
         help='how the region of interest is sampled')
     add('--positions', type=integer(1, _MAX_POSITIONS), default=DEFAULT_POSITIONS,

@@ -87,13 +87,13 @@ def _add_options(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add('--vary', type=_type(lambda text: parse_axis(text).distinct()), action='append',
         required=True, metavar='FIELD=VALUE,...',
-        help='field and its values, in the syntax of scenario files; the first one is the x axis '
-             'of the picture, the second one has a line for each value, and the others have '
+        help='field and its values, in the syntax of scenario files; the first field is the x '
+             'axis of the picture, the second has a line for each value, and the others have '
              'panels')
     add('--with', type=_type(parse_axis), action=_Along, metavar='FIELD=VALUE,...',
-        help='field that varies together with that of the previous --vary')
+        help='field that varies together with the field of the previous --vary')
     add('--measure', type=_type(parse_measures), default='crlb,mse', metavar='NAME,...',
-        help='measures, a panel for each; NAME+NAME for a panel of several '
+        help='measures, each in its own panel; NAME+NAME draws several in one panel '
              '(default: %(default)s)')
     add('--scenario', type=input_file, metavar='FILE',
         help="YAML file of all other fields (default: the paper's Table I)")

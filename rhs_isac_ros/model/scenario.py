@@ -122,8 +122,8 @@ class Extensions:
         'inverse Rice factor, 3GPP TR 38.901, section 7.5', label='multipath / direct path')
     multipath_direction_deg: tuple[float, float] = declare(
         (0.0, 0.0), -90.0, 90.0,
-        'Mean direction of the multipath, azimuth and elevation; in the paper the boresight.',
-        'deg', label='mean direction of the multipath')
+        'Mean direction of the multipath in azimuth and elevation. The paper assumes the '
+        'boresight.', 'deg', label='mean direction of the multipath')
     user_gain_std_db: float = declare(
         0.0, 0.0, 60.0,
         "Standard deviation of the gain of a user, log-normal, in addition to user_gain: "
@@ -144,15 +144,15 @@ class Extensions:
         'section 3.5', label='phase of a band, standard deviation')
     timing_std_s: float = declare(
         0.0, 0.0, 1.0,
-        'Standard deviation of the sampling-time offset of a cycle, a phase that is linear over '
-        'the sub-bands.', 's',
+        'Standard deviation of the sampling-time offset of a cycle, which adds a phase that is '
+        'linear over the sub-bands.', 's',
         'Speth, Fechtel, Fock and Meyr, Optimum receiver design for wireless broad-band systems '
         'using OFDM, part I, IEEE Trans. Commun. 47 (11), 1999',
         label='timing offset, standard deviation')
     carrier_offset_std_hz: float = declare(
         0.0, 0.0, 1e9,
-        "Standard deviation of the carrier frequency offset of a user's oscillator, the same in "
-        'all bands, a phase that is linear over the frames of a band.', 'Hz',
+        "Standard deviation of the carrier frequency offset of a user's oscillator. The offset is "
+        'the same in all bands and adds a phase that is linear over the frames of a band.', 'Hz',
         'Moose, A technique for orthogonal frequency division multiplexing frequency offset '
         'correction, IEEE Trans. Commun. 42 (10), 1994',
         label='carrier offset, standard deviation')
@@ -181,9 +181,9 @@ class Extensions:
         'that the plug-in documents.', '', label='impairments')
     blocked_probability: float = declare(
         0.0, 0.0, 1.0,
-        'Probability that a user has no direct path; drawn once per user. The signals are then '
-        'multipath, of a level that estimators assume to be known within 10 dB. Bounds are those '
-        'of users in sight.', '',
+        'Probability that a user has no direct path; drawn once per user. The signals then '
+        'consist of multipath only, and estimators assume that its level is known within 10 dB. '
+        'Bounds apply to users with a direct path.', '',
         'probability of the line of sight, 3GPP TR 38.901, section 7.4.2',
         label='share of blocked users')
     multipath: MultipathEstimate | None = declare(
@@ -193,8 +193,9 @@ class Extensions:
         '', label='multipath')
     channel: PathChannel | None = declare(
         None, 0.0, 0.0,
-        'File of propagation paths of users at known positions. Signals then follow these paths '
-        'instead of direct path and random multipath; estimators and bounds do not.',
+        'File of propagation paths of users at known positions. Simulated signals then follow '
+        'these paths instead of a direct path and random multipath. Estimators and bounds '
+        'ignore the file.',
         '', label='channel')
 
 

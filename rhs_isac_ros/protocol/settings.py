@@ -41,8 +41,8 @@ class BaseStationSettings:
         0.1, 'Time to wait for acks.', unit='s', low=0.001, high=60.0)
     # Not dynamic, because a change would not reach the users, which have the same timeout.
     step_timeout_s: float = setting(
-        1.0, 'Time to wait for the next message of a cycle.', unit='s', low=0.01, high=60.0,
-        dynamic=False)
+        1.0, 'Time to wait for the next message of a cycle, including repetitions.', unit='s',
+        low=0.01, high=60.0, dynamic=False)
     retries: int = setting(
         3, 'Maximum number of times that a step is repeated within step_timeout_s.',
         low=0, high=100)
@@ -53,7 +53,7 @@ class BaseStationSettings:
     allowed_users: str = setting(
         '', 'Users whose acks are accepted, such as 1, 4, 10-20; empty: all.')
     max_users: int = setting(
-        MAX_USERS, 'Highest number of a user whose acks are accepted.', low=1, high=MAX_USERS)
+        MAX_USERS, 'Highest user number from which acks are accepted.', low=1, high=MAX_USERS)
     ack_rate_hz: float = setting(
         200.0, 'Maximum rate of acks accepted from each user.', unit='Hz', low=1.0, high=1e6)
 
@@ -75,8 +75,8 @@ class PositionerSettings:
         'bayes', 'Position estimator.', choices=tuple(ESTIMATORS), plugins=plugins.ESTIMATORS)
     model_file: str = setting('', 'Trained model; required by the estimator neural.')
     reject_outside: bool = setting(
-        True, 'Whether users who are almost certainly outside of the region get no fix; only '
-        'bayes and ml.')
+        True, 'Whether users who are almost certainly outside of the region get no fix. Only '
+        'bayes and ml use it.')
     calibration_file: str = _calibration_file()
     prior: str = setting(
         'region', 'Prior of the position: uniform in the region of interest, or the track of the '
@@ -126,15 +126,15 @@ class Impairments:
     loss_probability: float = setting(
         0.0, 'Probability that a message is lost.', low=0.0, high=1.0)
     double_probability: float = setting(
-        0.0, 'Probability that a message that arrives is duplicated.', low=0.0, high=1.0)
+        0.0, 'Probability that a message that is not lost is duplicated.', low=0.0, high=1.0)
     delay_s: float = setting(
         0.0, 'Minimum delay of each message.', unit='s', low=0.0, high=10.0)
     jitter_s: float = setting(
         0.0, 'Maximum additional random delay; messages may be reordered.', unit='s',
         low=0.0, high=10.0)
     multipath_memory: bool = setting(
-        True, 'Whether the multipath of a user is correlated over its cycles by Eq. (4); '
-        'otherwise it is independent, and depends on the seed and not on times.')
+        True, 'Whether the multipath of a user is correlated over its cycles by Eq. (4). If not, '
+        'each cycle has an independent multipath, which does not depend on times.')
     user_gain_std_db: float = _of_scenario('user_gain_std_db')
     phase_std_rad: float = _of_scenario('phase_std_rad')
     band_phase_std_rad: float = _of_scenario('band_phase_std_rad')

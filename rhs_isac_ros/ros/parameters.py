@@ -89,7 +89,7 @@ _SCENARIO = _parameter(
     'scenario_file', '', "YAML file of the scenario; empty: Table I of the paper.")
 _SEED = _parameter('seed', 0, 'Seed of all random numbers.', low=0, high=2**31 - 1)
 _USER_TOPICS = _parameter(
-    'user_topics', 64, 'Highest number of a user with separate topics.',
+    'user_topics', 64, 'Highest user number for which separate topics are created.',
     low=0, high=MAX_USERS)
 
 # Mobilities of robots. The library has further mobilities.
@@ -118,20 +118,20 @@ _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
                    low=1, high=MAX_USERS),
         _parameter('user_count', 1, 'Number of users of the node, with consecutive ids.',
                    low=1, high=MAX_USERS),
-        _parameter('mobility', 'static', 'Mobility model, or a robot.',
+        _parameter('mobility', 'static', 'Mobility model, or source of the position of a robot.',
                    choices=(*mobility.KINDS, *ROBOTS), plugins=plugins.MOBILITIES),
         _parameter('odometry_topic', 'odom',
                    'Odometry of the robot in frame_id, for the mobility odometry.'),
         _parameter('robot_frame', 'base_link', 'Frame of the robot, for the mobility tf.'),
         _parameter(
             'robot_timeout_s', 1.0, 'Time without a position of the robot after which the user '
-            'does not answer beacons.', unit='s', low=0.05, high=3600.0),
+            'stops answering beacons.', unit='s', low=0.05, high=3600.0),
         *_FRAME,
         _USER_TOPICS,
         _parameter(
             'position_m', [], 'Initial position x, y, z of each user; empty: random points of '
             'the region of interest.', unit='m', low=-1e6, high=1e6),
-        _parameter('waypoints_m', [], 'Waypoints: x, y, z of each, in order.',
+        _parameter('waypoints_m', [], 'Coordinates x, y, z of each waypoint, in order.',
                    unit='m', low=-1e6, high=1e6),
         _parameter('speed_mps', 1.0, 'Speed, at most max_user_speed_mps of the scenario.',
                    unit='m/s', low=0.0, high=1e4),
@@ -172,7 +172,7 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
 CODEBOOK_PREFIX = 'codebook.'
 # The parameters of the optimizer that hold the codebook, with their descriptions.
 CODEBOOK: Mapping[str, str] = {
-    'codebook.id': 'Hash of the content, which must match.',
+    'codebook.id': 'Hash of the codebook; must match its content.',
     'codebook.shape': 'Sizes N_B, N_SB, F, K, N_E.',
     'codebook.average_crlb': 'Average Cramer-Rao bound [m^2].',
     'codebook.provenance': 'Provenance of the codebook.',

@@ -85,7 +85,7 @@ def parse_options() -> argparse.Namespace:
     add = parser.add_argument
     add('--pilots', type=positive_int, default=200, help='pilots of each surface')
     add('--surfaces', type=positive_int, default=6, help='number of surfaces')
-    add('--positions', type=positive_int, default=600, help='fresh positions')
+    add('--positions', type=positive_int, default=600, help='number of positions of other users')
     add('--codebook', type=input_file, default=default_codebook_file(), help='codebook file')
     add('--silent', action='store_true', help='calibrate with the default prior')
     return parser.parse_args()
