@@ -91,7 +91,7 @@ def _end_with_parent() -> None:
 
 
 def print_error(error: object, program: str = '') -> None:
-    """Print an error in the format of argparse; the default `program` is this process."""
+    """Print an error as argparse does; `program` defaults to the command of this process."""
     if not program:
         spec = getattr(sys.modules['__main__'], '__spec__', None)
         program = (f'python3 -m {spec.name.removesuffix(".__main__")}' if spec

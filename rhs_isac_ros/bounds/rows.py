@@ -191,10 +191,10 @@ class Evaluation:
 
 
 def rows_within(source: RowSource, tolerance: float) -> MeasurementRows:
-    """Return rows within a relative error, compressed as in `CompressedRows`.
+    """Compress rows up to a relative error; see `CompressedRows`.
 
-    If the tolerance is 0, the rows are exact. A small number of rows that would need a large basis
-    is not compressed, but stored in single precision.
+    If the tolerance is 0, the rows are exact. If there are few rows and they would need a large
+    basis, all are stored in single precision instead.
     """
     if tolerance == 0:
         return ExactRows(source)
@@ -206,7 +206,7 @@ def rows_within(source: RowSource, tolerance: float) -> MeasurementRows:
 
 
 def _rank_of_some(source: RowSource, tolerance: float, band: int) -> int:
-    """Return the rank, within a tolerance, of a sample of the rows and columns."""
+    """Return the rank, within a tolerance, of some rows and columns; 0 for a small source."""
     size, n_rows = 2 * _MAX_RANK, source.n_items * source.n_rows
     if n_rows <= size or source.width <= 3 * size:
         return 0

@@ -142,9 +142,10 @@ def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
 def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     """Optimise according to the options of `add_options`, write the file and print a summary.
 
-    Ctrl-C ends the search; the best codebook so far is then written. Returns the codebook in the
-    file and the reason why the search stopped. Raises one of `ERRORS` if an option or a file is
-    invalid, or a library is missing; an existing output file is kept.
+    Ctrl-C ends the search; the best codebook so far is then written, unless the command is still
+    comparing band plans. Returns the codebook in the file and the reason why the search stopped.
+    Raises one of `ERRORS` if an option or a file is invalid, or a library is missing; an existing
+    output file is kept.
     """
     output, partial = options.output, _partial(options.output)
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()

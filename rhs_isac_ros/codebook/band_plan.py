@@ -184,7 +184,7 @@ def choose_bands(
     spacing of frequencies from the low end of each interval. `min_gap_hz` is the smallest distance
     between two frequencies, by default the width of a band. `report` is called with each plan for
     which a codebook was optimised. Returns these plans, the best one first. Raises ValueError if
-    an argument is out of range, or no plan has the gap.
+    an argument is out of range, or no plan has the gap, and KeyboardInterrupt on Ctrl-C.
     """
     if n_bands < 1 or scenario.n_bands * scenario.n_frames % n_bands:
         raise ValueError(
@@ -204,6 +204,8 @@ def choose_bands(
         world = with_bands(scenario, plan)
         short = optimize(world, objective='error', seed=seed, n_positions=_SHORT_POSITIONS,
                          max_steps=_SHORT_STEPS)
+        if short.reason == INTERRUPTED:
+            raise KeyboardInterrupt
         error_m2 = expected_error(world, short.codebook, seed, _SHORT_PHASES)
         candidates.append(Candidate(plan, screening, error_m2))
         if report:

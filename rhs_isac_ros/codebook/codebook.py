@@ -252,7 +252,7 @@ class Provenance:
 
     @classmethod
     def parse(cls, text: str) -> 'Provenance | None':
-        """Parse the text that `to_text` returns; return None for any other text."""
+        """Parse a text of `to_text`, or of version 0.1.0; return None for any other text."""
         try:
             return cls(**decode(from_parameter(text)))
         except (TypeError, ValueError, RecursionError):

@@ -168,7 +168,10 @@ def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int)
 
 
 def _exchange(search: Search, variables: np.ndarray, max_steps: int) -> str:
-    """Exchange amplitudes while this lowers the objective; return the reason for stopping."""
+    """Change amplitudes by one level while this lowers the objective; return why it stopped.
+
+    Combining vectors are optimised before each sweep over the amplitudes.
+    """
     levels = _top_level(search)
     variables = np.array(variables)
     variables[:search.n_analog] = np.rint(variables[:search.n_analog] * levels) / levels

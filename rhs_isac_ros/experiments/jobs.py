@@ -154,7 +154,7 @@ def _interrupts_ignored() -> Iterator[None]:
     """Ignore SIGINT inside the block, and in processes that are started there.
 
     A terminal sends SIGINT to the whole process group, but only this process may end the workers.
-    Blocking the signal would not work: it would stay pending, and joblib unblocks it.
+    A signal mask would not do: it would only delay the signal until the end of the block.
     """
     # Only the main thread can set handlers, and SIGINT raises KeyboardInterrupt only there.
     if threading.current_thread() is not threading.main_thread():

@@ -32,7 +32,7 @@ _NEPERS_PER_DB = np.log(10) / 20
 
 
 class Scope(enum.Enum):
-    """How often the values of an impairment are redrawn: for every user, or in every cycle."""
+    """When the values of an impairment are drawn: once for each user, or anew in every cycle."""
 
     USER = 'user'
     CYCLE = 'cycle'

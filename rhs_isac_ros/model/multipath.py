@@ -378,7 +378,7 @@ def complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarr
 
 
 def _fields(scenario: Scenario) -> Scenario | MultipathEstimate:
-    """Return the scenario or its survey, whichever declares the fields of the covariance."""
+    """Return the object with the fields of the covariance: the survey if any, or the scenario."""
     return scenario.multipath or scenario
 
 

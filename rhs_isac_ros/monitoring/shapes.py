@@ -147,7 +147,7 @@ def _dimmed(user: int) -> Colour:
 
 
 def distance_95(n: int) -> float:
-    """Return the distance, in standard deviations, within which 95 % of an n-D Gaussian lie."""
+    """Return the distance, in standard deviations, within which 95 % of an n-D Gaussian lies."""
     from scipy.special import chdtri
 
     return math.sqrt(chdtri(n, 0.05))

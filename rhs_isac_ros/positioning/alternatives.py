@@ -86,10 +86,9 @@ class Alternative(Protocol):
 class Blocked:
     """A user without a direct path, whose signals are multipath of an unknown level.
 
-    A survey inflates the covariance of the multipath, and the level differs among users in sight.
-    The evidence for a user in sight is computed with the inflated covariance, under which weak
-    residuals are improbable. An average over the levels would correct this evidence by a factor.
-    Instead of this correction, the evidence for a blocked user is divided by the same factor.
+    The evidence for a user in sight is computed as if all users had the same level, with a
+    covariance that a survey inflates. An average over the levels would multiply this evidence by
+    a factor. Instead, the evidence for a blocked user is divided by it: only the ratio counts.
     """
 
     name, reason, limit = 'blocked', 'blocked', BLOCKED_LIMIT

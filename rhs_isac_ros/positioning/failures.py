@@ -311,11 +311,11 @@ class FailureModel:
         return len(failed) * self._log_odds - whitening.log_volume + value, -value
 
     def weigh_extensions(self, failed: Failed, site: Site, remainder: float = 0.0) -> np.ndarray:
-        """Compute the log-probability of `weigh` if one more element fails, float64 [N_E].
+        """Weigh a set, as `weigh` does, with each element added in turn, float64 [N_E].
 
-        The other elements are assumed to fail with the declared share times `remainder`; these
-        failures add to the covariance. An element that explains part of the signals then has a
-        higher value than an element that imitates the sum of several failures.
+        Further elements are assumed to fail with a probability of `remainder` times the declared
+        share; these failures add to the covariance. With a `remainder`, an element that explains
+        part of the signals has a higher value than one that imitates the sum of several failures.
         """
         extended, (columns, own) = self._extensions_of(failed, remainder), site.columns_of(failed)
         changes, amplitudes = site.elements

@@ -398,7 +398,7 @@ class TemplateTable:
         return np.clip(step, -limits, limits), peaks.value + changes + rise
 
     def _cell_ranges(self, cells: np.ndarray) -> np.ndarray:
-        """Return the ranges of the cells of pairs [K], float64 [K] [m]."""
+        """Return the central range [m] of the cell of each (template, cell) pair, float64 [K]."""
         return self.grid.ranges_m[self.grid.cell[cells]]
 
     def _loss_outside(self, phases: np.ndarray, points: np.ndarray, cells: np.ndarray,

@@ -246,7 +246,7 @@ class Expansion(NamedTuple):
 
 
 def whiten(model: MeasurementModel, mean: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Whiten the results of `Expansion.at`, complex128 [M, 4, N_B, N_SB F]."""
+    """Whiten both results of `Expansion.at`; return one array, complex128 [M, 4, N_B, N_SB F]."""
     n_bands, n_rows = model.shape
     columns = np.moveaxis(np.concatenate([mean[:, None], slopes], axis=1), 2, 0)
     white = np.matmul(columns.reshape(n_bands, -1, n_rows), np.swapaxes(model.whitener, 1, 2))
@@ -254,9 +254,9 @@ def whiten(model: MeasurementModel, mean: np.ndarray, slopes: np.ndarray) -> np.
 
 
 class Means:
-    """Mean signals and their derivatives; neighbouring points share one expansion.
+    """Mean signals and their derivatives; points in nearly the same direction share an expansion.
 
-    Modes of the posterior form rows along the range, in nearly the same direction.
+    This pays because the modes of the posterior line up along the range.
     """
 
     def __init__(self, model: MeasurementModel) -> None:

@@ -235,7 +235,7 @@ def train(
 def _fit(
         regressor: Any, inputs: np.ndarray, targets: np.ndarray, max_epochs: int,
         after_epoch: Callable[[int], float]) -> tuple[int, float]:
-    """Train up to `max_epochs` epochs; keep the best weights, return their epoch and error."""
+    """Train for at most `max_epochs`; restore the best weights, return their epoch and error."""
     best_weights: tuple[list[np.ndarray], list[np.ndarray]] = [], []
     best_mse, best_epoch, reference_epoch = np.inf, 0, 0
     sizes = [min(size, len(inputs)) for size in _BATCH_SIZES]

@@ -121,8 +121,8 @@ class Channel(Role):
 
     It answers pilots once it has received the true position of the user and the configuration of
     the surface, in any order. To answer data, it also needs the beam. The position applies to the
-    whole cycle, because messages take longer to cross the network than the signals that they
-    emulate. Changed impairments take effect with the next cycle.
+    whole cycle: the user hardly moves during the emulated signals, although messages take
+    longer. Changed impairments take effect with the next cycle.
     """
 
     SENDS = (m.FeedSignals, m.Data)
@@ -292,6 +292,6 @@ class Channel(Role):
 
 
 def _is_from_other_instance(event: m.Pilot | m.Data, truth: m.GroundTruth) -> bool:
-    """Return whether a user's message comes from a node that did not send the true position."""
+    """Return whether a user's message comes from another instance than the sender of `truth`."""
     is_downlink = isinstance(event, m.Data) and event.direction is m.Direction.DOWNLINK
     return not is_downlink and not m.same_instance(event.sender, truth.sender)

@@ -137,7 +137,7 @@ Action = Send | LogMessage | Reply | BuildEstimator | RevertSettings | PublishTr
 
 
 class Kind(enum.Enum):
-    """Kind of an outcome; its value is the prefix of the kind's counters in the diagnostics."""
+    """Kind of an outcome; the value is the prefix of its counters in the diagnostics."""
 
     DROPPED = 'dropped'    # a message was ignored
     REPEATED = 'retries'   # a step of a cycle was requested again

@@ -144,7 +144,7 @@ _POLL_S = 0.1
 
 
 def collect_signals() -> list[int]:
-    """Return a list to which handlers of SIGINT and SIGTERM append the signals that arrive."""
+    """Handle SIGINT and SIGTERM: return a list to which each signal that arrives is appended."""
     # A handler may interrupt the other one, so it must not take a lock.
     signals: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -152,6 +152,15 @@ def test_an_interrupted_search_ends_with_the_best_plan_so_far(small, short, monk
         best_of(small, [], lambda _: results[0])
 
 
+def test_ctrl_c_ends_the_comparison_of_plans(small, short, monkeypatch):
+    def interrupted(*args, **options):
+        return dataclasses.replace(optimize(*args, **options), reason='interrupted')
+
+    monkeypatch.setattr(band_plan, 'optimize', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        choose_bands(small, SPECTRUM, 2, raster_hz=25e6)
+
+
 @pytest.fixture
 def long_region():
     """Equally spaced bands repeat every 1.5 m."""
