@@ -1,7 +1,7 @@
-"""Entry points of the executables, which install signal handlers before any slow import.
+"""Entry points of the executables; they install signal handlers before any slow import.
 
-Importing ROS, NumPy and the nodes takes a moment. A signal during the import would print a
-traceback, so the handlers end the process with exit code 0, as a later signal does.
+Importing ROS, NumPy and the nodes takes a moment. During the imports, SIGINT and SIGTERM end the
+process with exit code 0; the default handler of SIGINT would print a traceback.
 """
 
 import importlib
@@ -24,7 +24,7 @@ EXECUTABLES = {
 
 
 def __getattr__(name: str) -> Callable[[], int]:
-    """Return a main function that imports an executable, runs it and returns its exit code."""
+    """Return a main function that imports and runs an executable and returns an exit code."""
     if name not in EXECUTABLES:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
@@ -48,7 +48,7 @@ def __getattr__(name: str) -> Callable[[], int]:
 
 
 def _what_provides(missing: str) -> str:
-    """Return a description of the software that provides a missing top-level module."""
+    """Describe what provides a missing top-level module; without rclpy, that is always ROS 2."""
     # pip also installs the executables on systems without ROS.
     if importlib.util.find_spec('rclpy') is None:
         return 'ROS 2 Jazzy, which is not sourced or not installed (no module rclpy)'
@@ -61,7 +61,7 @@ def _what_provides(missing: str) -> str:
 
 
 def _join_network(name: str) -> None:
-    """Join the network early, so that discovery runs while the modules of a node are imported."""
+    """If a node starts, join the network early: discovery then runs while modules are imported."""
     arguments = sys.argv[1:]
     if EXECUTABLES[name] != 'nodes' or arguments[:1] not in ([], ['--ros-args']):
         return
@@ -70,14 +70,14 @@ def _join_network(name: str) -> None:
     try:
         importlib.import_module('rhs_isac_ros.ros.startup').join([name, *arguments])
     except RuntimeError:
-        # Invalid ROS arguments, which the executable reports.
+        # Invalid ROS arguments or security settings, which the executable reports later.
         return
 
 
 def _end_with_parent() -> None:
     """Make the kernel send SIGTERM to this process when its parent dies, if `PARENT_ID` is set.
 
-    The parent may have several threads, so it cannot arrange this between fork and exec.
+    The parent may have several threads, so it cannot safely make the call between fork and exec.
     """
     parent = os.environ.pop(PARENT_ID, '')
     if parent:
@@ -91,7 +91,7 @@ def _end_with_parent() -> None:
 
 
 def print_error(error: object, program: str = '') -> None:
-    """Print an error as argparse does; `program` defaults to the command of this process."""
+    """Print an error to stderr after the prefix `program`, by default the name of this command."""
     if not program:
         spec = getattr(sys.modules['__main__'], '__spec__', None)
         program = (f'python3 -m {spec.name.removesuffix(".__main__")}' if spec
@@ -102,13 +102,13 @@ def print_error(error: object, program: str = '') -> None:
 def exit_code_of(
         main: Callable[[], int | None], errors: tuple[type[Exception], ...] = (),
         program: str = '') -> int:
-    """Run a main function, handle the standard streams, and return the exit code.
+    """Run a main function and return the exit code, even if a standard stream is closed or fails.
 
     The code is the result of `main` (0 for None); 0 if the reader of the output closes it early,
-    as ``head`` does; 1 if the output cannot be written; or 2 if `main` raises one of the `errors`,
-    whose message is then printed.
+    as ``head`` does; 1 if the output cannot be written; or 2 if `main` raises one of the `errors`.
+    In the last two cases, the error is printed. Other exceptions propagate.
     """
-    # If a standard stream is closed, the next file that opens would take its descriptor.
+    # If a standard stream is closed, the next file to be opened would take its descriptor.
     for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode, encoding='utf-8'))

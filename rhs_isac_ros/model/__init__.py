@@ -1,4 +1,4 @@
-"""The system model of the paper: geometry, propagation, surface and received signals."""
+"""The system model of the paper, with extensions: geometry, propagation, surface and signals."""
 
 from rhs_isac_ros.model.elements import ElementErrors, SurfaceEstimate, draw_surface
 from rhs_isac_ros.model.gain_pattern import GainPattern

@@ -1,4 +1,4 @@
-"""Array operations that all parts of the model use."""
+"""Array operations that several parts of the package use."""
 
 import functools
 import hashlib
@@ -21,7 +21,7 @@ def adjoint(matrices: np.ndarray) -> np.ndarray:
 
 def mixture_weights(log_weights: np.ndarray, axis: int | tuple[int, ...] = -1
                     ) -> tuple[np.ndarray, np.ndarray]:
-    """Normalise weights given as logarithms; return them and the log of their original sum."""
+    """Normalise weights, given as logarithms, over `axis`; return them and the log of the sum."""
     highest = log_weights.max(axis=axis, keepdims=True)
     weights = np.exp(log_weights - highest)
     total = weights.sum(axis=axis, keepdims=True)
@@ -29,13 +29,13 @@ def mixture_weights(log_weights: np.ndarray, axis: int | tuple[int, ...] = -1
 
 
 def blocks(n: int, size: int) -> list[slice]:
-    """Split n items into blocks of the given size; the last one may be smaller."""
+    """Return slices that split n items into blocks of the given size; the last may be smaller."""
     return [slice(start, start + size) for start in range(0, n, size)]
 
 
 @functools.cache
 def gauss_legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nodes and weights of Gauss-Legendre quadrature from -1 to 1."""
+    """Return the n nodes and weights of Gauss-Legendre quadrature from -1 to 1, read-only."""
     nodes, weights = np.polynomial.legendre.leggauss(n)
     return read_only(nodes), read_only(weights)
 
@@ -47,7 +47,7 @@ def digest(*arrays: np.ndarray) -> str:
 
 def check_arrays(owner: Any, shapes: Mapping[str, tuple[int, ...]],
                  error: type[ValueError] = ValueError) -> None:
-    """Raise `error` unless the attributes in `shapes` are finite and have the given shapes."""
+    """Raise `error` unless `owner` has finite attributes with the names and shapes in `shapes`."""
     for name, shape in shapes.items():
         array = getattr(owner, name)
         if np.shape(array) != shape:

@@ -43,7 +43,7 @@ _LOG2_NODES = 7
 # Number of positions evaluated at a time.
 _BLOCK = 32
 
-# Slope of the coefficients in c, and their offset, numbers or [N_E]; and gains of the bands.
+# Slope of the coefficients in c and their offset, numbers or [N_E]; gains of bands, 1 or [N_B].
 Response: TypeAlias = tuple[np.ndarray | float, np.ndarray | float, np.ndarray | float]
 # Function of a band and positions, float64 [N, 3] [m]. It returns matrices E, complex128
 # [N, N_SB F, R]; the errors of the direct-path signals are E z, with R white numbers z.
@@ -131,7 +131,7 @@ class ElementErrors(SurfaceModel):
 
 
 class DeclaredElements(SurfaceModel):
-    """The distribution of the elements that a scenario declares."""
+    """The distribution of the coefficients that a scenario declares."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
@@ -190,7 +190,7 @@ class SurfaceEstimate(SurfaceModel):
 
     @property
     def id(self) -> str:
-        """Hash of the estimate, 16 hexadecimal digits."""
+        """Hash of the estimate without `failed_probability`, 16 hexadecimal digits."""
         return digest(*(np.asarray(array, '<c16') for array in (
             self.gains, self.offsets, self.band_gains, self.factor)))
 
@@ -200,7 +200,7 @@ class SurfaceEstimate(SurfaceModel):
         return self.failed_probability > 0.5
 
     def std(self) -> np.ndarray:
-        """Return standard deviations of gains, offsets and band gain errors, [2 N_E + N_B]."""
+        """Return standard deviations of gains, offsets and relative band gains, [2 N_E + N_B]."""
         return np.sqrt(np.sum(np.abs(self.factor)**2, axis=1))
 
     @property
@@ -244,8 +244,8 @@ def draw_surface(scenario: Scenario, rng: np.random.Generator) -> ElementErrors:
 def error_terms(scenario: Scenario) -> list[tuple[float, float]]:
     """Return the factors of the coefficients' covariance, as constants and slopes in c.
 
-    The covariance of an element's coefficient between two frames is a sum of T terms: one for
-    relative errors, and two if elements can fail. Each is a product of two factors, one per frame.
+    The covariance of an element's coefficient between two frames is a sum of T terms: at most one
+    for relative errors and two for failures. A term is a product of two factors, one per frame.
     """
     rms, share = scenario.element_error_rms, scenario.failed_element_share
     spread = np.sqrt((1 + rms**2) * share)
@@ -266,7 +266,7 @@ def error_radiation(scenario: Scenario, beams: Beamforming) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def element_correlation(scenario: Scenario, band: int) -> np.ndarray:
-    """Compute the correlation of an element's gain over the measurements of a band.
+    """Compute the correlation of each element's gain over the measurements of a band.
 
     It includes the direct path, averaged over the region of interest, and the multipath. Returns
     complex128 [N_SB F, N_SB F, N_E], read-only.
@@ -300,7 +300,7 @@ def direct_design(scenario: Scenario, radiation: np.ndarray, band: int,
                   positions: np.ndarray) -> np.ndarray:
     """Compute the derivative of a band's mean signals with respect to gains and offsets.
 
-    Takes the weights of `element_radiation`. Returns complex128 [N, N_SB F, 2 N_E].
+    Takes the result of `element_radiation`. Returns complex128 [N, N_SB F, 2 N_E] for band gain 1.
     """
     los = los_gain(scenario, positions, band)
     by_measurement = np.repeat(np.concatenate([los, los], axis=-1), scenario.n_frames, axis=1)

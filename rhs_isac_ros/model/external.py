@@ -10,7 +10,7 @@ import numpy as np
 
 
 class External(abc.ABC):
-    """A scenario value from a file or plug-in; values with the same digest are equal."""
+    """A scenario value from a file or plug-in; two of a class are equal if their digests are."""
 
     origin: str  #: Path of the file, or name of the plug-in; empty for other values.
     # For error messages: the kind of value, and the values that a scenario accepts.

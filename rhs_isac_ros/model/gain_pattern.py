@@ -1,4 +1,4 @@
-"""Gain patterns: amplitude gain of an antenna as a function of the angle from its boresight.
+"""Gain patterns: the amplitude gain of an antenna as a function of the angle from its boresight.
 
 The boresight of the elements is the x axis, and the user's antenna points in the opposite
 direction. The line between an element and the user therefore makes the same angle theta with both
@@ -26,15 +26,15 @@ _STEP_RAD = 1e-3
 
 
 class PatternError(ValueError):
-    """A gain pattern has a wrong shape or digest, or values that are negative or not finite."""
+    """The function of a gain pattern fails, or its result has a wrong shape, type or values."""
 
 
 class GainPattern(External):
     """Amplitude gain that depends only on the angle from the boresight.
 
-    Patterns whose gains agree to seven digits compare equal, even with different functions.
-    Raises PatternError if a function fails, or returns a wrong shape, complex values or values out
-    of range.
+    Two patterns are equal if their gains, and their slopes if given, agree in single precision.
+    Raises PatternError if a function fails or does not return real numbers in the right shape, if
+    a gain is out of range, or if all gains below pi/2 are 0.
 
     Parameters
     ----------

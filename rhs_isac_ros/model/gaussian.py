@@ -1,4 +1,4 @@
-"""Information of Gaussian signals, and elimination of nuisance parameters from it."""
+"""Energy and information of Gaussian signals, and elimination of nuisance parameters."""
 
 from typing import NamedTuple
 
@@ -28,7 +28,7 @@ class Marginal(NamedTuple):
 
 def energy_limit(n: int, probability: float = FALSE_ALARM) -> float:
     """Return the energy that n complex normal numbers of variance 1 exceed with `probability`."""
-    # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
+    # Half a chi-square variable with 2 n degrees of freedom is a gamma variable of shape n.
     from scipy.special import gammainccinv
 
     return float(gammainccinv(n, probability))
@@ -50,10 +50,10 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
 
 
 def share_of_level(n: float, std_db: float) -> float:
-    """Return the share, from 0 to 1, of the variance of a log energy that an unknown level causes.
+    """Return the share of the variance of a log energy, from 0 to 1, that an unknown level causes.
 
-    The energy belongs to n complex Gaussian numbers, whose common level is a log-normal power.
-    If an energy deviates from its median, this share of the deviation is attributed to the level.
+    The energy is that of n complex Gaussian numbers, whose common level is a log-normal power. On
+    average, the level also causes this share of the deviation of a log energy from its median.
     """
     variance = float(np.log(10) / 10 * std_db)**2
     return variance / (variance + 1 / n)
@@ -67,7 +67,7 @@ def quadratic_form(whitened: np.ndarray) -> np.ndarray:
     # Re(a^H b) is the inner product of real and imaginary parts.
     parts = np.ascontiguousarray(whitened).view(whitened.real.dtype)
     if parts.shape[1] == 1:
-        # Products of single rows take many times as long as one sum over arrays.
+        # Matrix products of single rows take many times as long as one sum over arrays.
         form = np.einsum('nar,nar->na', parts, parts)[..., None]
     else:
         form = np.matmul(parts, np.swapaxes(parts, 1, 2))
@@ -80,9 +80,9 @@ def step_to_maximum(information: np.ndarray, gradient: np.ndarray) -> np.ndarray
 
 
 def marginalise(information: np.ndarray, gradient: np.ndarray, n: int = 3) -> Marginal:
-    """Integrate over all but the first n unknowns, by Laplace's method.
+    """Integrate a likelihood over all but the first n unknowns, by Laplace's method.
 
-    Takes the information, float64 [N, n + Q, n + Q], and the gradient, float64 [N, n + Q], of a
+    Takes the information, float64 [N, n + Q, n + Q], and the gradient, float64 [N, n + Q], of the
     log-likelihood.
     """
     if information.shape[1] == n:

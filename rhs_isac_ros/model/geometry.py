@@ -1,7 +1,7 @@
 """Positions of the elements and feeds, frequencies of the sub-bands, and polar coordinates.
 
-The polar coordinates (r, u, v) of a position are its range and two direction cosines. The position
-is in front of the surface, at r (w, u, v) with w = sqrt(1 - u^2 - v^2).
+The polar coordinates (r, u, v) of a position in front of the surface are its range r and its
+direction cosines u along y and v along z: it is at r (w, u, v) with w = sqrt(1 - u^2 - v^2).
 """
 
 import functools
@@ -11,12 +11,12 @@ import numpy as np
 from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
-# Lower limit of the region's extent [wavelengths], so that the prior of a flat region is finite.
+# Lower limit of a region's extent [wavelengths]; the information for an extent of 0 is infinite.
 _NO_EXTENT = 1e-5
 
 
 def element_interval_m(scenario: Scenario) -> float:
-    """Return the spacing Delta_E [m] of the elements, a multiple of lambda_avr (Section V)."""
+    """Return the element spacing Delta_E [m], a multiple of the mean wavelength (Section V)."""
     wavelengths_m = SPEED_OF_LIGHT_MPS / np.array(scenario.center_frequencies_hz)
     return scenario.element_interval_wavelengths * float(np.mean(wavelengths_m))
 
@@ -81,7 +81,7 @@ def to_polar(positions: np.ndarray) -> np.ndarray:
 def jacobian(points: np.ndarray) -> np.ndarray:
     """Compute the derivative of the position with respect to r [m], u and v at points [N, 3].
 
-    Returns float64 [N, 3, 3], in which rows are coordinates of the position.
+    Returns float64 [N, 3, 3]: rows x, y and z, columns r, u and v. Here, w is at least 3e-5.
     """
     distance, u, v = points.T
     w = np.sqrt(np.maximum(1 - u**2 - v**2, 1e-9))
@@ -93,7 +93,7 @@ def jacobian(points: np.ndarray) -> np.ndarray:
 
 
 def polar_bounds(bounds: np.ndarray) -> np.ndarray:
-    """Compute the limits of (r [m], u, v), [2, 3], in a box with the corners `bounds`, [2, 3]."""
+    """Compute the limits of (r [m], u, v), [2, 3], in a box with corners `bounds`, [2, 3] [m]."""
     nearest, farthest = np.clip(0.0, *bounds), np.abs(bounds).max(axis=0)
     limits = np.empty((2, 3))
     limits[:, 0] = np.linalg.norm(nearest), np.linalg.norm(farthest)
@@ -109,7 +109,7 @@ def polar_bounds(bounds: np.ndarray) -> np.ndarray:
 def region_information(scenario: Scenario) -> np.ndarray:
     """Return the information of a Gaussian prior as wide as the region, float64 [3, 3] [1/m^2].
 
-    Its variances, size^2 / 12, equal the variances of the uniform distribution.
+    The prior has the variances of a uniform distribution, size^2 / 12; size has a lower limit.
     """
     shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
     return np.diag(12 / np.maximum(scenario.roi_size_m, _NO_EXTENT * shortest)**2)

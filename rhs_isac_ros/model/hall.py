@@ -1,18 +1,18 @@
-"""Data of one hall that replace declared multipath: a measured covariance, or traced paths.
+"""Data of one hall that replace the declared multipath: a measured covariance, or traced paths.
 
-Let g be the Gaussian gains of the elements in all measurements of a band. Three fields of the
-scenario declare their covariance C_0. A survey with the radiation matrix T replaces the covariance
-L_0 of its signals, T g + noise, by the measured covariance L, and keeps the distribution of g
-given the signals. If the noise is negligible, the result has the smallest Kullback-Leibler
+Let g be the Gaussian gains of the elements in all measurements of a band. Three `FIELDS`, which a
+survey fits first, declare their covariance C_0. The survey, with the radiation matrix T, replaces
+the covariance L_0 of its signals, T g + noise, by the measured one, L, and keeps the distribution
+of g given the signals. If the noise is negligible, the result has the smallest Kullback-Leibler
 divergence from C_0 among all covariances of g that give the signals the covariance L:
 
     C = C_0 + C_0 T^H M T C_0    with    M = L_0^-1 (L - L_0) L_0^-1.
 
-C determines the covariance of the signals for any other beams and for single elements.
+C determines the covariance of signals that any other beams, or single elements, receive.
 
 Paths come from a ray tracer, for example. A path is a spherical wave from a virtual source, such
-as the mirror image of the user in a wall. Its gain is the line-of-sight gain to this source,
-including gain patterns of elements and users, times a complex reflection coefficient: the
+as the mirror image of the user in a wall. The gain of the path is the line-of-sight gain from this
+source, including gain patterns of elements and users, times a complex reflection coefficient: the
 amplitude of the path at the centre of the surface, relative to free space over the same distance.
 """
 
@@ -44,12 +44,12 @@ FIELDS = ('multipath_to_los_db', 'delay_spread_s', 'angular_spread_deg')
 CONDITIONS = (
     'center_frequencies_hz', 'n_subbands', 'subband_width_hz', 'n_frames', 'elements_per_side',
     'element_interval_wavelengths', 'multipath_direction_deg', 'roi_center_m', 'roi_size_m')
-# Largest ratio of a centre frequency to the frequency of the paths, or the inverse.
+# Largest ratio between a centre frequency and the frequency of the paths, in either direction.
 _MAX_FREQUENCY_RATIO = 1.5
 # Largest amplitude relative to free space, and largest distance between a user and the source of
 # the user's direct path.
 _MAX_COEFFICIENT, _MAX_OFFSET_M = 2.0, 0.01
-# Smallest share of the users who must be in the region of interest.
+# Minimum share of the users in the region of interest.
 _MIN_SHARE = 0.5
 # Types of the arrays of paths in memory; in a file, some have less precision.
 _TYPES = {'users': float, 'a': complex, 'src': float, 'n': int, 'f0': float, 'gains': complex}
@@ -63,7 +63,7 @@ class MultipathEstimate(ArrayFile):
     Raises ArchiveError if sizes disagree or a number is not finite.
     """
 
-    # The fields that declare C_0.
+    # Fields that declare C_0, in place of those of the scenario.
     multipath_to_los_db: float
     delay_spread_s: float
     angular_spread_deg: float
@@ -90,7 +90,7 @@ class MultipathEstimate(ArrayFile):
     def level_db(self) -> tuple[float, float]:
         """Median and standard deviation of the level of a user's multipath [dB].
 
-        The median is below 0 dB, because the survey inflates the covariance.
+        The level is relative to the covariance; if a survey inflated it, the median is negative.
         """
         return (-10 * math.log10(self.about.get('inflation', 1.0)),
                 self.about.get('level_std_db', 0.0))
@@ -177,9 +177,9 @@ class PathChannel(ArrayFile):
     def from_sionna(cls, paths: Any, f0: float) -> 'PathChannel':
         """Convert paths of Sionna RT, as its `PathSolver` returns them.
 
-        Users are the transmitters, and the only receiver is at the surface's centre, with axes
-        like the scenario's. Each device has one isotropic antenna. All reflections are specular,
-        and the frequency of the scene is `f0` [Hz]. Paths from behind the surface are removed.
+        Users must be transmitters, and the only receiver must be at the surface's centre, with
+        axes like the scenario's. Devices must have one isotropic antenna, and reflections must be
+        specular. `f0` [Hz] is the scene's frequency. Paths from behind the surface are removed.
         Raises ArchiveError if there are several receivers or antennas, or the result is invalid.
         """
         a = np.array(paths.a[0]) + 1j * np.array(paths.a[1])
@@ -200,7 +200,7 @@ class PathChannel(ArrayFile):
 
     @classmethod
     def joined(cls, parts: Sequence['PathChannel']) -> 'PathChannel':
-        """Join the users of several channels that have the same frequency and no `gains`."""
+        """Join the users of channels; raise ArchiveError if `f0` differs or there are `gains`."""
         n_paths = max(part.a.shape[1] for part in parts)
 
         def padded(name: str, value: float) -> np.ndarray:
@@ -217,7 +217,7 @@ class PathChannel(ArrayFile):
 
     @functools.cached_property
     def sources(self) -> np.ndarray:
-        """Virtual sources in full precision, float64 [N, P, 3] [m]; the user for a direct path."""
+        """Virtual sources, float64 [N, P, 3] [m]; the user for direct and missing paths."""
         missing, direct = (self.a == 0)[..., None], (self.n == 0)[..., None]
         return np.where(missing | direct, self.users[:, None], self.src)
 
@@ -228,7 +228,7 @@ class PathChannel(ArrayFile):
         return self.a * 4 * np.pi * self.f0 * distance / SPEED_OF_LIGHT_MPS
 
     def nearest(self, positions: np.ndarray) -> np.ndarray:
-        """Return the index of the user nearest to each position [N, 3] [m], int64 [N]."""
+        """Return the index of the user nearest to each position [M, 3] [m], int64 [M]."""
         squares = np.sum((positions[:, None] - self.users)**2, axis=2)
         return np.argmin(squares, axis=1)
 
@@ -256,7 +256,7 @@ class PathChannel(ArrayFile):
     def save(self, path: str | Path) -> None:
         """Write the paths to a compressed file of NumPy's format ``.npz``.
 
-        Amplitudes and virtual sources are rounded to single precision.
+        Amplitudes, virtual sources and `gains` are rounded to single precision.
         """
         arrays: dict[str, Any] = {
             name: np.asarray(array, _FILE_TYPES.get(name)) for name in _TYPES
@@ -267,7 +267,7 @@ class PathChannel(ArrayFile):
     def load(cls, path: str | Path) -> 'PathChannel':
         """Read paths from a file; arrays with other names are ignored.
 
-        Raises ArchiveError, with the name of the array, if the content is invalid.
+        Raises ArchiveError if the file cannot be read or its content is invalid.
         """
         arrays = read_arrays(path)
         with translated((TypeError, ValueError), ArchiveError, path):

@@ -86,9 +86,9 @@ class Exponents:
     def derivatives(self, divided: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Return the derivatives of signals with respect to z, [N, Q, N_B, N_SB F].
 
-        Takes signals after `divide`, and their mean. A parameter that moves the multipath acts on
-        the received multipath, so its derivative contains the signals, and differs between
-        positioning phases. The derivative with respect to any other parameter contains the mean.
+        Takes signals after `divide`, and their mean, [N, N_B, N_SB F]. For a parameter that moves
+        the multipath, the derivative contains the signals, including the received multipath, so it
+        differs between positioning phases. For any other parameter, it contains only the mean.
         """
         moves = self.moves_multipath[:, None, None]
         return self.scaled_patterns * np.where(moves, divided[:, None], mean[:, None])
@@ -143,7 +143,7 @@ def _shape(scenario: Scenario) -> tuple[int, int]:
 
 @dataclasses.dataclass(frozen=True)
 class Factor(Impairment):
-    """An impairment with independent values; a scenario field is their standard deviation."""
+    """An impairment with independent values, whose standard deviation is a scenario field."""
 
     field: str
     # Function that returns the exponents per unit of the values.
@@ -178,7 +178,7 @@ BUILT_IN: tuple[Factor, ...] = (
 def impairments_of(scenario: Scenario) -> tuple[Impairment, ...]:
     """Return the impairments of the signals that a scenario declares; none for Table I.
 
-    Raises PluginError if a plug-in cannot be loaded or returns no `Impairment`.
+    Raises PluginError if a plug-in cannot be loaded, fails or does not return an `Impairment`.
     """
     return (*(one for one in BUILT_IN if one.std(scenario) > 0), *_installed(scenario))
 

@@ -43,8 +43,8 @@ def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
     """Compute the gains without random multipath, complex128 [N, N_SB, N_E].
 
     Without a channel file, these are the gains of `los_gain`. With one, the gain at a position is
-    the sum over the paths of the nearest user in the file. `blocked`, bool [N], marks users that
-    have no direct path.
+    the sum over the paths of the nearest user in the file. `blocked`, bool [N], marks users whose
+    direct path is left out.
     """
     channel = scenario.channel
     blocked = np.zeros(len(positions), bool) if blocked is None else blocked
@@ -66,7 +66,7 @@ def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
 
 def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
              weights: np.ndarray) -> np.ndarray:
-    """Sum `los_gain` with weights [n, N_SB, N_E] over elements in n bands; return [n, N, N_SB]."""
+    """Sum `los_gain` of n bands over elements, weighted [n, N_SB, N_E]; return [n, N, N_SB]."""
     waves = los_waves(scenario, checked_positions(positions), bands, slopes=False)
     scaled = weights / subband_frequencies_hz(scenario)[list(bands), :, None]
     return np.stack([(gain @ row[..., None])[..., 0].T
@@ -96,7 +96,7 @@ def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *
     The derivative with respect to the user's position p is dh/dp = a (p - p_m) + b e_x. The
     boresight term b exists only with a gain pattern, which adds (dh/dtheta) (dtheta/dp) for the
     angle theta from the boresight: dtheta/dp = ((p - p_m) cos theta / d - e_x) / (d sin theta).
-    Without `slopes`, the gain is repeated in place of the radial factor a.
+    Without `slopes`, the gain is repeated in place of a, and b is None.
     """
     elements = element_positions(scenario)
     distances = np.sqrt(sum(
@@ -167,7 +167,7 @@ def _offsets(scenario: Scenario, positions: np.ndarray) -> np.ndarray:
 
 def _amplitude(
         scenario: Scenario, offsets: np.ndarray, *, slope: bool = False) -> float | np.ndarray:
-    """Return gain times distance times frequency, a number or [N, N_E], or its slope in theta."""
+    """Return abs(h) d f [m Hz] of gains h, a number or [N, N_E], or its derivative in theta."""
     gains = scenario.element_gain, scenario.user_gain
     angles = np.zeros(())
     if has_pattern(scenario):

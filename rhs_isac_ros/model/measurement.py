@@ -2,7 +2,7 @@
 
 The signals of band i are complex Gaussian with a mean that depends on the user's position and a
 covariance Lambda_i that does not. Bands are independent of each other. Errors of the elements add
-to the covariance; unknown gains and phases are described in `impairments`.
+a covariance, which depends on the position; `impairments` adds unknown gains and phases.
 """
 
 import functools
@@ -145,9 +145,10 @@ class MeasurementModel:
     Instances are immutable. The constructor computes only the radiation matrices; `prepare` or the
     first use computes the factors of the covariance and the weights of `mean_and_jacobian`.
 
-    Methods take positions of the user, float64 [N, 3] [m], and raise ValueError if the shape is
-    wrong or a value is not finite. Measurements are sub-band-major. The constructor raises
-    ValueError if the beamforming or the surface does not have the sizes of the scenario.
+    Methods that take positions of the user, float64 [N, 3] [m], raise ValueError if the shape is
+    wrong or a value is not finite. Measurements are sub-band-major. Only `sample` includes
+    impairments, blocked users and channel files. The constructor raises ValueError if the
+    beamforming or the surface does not have the sizes of the scenario.
 
     Parameters
     ----------
@@ -222,8 +223,7 @@ class MeasurementModel:
 
     def mean(self, positions: np.ndarray) -> np.ndarray:
         """Compute the mean signals, complex128 [N, N_B, N_SB F]: Eq. (8) for the direct path."""
-        # A change of this kernel or its block size would change the simulated signals of all
-        # seeds.
+        # A change of the arithmetic or the block size would change the results of all seeds.
         def of_band(positions: np.ndarray, _: slice, band: int) -> np.ndarray:
             los = los_gain(self.scenario, positions, band)
             return received_signal(los, 0.0, self.radiation[band], 0.0)
@@ -250,8 +250,8 @@ class MeasurementModel:
 
         The mean equals the result of `mean` up to rounding, and is computed faster. With
         `whitened`, both results are whitened. `by_coordinate`, float64 [N, 3, Q], contains
-        derivatives of the positions with respect to Q other coordinates; the derivatives of the
-        mean are then with respect to these coordinates.
+        derivatives of the positions with respect to Q other coordinates; the derivative of the
+        mean, [N, Q, N_B, N_SB F], is then with respect to these coordinates.
         """
         positions, weights = checked_positions(positions), self._weights
         n, (n_bands, n_rows) = len(positions), self.shape
@@ -275,7 +275,7 @@ class MeasurementModel:
         return mean, jacobian
 
     def fast_mean(self, positions: np.ndarray) -> np.ndarray:
-        """Compute the mean of `mean_and_jacobian` without the Jacobian, in a third of the time."""
+        """Compute only the mean of `mean_and_jacobian`, which takes a third of the time."""
         positions, weights = checked_positions(positions), self._weights
         mean = np.empty((len(positions), *self.shape), complex)
         for block in blocks(len(positions), weights.block):
@@ -337,17 +337,17 @@ class ElementSums:
             np.swapaxes(radiation.reshape(shape), 2, 3)
             / subband_frequencies_hz(scenario)[..., None, None])
         self._elements = element_positions(scenario)
-        # Axes along which elements are not at 0; for elements in a plane, there are two.
+        # The A axes along which elements are not at 0: at most two, as elements lie in a plane.
         self._axes = np.flatnonzero(self._elements.any(axis=0))
         coordinates = np.hstack([np.ones((shape[3], 1)), self._elements[:, self._axes]])
         moments = coordinates[:, :, None] * self._frames[..., None, :]
-        # T_i times 1 and the coordinates of the element [m], complex128 [N_B, N_SB, N_E, G F].
+        # `_frames` times 1 and A coordinates [m], complex128 [N_B, N_SB, N_E, (1 + A) F].
         self._moments = moments.reshape(*self._frames.shape[:3], -1)
 
     def terms(self, positions: np.ndarray, slopes: bool = True) -> np.ndarray:
         """Compute the mean and the terms of its derivative, complex128 [N_B, N, 1 + G, N_SB F].
 
-        Row 0 is the mean. The other rows, which `weights` multiplies, exist only with `slopes`.
+        Row 0 is the mean. The other G rows, for the result of `weights`, exist only with `slopes`.
         """
         n, (n_bands, n_subbands, _, n_frames) = len(positions), self._frames.shape
         n_terms = 2 + len(self._axes) + self._has_pattern if slopes else 1

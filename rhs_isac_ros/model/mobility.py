@@ -119,9 +119,9 @@ class Waypoints:
 
 
 class RandomWalk(StraightMobility):
-    """A user that walks in straight lines between random positions in the region of interest.
+    """A user that walks straight between random positions from `Scenario.sample_positions`.
 
-    The first position is random, unless it is given as `start`, float64 [3] [m].
+    The first position is also random, unless it is given as `start`, float64 [3] [m].
     """
 
     def __init__(
@@ -156,13 +156,13 @@ class RandomWalk(StraightMobility):
 
 
 class Traced:
-    """Path of another mobility, with each position moved to the nearest user of a channel file."""
+    """Path of another mobility with its positions moved to the nearest users of a channel file."""
 
     def __init__(self, mobility: Mobility, channel: PathChannel) -> None:
         self._mobility, self._channel = mobility, channel
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the position [3] [m] and velocity [3] [m/s]."""
+        """Return the moved position [3] [m], and the velocity [3] [m/s] of the other mobility."""
         position, velocity = self._mobility.state(now_s)
         return self._channel.users[self._channel.nearest(position[None])[0]].copy(), velocity
 
@@ -173,8 +173,8 @@ def make_plugin(
     """Create a mobility from a plug-in, an entry point of the group `plugins.MOBILITIES`.
 
     The plug-in is called with the arguments of `RandomWalk`. If `start` is None, the plug-in
-    chooses the first position. Raises PluginError if there is no such plug-in, or if it does not
-    return a mobility.
+    chooses the first position. Raises PluginError if there is no such plug-in, it fails, or it
+    does not return a mobility.
     """
     mobility: Mobility = plugins.make(plugins.MOBILITIES, name, scenario, speed_mps, rng, start)
     if not callable(getattr(mobility, 'state', None)):

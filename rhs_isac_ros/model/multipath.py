@@ -1,4 +1,4 @@
-"""Multipath: spatial covariance, correlation over sub-bands and frames, random gains.
+"""Multipath: spatial covariance, correlation over sub-bands and frames, and random gains.
 
 Indices of bands, sub-bands and frames start at 0. Bands are independent. Fields of the scenario
 declare the covariance of the gains; a measured covariance adds a term of low rank (see `hall`).
@@ -24,20 +24,20 @@ _ANGLE_NODES = 160
 _PANEL_PHASE_RAD = 400.0
 # Number of elements above which products with V_i are computed as convolutions.
 _MAX_MATRIX = 1024
-# Number of complex numbers processed at a time.
+# Target number of complex numbers to process at a time.
 _BLOCK_NUMBERS = 1 << 22
-# Nodes along each side of the region of interest, where 1 / r^2 is smooth.
+# Quadrature nodes along each side of the region of interest; few suffice, as 1 / r^2 is smooth.
 _ROI_NODES = 24
 
 
 def multipath_covariance(scenario: Scenario) -> np.ndarray:
-    """Implements Eq. (2). Covariance of the multipath gains, as the fields declare it.
+    """Implements Eq. (2). Covariance of the multipath gains, without the term of a survey.
 
     The power-angle profile is a product of two Laplacians with the spread `angular_spread_deg`,
     centred on `multipath_direction_deg`. Its total over the half space in front of the surface is
-    the mean line-of-sight power in the region of interest, plus ``multipath_to_los_db``; the paper
-    leaves this scale open. The power gain of the elements then weights the profile. Returns V_i,
-    complex128 [N_B, N_E, N_E]; for many elements, `declared_covariance` needs less memory.
+    the result of `mean_los_power`, raised by ``multipath_to_los_db``; the paper leaves this scale
+    open. The power gain of the elements then weights the profile. Returns V_i, complex128
+    [N_B, N_E, N_E], read-only; for many elements, `declared_covariance` needs less memory.
     """
     return _matrix(_lattice(scenario), scenario)
 
@@ -47,15 +47,15 @@ class SpatialCovariance:
     """V_i of Eq. (2), stored for fast products, for one band or for several on a leading axis.
 
     The declared covariance of two elements depends only on their offset on the lattice, so a
-    product with V_i is a convolution. For few elements, a matrix is as fast. A measured covariance
-    adds a term of low rank.
+    product with it is a convolution. For few elements, a matrix is as fast. A survey adds a
+    low-rank term to the declared covariance.
     """
 
     shape: tuple[int, int]  #: Numbers of rows and columns of the elements.
-    is_real: bool  #: Whether V_i is real, as it is for an even profile that is not measured.
+    is_real: bool  #: Whether V_i is real, as for an even profile without a measured term.
     power: np.ndarray  #: Power of the gain of each element, float64 [N_E] or [N_B, N_E].
     matrix: np.ndarray | None = None  #: V_i [..., N_E, N_E]; None for many elements.
-    # Fourier transform over the offsets of the elements; None for few elements.
+    # Fourier transform of V_i over the offsets of the elements; None for few elements.
     spectrum: np.ndarray | None = None
     # W F and F of the low-rank term that `plus` adds, if there is no matrix.
     excess: tuple[np.ndarray, np.ndarray] | None = None
@@ -66,7 +66,7 @@ class SpatialCovariance:
         return math.prod(self.shape)
 
     def __getitem__(self, bands: int | slice | list[int]) -> 'SpatialCovariance':
-        """Return V_i for some of the bands."""
+        """Return V_i of one or more of the bands."""
         return SpatialCovariance(
             self.shape, self.is_real, self.power[bands],
             None if self.matrix is None else self.matrix[bands],
@@ -84,7 +84,7 @@ class SpatialCovariance:
             total, matrix=read_only(self.matrix + np.matmul(adjoint(factor), through)))
 
     def scatter(self, weights: np.ndarray) -> np.ndarray:
-        """Multiply weights of elements, complex128 [..., N_E], by V_i; the shape is unchanged."""
+        """Map weights w, complex128 [..., N_E] or [N_B, ..., N_E], to w V_i of the same shape."""
         rows = weights.reshape(*self.power.shape[:-1], -1, weights.shape[-1])
         result = np.empty(rows.shape, complex)
         if self.matrix is None:
@@ -176,12 +176,12 @@ def _lattice(scenario: Scenario) -> np.ndarray:
 class _PlaneWaves(NamedTuple):
     """Plane waves from E elevations and A azimuths."""
 
-    # Shares of the power [E] and [A], and gain of an element, a number or [E, A].
+    # Shares of the power [E] and [A], and gain of an element, [E, A] or [1, 1].
     elevation_weights: np.ndarray
     azimuth_weights: np.ndarray
     gain: float | np.ndarray
-    # Phasors at the rows [E, rows] and at the columns [E, A, columns]; for an even profile, only
-    # their real parts.
+    # Phasors at the rows [E, rows] and at the columns [E, A, columns]; only their real parts along
+    # an axis that `is_even` marks.
     along_z: np.ndarray
     along_y: np.ndarray
 
@@ -287,9 +287,9 @@ def measurement_correlation(scenario: Scenario) -> np.ndarray:
 
 
 def coupling(scenario: Scenario, radiation: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Compute the declared covariance between signals received with two radiation matrices [W].
+    """Compute the declared cross-covariance of multipath received with two radiation matrices.
 
-    Returns complex128 [N_B, N_SB F, N_SB F] for matrices T_i, complex128 [N_B, N_SB F, N_E].
+    Returns complex128 [N_B, N_SB F, N_SB F] [W] for matrices T_i, complex128 [N_B, N_SB F, N_E].
     """
     scattered = np.matmul(declared_covariance(scenario).scatter(radiation), adjoint(other))
     return measurement_correlation(scenario) * scattered
@@ -321,7 +321,7 @@ def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray | None, np.n
 
 def draw_multipath(
         scenario: Scenario, band: int, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw multipath gains h^MP of n positioning phases, complex128 [n, N_SB F, N_E]."""
+    """Draw multipath gains h^MP of a band in n positioning phases, complex128 [n, N_SB F, N_E]."""
     spatial, over_rows = multipath_factors(scenario)[band]
     n_draws = over_rows.shape[1]
     if spatial is None:
@@ -354,8 +354,8 @@ def _draw_plane_waves(
 def _stretches(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """Compute A and T V_i of each band; g + C_0 T^H A T g then has the measured covariance.
 
-    Here, g are gains with the declared covariance C_0, and S is the covariance of the signals T g.
-    With R = S^(1/2), the covariance in `hall` requires R A R = (1 + R M R)^(1/2) - 1.
+    Here, g are gains with the declared covariance C_0, and the signals T g have a covariance
+    R R^H. The covariance in `hall` then requires R^H A R = (1 + R^H M R)^(1/2) - 1.
     """
     assert scenario.multipath
     radiation, stretches = scenario.multipath.radiation, []
@@ -378,18 +378,18 @@ def complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarr
 
 
 def _fields(scenario: Scenario) -> Scenario | MultipathEstimate:
-    """Return the object with the fields of the covariance: the survey if any, or the scenario."""
+    """Return the object whose fields declare V_i: the survey if there is one, or the scenario."""
     return scenario.multipath or scenario
 
 
 def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase: float
                         ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute n angles and normalised weights of a Laplacian; if even, of its positive half."""
+    """Return angles [rad] and weights of sum 1 for a Laplacian or, if even, its positive half."""
     nodes, weights = gauss_legendre(_ANGLE_NODES)
     mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)
     angles, density = [], []
     signs = (1,) if is_even else (-1, 1)
-    # Each interval begins at the cusp, the mean, and is shorter for a narrow profile.
+    # Each side of the cusp at the mean ends at 90 degrees, or earlier for a narrow profile.
     reaches = [min(1 - sign * mean / (np.pi / 2), 30 * spread / (np.pi / 2)) for sign in signs]
     for sign, reach in zip(signs, reaches, strict=True):
         panels = math.ceil(phase * reach / _PANEL_PHASE_RAD) or 1
@@ -403,7 +403,7 @@ def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase
 
 
 def square_root(matrix: np.ndarray) -> np.ndarray:
-    """Return R with R R^H = matrix; eigenvalues at the level of rounding are dropped."""
+    """Return R [n, rank] with R R^H = matrix, without eigenvalues at the level of rounding."""
     values, vectors = np.linalg.eigh(matrix)
     keep = values > values[-1] * len(values) * np.finfo(float).eps
     return read_only(vectors[:, keep] * np.sqrt(values[keep]))

@@ -28,7 +28,7 @@ _ROUNDING = 1e-9
 
 
 class ScenarioError(ValueError):
-    """A scenario field has a value that the model cannot use."""
+    """A scenario file is invalid, or a field has a value that the model cannot use."""
 
 
 def declare(
@@ -104,14 +104,14 @@ class Table1:
 
 @dataclasses.dataclass(frozen=True)
 class Extensions:
-    """Effects beyond the paper's model, all absent by default.
+    """Effects beyond the paper's model; with the defaults, none of them changes it.
 
     Standard deviations describe Gaussians with zero mean. Phases are wrapped to the circle: with a
     standard deviation of 2 pi or more, a phase is practically uniform, because its mean resultant
     length, exp(-std^2 / 2), is below 3e-9.
 
-    A user's gain and carrier offset are drawn once per user, phases and the timing offset once per
-    cycle, and element errors and failures once per surface.
+    Gain, carrier offset and blockage of a user are drawn once per user, phases and the timing
+    offset once per cycle, and element errors and failures once per surface.
     """
 
     multipath_to_los_db: float = declare(
@@ -199,7 +199,7 @@ class Extensions:
         '', label='channel')
 
 
-# Fields whose values come from plug-ins or files, and those among them that are files.
+# Fields whose values can come from plug-ins or files, and those of them that are files.
 _EXTERNAL: dict[str, type[External]] = {
     'element_gain': GainPattern, 'user_gain': GainPattern, 'multipath': MultipathEstimate,
     'channel': PathChannel}
@@ -210,7 +210,7 @@ _FILES = [name for name, kind in _EXTERNAL.items() if issubclass(kind, ArrayFile
 class Scenario(Extensions, Table1):
     """Geometry, bands and propagation of one system; the defaults are the paper's Table I.
 
-    A scenario has the fields of `Table1` and those of `Extensions`, which are all off by default.
+    A scenario has the fields of `Table1` and those of `Extensions`.
 
     Lengths are in metres in the frame ``map``: the surface lies in the plane x = 0, centred on
     the origin, with x pointing outward and z up.
@@ -261,7 +261,7 @@ class Scenario(Extensions, Table1):
         """Read a scenario from a YAML file that maps field names to values.
 
         Fields that the file omits keep their defaults. Paths in the file are relative to its
-        folder. Raises ScenarioError if the file is invalid.
+        folder. Raises ScenarioError if the file is unreadable or invalid.
         """
         with translated(ValueError, ScenarioError):
             content = read_yaml(path)
@@ -278,7 +278,7 @@ class Scenario(Extensions, Table1):
             return cls(**content)
 
     def changes(self) -> dict[str, Any]:
-        """Return the fields that differ from Table I, as values that `from_yaml` can read.
+        """Return the fields that differ from their defaults, as values that `from_yaml` can read.
 
         Gain patterns are written as name and digest, and files as path and digest. A pattern that
         is not a plug-in cannot be read back, and neither can arrays that are not in a file.
@@ -323,7 +323,7 @@ class Scenario(Extensions, Table1):
 
     @property
     def multipath_level_db(self) -> tuple[float, float]:
-        """Median and standard deviation of the level of a user's multipath [dB]."""
+        """Median and standard deviation of a user's multipath level [dB]; 0 without a survey."""
         return self.multipath.level_db if self.multipath else (0.0, 0.0)
 
     @property
@@ -344,14 +344,14 @@ class Scenario(Extensions, Table1):
 
     @functools.cached_property
     def roi_bounds_m(self) -> np.ndarray:
-        """Lower and upper corner of the region of interest, float64 [2, 3] [m], read-only."""
+        """Lower and upper corners of the region of interest, float64 [2, 3] [m], read-only."""
         center, size = np.array(self.roi_center_m), np.array(self.roi_size_m)
         return read_only(np.stack([center - size / 2, center + size / 2]))
 
     def sample_positions(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw positions from the region of interest, float64 [n, 3] [m].
+        """Draw positions of users, float64 [n, 3] [m].
 
-        Positions are uniform; with a channel file, they are drawn from the positions of its users.
+        They are uniform in the region of interest or, with a channel file, drawn from its users.
         """
         if self.channel:
             return self.channel.users[rng.integers(len(self.channel.users), size=n)]
@@ -360,7 +360,7 @@ class Scenario(Extensions, Table1):
 
 
 def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) -> None:
-    """Raise ValueError unless the shape of the array is `symbols`, keys of `Scenario.sizes`."""
+    """Raise ValueError unless the shape of `array` is `symbols`, keys of `Scenario.sizes`."""
     expected = tuple(scenario.sizes[symbol] for symbol in symbols.split())
     if np.shape(array) != expected:
         listed = ', '.join(symbols.split())
@@ -397,7 +397,7 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
 
 def _number(field: dataclasses.Field[Any], value: Any) -> Any:
     declared = field.metadata['declared']
-    # YAML reads 28e9 as a string, so strings are accepted as numbers.
+    # YAML reads 28e9 as a string, so strings are accepted as real numbers.
     convert = operator.index if declared.kind is int else float
     if not isinstance(value, bool):
         with contextlib.suppress(TypeError, ValueError, OverflowError):

@@ -102,7 +102,7 @@ def onboard_matrix(scenario: Scenario) -> np.ndarray:
 
 
 def on_levels(scenario: Scenario, analog: np.ndarray) -> np.ndarray:
-    """Round configurations, float64 of any shape, to the amplitudes that elements can take."""
+    """Round configurations to the amplitude levels of the elements; keep continuous amplitudes."""
     steps = scenario.amplitude_levels - 1
     return np.rint(analog * steps) / steps if steps > 0 else analog
 
