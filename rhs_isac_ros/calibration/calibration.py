@@ -20,19 +20,19 @@ _FORMAT = 1
 _ARRAYS = {'gains': complex, 'offsets': complex, 'band_gains': complex, 'factor': complex,
            'failed_probability': float}
 _DEVIATIONS = ('gains_std', 'offsets_std', 'band_gains_std')
-# Number of elements that a report lists.
+# Number of working elements that a report lists.
 _N_WORST = 5
 
 
 class CalibrationError(ValueError):
-    """A calibration is malformed or belongs to another scenario."""
+    """A calibration cannot be read, is malformed, or belongs to another scenario."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Calibration:
     """An estimate of a surface, the scenario to which it applies, and a record of its origin.
 
-    Raises CalibrationError if sizes disagree or a number is not finite.
+    Raises CalibrationError if sizes disagree, or a number is not finite or not a probability.
     """
 
     surface: SurfaceEstimate  #: The estimate, as used by estimators, bounds and beams.
@@ -60,7 +60,7 @@ class Calibration:
 
     @property
     def id(self) -> str:
-        """Hash of the content: ``ca`` and 16 hexadecimal digits."""
+        """Hash of the coefficients and their covariance: ``ca`` and 16 hexadecimal digits."""
         return f'ca{self.surface.id}'
 
     def check(self, scenario: Scenario) -> None:

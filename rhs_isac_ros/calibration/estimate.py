@@ -70,7 +70,7 @@ def estimate_surface(
         progress: Callable[[int, float], None] | None = None) -> SurfaceEstimate:
     """Estimate a surface from pilots of one or several codebooks.
 
-    The default prior is the result of `prior_of`; without pilots, it is also the estimate.
+    The default prior is the result of `prior_of`. Without pilots, the estimate is the prior.
     `progress` is called after each round with the number of the round and the largest change of a
     parameter, in standard deviations.
     """
@@ -96,7 +96,7 @@ def estimate_surface(
 
 
 def initial_values(nuisance: Nuisance, white: np.ndarray, white_mean: np.ndarray) -> np.ndarray:
-    """Estimate, one by one, the values [N, Q] that only rotate whole bands; other values are 0."""
+    """Estimate, one by one, nuisance values [N, Q] that only rotate whole bands; others are 0."""
     values = np.zeros((len(white), len(nuisance)))
     outputs = np.sum(np.conj(white_mean) * white, axis=2)
     for q in np.flatnonzero(nuisance.phases.any(axis=0)):
@@ -110,7 +110,7 @@ def initial_values(nuisance: Nuisance, white: np.ndarray, white_mean: np.ndarray
 
 def refined_values(nuisance: Nuisance, values: np.ndarray, signals: np.ndarray, mean: np.ndarray,
                    whiten: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Return values [N, Q] after a scoring step, for signals and their mean [N, N_B, N_SB F]."""
+    """Improve nuisance values [N, Q] by a scoring step, for signals [N, N_B, N_SB F]."""
     aligned = nuisance.divide(signals, values)
     slopes = whiten(nuisance.derivatives(aligned, mean))
     residual = whiten(aligned) - whiten(mean)

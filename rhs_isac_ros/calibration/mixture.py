@@ -32,7 +32,7 @@ class SurfacePrior:
     band_gain_rms: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
+        """Raise ValueError if a field is out of range."""
         for name, high in (('element_error_rms', 1.0), ('failed_element_share', 0.5),
                            ('band_gain_rms', 10.0)):
             value = getattr(self, name)
@@ -46,7 +46,7 @@ class Posterior(NamedTuple):
     # For the P = 2 N_E + N_B gains, offsets and band gains: float64 [2 P] and [2 P, 2 P].
     mean: np.ndarray
     covariance: np.ndarray
-    # The most likely states, bool [N_E], and probabilities of failure, float64 [N_E].
+    # Whether each element has probably failed, bool [N_E], and with what probability, [N_E].
     failed: np.ndarray
     failed_probability: np.ndarray
 

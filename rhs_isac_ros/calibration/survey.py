@@ -9,8 +9,8 @@ inflated by t, is
 The fields and nu maximise the evidence. L is close to the declared covariance for few positions,
 and to the sample covariance for many. If the multipath consists of a few strong paths, it is not
 Gaussian, and positioning errors would exceed the bound with t = 1. Each position is therefore left
-out in turn, and t is chosen so that 95 % of the positions lie in the 95 % region of the local
-bound, and 99 % pass the test of the residual.
+out in turn, and t is chosen so that about 95 % of the errors are in the 95 % region of the local
+bound, and 99 % of the residuals pass their test. In small surveys, t is close to a usual value.
 
 Positions are excluded if their signals are more probable as multipath of an unknown level, without
 a direct path.
@@ -39,16 +39,16 @@ from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.support.threads import one_blas_thread
 
-# Share of positions that should lie in the region of the local bound, and of residuals that should
-# pass their test.
+# Share of errors that should be in the region of the local bound, and share of residuals that
+# should pass their test.
 COVERAGE = 0.95
 _PASSING = 0.99
 # Inflation t without positions, and the weight of this value, in positions. It is a margin for
 # small surveys, in which the quantiles above are uncertain.
 _INFLATION, _INFLATION_WEIGHT = 1.8, 40
-# Standard deviation of the level of users in sight [dB], with the same weight.
+# Usual standard deviation of the level of users in sight [dB], with the same weight.
 _LEVEL_STD_DB = 1.2
-# Surveys with fewer positions, or a smaller span along a side of the region, cause a warning.
+# Surveys with fewer positions, or that span a smaller share of a side, cause a warning.
 MIN_POSITIONS = 20
 _MIN_SPAN = 0.5
 # Limits of delay spreads in units of the inverse bandwidth, angular spreads [deg], levels [dB] and
@@ -56,9 +56,10 @@ _MIN_SPAN = 0.5
 _DELAYS, _ANGLES, _LEVELS, _WEIGHTS = (1e-3, 10.0), (0.5, 300.0), (-80.0, 60.0), (0.5, 1e4)
 # Initial steps of the search: level [dB], and logarithms of the other parameters.
 _STEPS = (3.0, 1.0, 0.7, 1.0)
-# Prior probability of a blocked position if the scenario declares none, and its largest value.
+# Prior probability of a blocked position if the scenario declares none, and its upper limit.
 _BLOCKED_PROBABILITY, _MAX_BLOCKED = 0.1, 0.9
-# Rounds of alignment, estimation and search for blocked positions, and steps of each alignment.
+# Maximum number of rounds of alignment, estimation and search for blocked positions, and number of
+# steps of each alignment.
 _ROUNDS, _ALIGNMENT_STEPS = 4, 6
 
 
@@ -72,13 +73,13 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
     """Estimate the covariance of the multipath from signals at known positions.
 
     `positions`, float64 [N, 3] [m], should be spread over the region of interest; `received` are
-    complex128 [N, N_B, N_SB F], sub-band-major. The multipath fields of the scenario affect only
-    the start of the search; declared impairments are estimated for each position. The result is a
-    value of the field `Scenario.multipath`, and its `about` contains the expected coverage.
+    complex128 [N, N_B, N_SB F], sub-band-major. The declared level and spreads of the multipath
+    affect only the start of the search. Declared impairments are estimated for each position. The
+    result is a value of `Scenario.multipath`; its `about` contains the expected coverage.
 
     Raises ValueError if a shape is wrong, a number is not finite, or there is no position. Warns
-    with SurveyWarning if there are fewer than `MIN_POSITIONS` positions, or if they span less than
-    half of a side of the region.
+    with SurveyWarning if fewer than `MIN_POSITIONS` positions have a direct path, or if these span
+    less than half of a side of the region.
     """
     from scipy.stats import binomtest
 
@@ -119,7 +120,7 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
 
 
 def survey_report(estimate: MultipathEstimate) -> str:
-    """Describe an estimate: fields, weight of the prior, inflation, and expected coverage."""
+    """Describe an estimate: positions, fields, prior weight, inflation, coverage and warnings."""
     about = estimate.about
     coverage, low, high = (100 * share for share in about['coverage'])
     return '\n'.join([
@@ -135,7 +136,7 @@ def survey_report(estimate: MultipathEstimate) -> str:
 
 
 class _Fit(NamedTuple):
-    """The most likely fields of the scenario, and the residuals for these fields."""
+    """The most likely fields of the scenario, and the residuals that led to them."""
 
     # Scenario with the fields, and weight of the prior in positions.
     fields: Scenario
@@ -254,11 +255,11 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
 
 def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndarray,
               in_sight: np.ndarray, total: np.ndarray, weight: float) -> np.ndarray:
-    """Mark positions that probably have a direct path, given all other positions, bool [N].
+    """Mark positions that probably have a direct path, bool [N]; if there are none, mark all.
 
-    Without a direct path, signals are multipath of an unknown level. With a direct path, its level
-    varies as among the positions that are `in_sight`. `total`, complex128 [N_B, R, R], is the sum
-    over these positions and the prior, and has the given `weight`.
+    Without a direct path, signals are multipath of an unknown level. With one, the level of the
+    multipath varies as among the positions that are `in_sight`. `total`, complex128 [N_B, R, R],
+    is the sum over these positions and the prior, and has the given `weight`.
     """
     whitener = np.linalg.inv(np.linalg.cholesky(total))
     with_path = np.einsum('irs,nis->nir', whitener, residuals)
@@ -281,7 +282,7 @@ def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
 
 
 def _inflation(distances: np.ndarray, energies: np.ndarray, n_measurements: int) -> float:
-    """Return the inflation t, including the margin for small surveys."""
+    """Return the inflation t, which is close to `_INFLATION` in small surveys."""
     most = max(1.0, float(energies.mean()) / n_measurements,
                float(np.quantile(distances, COVERAGE)) / _radius(),
                float(np.quantile(energies, _PASSING)) / energy_limit(n_measurements))
@@ -290,7 +291,7 @@ def _inflation(distances: np.ndarray, energies: np.ndarray, n_measurements: int)
 
 
 def _level_std_db(energies: np.ndarray, n_measurements: int) -> float:
-    """Return the standard deviation of the power of the residuals among users [dB]."""
+    """Return the standard deviation of the level among users [dB], from residual energies."""
     n = len(energies)
     # Energies of Gaussian residuals vary even if the residuals have equal power.
     excess = max(float(np.var(np.log(energies))) - 1 / n_measurements, 0.0)

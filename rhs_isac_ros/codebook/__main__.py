@@ -56,12 +56,12 @@ from rhs_isac_ros.support.progress import progress_bar
 HELD_OUT_POSITIONS = 2000
 # With more positions, the samples would fill the memory.
 _MAX_POSITIONS = 10**5
-# Errors that the user can correct. Their messages state the expected values.
+# Errors that the user can correct; the command prints their messages.
 ERRORS = (MissingLibraryError, ValueError, OSError, MemoryError)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, even after Ctrl-C, or 2 if an argument or a file is invalid."""
+    """Run the command; return 0, even if Ctrl-C ends the search, or 2 after one of `ERRORS`."""
     parser = ArgumentParser(
         prog='python3 -m rhs_isac_ros.codebook', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
@@ -119,7 +119,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Exit with a usage error if options contradict each other or a library is missing."""
+    """Exit with a usage error if options conflict, or a library or a file is missing."""
     check_distinct(parser, options, '' if options.spectrum else 'plan')
     if bool(options.spectrum) != bool(options.bands):
         parser.error('argument --bands: expected together with --spectrum')
@@ -142,10 +142,10 @@ def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
 def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     """Optimise according to the options of `add_options`, write the file and print a summary.
 
-    Ctrl-C ends the search; the best codebook so far is then written, unless the command is still
-    comparing band plans. Returns the codebook in the file and the reason why the search stopped.
-    Raises one of `ERRORS` if an option or a file is invalid, or a library is missing; an existing
-    output file is kept.
+    If Ctrl-C ends the search, the best codebook so far is written; before that, while band plans
+    are compared, Ctrl-C raises KeyboardInterrupt. Returns the codebook in the file and the reason
+    why the search stopped. Raises one of `ERRORS` if an option or a file is invalid, or a library
+    is missing; an existing output file is then kept, unless only the plot fails.
     """
     output, partial = options.output, _partial(options.output)
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
@@ -247,7 +247,7 @@ def _save_partial(result: OptimizeResult, partial: Path) -> None:
 
 
 def _save(codebook: Codebook, output: Path) -> None:
-    """Save the result, in a temporary directory if need be, because it may have taken hours."""
+    """Save the result; if that fails, save it in a temporary directory and raise OSError."""
     try:
         codebook.save(output)
     except OSError as error:

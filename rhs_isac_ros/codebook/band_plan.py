@@ -24,7 +24,7 @@ from rhs_isac_ros.support import streams
 
 # Largest number of plans that are all compared; beyond it, a coordinate search selects some.
 MAX_EXHAUSTIVE = 20_000
-# Number of starts of the coordinate search.
+# Number of random starts of the coordinate search.
 _STARTS = 8
 
 
@@ -46,11 +46,11 @@ def screen(
         frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
         errors: Callable[[np.ndarray], np.ndarray], rng: np.random.Generator,
         max_exhaustive: int = MAX_EXHAUSTIVE) -> tuple[np.ndarray, np.ndarray]:
-    """Return plans with low errors, ascending float64 [P, N_B] [Hz], and the errors [P].
+    """Return plans of ascending frequencies, float64 [P, N_B] [Hz], and their errors [P].
 
-    If there are at most `max_exhaustive` plans, this function returns all that have the gap.
-    Otherwise, it returns the results of coordinate searches from several starts, which move one
-    frequency at a time to the best one of the raster.
+    If there are at most `max_exhaustive` plans, with or without the gap, this function returns all
+    with the gap. Otherwise, it returns the results of coordinate searches from several starts,
+    which move one frequency at a time to the best one of the raster.
     """
     if math.comb(len(frequencies_hz), n_bands) > max_exhaustive:
         return _coordinate_search(frequencies_hz, n_bands, gap_hz, errors, rng)
@@ -102,11 +102,11 @@ def first_fit(frequencies_hz: np.ndarray, n_bands: int, gap_hz: float) -> np.nda
 
 
 DEFAULT_RASTER_HZ = 10e6
-# Signal energies with an optimised codebook, relative to a random codebook. The screening proposes
+# Assumed signal energies with an optimised codebook, relative to a random one. The screening finds
 # plans for each, because wider plans are better with more energy. Plans for 8 and above would
 # confuse directions more often, which the screening does not consider.
 _ENERGY_LEVELS = (2.0, 3.0, 4.0)
-# Number of plans with a short optimisation, and its number of positions and of steps.
+# Number of plans with a short optimisation, and numbers of positions and steps of each.
 _CANDIDATES = 6
 _SHORT_POSITIONS, _SHORT_STEPS = 64, 200
 # Largest number of full optimisations, and largest ratio of a candidate's error to the lowest.
@@ -114,9 +114,9 @@ _FINALISTS, _MAX_RATIO = 3, 1.25
 # A later candidate replaces the best one if the ratio of their errors is below this number. Its
 # difference from 1 is two standard errors of the global bound.
 _BETTER = 0.95
-# Numbers of phases in the global bound after a short optimisation, and after a full one.
+# Numbers of positioning phases in the global bound after short and after full optimisations.
 _SHORT_PHASES, _PHASES = 1024, 4096
-# Positions at which energies and errors are averaged, and number of quantiles of the energies.
+# Number of positions for energies and errors, and number of quantiles of the energies.
 _POSITIONS, _QUANTILES = 256, 16
 # Candidates differ by at least this many steps of the raster in some frequency.
 _MIN_DIFFERENCE = 4
@@ -133,7 +133,7 @@ class Candidate:
 
 @dataclasses.dataclass(frozen=True)
 class BandPlan:
-    """The result of `best_of`: the scenario with its bands, and its codebook.
+    """The result of `best_of`: a scenario with the chosen bands, and a codebook for it.
 
     `candidates` are the plans compared by `choose_bands`, the best one first. `error_m2` is the
     expected squared error, or NaN if the optimisation of the codebook was interrupted.
@@ -149,12 +149,12 @@ def best_of(
         scenario: Scenario, candidates: Sequence[Candidate],
         search: Callable[[Scenario], OptimizeResult], seed: int = 0,
         report: Callable[[Candidate], None] | None = None) -> BandPlan:
-    """Optimise codebooks for the first candidates, and return the plan with the lowest error.
+    """Optimise codebooks for the first candidates, and return the best plan.
 
-    The candidates are in ascending order of their errors. The first one is chosen unless the error
-    of another is clearly lower; candidates with much larger errors are skipped. `search` optimises
-    a codebook; if it is interrupted, the best plan so far is returned. After each
-    optimisation, `report` is called with the candidate and its new error.
+    The candidates are in ascending order of their errors. A later plan replaces an earlier one
+    only if its new error is clearly lower; candidates with much larger errors are skipped.
+    `search` optimises a codebook; if it is interrupted, the best plan so far is returned. After
+    each complete optimisation, `report` is called with the candidate and its new error.
     """
     best: BandPlan | None = None
     for candidate in candidates[:_FINALISTS]:
@@ -178,13 +178,13 @@ def choose_bands(
         scenario: Scenario, spectrum_hz: Sequence[tuple[float, float]], n_bands: int, *,
         raster_hz: float = DEFAULT_RASTER_HZ, min_gap_hz: float | None = None, seed: int = 0,
         report: Callable[[Candidate], None] | None = None) -> tuple[Candidate, ...]:
-    """Choose centre frequencies with which users can be located accurately.
+    """Propose centre frequencies with which users can be located accurately.
 
     `spectrum_hz` are intervals of centre frequencies, including their ends. `raster_hz` is the
     spacing of frequencies from the low end of each interval. `min_gap_hz` is the smallest distance
     between two frequencies, by default the width of a band. `report` is called with each plan for
     which a codebook was optimised. Returns these plans, the best one first. Raises ValueError if
-    an argument is out of range, or no plan has the gap, and KeyboardInterrupt on Ctrl-C.
+    an argument is invalid or no plan has the gap, and KeyboardInterrupt on Ctrl-C.
     """
     if n_bands < 1 or scenario.n_bands * scenario.n_frames % n_bands:
         raise ValueError(
@@ -214,7 +214,7 @@ def choose_bands(
 
 
 def with_bands(scenario: Scenario, frequencies_hz: Sequence[float]) -> Scenario:
-    """Return the scenario with other bands, and with the same total number of frames."""
+    """Return the scenario with other bands, which share the total number of frames evenly."""
     return dataclasses.replace(
         scenario, center_frequencies_hz=tuple(frequencies_hz),
         n_frames=scenario.n_bands * scenario.n_frames // len(frequencies_hz))
@@ -224,7 +224,7 @@ def _proposals(
         scenario: Scenario, frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
         difference_hz: float, rng: np.random.Generator
 ) -> list[tuple[tuple[float, ...], float]]:
-    """Return plans with their screening errors, taking plans from each energy level in turn."""
+    """Return plans and their screening errors, the best of each energy level in turn."""
     spread = np.linspace(frequencies_hz[0], frequencies_hz[-1], n_bands)
     energies = _energies(with_bands(scenario, spread.tolist()))
     low, high = scenario.roi_bounds_m
@@ -251,7 +251,7 @@ def expected_error(
         scenario: Scenario, codebook: Codebook, seed: int = 0, n_phases: int = 2048) -> float:
     """Estimate the mean squared error with a codebook [m^2].
 
-    Without nuisance parameters, the estimate is the global bound, a few percent below the error.
+    Without nuisance parameters, the estimate is the global bound, slightly below the error.
     With nuisance parameters, which the global bound ignores, it is the average local bound with
     the region as prior, plus the squared error from confusing ranges.
     """

@@ -33,20 +33,20 @@ _LEVEL_TOLERANCE = 1e-9
 
 
 class CodebookError(ValueError):
-    """A codebook is malformed or does not fit its scenario."""
+    """A codebook is missing or malformed, or does not fit a scenario."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Codebook:
     """Analog and digital beamforming of a positioning phase.
 
-    Raises CodebookError if an array has the wrong number of dimensions or an entry that is not
-    finite, if the sizes of the arrays disagree, or if an entry of `analog` is outside [0, 1].
+    Raises CodebookError if an array is empty, has the wrong number of dimensions or contains
+    anything but finite numbers, if the sizes disagree, or if `analog` is not within [0, 1].
     """
 
     analog: np.ndarray  #: Configurations C, float64 [N_B, F, N_E], each entry in [0, 1].
     digital: np.ndarray  #: Combining vectors S, complex128 [N_B, N_SB, F, K] [sqrt(W)].
-    average_crlb_m2: float = math.nan  #: Bound averaged over sampled positions, or NaN.
+    average_crlb_m2: float = math.nan  #: CRLB averaged over sampled positions; NaN if unknown.
     provenance: str = ''  #: Origin of the codebook; see `Provenance`.
 
     def __post_init__(self) -> None:
@@ -78,7 +78,7 @@ class Codebook:
 
     @functools.cached_property
     def id(self) -> str:
-        """Hash of the content: ``cb`` and 16 hex digits, which YAML never parses as a number."""
+        """Hash of the arrays: ``cb`` and 16 hex digits, which YAML never parses as a number."""
         digest = hashlib.sha256(repr(self.shape).encode())
         digest.update(self.analog.astype('<f8').tobytes())
         digest.update(self.digital.astype('<c16').tobytes())
@@ -87,8 +87,8 @@ class Codebook:
     def check(self, scenario: Scenario) -> None:
         """Raise CodebookError if the codebook does not fit a scenario.
 
-        The sizes and the power of each frame must match the scenario. If the scenario has
-        amplitude levels, every amplitude must equal one of them.
+        The sizes must be those of the scenario, and every frame must have the power `max_power_w`.
+        If the scenario has amplitude levels, every amplitude must equal one of them.
         """
         with translated(ValueError, CodebookError):
             check_shape('analog', self.analog, 'N_B F N_E', scenario)
@@ -121,8 +121,8 @@ class Codebook:
     def from_parameters(cls, parameters: dict[str, Any]) -> 'Codebook':
         """Create a codebook from ROS parameters as returned by `to_parameters`.
 
-        ``codebook.id`` may be empty or missing. Raises CodebookError if a parameter is missing or
-        malformed, or the id does not match the content.
+        Id, average CRLB and provenance may be missing, and the id may be empty. Raises
+        CodebookError if another parameter is missing, one is malformed, or the id does not match.
         """
         shape = parameters.get('codebook.shape')
         if not isinstance(shape, Sequence) or len(shape) != 5 or not all(
@@ -180,7 +180,7 @@ def _number(parameters: dict[str, Any], name: str) -> float:
 
 
 def _array(parameters: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a list parameter as a float64 array; raise CodebookError unless it fits `shape`."""
+    """Return a list parameter as float64 of `shape`; raise CodebookError if it does not fit."""
     values = parameters.get(f'codebook.{name}', ())
     if isinstance(values, str):
         # ``ros2 param load`` sends a list as text if it contains a number such as 1e-05.
@@ -197,7 +197,7 @@ def _array(parameters: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.
 
 
 def default_codebook_file() -> Path:
-    """Return the path of ``config/codebook.yaml``; raise CodebookError if it is not installed."""
+    """Return the path of ``config/codebook.yaml``; raise CodebookError if it is not found."""
     # Every installation scheme puts share/ into a folder above the modules: the prefix of pip and
     # colcon, or the folder of pip's --target. A clone has config/ beside the package.
     package = Path(__file__).resolve().parents[1]
@@ -212,7 +212,7 @@ def default_codebook_file() -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class Provenance:
-    """The arguments of an optimisation and its progress."""
+    """The arguments and the progress of an optimisation, and the version of the package."""
 
     method: str
     objective: str
@@ -222,9 +222,9 @@ class Provenance:
     scenario: dict[str, Any]  #: Fields of the scenario that differ from Table I.
     version: str = __version__
     calibration: str = ''  #: Id of the calibration, if any.
-    steps: int = 0  #: Number of steps, including those of resumed runs.
-    evaluations: int = 0  #: Number of evaluations, including those of resumed runs.
-    value_m2: float = math.nan  #: Lowest value of the objective.
+    steps: int = 0  #: Number of steps, including those before a resumption.
+    evaluations: int = 0  #: Number of evaluations, including earlier ones.
+    value_m2: float = math.nan  #: Lowest value of the objective; NaN if unknown.
     reason: str = ''
 
     def to_text(self) -> str:
@@ -252,7 +252,7 @@ class Provenance:
 
     @classmethod
     def parse(cls, text: str) -> 'Provenance | None':
-        """Parse a text of `to_text`, or of version 0.1.0; return None for any other text."""
+        """Parse a text that `to_text` or version 0.1.0 wrote; return None for any other text."""
         try:
             return cls(**decode(from_parameter(text)))
         except (TypeError, ValueError, RecursionError):
@@ -261,8 +261,8 @@ class Provenance:
 
 # ``ros2 param load`` parses each value of a file as YAML a second time. It cannot send a string
 # such as ``{seed: 0}``, which then becomes a mapping, but it preserves strings that need no quotes
-# in YAML. The strings that match `_WORDS` need none. Single spaces separate their words, so ``, ``
-# can separate the fields.
+# in YAML. The strings that match `_WORDS` need none. They contain no comma, so ``, `` can separate
+# the fields.
 _WORDS = re.compile(r'[A-Za-z][\w.+-]*( [\w.+-]+)*', re.ASCII)
 # Values of JSON that look like words.
 _CONSTANTS = {'null', 'true', 'false', 'NaN', 'Infinity'}
@@ -285,14 +285,14 @@ def decode(text: str) -> dict[str, Any]:
 
 
 def to_parameter(text: str) -> str:
-    """Return a text, encoded if parsing it as YAML would change it."""
+    """Return a text, encoded if parsing it as YAML would change it or if it looks encoded."""
     if not text or _parse_yaml(text) == text and not text.startswith(_NOTE):
         return text
     return _NOTE + _to_json(text)
 
 
 def from_parameter(text: str) -> str:
-    """Return the original text of a string that `to_parameter` returned.
+    """Return the original text of a string from `to_parameter`; return other texts unchanged.
 
     A mapping, which versions up to 0.1.0 wrote, is converted to the format of `encode`.
     """

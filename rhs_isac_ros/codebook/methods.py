@@ -1,8 +1,8 @@
 """Optimisation methods: each minimises a `Search` and returns the reason for stopping.
 
-The default is L-BFGS-B. If an objective has many pairs, it evaluates samples of them. If the
-elements have discrete levels, it ends with exchanges of amplitudes. The alternating, direct and
-genetic methods are described in the paper and its references.
+The default method is L-BFGS-B. For objectives with many pairs, it evaluates samples of them. For
+elements with discrete levels, it ends with changes of single amplitudes. The alternating, direct
+and genetic methods are described in the paper and its references.
 """
 
 import itertools
@@ -34,8 +34,8 @@ def run_lbfgs(
         on_step: Callable[[], None], memory: int = _MEMORY) -> Any:
     """Minimise a function that returns its value and gradient, with SciPy's L-BFGS-B.
 
-    The values must be positive; their unit does not affect the steps. In the `OptimizeResult`,
-    `fun` and `jac` are relative to the first value. `on_step` is called after each step.
+    The values must not be negative; their unit does not affect the steps. In SciPy's result, `fun`
+    and `jac` are relative to the first value that is not 0. `on_step` is called after each step.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import minimize
@@ -60,7 +60,7 @@ def run_lbfgs(
 
 # Objectives with fewer pairs are evaluated with all pairs.
 FEWEST_PAIRS = 4096
-# Pairs and steps of each round; the last round is repeated. The first steps change the codebook,
+# Pairs and steps of each round; the last entry is repeated. The first steps change the codebook,
 # and with it the important pairs, the most. Later steps need a more accurate objective.
 _ROUNDS = (2048, 200), (4096, 600)
 # Number of corrections. With more corrections, their products would take longer than evaluations.
@@ -91,7 +91,7 @@ def minimize_sampled(search: Search) -> str:
 
 
 def _round(search: Search, start: np.ndarray, n_pairs: int, steps: int) -> tuple[int, np.ndarray]:
-    """Minimise the objective on one sample; return the number of steps and the best point."""
+    """Minimise the objective on one sample; return the number of steps and the lowest point."""
     scale = np.ones(len(start))
     scale[search.n_analog:] = _DIGITAL_SCALE
     sample = search.sample(start, n_pairs)
@@ -123,22 +123,22 @@ def _round(search: Search, start: np.ndarray, n_pairs: int, steps: int) -> tuple
 
 # Weights of the penalty in its rounds, relative to the objective.
 _WEIGHTS = (0.1, 0.3, 1.0, 3.0, 10.0)
-# Shares of the steps for the relaxation and for the penalty; the rest is for the exchange.
+# Shares of the steps without and with the penalty; the rest is for changes of single amplitudes.
 _RELAXED, _PENALISED = 0.4, 0.3
-# Steps on the combining vectors after each sweep.
+# Maximum number of steps on the combining vectors before each sweep.
 _DIGITAL_STEPS = 20
-# Number of successive exchanges without a lower objective after which a sweep ends.
+# Number of successive attempts that do not lower the objective after which a sweep ends.
 _MAX_FAILURES = 64
 
 
 def minimize_levels(search: Search) -> str:
     """Minimise over amplitudes with L discrete levels, and return the reason for stopping.
 
-    The first of three phases treats amplitudes as continuous. The second adds the penalty
+    The first of three stages treats amplitudes as continuous. The second adds the penalty
     sin^2(pi (L - 1) c) for each amplitude c, which is zero at the levels. Its weight grows, and
     amplitudes move to the levels while all other variables adapt. The third moves single
     amplitudes to neighbouring levels, those with the largest gradient first, as long as this
-    lowers the objective. L-BFGS-B minimises over continuous variables.
+    lowers the objective. All stages minimise over continuous variables with L-BFGS-B.
     """
     share = _PENALISED / len(_WEIGHTS)
     variables, left = search.start, search.max_steps
@@ -152,7 +152,7 @@ def minimize_levels(search: Search) -> str:
 
 
 def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int) -> np.ndarray:
-    """Minimise over continuous amplitudes with a penalty, and evaluate the rounded result."""
+    """Minimise with continuous amplitudes and a penalty; evaluate the end point with levels."""
     scale = weight * search.relaxed_value_and_gradient(start)[0] / search.n_analog
     frequency = np.pi * _top_level(search)
 
@@ -168,7 +168,7 @@ def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int)
 
 
 def _exchange(search: Search, variables: np.ndarray, max_steps: int) -> str:
-    """Change amplitudes by one level while this lowers the objective; return why it stopped.
+    """Change amplitudes by one level while this lowers the objective; return the reason to stop.
 
     Combining vectors are optimised before each sweep over the amplitudes.
     """
@@ -190,16 +190,16 @@ def _exchange(search: Search, variables: np.ndarray, max_steps: int) -> str:
 
 def _sweep(search: Search, variables: np.ndarray, max_exchanges: int
            ) -> tuple[np.ndarray, int, int, int]:
-    """Exchange amplitudes in the order of the expected decrease.
+    """Change amplitudes by one level where this lowers the objective, the most promising first.
 
-    Returns the variables and three numbers: of exchanges, of failed attempts since the last
-    exchange, and of amplitudes with a level in the direction of descent.
+    Returns the variables and three numbers: of changes, of failed attempts since the last change,
+    and of amplitudes with a level in the direction of descent.
     """
     levels = _top_level(search)
     value, gradient = search.value_and_gradient(variables)
     by_analog = gradient[:search.n_analog]
     target = variables[:search.n_analog] - np.sign(by_analog) / levels
-    # There is no level outside of [0, 1].
+    # There is no level outside [0, 1].
     allowed = np.flatnonzero((target > -0.5 / levels) & (target < 1 + 0.5 / levels))
     exchanged = failures = 0
     for entry in allowed[np.argsort(-np.abs(by_analog[allowed]))]:
@@ -242,9 +242,9 @@ def minimize_interior_point(
         search: Search, start: np.ndarray, free: np.ndarray, max_steps: int) -> np.ndarray:
     """Minimise over the free variables with SciPy's `trust-constr` and a BFGS Hessian.
 
-    This is the interior-point algorithm of Byrd, Hribar and Nocedal that the paper cites, with a
-    trust region and conjugate gradients. `start`, float64 [n], contains all variables; `free`,
-    bool [n], marks the free ones. Returns the best of `start` and all evaluated points.
+    With bounds, this is the interior-point algorithm of Byrd, Hribar and Nocedal that the paper
+    cites; without bounds, a trust-region method. `start`, float64 [n], contains all variables;
+    `free`, bool [n], marks the free ones. Returns the best of `start` and all evaluated points.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import BFGS, Bounds, minimize
@@ -266,7 +266,7 @@ def minimize_interior_point(
     steps = evaluations = 0
 
     def on_iteration(_: np.ndarray, state: Any) -> bool:
-        """Count iterations with a step; SciPy also reports the start and each new barrier."""
+        """Count steps, and end at the limit; SciPy also reports the start and new barriers."""
         nonlocal steps, evaluations
         if steps < max_steps and state.nfev > max(evaluations, 1):
             steps, evaluations = steps + 1, state.nfev
@@ -289,14 +289,14 @@ def minimize_interior_point(
     return best[1]
 
 
-# N_itr of Table I. With the default number of steps, each sub-problem takes N_us = 50 steps.
+# N_itr of Table I. With the default number of steps, each sub-problem may take N_us = 50 steps.
 _ITERATIONS = 4
 
 
 def minimize_alternating(search: Search) -> str:
-    """Implements Algorithm 1. Solve sP1 and sP2 alternately until neither changes a variable.
+    """Implements Algorithm 1. Solve sP1 and sP2 alternately, at most N_itr times.
 
-    The 2 N_itr sub-problems share the steps of the search evenly.
+    It ends earlier if neither changes a variable. The 2 N_itr sub-problems share the steps evenly.
     """
     steps = max(search.max_steps // (2 * _ITERATIONS), 1)
     remaining = search.max_steps
@@ -328,8 +328,8 @@ _POPULATION = 200
 def minimize_genetic(search: Search) -> str:
     """Minimise with pymoo's genetic algorithm; each step is a generation.
 
-    Only the direction of a combining vector matters, so its real and imaginary parts are confined
-    to [-1, 1]. The first generation contains the start. Raises MissingLibraryError without pymoo.
+    Combining vectors are scaled later, so their real and imaginary parts are confined to [-1, 1].
+    The first generation contains the start. Raises MissingLibraryError without pymoo.
     """
     with optional_import("method 'genetic'", extra='genetic'):
         from pymoo.algorithms.soo.nonconvex.ga import GA

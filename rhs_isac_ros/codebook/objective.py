@@ -1,9 +1,9 @@
 """Objectives of the codebook optimisation, and the samples of the region that they average over.
 
-Each objective is a function of a scenario, sampled positions, float64 [N_sam, 3] [m], a generator
-and `tick`. It raises ValueError unless the positions are a finite [N, 3] array with at least one
-row. During computations that do not depend on the codebook, it calls `tick` repeatedly, which may
-end them with an exception.
+Each function in `OBJECTIVES` takes a scenario, sampled positions, float64 [N_sam, 3] [m], a random
+generator and `tick`, and returns an `Average`. It raises ValueError unless the positions are a
+finite [N_sam, 3] array with at least one row. During computations that do not depend on the
+codebook, it calls `tick` repeatedly, which may end them with an exception.
 """
 
 import dataclasses
@@ -22,8 +22,8 @@ from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 # Relative error of the rows (see `bounds.rows`) of an objective. The error of the objective is
 # then below 0.1 %, far less than the sampling error. The gradient is exact for the value returned.
 ROW_TOLERANCE = 3e-5
-# Number of confusable positions for each sampled position: large, because a few close pairs
-# dominate the mean.
+# Number of confusable positions for each sampled position: large, because a few pairs with very
+# similar signals dominate the mean.
 _PAIRS_PER_POSITION = 128
 # Exponent of the volumes in the weights of pairs. With 1, a few pairs that are rarely drawn would
 # have most of the weight.
@@ -55,7 +55,7 @@ def nuisance(
 def ambiguity(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
         tick: Tick = no_tick) -> Average:
-    """Objective [m^2]: mean cost of confusing sampled positions with similar-looking ones."""
+    """Objective [m^2]: mean cost of confusing sampled positions with ones of similar signals."""
     first_positions = np.repeat(positions, _PAIRS_PER_POSITION, axis=0)
     second_positions = draw_confusable(scenario, first_positions, rng)
     return PairwiseErrorCost(
@@ -65,9 +65,9 @@ def ambiguity(
 def error(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
         tick: Tick = no_tick) -> Average:
-    """Objective [m^2]: the cost of `ambiguity`, weighted almost as in the mean squared error.
+    """Objective [m^2]: like `ambiguity`, but weighted almost as in the mean squared error.
 
-    Across the line of sight, pairs extend farther than in `ambiguity`, up to the far side
+    Across the line of sight, pairs extend farther than in `ambiguity`, beyond the first side
     lobes. Their weights grow with the volumes that they represent (`confusable_volumes`). With the
     volumes themselves as weights, the cost would be proportional to the union bound on the mean
     squared error.
@@ -87,7 +87,7 @@ OBJECTIVES: Mapping[str, Callable[..., Average]] = {
 
 
 def sobol(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw scrambled Sobol points, float64 [n, 3] [m].
+    """Draw scrambled Sobol points in the region of interest, float64 [n, 3] [m].
 
     They are more evenly spread than independent points, and most evenly if `n` is a power of two.
     """
@@ -105,21 +105,21 @@ SAMPLINGS: Mapping[str, Callable[[Scenario, int, np.random.Generator], np.ndarra
 
 # Grid points of the range lag per shortest carrier wavelength.
 _LAGS_PER_WAVELENGTH = 64
-# Limits of the scale of transverse displacements, in widths of the narrowest beam: up to the first
-# side lobes, and beyond.
+# Limits of the scale of transverse displacements, in widths of the narrowest beam. Displacements
+# reach the first side lobes with `NEAR`, and go beyond them with `WIDE`.
 NEAR, WIDE = (0.03, 0.3), (0.03, 0.6)
 # Share of pairs that differ only in direction.
 _ZERO_LAG_FRACTION = 0.3
-# Limit of rounding errors: of lags in radians, and of squared displacements in beam widths.
+# Lags [rad] and squared displacements [squared beam widths] below this are rounding errors.
 _ROUNDING = 1e-7
-# Number of attempts to draw a position inside the region.
+# Maximum number of attempts to draw a position inside the region.
 _MAX_DRAWS = 200
 
 
 def draw_confusable(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
         scales: tuple[float, float] = NEAR) -> np.ndarray:
-    """Draw a position with similar signals for each of N positions, both float64 [N, 3] [m].
+    """For each of N positions, draw another one with similar signals, float64 [N, 3] [m].
 
     Two positions are hard to distinguish if their ranges differ by about a whole number of
     wavelengths in every band. Range lags are therefore drawn with a density proportional to
@@ -138,7 +138,7 @@ def draw_confusable(
     for _ in range(_MAX_DRAWS):
         lag = np.interp(rng.uniform(size=len(pending)), cumulative, lags) * lagging[pending]
         moved = _displaced(scenario, positions[pending], lag, rng, scales)
-        # Clipping is for regions so thin, compared with a beam, that no draw is inside.
+        # Clipping matters for regions so thin, compared with a beam, that no draw is inside.
         others[pending] = np.clip(moved, low, high)
         pending = pending[~((moved >= low) & (moved <= high)).all(axis=1)]
     return others
@@ -149,7 +149,7 @@ def confusable_volumes(
         scales: tuple[float, float]) -> np.ndarray:
     """Compute the volumes that positions from `draw_confusable` represent, float64 [N].
 
-    The volumes are reciprocal densities of the draws, so that weighted sums over the draws are
+    A volume is the reciprocal density of a draw, so that weighted sums over draws approximate
     integrals over the region. Each volume is divided by r^5, where r is the range of the position
     in `positions`. The volume of the posterior of this position is proportional to r^5 if the
     amplitude of the signals is inversely proportional to r.
@@ -185,7 +185,7 @@ def _displaced(scenario: Scenario, positions: np.ndarray, lags: np.ndarray,
     transverse -= sight * np.sum(transverse * sight, axis=1, keepdims=True)
     lags = lags * rng.choice([-1, 1], size=n)
     moved = positions + free * transverse
-    # Coordinates in which the region has no extent remain unchanged; the others are scaled to fit.
+    # Coordinates in which the region has no extent are kept; the others are scaled to the range.
     wanted = ranges[:, 0] + lags
     within = np.sqrt(np.maximum(wanted**2 - np.sum(moved[:, ~free]**2, axis=1), 0))
     within = np.copysign(within, wanted) / np.linalg.norm(moved[:, free], axis=1)
@@ -206,7 +206,7 @@ def _lag_density(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _beam_width(scenario: Scenario) -> float:
-    """Return the width of the narrowest beam that the surface can form [rad]."""
+    """Return the width of the narrowest beam that the surface can form, at most 1 [rad]."""
     shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
     side = max(scenario.n_columns, scenario.n_rows) * element_interval_m(scenario)
     return float(min(shortest / side, 1.0))

@@ -28,7 +28,7 @@ from rhs_isac_ros.model.surface import on_levels
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.threads import one_blas_thread
 
-# Number of Sobol points; this number is as good as 1200 independent positions.
+# Number of Sobol points: for Table I, about as good as 1200 independent positions.
 DEFAULT_POSITIONS = 256
 # Reason for stopping after Ctrl-C.
 INTERRUPTED = 'interrupted'
@@ -38,7 +38,7 @@ class Method(NamedTuple):
     """An optimisation method with its default limit on update steps.
 
     The function `minimize` takes a `Search` and returns the reason for stopping. It is None for a
-    method that returns the start unchanged.
+    method that returns its start without a search.
     """
 
     minimize: Callable[[Search], str] | None
@@ -60,7 +60,7 @@ class OptimizeResult:
     """Result of an optimisation."""
 
     codebook: Codebook  #: The best one found; `average_crlb_m2` is for the sampled positions.
-    history: tuple[Progress, ...]  #: Progress after each step; step 0 is the start.
+    history: tuple[Progress, ...]  #: Progress at the start and after each step.
     reason: str  #: The reason for stopping.
 
 
@@ -74,12 +74,12 @@ def optimize(
         keep: Callable[[OptimizeResult], None] | None = None) -> OptimizeResult:
     """Find a codebook that minimises an objective.
 
-    If the scenario has ``amplitude_levels``, only ``genetic`` and ``lbfgs``, which then uses
-    `minimize_levels`, can optimise configurations. After a KeyboardInterrupt, the best codebook so
-    far is returned. Raises ValueError if a name is unknown, a number or the positions are out of
-    range, `resume` was made with other arguments, the calibration belongs to another scenario, or
-    the signals do not determine the positions. Raises MissingLibraryError if the method needs a
-    missing library, and CodebookError if `start` does not fit the scenario.
+    After a KeyboardInterrupt during the search, the best codebook so far is returned. Raises
+    ValueError if a name is unknown, a number is out of range, `positions` is empty or not a finite
+    [N_sam, 3] array, `resume` was made with other arguments, a codebook or the calibration does
+    not fit the scenario, the objective is infinite at the start, or the amplitudes are discrete
+    and the method is ``alternating`` or ``direct``. Raises MissingLibraryError if the method needs
+    a missing library.
 
     Parameters
     ----------
@@ -98,10 +98,10 @@ def optimize(
     seed
         Seed of the samples, the start and the method.
     start
-        Codebook to start from; by default the paper's, with random configurations.
+        Codebook to start from; by default random, or directional with the method ``directional``.
     resume
-        Result of an earlier call with the same arguments, to continue from; its steps and
-        evaluations count towards the limits.
+        Codebook of an earlier call with the same arguments, to continue from; the earlier steps
+        and evaluations count towards the limits.
     calibration
         Calibration of the surface, treated as exact; by default the scenario's surface.
     max_steps
@@ -109,8 +109,8 @@ def optimize(
     max_evaluations
         Maximum number of evaluations of the objective; by default unlimited.
     progress
-        Called after each step and, during the set-up of the objective, once a second with an
-        infinite value. An exception from `progress` ends the optimisation; with a
+        Called at the start, after each step and, during the set-up of the objective, at most once
+        a second with an infinite value. An exception from `progress` ends the optimisation; with a
         KeyboardInterrupt during the set-up, the result is the start.
     keep
         Called at most every ten seconds with the result so far.
@@ -149,7 +149,7 @@ def optimize(
     def result(best: Codebook, history: Sequence[Progress], reason: str) -> OptimizeResult:
         bound = float(crlb_of(MeasurementModel(scenario, best, surface), positions).mean())
         if not history:
-            # Without an objective, only the bound is known.
+            # Only the bound is known, which is the objective only if that is 'crlb'.
             value_m2 = _determined(bound) if objective == 'crlb' else np.nan
             history = [Progress(done.steps, done.evaluations, value_m2, 0.0)]
             report(history[0])
@@ -192,7 +192,7 @@ def check_start(codebook: Codebook, scenario: Scenario) -> None:
 
 
 def _minimizer(problem: Problem, method: str) -> Callable[[Search], str]:
-    """Return a method's function; raise ValueError if it cannot optimise discrete amplitudes."""
+    """Return the function of a method; raise ValueError if it has none for discrete levels."""
     levels = problem.scenario.amplitude_levels
     if levels and method == 'lbfgs':
         return minimize_levels
@@ -247,7 +247,7 @@ class _Report:
             self.keep()
 
     def tick(self) -> None:
-        """Report the elapsed time, at most once a second."""
+        """Report the elapsed time before the search, at most once a second."""
         elapsed_s = time.perf_counter() - self._begin
         if not (self._is_searching or elapsed_s < self._before.elapsed_s + self._TICK_S):
             self._before = dataclasses.replace(self._before, elapsed_s=elapsed_s)

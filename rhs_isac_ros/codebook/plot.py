@@ -33,7 +33,7 @@ def plot_optimization(
         scenario: Scenario, codebook: Codebook, history: Sequence[Progress]) -> Any:
     """Plot convergence, the bound over the region of interest, and the beam patterns.
 
-    Returns a `matplotlib.figure.Figure`; raises the errors of `paper_style`.
+    Returns a `matplotlib.figure.Figure`. Raises MissingLibraryError without Matplotlib.
     """
     rows = -(-scenario.n_bands // _N_COLUMNS)
     figure = new_figure(PAGE_IN, 2.7 + 2.3 * rows)

@@ -14,11 +14,11 @@ from rhs_isac_ros.model.surface import on_levels
 
 
 class Problem:
-    """Implements Eq. (16). Problem P1: minimise an average bound over codebooks of fixed power.
+    """Implements Eq. (16). Problem P1, with any `Average` as the objective to minimise.
 
     Solvers operate on one real vector: the configurations, then the real and the imaginary parts
-    of unscaled combining vectors. `unpack` scales the combining vectors to P_max, which eliminates
-    the power constraint. Solvers must keep the configurations in [0, 1].
+    of unscaled combining vectors. `unpack` scales those of each frame to the power P_max, which
+    eliminates the power constraint. Solvers must keep the configurations in [0, 1].
     """
 
     def __init__(self, scenario: Scenario, objective: Average) -> None:
@@ -42,7 +42,7 @@ class Problem:
             [codebook.analog.ravel(), digital.real.ravel(), digital.imag.ravel()])
 
     def unpack(self, variables: np.ndarray, *, relaxed: bool = False) -> Codebook:
-        """Return the codebook for variables from `pack`; it satisfies all constraints.
+        """Return the codebook for variables ordered as in `pack`, with the power P_max.
 
         Unless `relaxed`, configurations are rounded to the amplitudes that elements can take.
         """
@@ -58,18 +58,18 @@ class Problem:
         return cost.rows.n_items if isinstance(cost, PairwiseErrorCost) else 0
 
     def sample(self, variables: np.ndarray, n_pairs: int, rng: np.random.Generator) -> 'Problem':
-        """Return the problem with pairs drawn at `variables`; see `PairwiseErrorCost.sample`."""
+        """Return the problem with a sample of its pairs; see `PairwiseErrorCost.sample`."""
         cost = self.objective
         assert isinstance(cost, PairwiseErrorCost)
         return Problem(self.scenario, cost.sample(self.unpack(variables), n_pairs, rng))
 
     def value(self, variables: np.ndarray) -> float:
-        """Return the objective [m^2] for variables from `pack`."""
+        """Return the objective [m^2] for variables ordered as in `pack`."""
         return self.objective.value(self.unpack(variables))
 
     def value_and_gradient(
             self, variables: np.ndarray, *, relaxed: bool = False) -> tuple[float, np.ndarray]:
-        """Return the objective [m^2] and its gradient, shaped like `variables` from `pack`."""
+        """Return the objective [m^2] and its gradient, float64 [n]; see `unpack` for `relaxed`."""
         _, raw, norm = self._split(variables)
         value, by_analog, by_digital = self.objective(self.unpack(variables, relaxed=relaxed))
         # Scaling to a fixed norm removes the component of the gradient along `raw`.
@@ -79,7 +79,7 @@ class Problem:
             [by_analog.ravel(), by_raw.real.ravel(), by_raw.imag.ravel()])
 
     def _split(self, variables: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return configurations, unscaled combining vectors, and the vectors' norm per frame."""
+        """Return configurations, unscaled combining vectors, and their norm in each frame."""
         analog = np.clip(variables[:self.n_analog], 0.0, 1.0).reshape(self._analog_shape)
         real, imag = np.split(variables[self.n_analog:], 2)
         raw = (real + 1j * imag).reshape(self._digital_shape)
@@ -106,8 +106,8 @@ class Search:
 
     Each method defines its own update steps. `done` contains the numbers of steps and evaluations
     of a resumed search, which count towards the limits. The attribute `start`, float64 [n], is the
-    first point, and `max_steps` is the number of steps that remain. The lowest objective so far,
-    at the point `best`, is `value_m2`. `history` has an entry for the start and for each step.
+    first point, and `max_steps` is the limit less the steps in `done`. `value_m2` is the lowest
+    objective so far, at the point `best`. `history` has an entry for the start and for each step.
     """
 
     def __init__(
@@ -125,9 +125,9 @@ class Search:
         self._last: tuple[np.ndarray, float, np.ndarray] | None = None
 
     def begin(self) -> float:
-        """Evaluate the objective [m^2] at the start, the first entry of the history.
+        """Evaluate the objective [m^2] at the start, and record the first entry of the history.
 
-        In a resumed search, this evaluation does not count, because the earlier search made it.
+        In a resumed search, the evaluation does not count, because the earlier search counted it.
         """
         if self._evaluations:
             self._evaluations -= 1
@@ -136,7 +136,7 @@ class Search:
         return value
 
     def finish(self) -> None:
-        """Record a last step if there were evaluations since the previous one."""
+        """Record a last step if none is recorded yet, or evaluations followed the latest one."""
         if not self.history or self._evaluations > self.history[-1].evaluations:
             self.on_step()
 
@@ -149,7 +149,7 @@ class Search:
 
     def value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
         """Evaluate the objective [m^2] and its gradient, float64 [n], or raise BudgetSpent."""
-        # A method begins at the point at which the previous one ended.
+        # The last result is kept, because a solver often begins where another one ended.
         if self._last is None or not np.array_equal(self._last[0], variables):
             self._count()
             value, gradient = self.problem.value_and_gradient(variables)
@@ -158,17 +158,17 @@ class Search:
         return self._last[1:]
 
     def relaxed_value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
-        """Evaluate with continuous amplitudes; never record the point as the best one."""
+        """Evaluate both with continuous amplitudes; never record the point as the best one."""
         self._count()
         return self.problem.value_and_gradient(variables, relaxed=True)
 
     def sample(
             self, variables: np.ndarray, n_pairs: int
     ) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
-        """Return a function that estimates `value_and_gradient` from pairs drawn at a point.
+        """Return a function that estimates `value_and_gradient` from a sample of `n_pairs` pairs.
 
-        The function never records a point as the best one. It raises BudgetSpent if no evaluation
-        would be left for the final point.
+        The sample is for codebooks near `variables`. The function never records the best point. It
+        raises BudgetSpent if no evaluation would be left for the final point.
         """
         problem = self.problem.sample(variables, n_pairs, self.rng)
 

@@ -34,10 +34,10 @@ def directional_codebook(
         scan: str = 'width') -> Codebook:
     """Focus each of the N_B F frames on a point of a scan: the paper's `Directional`.
 
-    The configuration follows the holographic principle. The weights of each sub-band are the
-    matched filter of the resulting feed signals, with equal power in all sub-bands. The codebook
-    is deterministic, so `rng` is unused. `scan` is one of `SCANS`. Raises ValueError if the
-    scan is unknown, or a gain pattern of the scenario is zero at a focal point.
+    The configuration follows the holographic principle, rounded to the amplitude levels, if any.
+    The weights of each sub-band are the matched filter of the resulting feed signals, with equal
+    power in all sub-bands. The codebook is deterministic, so `rng` is unused. `scan` is one of
+    `SCANS`. Raises ValueError if it is unknown, or no element has a gain at a focal point.
     """
     if scan not in SCANS:
         raise ValueError(f'scan: {scan!r}, expected one of {sorted(SCANS)}')

@@ -33,14 +33,14 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
         floors = 1 / gains
         level = (power_w + floors.sum(axis=-1, keepdims=True)) / n
         if (level > floors).all():
-            # Every channel is above its floor, as usual.
+            # The level is above every floor, as usual.
             return level - floors
     # If no gain is positive, all levels and floors are infinite.
     with np.errstate(divide='ignore', over='ignore', invalid='ignore'):
         floors = 1 / np.maximum(gains, 0)
         ranked = np.sort(floors, axis=-1)
         levels = (power_w + np.cumsum(ranked, axis=-1)) / np.arange(1, n + 1)
-        # The channels above their floor are the first ones in the order of the floors.
+        # The channels that receive power are the first ones in the order of the floors.
         n_filled = np.sum(levels > ranked, axis=-1, keepdims=True)
         level = np.take_along_axis(levels, np.maximum(n_filled - 1, 0), axis=-1)
         shares = np.maximum(level - floors, 0.0)
@@ -64,8 +64,8 @@ class BandLink:
     onboard: np.ndarray  #: B_j, complex128 [N_SB, K, N_E].
     los: np.ndarray  #: Line-of-sight gains, complex128 [N_SB, N_E].
     spatial: SpatialCovariance  #: V_i.
-    noise_power_w: float  #: Noise power of a sub-band.
-    power_w: float  #: Power of the digital part, summed over sub-bands.
+    noise_power_w: float  #: Noise power of a sub-band [W].
+    power_w: float  #: Power of the digital part, summed over sub-bands [W].
     fixed: np.ndarray  #: Elements whose configuration is always 1, bool [N_E].
 
     @classmethod
@@ -73,7 +73,7 @@ class BandLink:
            surface: SurfaceEstimate | None = None) -> 'BandLink':
         """Return the links to a position, float64 [3] [m], in the given bands, counted from 0.
 
-        Coefficients of an estimated surface are included in the propagation on the board. Raises
+        Coefficients and band gains of an estimated surface are included in `onboard`. Raises
         ValueError if the position is not a finite [3] array.
         """
         onboard, fixed = arrays(scenario, surface)
@@ -95,8 +95,8 @@ class BandLink:
     def best_digital(self, analog: np.ndarray) -> np.ndarray:
         """Return the best digital part for configurations, complex128 [..., N_SB, K] [sqrt(W)].
 
-        For each sub-band, it is the principal eigenvector of the channels' correlation matrix at
-        the feeds. Water-filling divides the power.
+        In each sub-band, it is a multiple of the conjugate of the principal eigenvector of the
+        channels' correlation matrix at the feeds. Water-filling divides the power.
         """
         gains, directions = np.linalg.eigh(self.correlations(*self.feeds(analog)))
         power = water_filling(gains[..., -1] / self.noise_power_w, self.power_w)

@@ -54,9 +54,9 @@ def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray)
 @one_blas_thread
 def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray,
                     blocked: np.ndarray | None = None) -> np.ndarray:
-    """Compute the capacity over the paths of the scenario's channel file.
+    """Compute the capacity over the paths of the channel file, or else `capacity`.
 
-    `blocked`, bool [N], marks users without a direct path. Without a file, return `capacity`.
+    `blocked`, bool [N], marks users without a direct path. Without a file, it has no effect.
     """
     if not scenario.channel:
         return capacity(scenario, beam, positions)
@@ -185,9 +185,9 @@ def beam_pattern(
 
 @functools.lru_cache(maxsize=4)
 def _directions(step_deg: float) -> np.ndarray:
-    """Return unit vectors over the half space x > 0, float64 [n_el, n_az, 3], read-only."""
+    """Return unit vectors over the half space x >= 0, float64 [n_el, n_az, 3], read-only."""
     n_half = max(1, int(np.ceil(90 / step_deg)))
-    # An odd number of angles places the middle ones on boresight.
+    # An odd number of angles places the middle one on boresight.
     angles = np.linspace(-np.pi / 2, np.pi / 2, 2 * n_half + 1)
     elevation, azimuth = np.meshgrid(angles, angles, indexing='ij')
     return read_only(np.stack([np.cos(elevation) * np.cos(azimuth),

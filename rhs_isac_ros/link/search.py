@@ -16,8 +16,8 @@ from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
 _MAX_OMITTED, _MAX_MODES = 0.02, 256
 # Relative accuracy of the powers of the modes.
 _MODE_TOLERANCE = 1e-3
-# If the phases of sub-bands drift apart by more than this over the surface, the search treats the
-# sub-bands separately, up to this number of them.
+# Largest drift of phases from one sub-band of the search to the next, and largest number of these
+# sub-bands.
 _MAX_DRIFT_RAD = 1.0
 _MAX_SUBBANDS = 16
 # Number of random starts, and number that remains after the first step.
@@ -36,7 +36,7 @@ _N_SCATTERED_STEPS = 8
 _MIN_DIFFERENCE = 1e-6
 # Limits of the amplitudes relative to the noise.
 _AMPLITUDES = (1e-3, 1e4)
-# Lower limit of a norm, to avoid a division by zero.
+# Small number added to norms, to avoid divisions by zero.
 _MIN_NORM = 1e-30
 
 
@@ -47,7 +47,7 @@ class Tables(NamedTuple):
     onboard: np.ndarray  # Gains on the board, complex64 [N_B, N_E, J, K].
     # Gains from each feed via each element to each wave in the air, complex64 [N_B, N_E, J, K, L].
     # The first wave, the line of sight, is zero here. The others are the strongest modes of the
-    # multipath, the columns of G with G G^T close to V_i.
+    # multipath, the columns of G with G G^H close to V_i.
     paths: np.ndarray
     starts: np.ndarray  # Waves on the board with which the search starts, float32 [S, 2 J K].
     peaks: np.ndarray  # Upper limits of the amplitude of a mode at a feed, float64 [N_B].
@@ -63,7 +63,7 @@ def candidate_configurations(
     board, s B, is in phase with a wave in the air, G w. The waves in the air are the line of sight
     and the modes of the multipath, the columns of G. The search improves waves and configuration
     in turn: the best pair of waves for a configuration belongs to the largest singular value of
-    B diag(c) G. It begins with fixed waves on the board, spread over all directions, and at first
+    B diag(c) G. It begins with random waves on the board, the same at all positions, and at first
     includes only the line of sight, for which the best wave on the board is known. It then adds
     configurations for the multipath alone and the matched filter to the best of these. All are
     improved with the strongest modes, and the best results with all modes.
@@ -96,7 +96,7 @@ def candidate_configurations(
 
 @functools.lru_cache(maxsize=16)
 def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
-    """Compute the tables for a scenario and a calibrated surface."""
+    """Compute the tables for a scenario and a calibrated surface, if any."""
     onboard, fixed = band_link.arrays(scenario, surface)
     subbands = band_link.representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS)
     on_board = np.moveaxis(onboard[:, subbands], -1, 1)
@@ -151,7 +151,7 @@ def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
 
 def _scattered_configurations(
         paths: np.ndarray, fixed: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Search from random waves in the air for configurations that suit the multipath alone."""
+    """Search from random pairs of waves for configurations that suit the multipath alone."""
     shape = (len(paths), _N_STARTS, *paths.shape[2:])
     on_board = _complex_normal((*shape[:-1], 1), rng)
     in_air = _complex_normal((*shape[:-2], 1, shape[-1]), rng)
@@ -194,7 +194,7 @@ class _Waves(NamedTuple):
     @classmethod
     def at(cls, paths: np.ndarray, analog: np.ndarray,
            on_board: np.ndarray | None = None) -> '_Waves':
-        """Compute waves by a power-method step from `on_board` or, by default, the direct path."""
+        """Compute waves by a power step from `on_board`; by default, use the direct path."""
         n_bands, n_elements, *shape = paths.shape
         channels = (analog @ paths.reshape(n_bands, n_elements, -1).view(np.float32)).view(
             np.complex64).reshape(n_bands, -1, *shape)

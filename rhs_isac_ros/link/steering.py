@@ -21,7 +21,7 @@ from rhs_isac_ros.support.threads import one_blas_thread
 
 # Maximum number of rounds; usually two or three suffice.
 _MAX_ROUNDS = 100
-# Smallest relative gain of the capacity that justifies another round.
+# Smallest relative increase of the capacity that justifies another round.
 _MIN_GAIN = 1e-9
 
 
@@ -29,12 +29,11 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Improve configurations until no step increases their capacity.
 
     Each round finds the best digital part, and then a better configuration for it. The received
-    power is convex in the configuration, so it lies above its linear model at any point. The
-    vertex of the box [0, 1]^N_E in the direction of the gradient therefore receives more power,
-    unless the point is that vertex. The capacity usually, but not always, increases with the
-    power. If the vertex does not increase the capacity, the round moves a single element to an end
-    of its range: the element that increases the capacity most. The capacity never falls below its
-    value at the start.
+    power is convex in the configuration, so it is nowhere below its linear model at a point. With
+    one sub-band, the vertex of the box [0, 1]^N_E in the direction of the gradient therefore never
+    receives less power. With several, the vertex usually, but not always, increases the capacity.
+    If it does not, the round moves a single element to an end of its range: the element that
+    increases the capacity most. The capacity never falls below its value at the start.
 
     Takes links of several bands, and initial configurations `analog`, float64 [N_B, n, N_E], with
     entries in [0, 1]. Returns configurations of the same shape and range, and their capacities
@@ -71,7 +70,7 @@ class _Point(NamedTuple):
     vertex: np.ndarray  # Vertex in the direction of the gradient, float64 [N_B, n, N_E].
     snr: np.ndarray  # Signal-to-noise ratios, float64 [N_B, n, N_SB].
     slope: np.ndarray  # Derivatives of the ratios, float64 [N_B, n, N_SB, N_E].
-    curvature: np.ndarray  # Coefficient of the square of an element's change, like `slope`.
+    curvature: np.ndarray  # Coefficients of an element's squared change, shaped like `slope`.
 
     @classmethod
     def at(cls, link: BandLink, spread: np.ndarray, analog: np.ndarray) -> '_Point':
@@ -94,7 +93,7 @@ class _Point(NamedTuple):
         return cls(analog, np.log1p(snr).sum(axis=-1), vertex, snr, slope, curvature)
 
     def element_step(self, link: BandLink) -> tuple[np.ndarray, np.ndarray]:
-        """Return the configurations with the best change of one element, and the gains [nat]."""
+        """Return configurations after the best change of one element, and the rate gains [nat]."""
         # Axes: end, band, start, sub-band, element.
         steps = np.stack([-self.analog, 1 - self.analog])[:, :, :, None] * ~link.fixed
         # The power is quadratic in each element, so this is exact; only rounding can make it
@@ -151,7 +150,7 @@ class CapacityReport:
 @one_blas_thread
 def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
           surface: SurfaceEstimate | None = None) -> Beam:
-    """Find a beam that maximises Eq. (10) for a user at a position, float64 [3] [m].
+    """Find a beam that nearly maximises Eq. (10) for a user at a position, float64 [3] [m].
 
     A search from many starts, including the matched filter, proposes configurations. The best few
     are improved together with the digital part. Amplitudes are 0 or 1, which are valid for any
@@ -188,7 +187,7 @@ def prepare_steering(scenario: Scenario, surface: SurfaceEstimate | None = None)
 
 
 def applied_beam(beam: Beam, surface: SurfaceEstimate | None) -> Beam:
-    """Return a beam with the coefficients and gains that a calibrated surface applies to it."""
+    """Return a beam with the coefficients and band gain of a calibrated surface, if any."""
     if surface is None:
         return beam
     return Beam(surface.applied(beam.analog), surface.band_gains[beam.band] * beam.digital,
@@ -224,11 +223,11 @@ def capacity_report(
         surface: SurfaceEstimate | None = None) -> CapacityReport:
     """Compare a beam with the beam that `choose_beam` finds for the true position.
 
-    If the scenario has a channel file, both beams transmit over its paths. The search for a beam
-    ends slightly below the maximum. With an accurate position estimate, the loss may therefore be
-    negative, typically by less than a tenth of a per cent. `bands` and `surface` are passed to
-    `choose_beam`. Raises ValueError if the position is not a finite [3] array, or the beam does
-    not fit the scenario.
+    If the scenario has a channel file, both beams transmit over its paths, which `choose_beam`
+    ignores. The search ends slightly below the maximum. The loss may therefore be negative;
+    without a channel file, typically by less than a tenth of a per cent. `bands` and `surface` are
+    passed to `choose_beam`. Raises ValueError if the position is not a finite [3] array, or the
+    beam does not fit the scenario.
     """
     def actual_bps(beam: Beam) -> float:
         place = np.asarray(position, dtype=float)[None]
