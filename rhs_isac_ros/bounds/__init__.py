@@ -1,4 +1,4 @@
-"""Local and global bounds on positioning errors, and gradients of the local bounds."""
+"""Bounds on positioning errors, predicted errors, and gradients for the design of codebooks."""
 
 from rhs_isac_ros.bounds.average import AverageCrlb, average_crlb
 from rhs_isac_ros.bounds.fisher import crlb, crlb_of, fisher_information

@@ -1,7 +1,7 @@
 """Averages of losses that depend on a codebook through quadratic forms, with gradients.
 
 The average Cramer-Rao bound is one example. In this module, `by_radiation` is the gradient
-d/dRe(T_i) + i d/dIm(T_i) of an objective, complex128 [N_B, N_SB F, N_E].
+d/dRe(T_i) + i d/dIm(T_i) of an average, complex128 [N_B, N_SB F, N_E].
 """
 
 import dataclasses
@@ -60,16 +60,16 @@ class Gradient(NamedTuple):
 class Combination(NamedTuple):
     """Rows of a quadratic form, each of which is a multiple of a row of the source."""
 
-    # Index of the source row [G], and factor of the row in each band, complex128 [N_B, G].
+    # Index of each row's source row, int [G], and factor in each band, complex128 [N_B, G].
     sources: np.ndarray
     scale: np.ndarray
 
     def forward(self, band: int, whitened: np.ndarray) -> np.ndarray:
-        """Compute the rows, complex128 [n, G, R], from the source rows, [n, S, R]."""
+        """Compute the rows, complex [n, G, R], from the S rows of the source, [n, S, R]."""
         return whitened[:, self.sources] * self.scale[band, :, None]
 
     def backward(self, band: int, weighted: np.ndarray, n_rows: int) -> np.ndarray:
-        """Propagate gradients from the rows, [n, G, R], back to the source rows, [n, S, R]."""
+        """Propagate gradients from the rows, [n, G, R], back to those of the source, [n, S, R]."""
         gathered = np.zeros((len(weighted), n_rows, weighted.shape[2]), complex)
         for row, (source, scale) in enumerate(zip(self.sources, self.scale[band], strict=True)):
             gathered[:, source] += np.conj(scale) * weighted[:, row]
@@ -77,17 +77,16 @@ class Combination(NamedTuple):
 
 
 class Average:
-    """Mean loss of items, each of which depends on a codebook through a quadratic form.
+    """Mean of losses, each of which depends on a codebook through the quadratic form of an item.
 
-    The form of an item is 2 Re sum_i D_i^H Lambda_i^-1 D_i, where the G = `n_rows` columns of D_i
-    are the means of the item's rows. If the rows are derivatives, the form is the Fisher
-    information. If they are differences, it is twice the squared distance between mean signals.
+    The form of an item is 2 Re sum_i D_i^H Lambda_i^-1 D_i, where the columns of D_i are the means
+    of the item's G rows. If the rows are derivatives, the form is the Fisher information. If they
+    are differences, it is twice the squared distance between whitened mean signals.
 
     Parameters
     ----------
     tolerance
-        Relative error of the rows (see `CompressedRows`); 0 selects exact rows. Raises ValueError
-        if a positive tolerance is too small.
+        Relative error of the rows, as in `CompressedRows`; 0 selects exact rows.
     combination
         Rows of the form, if they differ from the rows of the source.
     """
@@ -138,7 +137,7 @@ class Average:
 
     def _blocks(self, evaluation: Evaluation
                 ) -> Iterator[tuple[slice, list[np.ndarray], np.ndarray, np.ndarray]]:
-        """Yield a block, its whitened means [n, G, N_SB F] by band, and the results of `Loss`."""
+        """Yield each block, whitened means [n, G, N_SB F] by band, and the results of `Loss`."""
         for block in self.rows.blocks():
             whitened = [evaluation.whitened(block, i) for i in range(self.scenario.n_bands)]
             if self._combination:
@@ -160,10 +159,10 @@ def average_crlb(
 
 
 class AverageCrlb(Average):
-    """Average bound at fixed positions, float64 [N, 3] [m], for evaluation with many codebooks.
+    """Average of `crlb` over fixed positions, float64 [N, 3] [m], for use with many codebooks.
 
     Nuisance parameters, errors of the elements and `region_prior` are treated as in `crlb`.
-    `tolerance` is the same as in `Average`. `tick` is called repeatedly while the rows are
+    `tolerance` is the same as in `Average`. `tick` is called repeatedly while rows are
     computed, and may raise an exception to end the computation.
     """
 
@@ -193,16 +192,16 @@ class AverageCrlb(Average):
         slopes = np.matmul(finite, finite)
         if joint.shape[1] == 3:
             return values, slopes
-        # W = [I; regression] minimises the Schur complement W^T J W, so it is treated as constant.
+        # W = [I; regression] minimises W^T J W, the Schur complement, so W counts as constant.
         identity = np.broadcast_to(np.eye(3), (len(joint), 3, 3))
         whole = np.concatenate([identity, marginal.regression], axis=1)
         return values, whole @ slopes @ np.swapaxes(whole, 1, 2)
 
 
 def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
-    """Derive the rows of all parameters from the rows of the gain and its derivative."""
-    # A parameter whose pattern is constant in each band is a multiple of the gain; each other
-    # parameter has its own row. Without nuisance parameters, the derivative suffices.
+    """Return patterns of the source rows, and their combination into rows of all parameters."""
+    # If a parameter's pattern is constant in each band, its row is a multiple of the gain. Others
+    # have their own source rows. Without nuisance parameters, the derivative suffices.
     scaled = nuisance_of(scenario).scaled_patterns
     if not len(scaled):
         return [], None
@@ -222,7 +221,7 @@ def _weighted(weights: np.ndarray, whitened: np.ndarray) -> np.ndarray:
     """Multiply weights [n, G, G] by rows [n, G, R], in the precision of the rows."""
     parts = whitened.view(whitened.real.dtype)
     weights = weights.astype(parts.dtype, copy=False)
-    # Products of single rows take many times as long as one product of arrays.
+    # Matrix products of single rows take many times as long as one elementwise product.
     product = weights * parts if parts.shape[1] == 1 else np.matmul(weights, parts)
     return product.view(whitened.dtype)
 
@@ -230,7 +229,7 @@ def _weighted(weights: np.ndarray, whitened: np.ndarray) -> np.ndarray:
 def quadratic_gradients(
         model: MeasurementModel, codebook: Beamforming, mean_terms: np.ndarray,
         covariance_terms: np.ndarray, n_items: int) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the gradients of an average, as in `Gradient`, from the sums over n items.
+    """Compute the gradients of an average, as in `Gradient`, from sums over all items.
 
     The sums are results of `Evaluation.sums` for all bands, complex128 [N_B, N_SB F, N_E] and
     [N_B, N_SB F, N_SB F].
@@ -270,7 +269,7 @@ def _by_error(scenario: Scenario, radiation: np.ndarray, covariance_terms: np.nd
 def _through_term(
         scenario: Scenario, codebook: Beamforming, constant: np.ndarray | float,
         slope: np.ndarray | float, by_radiation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gradients by C and S through a term (constant + slope C) * (S B)."""
+    """Return the gradients with respect to C and S of a term (constant + slope C) * (S B)."""
     beams = AppliedBeams(np.conj(constant + slope * codebook.analog), codebook.digital)
     return (gradient_analog(scenario, codebook, np.conj(slope) * by_radiation),
             gradient_digital(scenario, beams, by_radiation))

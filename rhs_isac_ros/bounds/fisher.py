@@ -11,7 +11,7 @@ from rhs_isac_ros.model.measurement import position_blocks
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
-# If a pivot of a normalised matrix is smaller, the matrix is singular up to rounding.
+# A normalised matrix with a pivot below this is singular up to rounding.
 _MIN_PIVOT = 1e-14
 
 
@@ -20,11 +20,11 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
          region_prior: bool = False) -> np.ndarray:
     """Implements Eq. (11). Cramer-Rao lower bound on the mean squared positioning error.
 
-    Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2]; infinite where the
-    signals do not determine the position. Declared nuisance parameters are unknown, with their
-    distributions as priors: the result is then the hybrid bound. Errors of the elements add their
-    covariance, averaged over the region. `region_prior` adds the region of interest as a Gaussian
-    prior of covariance size^2 / 12. Raises ValueError if `positions` is not a finite [N, 3] array.
+    Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2], infinite where the
+    information is singular. Declared nuisance parameters are unknown, with their distributions as
+    priors; the result is then the hybrid bound. Errors of the elements add their covariance,
+    averaged over the region. `region_prior` adds a Gaussian prior that has the variances of the
+    region, size^2 / 12. Raises ValueError if `positions` is not a finite [N, 3] array.
     """
     return crlb_of(MeasurementModel(scenario, codebook), positions, region_prior=region_prior)
 
@@ -32,7 +32,7 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
 @one_blas_thread
 def crlb_of(model: MeasurementModel, positions: np.ndarray, *,
             region_prior: bool = False) -> np.ndarray:
-    """Compute `crlb` for a measurement model, whose whitener all calls share."""
+    """Compute `crlb` for a measurement model, which keeps its whitener for further calls."""
     information = without_nuisance(joint_information_of(model, positions)).information
     if region_prior:
         information = information + region_information(model.scenario)
@@ -40,7 +40,7 @@ def crlb_of(model: MeasurementModel, positions: np.ndarray, *,
 
 
 def without_nuisance(joint: np.ndarray) -> Marginal:
-    """Integrate the result of `joint_information_of` over the nuisance parameters."""
+    """Integrate `joint_information_of` over nuisance parameters with priors of unit variance."""
     prior = np.diag(np.repeat([0.0, 1.0], [3, joint.shape[1] - 3]))
     return marginalise(joint + prior, np.zeros(joint.shape[:2]))
 
@@ -48,7 +48,7 @@ def without_nuisance(joint: np.ndarray) -> Marginal:
 def inverse_information(information: np.ndarray) -> np.ndarray:
     """Invert Fisher information matrices, float64 [N, 3, 3] [1/m^2].
 
-    If a matrix is singular, the diagonal of the result [m^2] is infinite.
+    If a matrix is not positive definite up to rounding, the diagonal of its inverse is infinite.
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
@@ -77,7 +77,7 @@ def inverse_information(information: np.ndarray) -> np.ndarray:
 
 
 def fisher_information(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
-    """Implements Eq. (12). Fisher information of the received signals about the position.
+    """Implements Eq. (12). Fisher information about the position, with known nuisance parameters.
 
     Takes positions of the user, float64 [N, 3] [m]. Returns I_FIM, float64 [N, 3, 3] [1/m^2].
     """

@@ -2,16 +2,16 @@
 
 The position is uniform in the region of interest; q = (r, u, v) are its range and direction
 cosines. No estimator has a smaller mean squared error than the posterior mean. An informed
-estimator, which is also given q modulo a lattice, has a smaller error still: only M points
-remain for the position. With the whitened differences d_k = L^-1 (mu(p_k) - mu(p)),
-Lambda = L L^H, and white noise n of unit covariance, the log-likelihood of point k relative to the
-true one is -d_k^H d_k + 2 Re(d_k^H n). The error of the informed estimator is therefore an average
-over n, which is drawn at random. Of two points, the wrong one is likelier with probability
+estimator, which is also given q modulo a lattice, has a smaller error still, because only points
+p_k of a lattice remain for the position p. With the differences d_k = L^-1 (mu(p_k) - mu(p)),
+Lambda = L L^H, and white noise n of unit covariance, the log-likelihood of p_k relative to that of
+p is -d_k^H d_k + 2 Re(d_k^H n). The error of the informed estimator is therefore an average over
+n, which is drawn at random. Of two points, the wrong one is likelier with probability
 Q(sqrt(d^H d / 2)). This extends the Ziv-Zakai bound (Bell, Steinberg, Ephraim and Van Trees,
 Extended Ziv-Zakai lower bound for vector parameter estimation, IEEE Trans. Inf. Theory 43 (2),
 1997) from pairs of hypotheses to all hypotheses at once.
 
-The finer the lattice, the tighter the bound. Steps of one to two local standard deviations lose
+The finer the lattice, the tighter the bound. Steps of up to 2.4 local standard deviations lose
 little, because even such coarse samples of a Gaussian have almost its exact variance.
 """
 
@@ -33,12 +33,12 @@ from rhs_isac_ros.support.threads import one_blas_thread
 # the steps across the line of sight are half as large.
 _STEPS = np.array([2.4, 1.2, 1.2])
 _MIN_STEPS = 24
-# Largest number of lattice points in the box around the region; beyond it, steps grow.
+# Maximum number of lattice points in the box around the region; to keep it, steps are enlarged.
 _MAX_POINTS = 2_000_000
 # Number of positioning phases that share an offset of the lattice, and number evaluated at a time.
 _PER_OFFSET = 512
 _BLOCK = 16
-# Points whose log-likelihood is lower than the true point's by more than this have no effect.
+# Points whose log-likelihood is lower than the true point's by more than this are neglected.
 _MARGIN = 20.0
 # Nodes of the interpolation over the range, in addition to those for the phase of the sub-bands,
 # and number of ranges at which the likelihood of a ray is bounded.
@@ -147,7 +147,7 @@ class _Lattice:
         self._best_prior = np.max(self._prior, axis=1)
 
     def phases(self, n: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
-        """Draw points and signals; yield each position, posterior variance and squared error."""
+        """Draw points and signals; yield arrays (position, posterior variance, squared error)."""
         model = self._model
         # Systematic sampling spreads the points evenly over the region.
         shares = np.cumsum(np.exp(self._prior - self._prior.max()))
@@ -163,7 +163,7 @@ class _Lattice:
                 yield self._moments(products, ray, index)
 
     def _products(self, signals: np.ndarray) -> np.ndarray:
-        """Return the products of signals and templates at the nodes, [n, rays, bands, nodes]."""
+        """Return products of signals and smooth means at the nodes, [n, rays, bands, nodes]."""
         products = np.stack([
             np.matmul(np.conj(signals[:, band]), smooth).reshape(
                 len(signals), len(self._offset), -1)
@@ -190,7 +190,7 @@ class _Lattice:
 
 
 def _weights(nodes: np.ndarray, angles: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return barycentric weights from Chebyshev nodes of the first kind, [nodes, points]."""
+    """Return weights that interpolate from Chebyshev nodes to `points`, [nodes, points]."""
     gaps = points - nodes[:, None]
     gaps[gaps == 0] = np.finfo(float).tiny
     terms = ((-1.0)**np.arange(len(nodes)) * np.sin(angles))[:, None] / gaps

@@ -30,7 +30,7 @@ _DIFFERENCE_M, _TOLERANCE_M = 1e-4, 1e-7
 _PER_WAVELENGTH = 8
 # Scale of the distance between the maximum of an ambiguity and the ray [m].
 _MAX_OFFSET_M = 0.5
-# Quantile, in standard deviations, of the residual energy that estimators should accept: 99 %.
+# 99 % quantile of the residual energy, in standard deviations above its mean.
 _QUANTILE = 2.33
 # Conditions for a valid result: largest share of ambiguities in the squared error, smallest
 # distance from the border of the region in standard deviations, and largest relative error of the
@@ -43,9 +43,9 @@ class Misspecified(NamedTuple):
 
     bias: np.ndarray  #: Pseudo-true position minus true position, float64 [N, 3] [m].
     covariance: np.ndarray  #: Covariance about the pseudo-true position, [N, 3, 3] [m^2].
-    #: Whether the result describes the estimator, bool [N]: ambiguities of the range are
-    #: improbable, the mean is almost linear within the errors, the border of the region is far
-    #: away, and estimators accept the residual of the signals.
+    #: Whether the result describes the estimator, bool [N]: the covariance is finite, confusion of
+    #: ranges adds almost no error, the mean is almost linear within the errors, the border of the
+    #: region is far away, and estimators accept the energy of the residual.
     valid: np.ndarray
 
     @property
@@ -60,8 +60,8 @@ def misspecified(
         assumed: MeasurementModel, true: MeasurementModel, positions: np.ndarray) -> Misspecified:
     """Compute the errors of an estimator whose assumed model differs from the true one.
 
-    Takes positions of the user, float64 [N, 3] [m]. Raises ValueError unless both models have the
-    same sizes and no nuisance parameters, such as phases.
+    Takes positions of the user, float64 [N, 3] [m]. Raises ValueError if they are not finite
+    [N, 3], the models differ in size, or a model has nuisance parameters, such as phases.
     """
     positions = checked_positions(positions)
     if assumed.shape != true.shape:
@@ -93,12 +93,12 @@ def _curvature(slopes: np.ndarray) -> np.ndarray:
 
 
 def _projections(slopes: np.ndarray, signals: np.ndarray) -> np.ndarray:
-    """Return the real inner products of derivatives and signals, float64 [N, 3]."""
+    """Return the real parts of inner products of derivatives and signals, float64 [N, 3]."""
     return np.einsum('nair,nir->na', slopes.conj(), signals).real
 
 
 def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Minimise the distance between whitened mean and target by damped Gauss-Newton steps."""
+    """Search from `positions` for the mean closest to `target`, by damped Gauss-Newton steps."""
     def cost(places: np.ndarray) -> np.ndarray:
         distances = np.abs(target - model.whiten(model.mean(places)))**2
         return np.sum(distances, axis=(1, 2))
@@ -126,7 +126,7 @@ def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndar
 
 
 def _bending(model: MeasurementModel, places: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Return the curvature due to the second derivative of the mean, float64 [N, 3, 3]."""
+    """Return how much the second derivative of the mean reduces A, float64 [N, 3, 3]."""
     bending = np.empty((len(places), 3, 3))
     for axis in range(3):
         step = _DIFFERENCE_M * np.eye(3)[axis]
@@ -167,8 +167,8 @@ def _is_valid(model: MeasurementModel, places: np.ndarray, bias: np.ndarray,
 
 def _ambiguities(model: MeasurementModel, place: np.ndarray, mean: np.ndarray,
                  residual: np.ndarray, white: np.ndarray, covariance: np.ndarray) -> float:
-    """Bound the squared error [m^2] from confusion with other ranges in the same direction."""
-    # The sum over maxima of squared distance times probability of being likelier than the truth.
+    """Estimate the squared error [m^2] from confusion with other ranges in the same direction."""
+    # Each maximum adds its squared distance times its probability of being likelier than `place`.
     from scipy.special import ndtr
 
     scenario = model.scenario
@@ -192,7 +192,7 @@ def _ambiguities(model: MeasurementModel, place: np.ndarray, mean: np.ndarray,
     probability = ndtr(-excess / np.sqrt(np.maximum(variance, 1e-300)))
     is_maximum = np.r_[True, probability[1:] >= probability[:-1]] & np.r_[
         probability[:-1] >= probability[1:], True]
-    # The mode of the true position has the local standard deviation along the range.
+    # The mode at `place` itself has the local standard deviation along the range.
     own = 4 * np.sqrt(direction @ covariance @ direction) + step
     other = is_maximum & (np.abs(points - distance) > own)
     return float(np.sum(probability[other] * (points[other] - distance)**2))

@@ -1,9 +1,9 @@
 """Error from confusing distant positions, which the local Cramer-Rao bound does not include.
 
 The phases of the bands may be unknown: theta = A z, with standard normal z. The distance between
-two signals is then the minimum over z of ``sum_i 2 |a_i exp(i theta_i) - b_i|^2 + |z|^2``. For
-close positions, it agrees with the marginal Fisher information. If the signals differ only in the
-phases of their bands, at most the cost ``|z|^2`` of the phases remains. It vanishes as A grows.
+whitened signals is then the minimum over z of ``sum_i 2 |a_i exp(i theta_i) - b_i|^2 + |z|^2``.
+For close positions, it agrees with the marginal Fisher information. If the signals differ only in
+the phases of their bands, at most the cost ``|z|^2`` remains, which vanishes as A grows.
 """
 
 import copy
@@ -20,7 +20,7 @@ from rhs_isac_ros.model.surface import Beamforming
 # Share of a sample that is drawn uniformly. It limits the weight of a pair whose cost grows while
 # the codebook changes.
 _UNIFORM_SHARE = 0.05
-# Steps of the minimisation over the phases; each lowers the distance.
+# Steps of the minimisation over the phases; none increases the distance.
 _STEPS = 40
 
 
@@ -29,10 +29,10 @@ class PairwiseErrorCost(Average):
 
     A maximum-likelihood decision between two positions is wrong with probability Q(sqrt(q / 2)),
     where q = sum_i dmu_i^H Lambda_i^-1 dmu_i and dmu is the difference of the mean signals. The
-    cost is the average of ``|p - p'|^2 Q(sqrt(q / 2))``, in m^2 like the bound. In its quadratic
-    form, the difference h(p) - h(p') replaces the derivative of Eq. (12). If the scenario declares
-    unknown phases, the form is minimised over them; other nuisance parameters are not included.
-    The arguments contain positions, float64 [N, 3] [m], and weights, float64 [N], of N pairs.
+    cost is the average of ``w |p - p'|^2 Q(sqrt(q / 2))`` [m^2]. In its quadratic form, the
+    difference h(p) - h(p') replaces the derivative of Eq. (12). If the scenario declares unknown
+    phases, the form is minimised over them; other nuisance parameters are not included. Takes the
+    positions, float64 [N, 3] [m], and weights w, float64 [N], of N pairs; without weights, w = 1.
     `tolerance` and `tick` are the same as in `AverageCrlb`. Raises ValueError if a shape is wrong,
     a position is not finite, a weight is negative or NaN, or there are no pairs.
     """
@@ -73,8 +73,8 @@ class PairwiseErrorCost(Average):
     ) -> 'PairwiseErrorCost':
         """Return the cost of n of the pairs, drawn with probabilities that grow with their cost.
 
-        For this codebook, the cost of the sample is an unbiased estimate of the cost of all pairs.
-        For similar codebooks, the estimate is close, because a few very similar pairs contribute
+        The cost of the sample is an unbiased estimate of the cost of all pairs. It is close for
+        this codebook and similar ones, because a few pairs with very similar signals contribute
         most of the cost. Samples are evaluated in single precision. Raises ValueError if n is not
         from 1 to the number of pairs, or if the rows are not compressed.
         """
@@ -111,14 +111,14 @@ class PairwiseErrorCost(Average):
         return costs * ndtr(-root / 2), (costs * slope)[:, None, None] * slopes
 
     def _squares(self, forms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the values 2 q [n], and their derivatives with respect to the forms."""
+        """Return the values 2 q [n], and their derivatives by the forms, [n or 1, G, G]."""
         if not self._scales.size:
             return forms[:, 0, 0], np.ones((1, 1, 1))
         first = np.arange(0, forms.shape[1], 3)
         turned, second = first + 1, first + 2
         phases, penalties = best_phases(
             forms[:, first, second] + 1j * forms[:, turned, second], self._scales)
-        # The phases minimise the value, so its derivative does not depend on them.
+        # The phases minimise the value, so their changes do not contribute to its derivative.
         slopes = np.zeros(forms.shape)
         slopes[:, first, first] = slopes[:, second, second] = 1.0
         slopes[:, first, second] = slopes[:, second, first] = -np.cos(phases)
@@ -139,7 +139,7 @@ def best_phases(products: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, n
     curvature = np.einsum('bq,nb,bp->nqp', scales, magnitude, scales) + np.eye(scales.shape[1])
     inverse = np.linalg.inv(curvature)
     candidates = []
-    # If A is small, the minimum is near 0; if A is large, it is near the angles of the products.
+    # If A is small, the best z is near 0; if A is large, the phases are near the products' angles.
     for z in (np.zeros((len(products), scales.shape[1])), angle @ np.linalg.pinv(scales).T):
         for _ in range(_STEPS):
             slope = (magnitude * np.sin(z @ scales.T - angle)) @ scales + z
@@ -154,7 +154,7 @@ def best_phases(products: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _rows_of_bands(n_bands: int) -> Combination:
-    """Return the rows a_i, i a_i and b_i of each band, from the rows of the two signals."""
+    """Return the rows a_i, j a_i and b_i of each band as multiples of the two signals' rows."""
     scale = np.zeros((n_bands, n_bands, 3), complex)
     scale[np.arange(n_bands), np.arange(n_bands)] = 1, 1j, 1
     return Combination(np.tile([0, 0, 1], n_bands), scale.reshape(n_bands, -1))

@@ -1,9 +1,9 @@
 """Confusion of ranges at which the signals have similar phases in all bands.
 
 If two ranges differ by a lag r, the phases of a carrier f_i differ by 2 pi f_i r / v_0. The range
-ambiguity function is the mismatch sum_i w_i (1 - cos(2 pi f_i r / v_0)), with equal weights w_i.
-Its minima are the lags that are hard to distinguish from 0. The function depends only on the
-frequencies, so many band plans can be compared in little time.
+ambiguity function is the mismatch sum_i (1 - cos(2 pi f_i r / v_0)) over the bands. Its local
+minima, apart from 0, are the lags that are hard to distinguish from 0. The function depends only
+on the frequencies, so many band plans can be compared in little time.
 """
 
 import numpy as np
@@ -26,10 +26,10 @@ _BLOCK = 128
 
 def range_confusion_error(
         frequencies_hz: np.ndarray, energies: np.ndarray, max_lag_m: float) -> np.ndarray:
-    """Estimate the squared error from confusing ranges for P band plans, float64 [P] [m^2].
+    """Estimate the squared error from confused ranges for P band plans, float64 [P] [m^2].
 
-    Each minimum r of the mismatch has the weight w = (1 - r / r_max) Q(sqrt(q / 2)), with
-    q = 2 E sum_i (1 - cos(2 pi f_i r / v_0)) / N_B. The factor 1 - r / r_max is the share of the
+    A minimum at a lag r of either sign has the weight w = (1 - |r| / r_max) Q(sqrt(q / 2)), with
+    q = 2 E sum_i (1 - cos(2 pi f_i r / v_0)) / N_B. The factor 1 - |r| / r_max is the share of
     positions for which the lag stays inside the region. The estimate is sum w r^2 / (1/2 + sum w),
     the mean of r^2 over the confused ranges and the true one, averaged over the energies E.
 
@@ -42,7 +42,7 @@ def range_confusion_error(
     n_bands = frequencies_hz.shape[1]
     errors = np.zeros(len(frequencies_hz))
     lags = _lags(float(frequencies_hz.max()), max_lag_m)
-    # The cosines of each frequency are computed once.
+    # The cosines of each distinct frequency are computed once.
     distinct, index = np.unique(frequencies_hz, return_inverse=True)
     cosines = np.cos(2 * np.pi / SPEED_OF_LIGHT_MPS * np.outer(distinct, lags))
     index = index.reshape(frequencies_hz.shape)
@@ -64,11 +64,11 @@ def range_confusion_error_of(
         model: MeasurementModel, positions: np.ndarray, rng: np.random.Generator) -> float:
     """Estimate the squared error from confused ranges for one codebook [m^2].
 
-    This is the error of the posterior mean over a true position and the positions that can be
-    confused with it, averaged over N true positions, float64 [N, 3] [m]. The lags are the minima
-    of the mismatch along the line of sight. Signals are made as similar as possible by a small
-    displacement of the confused position, to first order, and by declared unknown phases. Noise is
-    drawn several times for each position.
+    This is the squared range error of the posterior mean over a true position and confused ones,
+    averaged over N true positions, float64 [N, 3] [m]. Confused positions lie in the region, on
+    the line of sight, at lags that are minima of the mismatch. A small displacement, to first
+    order, and declared unknown phases make their signals as similar as possible to those of the
+    true position. Noise is drawn several times for each position.
     """
     positions = checked_positions(positions)
     scenario = model.scenario
@@ -99,7 +99,7 @@ def range_confusion_error_of(
 def _differences(
         model: MeasurementModel, mean: np.ndarray, confused: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the differences [n, R] at the best displacement and phases, and phase costs [n]."""
+    """Return the smallest whitened differences, real [n, 2 N_B R], and costs of the phases [n]."""
     means, jacobians = model.mean_and_jacobian(confused)
     means, jacobians, target = model.whiten(means), model.whiten(jacobians), model.whiten(mean)
     scales, penalties = nuisance_of(model.scenario).scaled_phases, np.zeros(len(confused))
@@ -115,7 +115,7 @@ def _differences(
     difference, directions = _real(means - target), _real(slopes)
     by_position = np.einsum('nur,nr->nu', directions, difference)
     information = np.einsum('nur,nvr->nuv', directions, directions)
-    # Phases have a prior; the information of real parts is half the curvature.
+    # `information` is half the curvature, to which the prior of the phases adds 1.
     information[:, 3:, 3:] += np.eye(scales.shape[1]) / 2
     displacement = step_to_maximum(information, by_position)
     return difference - np.einsum('nu,nur->nr', displacement, directions), penalties
@@ -134,7 +134,7 @@ def _is_minimum(mismatch: np.ndarray) -> np.ndarray:
 
 
 def _refined(mismatch: np.ndarray, plan: np.ndarray, lag: np.ndarray) -> np.ndarray:
-    """Refine minima by parabolas through their neighbours; return at least 0 for each [n]."""
+    """Return minima [n], at least 0, of parabolas through grid minima and their neighbours."""
     before, at, after = (mismatch[plan, lag + step] for step in (-1, 0, 1))
     lowest = at - (after - before)**2 / (8 * (before - 2 * at + after))
     return np.maximum(lowest, 0.0)

@@ -2,7 +2,7 @@
 
 A row is a linear function of the line-of-sight gains of one band, such as their derivative with
 respect to a coordinate, or their difference between two positions. Its mean is the same function
-of the mean signals, as in Eq. (13). An objective spends most of its time on whitened means.
+of the mean signals, as in Eq. (13). Most of the time of an evaluation goes into whitened means.
 """
 
 import copy
@@ -17,22 +17,22 @@ from rhs_isac_ros.support import streams
 
 # Function that long computations call repeatedly; it may raise an exception to end them.
 Tick = Callable[[], None]
-# Rows, and the factor of their means in each band and measurement, complex128 [N_B, N_SB F], or
-# None for 1. Together, the slices cover all rows.
+# Some of the rows, and the factor of their means in each band and measurement, complex128
+# [N_B, N_SB F], or None for 1. The slices of all patterns cover all rows.
 Pattern = tuple[slice, np.ndarray | None]
 PLAIN: Sequence[Pattern] = ((slice(None), None),)
-# Number of items in a block, if each has three rows. The arrays of a block fit into the cache.
+# Items in a block, three times as many if each has one row. Their means fit into the cache.
 _BLOCK = 128
-# Largest number of complex numbers in a block of exact rows.
+# Largest number of complex numbers in the uncompressed rows of a block of several items.
 _BLOCK_NUMBERS = 1 << 21
 # Memory for exact rows that are kept between evaluations [bytes].
 _CACHE_BYTES = 1 << 30
 # Largest useful rank. With more basis vectors, a small number of exact rows is as fast.
 _MAX_RANK = 192
-# Minimum number of columns of the first sketch. Each further sketch has twice as many.
+# Minimum number of columns of the first sketch. The number doubles from sketch to sketch.
 _MIN_SKETCH = 128
-# Number of rows used to find a basis for many rows, and the share of the tolerance that their
-# error may reach.
+# Approximate number of rows used to find a basis for many rows, and the share of the tolerance
+# that their error may reach.
 _SKETCHED_ROWS = 2048
 _SKETCH_MARGIN = 0.8
 # Smaller relative errors would be lost in the rounding of Gram matrices.
@@ -48,7 +48,7 @@ class RowSource:
     """G rows of each of n items, computed in blocks."""
 
     scenario: Scenario
-    #: Function of a block of n items and a band that returns complex128 [n, G, N_SB, N_E].
+    #: Function of a block of n items and a band; returns rows, complex128 [n, G, N_SB, N_E].
     rows: Callable[[slice, int], np.ndarray]
     n_items: int
     n_rows: int  #: Number G of rows of an item.
@@ -70,7 +70,7 @@ class RowSource:
 class MeasurementRows:
     """Rows of all items and bands, as coefficients of basis vectors.
 
-    The sub-bands of a band form J groups of S. The bases of the groups are complex128
+    The sub-bands of a band form J groups of S sub-bands. The bases of a band are complex128
     [J, S, N_E, R], or None if the coefficients are the rows themselves, with S = 1 and R = N_E.
     """
 
@@ -81,7 +81,7 @@ class MeasurementRows:
         self.bases: list[np.ndarray | None] = [None] * source.scenario.n_bands
 
     def blocks(self) -> list[slice]:
-        """Split the items into blocks that fit into the cache."""
+        """Split the items, in order, into blocks of a suitable size."""
         return blocks(self.n_items, self.n_rows, self._width)
 
     def in_block(self, block: slice, band: int) -> np.ndarray:
@@ -89,7 +89,7 @@ class MeasurementRows:
         raise NotImplementedError
 
     def means(self, band: int, radiation: np.ndarray) -> np.ndarray:
-        """Return the means of the basis vectors, complex128 [J, R, S F]."""
+        """Return the means of the basis vectors of a band, complex128 [J, R, S F]."""
         frames = radiation.reshape(self.n_groups, self._n_in_group, -1, radiation.shape[-1])
         basis = self.bases[band]
         means = frames if basis is None else np.matmul(frames, np.conj(basis))
@@ -129,7 +129,7 @@ class Evaluation:
         return np.matmul(means, self._whitener[band].T) if self._is_folded else means
 
     def whitened(self, block: slice, band: int) -> np.ndarray:
-        """Compute the whitened means of a block of n items, complex128 [n, G, N_SB F]."""
+        """Compute the whitened means of a block of n items, complex [n, G, N_SB F]."""
         rows = self._rows.in_block(block, band)
         n_groups, n, n_rows, rank = rows.shape
         means = np.empty((n, n_rows, n_groups, self._filters[band][0].shape[2]), rows.dtype)
@@ -148,7 +148,7 @@ class Evaluation:
         return whitened
 
     def accumulate(self, block: slice, band: int, weighted: np.ndarray) -> None:
-        """Add a block's weighted whitened means, complex128 [n, G, N_SB F], to the sums.
+        """Add a block's weighted whitened means, complex [n, G, N_SB F], to the sums.
 
         The last call of `whitened` for this band must have been for the same block.
         """
@@ -191,10 +191,10 @@ class Evaluation:
 
 
 def rows_within(source: RowSource, tolerance: float) -> MeasurementRows:
-    """Compress rows up to a relative error; see `CompressedRows`.
+    """Return rows with a relative error of at most `tolerance`; see `CompressedRows`.
 
     If the tolerance is 0, the rows are exact. If there are few rows and they would need a large
-    basis, all are stored in single precision instead.
+    basis, they are stored in single precision without compression.
     """
     if tolerance == 0:
         return ExactRows(source)
@@ -222,7 +222,7 @@ def _rank_of_some(source: RowSource, tolerance: float, band: int) -> int:
 
 
 class ExactRows(MeasurementRows):
-    """Rows without approximation, kept between evaluations if they fit into memory."""
+    """Uncompressed rows, kept between evaluations unless they exceed `_CACHE_BYTES`."""
 
     def __init__(
             self, source: RowSource, kind: type[np.complexfloating] = np.complex128) -> None:
@@ -247,12 +247,12 @@ class ExactRows(MeasurementRows):
 
 
 class CompressedRows(MeasurementRows):
-    """Rows as coefficients in a basis, for less memory and one large matrix product per band.
+    """Rows as coefficients in a basis, which saves memory and allows large matrix products.
 
-    The rows of all positions and sub-bands in a region span, to a given accuracy, far fewer
-    dimensions than there are elements and sub-bands. A randomised range finder with a fixed seed
-    finds a basis. `tolerance`, from `MIN_TOLERANCE` to 1, is the root mean square of the relative
-    errors of the rows.
+    To a given accuracy, the rows of all positions in a region span far fewer dimensions than a row
+    has entries. A randomised range finder with a fixed seed finds a basis. `tolerance` limits the
+    root mean square of the relative errors of the rows. Raises ValueError if it is less than
+    `MIN_TOLERANCE`, or not less than 1.
     """
 
     def __init__(self, source: RowSource, tolerance: float) -> None:
@@ -272,8 +272,7 @@ class CompressedRows(MeasurementRows):
     def chosen(self, items: np.ndarray) -> 'CompressedRows':
         """Return the rows of some items, int [n], with coefficients in single precision.
 
-        Single precision halves the time of products. Its rounding, 6e-8, is far below the relative
-        error of the rows.
+        This halves the time of products. The rounding, 6e-8, is less than any valid tolerance.
         """
         rows = copy.copy(self)
         rows.n_items = len(items)
@@ -294,7 +293,7 @@ class CompressedRows(MeasurementRows):
 
 
 def blocks(n_items: int, n_rows: int, width: int) -> list[slice]:
-    """Split items of `n_rows` rows, in order, into blocks that are smaller for very wide rows."""
+    """Split items of `n_rows` rows into successive blocks, smaller ones if rows are very wide."""
     size = max(3 // n_rows, 1) * _BLOCK
     size = max(min(size, _BLOCK_NUMBERS // max(n_rows * width, 1)), 1)
     return [slice(start, min(start + size, n_items)) for start in range(0, n_items, size)]
@@ -362,6 +361,6 @@ def _sketch(
         rows = rows_of(block)
         norms = np.linalg.norm(rows, axis=1)
         weights = rng.normal(size=(size, len(rows))) / np.where(norms == 0, 1.0, norms)
-        # A real product takes a quarter of the operations of a complex one.
+        # A product with real weights takes half as many operations as with complex ones.
         mixtures = mixtures + weights @ rows.view(float)
     return np.linalg.qr(np.conj(mixtures.view(complex).T))[0]

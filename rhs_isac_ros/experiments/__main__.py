@@ -55,7 +55,7 @@ _EPILOG = '\n\n'.join(textwrap.fill(f'{title}: {", ".join(names)}.', 79) for tit
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return the exit code of `run_command`, or 2 after a usage error."""
+    """Run the command; return the code of `run_command`, or exit with 2 after a usage error."""
     parser = ArgumentParser(
         prog='python3 -m rhs_isac_ros.experiments',
         description='Run experiments on the cores of this machine or on a Dask cluster.',
@@ -122,7 +122,7 @@ def _add_options(parser: ArgumentParser) -> None:
 
 
 def _check(parser: ArgumentParser, options: argparse.Namespace) -> None:
-    """Exit with a usage error if there are too many settings, or a library is missing."""
+    """Exit with a usage error for too many settings, or for ``--picture`` without matplotlib."""
     n_settings = math.prod(len(axis.values) for axis in options.vary)
     if n_settings > _MAX_SETTINGS:
         parser.error(f'argument --vary: {n_settings} settings, expected at most {_MAX_SETTINGS}')
@@ -158,7 +158,7 @@ def _run(sweep: Sweep, options: argparse.Namespace) -> None:
 
 
 def _report(axes: Sequence[Axis], points: Sequence[Point]) -> str:
-    """Return the points as a table with a row per setting and a column per measure."""
+    """Return the points as a Markdown table with a row per setting and a column per measure."""
     names = [axis.fields[0] for axis in axes]
     measures = list(dict.fromkeys(point.measure for point in points))
     rows: dict[tuple[str, ...], list[str]] = {}

@@ -23,7 +23,7 @@ from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 
 class JobError(Exception):
-    """A job failed; the message begins with the name of the job."""
+    """A job failed, its process died, or its worker has another version of this package."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +77,7 @@ def _file(folder: Path, job: Job) -> Path:
     return folder / f'{job.name}.json'
 
 
-# Timeouts for the scheduler of a cluster, and for its first worker.
+# Timeouts for the scheduler of a cluster, its first worker, and a thread of the process pool.
 _SCHEDULER_TIMEOUT_S = 30
 _WORKER_TIMEOUT_S = 30
 _THREAD_TIMEOUT_S = 5
@@ -89,7 +89,7 @@ def run_locally(
     """Run jobs in single-threaded processes on this machine; yield each result when it is ready.
 
     If `n_jobs` is -1, there is one process per core; if it is 1, all jobs run in this process.
-    Closing the generator ends the processes. Before joblib 1.4, results have the jobs' order.
+    Closing the generator ends the processes. Joblib before 1.4 yields results in the jobs' order.
     """
     with optional_import('running jobs', extra='experiments'):
         import joblib
@@ -125,9 +125,9 @@ def run_on_cluster(
 ) -> Generator[JobResult, None, None]:
     """Run jobs on the Dask cluster of a scheduler; yield each result when it is ready.
 
-    Closing the generator cancels pending jobs. This function uses `distributed` directly, because
-    joblib would run the jobs of a cluster with a single thread in this process, and would never
-    return if a worker died.
+    Closing the generator cancels pending jobs. This function uses `distributed` directly: joblib
+    would never return if a worker died, and would run the jobs in this process if the cluster had
+    a single thread.
     """
     with optional_import('running jobs on a Dask cluster', extra='experiments'):
         from distributed import Client, as_completed
@@ -151,7 +151,7 @@ def run_on_cluster(
 
 @contextlib.contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Ignore SIGINT inside the block, and in processes that are started there.
+    """Ignore SIGINT inside a block of the main thread, and in processes that are started there.
 
     A terminal sends SIGINT to the whole process group, but only this process may end the workers.
     A signal mask would not do: it would only delay the signal until the end of the block.
@@ -178,9 +178,10 @@ def run_jobs(
     one per core; `dask` is the address of the scheduler of a Dask cluster to use instead. If
     stderr is a terminal, a progress bar with the label appears there.
 
-    Raises JobError if a job fails or its worker has another version of this package,
-    ConnectionError if the cluster does not respond, OSError if a result cannot be read or stored,
-    and MissingLibraryError if a library is not installed.
+    Raises JobError if a job fails, its process dies or its worker has another version of this
+    package, ConnectionError if the cluster does not respond, OSError if a result cannot be read or
+    stored, MissingLibraryError if a library is not installed, and ValueError if two jobs have the
+    same name.
     """
     if len({job.name for job in jobs}) < len(jobs):
         raise ValueError('jobs: two have the same name, expected unique names')
@@ -237,7 +238,7 @@ def _address(text: str) -> str:
 
 
 def run_command(experiment: Callable[[], None]) -> int:
-    """Run an experiment; return 0, 1 after an error, which is printed, or 130 after Ctrl-C."""
+    """Run an experiment; return 0, 130 after Ctrl-C, or 1 after a job, file or library error."""
     try:
         experiment()
     except KeyboardInterrupt:
@@ -252,7 +253,7 @@ def run_command(experiment: Callable[[], None]) -> int:
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Format a Markdown table, the first column left-aligned and the others right-aligned."""
+    """Format a Markdown table: the first column is left-aligned, the others right-aligned."""
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     rule = ['-' * widths[0], *('-' * (width - 1) + ':' for width in widths[1:])]
     lines = [

@@ -14,11 +14,11 @@ _INTERVAL = (2.5, 97.5)
 class Replicates(NamedTuple):
     """A statistic over several members and cases, with its replicates from the bootstrap.
 
-    A member is a repetition, such as another training or another random codebook.
+    Cases are, for example, positions; members are repetitions, such as other random codebooks.
     """
 
     #: The statistic, followed by its replicates, which resample cases and members, float64
-    #: [1 + replicates]; NaN where a replicate has no result.
+    #: [1 + replicates]; NaN if a replicate contains no result.
     values: np.ndarray
     by_member: np.ndarray  #: Like `values`, but the replicates resample only members.
     n_members: int
@@ -35,7 +35,7 @@ class Replicates(NamedTuple):
     def reduction_from(self, baseline: 'Replicates') -> tuple[float, float, float]:
         """Return the reduction relative to a baseline, and its 95 % interval [%].
 
-        The comparison is paired if both have the same number of cases.
+        The cases are paired if both statistics have the same number of cases.
         """
         with np.errstate(divide='ignore', invalid='ignore'):
             ratios, own, other = (one / two for one, two in (
@@ -74,7 +74,7 @@ def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -
 
 
 def share_percent(count: int, total: int) -> tuple[float, float, float]:
-    """Return a share of a positive total, with the ends of Wilson's 95 % interval [%]."""
+    """Return `count` relative to `total` [%], and the ends of Wilson's 95 % interval [%]."""
     if total < 1:
         raise ValueError(f'total: {total}, expected at least 1')
     z2 = float(ndtri(0.975))**2
@@ -112,7 +112,7 @@ def _interval(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
     With few members, the percentiles are too close to the statistic. Their distances from it are
     multiplied by the ratio of the quantiles of Student's t and the normal distribution, with
     Satterthwaite's degrees of freedom. Each part contains the replicates due to the members of one
-    sample, and the number of members. The scale is logarithmic if all replicates are positive.
+    sample, and the number of members. The scale is logarithmic if all values are positive.
     """
     with np.errstate(invalid='ignore'):
         if all(np.nanmin(array) > 0 for array in (values, *(part for part, _ in parts))):

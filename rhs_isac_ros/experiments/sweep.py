@@ -1,4 +1,4 @@
-"""Sweeps: measures over a product of settings, one result for each setting and measure."""
+"""Sweeps: measures in many settings, with one result for each setting and measure."""
 
 import csv
 import dataclasses
@@ -51,7 +51,7 @@ _SAMPLES = 64
 _RADIUS = float(chdtri(3, 0.05))
 # Above this coarseness of its lattice, a global bound is too loose.
 _MAX_COARSENESS = 3.0
-# Largest relative error of the power without scaling, smaller than that in `Codebook.check`.
+# Largest relative error of the power that is not corrected; `Codebook.check` allows a larger one.
 _POWER_TOLERANCE = 1e-9
 # Families of quantities that a job computes. LOSS includes CAPACITY, which includes ERROR.
 CRLB, BOUND, ERROR, CAPACITY, LOSS = 'crlb', 'bound', 'error', 'capacity', 'loss'
@@ -63,7 +63,7 @@ _FIRST_SOBOL = threading.Lock()
 
 
 def families(quantities: Iterable[str]) -> list[str]:
-    """Return the families of quantities whose jobs together compute the given quantities."""
+    """Return the smallest set of families whose jobs compute the given quantities."""
     wanted = set(quantities)
     found = [family for family, names in _QUANTITIES.items() if wanted.intersection(names)]
     return [family for family in found if family not in _INCLUSIVE] + [
@@ -106,8 +106,8 @@ def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, An
              first: int, n: int, estimator: str = '') -> dict[str, list[float]]:
     """Run a job: compute a family of quantities at `n` positions, beginning with number `first`.
 
-    The seed determines the sequence of positions, which is the same for all scenarios with the
-    same region. Each list of the result has one value per position.
+    The seed and the region determine the sequence of positions, except for the global bound, which
+    draws its own. Each list of the result has one value per position.
     """
     world, book = Scenario(**scenario), Codebook.from_parameters(dict(codebook))
     if family == BOUND:
@@ -151,7 +151,7 @@ def _estimator(name: str, scenario: str, codebook: str) -> Estimator:
 
 
 def _initialise_sobol() -> None:
-    """Create a Sobol sequence, because SciPy loads a table at its first use without a lock."""
+    """Create a Sobol sequence under a lock; at first use, SciPy loads a table without one."""
     with _FIRST_SOBOL:
         qmc.Sobol(1)
 
@@ -190,7 +190,7 @@ class Sweep:
     base: Scenario  #: Scenario with the values that are not varied.
     settings: Sequence[Setting]  #: Result of `settings_of`.
     measures: Sequence[str]  #: Keys of `MEASURES`.
-    n_positions: int = 2000  #: Per setting; region and seed determine the positions.
+    n_positions: int = 2000  #: Number of positions in each setting.
     seed: int = 0  #: Seed of positions, signals and codebooks.
     objective: str = 'ambiguity'  #: Objective of an optimisation.
     steps: int = 300  #: Maximum number of steps of an optimisation.
@@ -254,7 +254,7 @@ class Sweep:
             for first in range(0, self.n_positions, BLOCK)] for family in families(quantities)}
 
     def codebooks(self, setting: Setting, made: Mapping[str, Mapping[str, Any]]) -> list[Codebook]:
-        """Return the codebooks of a setting; `made` contains the results of jobs by job name."""
+        """Return the codebooks of a setting; `made` has the results of `designs` by job name."""
         books = [Codebook.from_parameters(dict(made[job.name])) for job in self.designs(setting)]
         return [_fitted(book, setting)
                 for book in books or [self._files[setting.codebook]]]
@@ -271,7 +271,7 @@ def run_sweep(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = N
 
 def run_blocks(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = None
                ) -> list[Results]:
-    """Run the jobs of a sweep that have no stored result, and return the results in order.
+    """Run the jobs of a sweep that have no stored result; return the results of each setting.
 
     Several sweeps may share a folder. `run_jobs` describes the other arguments and the errors.
     """
@@ -311,7 +311,7 @@ def table(sweep: Sweep, points: Sequence[Point]) -> str:
 
 
 def _fitted(codebook: Codebook, setting: Setting) -> Codebook:
-    """Return a codebook with the power of a setting; raise CodebookError if it does not fit."""
+    """Scale a codebook to the power of a setting; raise CodebookError if it does not fit."""
     fitted = with_power(codebook, setting.scenario.max_power_w)
     fitted.check(setting.scenario)
     return fitted
@@ -333,7 +333,7 @@ def _job(kind: str, arguments: dict[str, Any]) -> Job:
 
 def _results(function: Callable[..., dict[str, Any]], jobs: Iterable[Job], folder: Path,
              n_jobs: int, dask: str | None, label: str) -> dict[str, dict[str, Any]]:
-    """Run every job once, and return the results by name."""
+    """Run each distinct job that has no stored result; return all results by job name."""
     distinct = {job.name: job for job in jobs}
     results = run_jobs(function, [*distinct.values()], folder, n_jobs, dask, label)
     return dict(zip(distinct, results, strict=True))

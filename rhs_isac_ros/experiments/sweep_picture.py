@@ -25,11 +25,11 @@ _PANEL_IN, _LEGEND_IN, _LINE_IN = 2.2, 0.4, 0.13
 # in other units always have a linear scale.
 _WIDE = 8.0
 _LOGARITHMIC = ('m', 'm²')
-# Up to this ratio, a logarithmic axis has labels within decades.
+# Below this ratio of largest to smallest value, a logarithmic axis has labels within decades.
 _FEW_DECADES = 200
-# Horizontal offset between lines, relative to the axis, which keeps intervals from overlapping.
+# Horizontal offset between lines, relative to the range of x, which keeps intervals apart.
 _SHIFT = 0.01
-# With more values than this, the ticks are not placed at the values.
+# With more numbers than this on the x axis, the ticks are not placed at these numbers.
 _MAX_TICKS = 8
 
 
@@ -49,7 +49,7 @@ def draw(axes: Sequence[Axis], points: Sequence[Point],
     """Draw points, and return the `matplotlib.figure.Figure`.
 
     The first axis is the x axis of the panels. The second has one line per value, and each
-    combination of the others' values has a row of panels. `panels` lists the measures by column.
+    combination of the others' values has a row of panels. `panels` lists the measures per column.
     """
     first, *others = [axis.ordered() for axis in axes]
     lines, rows = others[:1], others[1:]
@@ -79,7 +79,7 @@ def draw(axes: Sequence[Axis], points: Sequence[Point],
 
 def draw_panel(panel: Any, first: Axis, others: Sequence[Axis], points: Sequence[Point],
                names: Sequence[str]) -> None:
-    """Draw measures of one unit against the first axis, with a line for each value of `others`."""
+    """Draw measures of one unit against the first axis; values of `others` have separate lines."""
     values = [entry[0] for entry in first.values]
     numeric = all(isinstance(value, int | float) for value in values)
     places = np.array(values if numeric else range(len(values)), float)
@@ -92,7 +92,7 @@ def draw_panel(panel: Any, first: Axis, others: Sequence[Axis], points: Sequence
     if logarithmic:
         panel.set_yscale('log')
     for line in _lines(others, points, names):
-        # Infinite values cannot be drawn.
+        # Infinite values and NaN cannot be drawn.
         own = [point for point in line.points if np.isfinite(point.interval.value)]
         ranks = [values.index(point.setting.varied[first.fields[0]]) for point in own]
         _draw_line(panel, _shifted(panel, places, line.shift)[ranks], factor
@@ -110,10 +110,10 @@ def draw_panel(panel: Any, first: Axis, others: Sequence[Axis], points: Sequence
 
 def add_legend(place: Any, panels: Sequence[Any], lines: Sequence[Axis],
                joined: Sequence[Sequence[str]] = ()) -> None:
-    """Draw one legend for all panels, which have the same lines, in separate axes, `place`.
+    """Draw one legend for all panels, which have the same lines, in the Matplotlib axes `place`.
 
-    `lines` contains the axes of the sweep that the lines distinguish. `joined` lists the measures
-    of each panel with several measures.
+    `lines` contains the axes of the sweep whose values the lines distinguish. `joined` lists the
+    measures of each panel with several measures.
     """
     found: dict[str, Any] = {}
     for panel in panels:
@@ -145,7 +145,7 @@ def _text(axis: Axis, value: Any) -> str:
 
 
 def is_geometric(values: Sequence[float]) -> bool:
-    """Return whether the ratios between successive values vary less than the differences."""
+    """Return whether three or more positive values have more even ratios than differences."""
     if len(values) < 3 or min(values) <= 0:
         return False
     steps, ratios = np.diff(values), np.diff(np.log(values))
@@ -154,7 +154,7 @@ def is_geometric(values: Sequence[float]) -> bool:
 
 
 def _set_scale(panel: Any, values: Sequence[float]) -> None:
-    """Make the x axis logarithmic if its values, apart from a leading 0, are `is_geometric`."""
+    """Make the x axis logarithmic if its values, without a leading 0, satisfy `is_geometric`."""
     if is_geometric(values):
         panel.set_xscale('log')
     elif values[0] == 0 and is_geometric(values[1:]):
@@ -171,10 +171,11 @@ def _scale(unit: str, values: Sequence[float]) -> tuple[float, str]:
 
 
 def _lines(others: Sequence[Axis], points: Sequence[Point], names: Sequence[str]) -> list[_Line]:
-    """Return the lines of a panel.
+    """Return the lines of a panel, one for each measure and combination of values of `others`.
 
-    The values of `others` differ in colour and marker, and the measures differ in line style and
-    fill. With a single measure, the values also differ in line style.
+    Values differ in colour and marker, and measures in line style. Only the first measure has
+    filled markers. If there is one measure, values also differ in line style. Without `others`,
+    measures also differ in colour and marker.
     """
     keys = list(dict.fromkeys(_key(point, others) for point in points))
     lines = []
@@ -207,7 +208,7 @@ def _draw_line(panel: Any, x: np.ndarray, intervals: np.ndarray, line: _Line) ->
         markerfacecolor=line.fill, label=line.label)
     for bar in bars.lines[2]:
         bar.set_linewidth(0.8)
-    # An interval without an upper end becomes an arrow to the edge of the panel.
+    # An interval with an infinite upper end becomes an arrow to the edge of the panel.
     for place in np.flatnonzero(np.isposinf(high)):
         panel.annotate('', (x[place], 1), (x[place], value[place]),
                        xycoords=panel.get_xaxis_transform(), textcoords='data',
@@ -232,7 +233,7 @@ def _key(point: Point, axes: Sequence[Axis]) -> tuple[Any, ...]:
 
 
 def _label(axis: Axis) -> str:
-    """Return the name and symbol of an axis, with its unit unless the values contain it."""
+    """Return the label of an axis, with the unit of its field unless the values contain it."""
     name = axis.fields[0]
     if name not in FIELDS:
         return name

@@ -65,8 +65,8 @@ def measured(measure: Measure, results: np.ndarray) -> Interval:
     """Return a measure of results, float64 [codebooks, positions], with its interval.
 
     The interval comes from a bootstrap over codebooks and positions. A share has Wilson's interval
-    if there is one codebook, or if all results are equal, which would leave the bootstrap no
-    width. If a result is NaN, so are value and ends; if a mean is infinite, only the ends are NaN.
+    if there is one codebook, or if all results are equal: the bootstrap interval would then have
+    no width. A NaN result makes value and ends NaN; an infinite mean makes only the ends NaN.
     """
     if np.isnan(results).any():
         return Interval(np.nan, np.nan, np.nan)
@@ -149,7 +149,7 @@ class Axis(NamedTuple):
         return self
 
     def ordered(self) -> 'Axis':
-        """Return the axis in ascending order of its first field if these values are numbers."""
+        """Return the axis, in ascending order if the values of its first field are numbers."""
         if all(isinstance(first, int | float) for first, *_ in self.values):
             return Axis(self.fields, tuple(sorted(self.values, key=lambda values: values[0])))
         return self
@@ -187,8 +187,8 @@ def settings_of(
         base: Scenario, axes: Sequence[Axis], codebook: str, estimator: str) -> list[Setting]:
     """List all combinations; the last axis varies fastest.
 
-    `codebook` and `estimator` apply unless an axis varies them. Raises ValueError if a field is on
-    two axes, or values contradict each other.
+    `codebook` and `estimator` apply unless an axis varies them. Raises ValueError if a field is
+    varied twice, or values contradict each other.
     """
     names = [name for axis in axes for name in axis.fields]
     for name in names:

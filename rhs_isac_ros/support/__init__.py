@@ -1,1 +1,1 @@
-"""Files, command lines, progress, pictures, plug-ins, random streams and threads."""
+"""Shared helpers: files, command lines, fields, plug-ins, pictures, streams and threads."""

@@ -59,7 +59,7 @@ share = _number(Field(float, low=0, high=1))
 
 
 def interval(text: str) -> tuple[float, float]:
-    """Parse LOW:HIGH, positive numbers in ascending order, or raise ArgumentTypeError."""
+    """Parse LOW:HIGH, positive numbers with LOW <= HIGH, or raise ArgumentTypeError."""
     low, colon, high = text.partition(':')
     try:
         numbers = positive_float(low), positive_float(high)
@@ -71,9 +71,9 @@ def interval(text: str) -> tuple[float, float]:
 
 
 def input_file(text: str) -> Path:
-    """Parse the path of an existing file, or raise argparse.ArgumentTypeError."""
+    """Parse the path of a file that can be read, or raise argparse.ArgumentTypeError."""
     path = Path(text)
-    # A pipe is not opened, because its content can be read only once.
+    # The file is not opened, because the content of a pipe can be read only once.
     if not text or not os.path.exists(path):
         raise argparse.ArgumentTypeError(f'{text!r}, expected an existing file')
     if path.is_dir():
@@ -104,9 +104,9 @@ def picture_file(text: str) -> Path:
 
 
 def output_folder(text: str) -> Path:
-    """Parse the path of a folder that exists or can be created, or raise ArgumentTypeError."""
+    """Parse the path of a folder that can be written or created, or raise ArgumentTypeError."""
     path = Path(text)
-    # The nearest ancestor that exists; the root always does.
+    # Find the folder or its nearest ancestor that exists; the root always does.
     try:
         found = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
         if not text or not found.is_dir():

@@ -20,7 +20,7 @@ class ParameterError(ValueError):
 class Field:
     """Declaration of a value: its type, its unit, and its range or choices."""
 
-    kind: type  #: ``bool``, ``int``, ``float``, ``str``, or ``list`` for a list of numbers.
+    kind: type  #: ``bool``, ``int``, ``float``, ``str``, or ``list`` for a list of floats.
     text: str = ''  #: Description.
     unit: str = ''
     low: float = -math.inf  #: Range of numbers, inclusive.
@@ -35,7 +35,7 @@ class Field:
 
     @property
     def range(self) -> str:
-        """Valid values as text; empty if every value of the type is valid."""
+        """Valid values as text; empty if the declaration does not limit them."""
         if self.choices:
             return ', '.join(self.choices) + (' or a plug-in' if self.plugins else '')
         # Large integers need all digits.

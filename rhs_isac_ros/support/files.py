@@ -1,4 +1,4 @@
-"""Atomic writing of files, and files of arrays with a description."""
+"""Atomic writing of files, reading of YAML, and files of arrays with a description."""
 
 import contextlib
 import json
@@ -13,8 +13,8 @@ from typing import Any, BinaryIO
 import numpy as np
 import yaml
 
-# Maximum sizes [bytes] of the arrays of an archive, and of a YAML file. Reading a YAML file takes
-# up to 240 times as much memory as its size.
+# Maximum sizes [bytes] of the arrays of an archive, and of a YAML file. The memory needed to read
+# a YAML file is up to 240 times its size.
 _MAX_BYTES, _MAX_YAML_BYTES = 2**28, 2**24
 # Maximum depth of the lists and mappings of a YAML file.
 _MAX_YAML_DEPTH = 16
@@ -49,7 +49,7 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
 
 
 def check_writable(path: Path) -> None:
-    """Raise OSError if `write_whole` cannot write a file, or would replace a device."""
+    """Raise OSError if `write_whole` cannot write a file, or would replace a special file."""
     if path.is_dir():
         raise IsADirectoryError(f'{path}: a directory, expected a file')
     if path.exists() and not path.is_file():
@@ -100,7 +100,7 @@ def write_archive(path: str | Path, arrays: Mapping[str, np.ndarray | float],
 
 
 def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np.ndarray]:
-    """Read the arrays of a file of NumPy's format ``.npz``.
+    """Read the arrays of a file of NumPy's format ``.npz``; a ``.npy`` file yields none.
 
     With `names`, the result is empty unless the file has exactly these arrays, apart from
     ``about``, and stores them uncompressed; compressed arrays may be far larger than the file.
@@ -126,10 +126,10 @@ def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np
 
 def read_archive(path: str | Path, kind: str, version: int, names: set[str]
                  ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read arrays and their description, without the key ``format``.
+    """Read arrays and their description, from which the key ``format`` is removed.
 
-    Raises ArchiveError if the file cannot be read, is damaged, has a format other than `version`
-    or arrays other than `names`. `kind` describes the content in errors.
+    Raises ArchiveError if the file cannot be read, is damaged or compressed, has a format other
+    than `version`, or arrays other than `names`. `kind` describes the content in errors.
     """
     arrays = read_arrays(path, names)
     try:

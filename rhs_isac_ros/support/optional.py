@@ -14,10 +14,10 @@ class MissingLibraryError(ImportError):
 
 @contextlib.contextmanager
 def optional_import(purpose: str, extra: str = '') -> Iterator[None]:
-    """Replace an ImportError in a block with a MissingLibraryError that contains instructions.
+    """Replace an ImportError in a block with a MissingLibraryError, which mentions the library.
 
-    The message begins with `purpose`, the task that needs the library. `extra` is the extra of
-    this package that installs it.
+    The message begins with `purpose`, the task that needs the library. With `extra`, the extra of
+    this package that installs the library, the message contains the command to install it.
     """
     try:
         yield

@@ -29,7 +29,7 @@ _STYLE: dict[Any, object] = {
     'boxplot.medianprops.color': 'black', 'boxplot.medianprops.linewidth': 1.4,
     'image.cmap': COLOUR_MAP,
     'figure.constrained_layout.use': True, 'savefig.dpi': 300.0,
-    # Publishers refuse fonts of type 3. Type 42 is TrueType, whose text can be searched.
+    # Many publishers refuse fonts of type 3. Type 42 is TrueType, whose text can be searched.
     'pdf.fonttype': 42,
     # Text as outlines, because an SVG file contains no fonts.
     'svg.fonttype': 'path',
@@ -89,7 +89,7 @@ def paper_style(purpose: str = 'drawing') -> Iterator[None]:
 
 
 def new_figure(width_in: float, height_in: float) -> Any:
-    """Return an empty Matplotlib figure, without pyplot, which would need a window system.
+    """Return an empty Matplotlib figure, made without pyplot, which may open windows.
 
     Create the figure and draw on it inside `paper_style`.
     """
@@ -108,7 +108,7 @@ def new_panels(
 
 def add_panels(
         place: Any, n_rows: int, n_columns: int, **sharing: bool) -> tuple[Any, Any]:
-    """Add a grid of panels; return the panels, an array of axes, and axes above for a legend.
+    """Add a grid of panels; return an array of the panels, and axes above them for a legend.
 
     `place` is a Matplotlib `SubplotSpec`; `sharing` may contain ``sharex`` and ``sharey``.
     """
@@ -122,7 +122,7 @@ def add_panels(
 
 
 def label_decades(axis: Any) -> None:
-    """Label a logarithmic axis with plain numbers; call this after drawing on it."""
+    """Label a logarithmic axis with plain numbers, within decades too; call this after drawing."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     low, high = axis.get_view_interval()
@@ -156,7 +156,7 @@ def write_picture(path: str | Path, figure: Any) -> None:
 
 
 def _fix_layout(figure: Any) -> None:
-    """Lay out a figure, and round positions, because their last digits differ between runs."""
+    """Lay out a figure, and round its positions, whose last digits differ between runs."""
     from matplotlib import rc_context
     from matplotlib.transforms import Bbox
 

@@ -1,9 +1,9 @@
 """Threads of the numerical functions of the package.
 
 Most matrix products here are so small that the threads of BLAS spend more time waiting for each
-other than computing. If another process occupies a core, a call takes up to fifty times as long as
-with one thread. Public functions therefore run BLAS with one thread (`one_blas_thread`). Large
-tasks are divided into blocks, which run in parallel (`map_blocks`).
+other than computing. If another process occupies a core, a call with several threads takes up to
+fifty times as long as with one. Public functions therefore run BLAS with one thread
+(`one_blas_thread`). Large tasks are divided into blocks, which run in parallel (`map_blocks`).
 """
 
 import contextlib
@@ -160,7 +160,7 @@ def _mark_worker() -> None:
 
 
 def _n_cores() -> int:
-    # Only some systems have affinities.
+    # Not every system can bind a process to some of the cores.
     if hasattr(os, 'sched_getaffinity'):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
