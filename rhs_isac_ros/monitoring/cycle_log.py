@@ -17,7 +17,7 @@ RECEIVES = (m.Beacon, m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Ca
 
 @dataclasses.dataclass
 class CycleTimes:
-    """Times at which a subscriber received the messages of one cycle [s]; NaN if missing."""
+    """Start and end of a cycle, as received by a subscriber [s]; NaN if missing."""
 
     cycle_id: int
     user: int = 0  # 0 before the grant
@@ -32,9 +32,9 @@ class CycleTimes:
         return self.state.elapsed_s if self.state and self.state.outcome else math.nan
 
     def durations_s(self) -> dict[m.Phase, float]:
-        """Return the duration of each phase, as measured by the base station [s].
+        """Return the duration of each phase that began, as measured by the base station [s].
 
-        The sum of the durations is `duration_s`.
+        The sum of the durations is `duration_s`. Without a state, the result is empty.
         """
         if self.state is None:
             return {}
@@ -97,8 +97,8 @@ class CycleRecord(CycleTimes):
 class CycleLog:
     """Collects the cycles of one network, even if its base station restarts.
 
-    `ended` lists all cycles that have ended, in order; `complete` lists the served cycles without
-    missing messages.
+    `ended` lists the cycles that have ended, in order; `complete` lists the served cycles whose
+    messages have all arrived. `clear` empties both lists.
     """
 
     def __init__(self) -> None:
@@ -117,7 +117,7 @@ class CycleLog:
         return [record for record in self.given_up if record.outcome != Outcome.NO_FIX.value]
 
     def add(self, message: m.Message, now_s: float) -> None:
-        """Add a message whose type is in `RECEIVES`; `now_s` is the time of its arrival [s]."""
+        """Add a message of a type in `RECEIVES`, which arrived at `now_s` [s], to its cycle."""
         if not message.cycle_id:
             return
         if isinstance(message, m.Beacon):
@@ -147,7 +147,7 @@ class CycleLog:
             del self._open[record.cycle_id]
 
     def clear(self) -> None:
-        """Discard all cycles that have ended."""
+        """Empty the lists `complete` and `ended`."""
         self.complete.clear()
         self.ended.clear()
 

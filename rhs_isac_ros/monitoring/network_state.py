@@ -58,7 +58,7 @@ class Overview:
         self.nodes: dict[str, NodeStatus] = {}
         self._log = CycleLog()
         self._served_s: collections.deque[float] = collections.deque()
-        # Arrival of the first message [s].
+        # Arrival of the first message [s]; infinite before it.
         self.began_s = math.inf
 
     def add(self, message: m.Message, now_s: float) -> None:
@@ -84,12 +84,12 @@ class Overview:
         self._log.clear()
 
     def add_report(self, node: str, report: Report, now_s: float) -> None:
-        """Add the report of a node that arrived at `now_s` [s]."""
+        """Add a report of a node; the report arrived at `now_s` [s]."""
         if node in self.nodes or len(self.nodes) < _MAX_NODES:
             self.nodes[node] = NodeStatus(report, now_s)
 
     def rate_hz(self, now_s: float) -> float:
-        """Return the rate of served cycles over the last ten seconds, or since the start [Hz]."""
+        """Return the rate of served cycles over the last 10 s, or since the first message [Hz]."""
         begin_s = max(now_s - _RATE_WINDOW_S, self.began_s)
         while self._served_s and self._served_s[0] < begin_s:
             self._served_s.popleft()
@@ -119,7 +119,7 @@ class Overview:
 
 # Types of the messages that the state of the scene uses.
 SCENE_RECEIVES = (m.RhsConfiguration, m.GroundTruth, m.GroundTruths, m.PositionEstimate, m.Beam)
-# Maximum number of positions in a path, and minimum distance between consecutive true positions.
+# Maximum number of positions in a path; minimum distance between consecutive true ones [m].
 _MAX_PATH_LENGTH = 200
 _MIN_STEP_M = 0.05
 
@@ -131,7 +131,7 @@ def new_path() -> collections.deque[np.ndarray]:
 
 @dataclasses.dataclass
 class UserState:
-    """Position, estimate and paths of one user; a path ends with the latest position."""
+    """True position, estimate and paths of one user; a path lists positions from old to new."""
 
     user: int
     updated_s: float  # arrival of the latest message about the user [s]
@@ -221,7 +221,7 @@ class SceneState:
 
     @property
     def shown_user(self) -> UserState | None:
-        """User of the latest beam, or of the latest estimate if the cycle of the beam has none."""
+        """User of the latest beam if its cycle has an estimate, else of the latest estimate."""
         state = self.users.get(self.beam.user) if self.beam else None
         if state and state.estimate and self.beam and (
                 state.estimate.cycle_id == self.beam.cycle_id):

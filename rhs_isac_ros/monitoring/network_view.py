@@ -160,7 +160,7 @@ def mode_axes() -> tuple[Lines, Points]:
 
 
 def mode_bars(user: int, found: WeightedModes, origin: np.ndarray) -> Lines:
-    """Return modes as bars at their range errors relative to `origin`, in the colour of a user."""
+    """Return modes as bars at their range minus the range of `origin`, in the colour of a user."""
     errors = np.linalg.norm(found.positions, axis=1) - np.linalg.norm(origin)
     return Lines(tuple(_line(error, HEIGHT_M * probability) for error, probability in zip(
         errors.tolist(), found.probabilities.tolist(), strict=True)),
@@ -168,7 +168,7 @@ def mode_bars(user: int, found: WeightedModes, origin: np.ndarray) -> Lines:
 
 
 def mode_estimate(position: np.ndarray, origin: np.ndarray) -> Lines:
-    """Return an estimate, float64 [3] [m], as a white line at its range error from `origin`."""
+    """Return an estimate, float64 [3] [m], as a white line at its range minus that of `origin`."""
     error = float(np.linalg.norm(position) - np.linalg.norm(origin))
     return Lines((_line(error, HEIGHT_M),), (1.0, 1.0, 1.0), _LINE_WIDTH)
 
@@ -202,7 +202,7 @@ class NetworkView:
                 Entry(0, f'{MODES}/grid', grid), Entry(0, f'{MODES}/labels', labels)]
 
     def add(self, message: m.Message, now_s: float) -> list[Entry]:
-        """Add a message of a type in `RECEIVES`, which arrived at `now_s` [s]; return entries."""
+        """Add a message of a type in `RECEIVES` that arrived at `now_s` [s]; return entries."""
         cycle = self._count(message.cycle_id)
         if isinstance(message, cycle_log.RECEIVES):
             self._log.add(message, now_s)
@@ -308,7 +308,7 @@ class NetworkView:
         return user in self._users
 
     def _count(self, cycle_id: int) -> int:
-        """Return the number of a cycle; messages outside of cycles belong to the latest cycle."""
+        """Return the number of a cycle; for id 0, the number of the latest cycle, or 1."""
         if not cycle_id:
             return max(self.n_cycles, 1)
         if cycle_id not in self._cycles:

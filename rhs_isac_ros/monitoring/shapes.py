@@ -104,7 +104,7 @@ Entity: TypeAlias = (
 class Entry(NamedTuple):
     """An entity, its path, and the first cycle that shows it.
 
-    A view counts the cycles that it observes from 1; an entry of cycle 0 is always shown.
+    A view numbers the observed cycles from 1; an entry of cycle 0 is always shown.
     """
 
     cycle: int
@@ -116,7 +116,7 @@ class Entry(NamedTuple):
 MIN_LEVEL_DB = -20.0
 # Radius of the invisible balls to which labels are attached.
 INVISIBLE_M = 1e-3
-# The hues of consecutive users differ by the golden ratio.
+# The hues of consecutive users differ by this share of a full turn, the golden ratio.
 _HUE_STEP = 0.618034
 _GREY = (0.5, 0.5, 0.5)
 _TRUTH_RADIUS_M, _ESTIMATE_RADIUS_M = 0.18, 0.12
@@ -221,7 +221,7 @@ def estimate(message: m.PositionEstimate) -> tuple[Points, Ellipsoids]:
 def modes(user: int, found: WeightedModes) -> tuple[Points, Ellipsoids]:
     """Return the modes of a posterior as balls, and their 95 % ellipsoids.
 
-    A more probable mode has a larger ball, in a colour closer to the colour of the user.
+    Less probable modes have smaller, greyer balls; modes below 0.5 % are left out.
     """
     chosen = found.probabilities >= _MIN_PROBABILITY
     probabilities, positions, covariances = (field[chosen] for field in found)
@@ -239,8 +239,8 @@ def path(user: int, positions: Iterable[np.ndarray]) -> Lines:
 def traced(scenario: Scenario, message: m.GroundTruth) -> Lines:
     """Return the propagation paths to the surface from the traced position nearest to a user.
 
-    The wall that reflects a path is halfway between the user and the path's virtual source.
-    Paths with several reflections are left out. Without a channel file, there are no paths.
+    A wall that reflects a path is halfway between the traced position and the virtual source of
+    the path. Paths with several reflections are left out. Without a channel file, there are none.
     """
     strips: list[np.ndarray] = []
     if channel := scenario.channel:

@@ -1,4 +1,4 @@
-"""The base station, which sends beacons and selects, locates and serves one user in each cycle."""
+"""The base station, which invites users by beacons, and locates and serves one at a time."""
 
 import collections
 import dataclasses
@@ -29,7 +29,7 @@ class State(enum.Enum):
     """States of the base station."""
 
     WAITING = 'waiting'            # waits for a codebook and the other roles
-    PAUSED = 'paused'              # waits for an operator to resume or step the cycles
+    PAUSED = 'paused'              # waits for an operator to resume, or to request a cycle
     RESTING = 'resting'            # waits between cycles
     BEACONING = 'beaconing'        # waits for acks
     CONFIGURING = 'configuring'    # waits for the RHS to report the configurations of all bands
@@ -52,9 +52,9 @@ class Cycle:
 
     cycle_id: int
     codebook: Codebook | None = None  # latest codebook when the last beacon was sent
-    attempt: int = 0  # number of beacons sent before the current one
+    attempt: int = 0  # number of earlier beacons in this cycle
     user: int = 0     # user that was granted the cycle; 0 before the grant
-    # Instance of the user, from the grant or else from the first feed signals; 0 if unknown.
+    # Instance of the user, from its acks or else from the first feed signals; 0 if unknown.
     user_instance: int = 0
     # Instance of the channel that sent the first signals; 0 if unknown.
     channel: int = 0
@@ -122,7 +122,7 @@ class BaseStation(StateMachine):
         self._second = 0
         self._use(settings)
         self._pause_requested = False  # whether a pause begins after the current cycle
-        self._offered: Codebook | None = None  # codebook for the next cycle
+        self._offered: Codebook | None = None  # codebook for the next beacon
         # Roles that are missing; None before the first report.
         self._missing: tuple[str, ...] | None = None
         self._cycle = Cycle(first_cycle_id - 1)
@@ -139,7 +139,7 @@ class BaseStation(StateMachine):
         self._acks.clear()
 
     def timeout_s(self, state: enum.Enum) -> float | None:
-        """Return the timeout of a state [s]; the attempts of a step share its timeout equally."""
+        """Return the timeout of a state [s], or None; the attempts at a step share it equally."""
         settings = self._settings.in_use
         if state is State.BEACONING:
             return settings.ack_timeout_s
@@ -155,7 +155,7 @@ class BaseStation(StateMachine):
     # Guards
 
     def _not_ready(self, event: Event) -> bool:
-        """Return whether a role or the codebook is missing after an event."""
+        """Return whether, after an event, roles are missing or unknown, or no codebook exists."""
         missing = event.missing if isinstance(event, events.PeersChanged) else self._missing
         has_codebook = self._offered or isinstance(event, events.CodebookOffered)
         return missing != () or not has_codebook
@@ -237,7 +237,7 @@ class BaseStation(StateMachine):
         self._missing = None
 
     def _skip_cycles(self, event: events.Resumed) -> None:
-        """Skip the cycle ids that another base station has used."""
+        """Skip the cycle ids that another base station may have used."""
         self._cycle.cycle_id = max(event.first_cycle_id - 1, self._cycle.cycle_id)
 
     def _store_settings(self, event: events.SettingsOffered) -> None:
@@ -252,7 +252,7 @@ class BaseStation(StateMachine):
                 self.log(f'user {user} removed: not in allowed_users {settings.allowed_users!r}')
 
     def _log_not_ready(self, event: Event) -> None:
-        """Log the missing roles and codebook, unless they were logged or are not known yet."""
+        """Log missing roles and codebook if they have changed, unless the roles are unknown."""
         lacking = self._lacking()
         if self._missing is not None:
             self._serving = False
@@ -261,7 +261,7 @@ class BaseStation(StateMachine):
                 self.log(f'waiting for {", ".join(lacking)}', warning=True)
 
     def fill(self, text: str) -> str:
-        """Fill in the cycle id (``{cycle}``) and missing roles (``{lacking}``, ``{waiting}``)."""
+        """Fill in the cycle id (``{cycle}``) and missing parts (``{lacking}``, ``{waiting}``)."""
         lacking = ', '.join(self._lacking())
         return text.format(cycle=self._cycle.cycle_id, lacking=lacking,
                            waiting=f'; waiting for {lacking}' if lacking else '')
@@ -300,7 +300,7 @@ class BaseStation(StateMachine):
         self._beacon()
 
     def _beacon(self) -> None:
-        self._cycle.codebook = self._offered  # may change until the grant
+        self._cycle.codebook = self._offered  # the codebook may change until the grant
         self._cycle.began_s[m.Phase.BEACONING] = self.now_s
         first, last = self._users.invite(self._cycle.attempt)
         self._send(m.Beacon, attempt=self._cycle.attempt, first_user=first, last_user=last)
@@ -323,7 +323,7 @@ class BaseStation(StateMachine):
         self.log(self._users.add_answer(event.user, event.sender, self.now_s), warning=True)
 
     def _register_user(self, event: m.Ack) -> None:
-        """Register a user, so that the next cycle waits for this user, too."""
+        """Register a user that answered too late for this cycle."""
         self.log(self._users.register(event.user, event.sender, self.now_s), warning=True)
 
     def _grant(self, event: m.Ack | Timeout) -> None:
@@ -359,7 +359,7 @@ class BaseStation(StateMachine):
                    n_frames=self._scenario.n_frames)
 
     def _store_signals(self, event: m.FeedSignals) -> None:
-        """Store the signals of a band; the first signals set the instances of user and channel."""
+        """Store the signals of a band, and the instances of user and channel if still unknown."""
         cycle = self._cycle
         cycle.user_instance = cycle.user_instance or event.user_instance
         cycle.channel = cycle.channel or event.sender
@@ -415,7 +415,7 @@ class BaseStation(StateMachine):
         self._apply_settings(event)
 
     def _finish(self, event: m.Data) -> None:
-        """End the cycle with service; log the start of service, or the outages that ended."""
+        """End the cycle with service; log the start of service and the outages that ended."""
         cycle, n_users = self._cycle, len(self._users)
         self._end_cycle('served')
         if not self._serving:
@@ -455,7 +455,7 @@ class BaseStation(StateMachine):
     # For each event, the first matching row applies.
     TABLE = (
         *on(events.CodebookOffered, 'codebook')(
-            # A new codebook takes effect with the next cycle, like new settings.
+            # A new codebook takes effect with the next beacon.
             Row((State.WAITING,), (_store_codebook, _log_not_ready), guard=_not_ready),
             Row((State.WAITING,), (_store_codebook, _begin_cycle), State.BEACONING),
             Row(ANY, (_store_codebook,))),
@@ -474,7 +474,7 @@ class BaseStation(StateMachine):
         *on(events.Resumed, 'resumed')(
             Row((State.WAITING, State.PAUSED), (_skip_cycles,))),
         *on(events.PauseRequested, 'pause')(
-            # A pause begins between two cycles; a step runs one cycle of a paused base station.
+            # A pause begins between cycles or after an unanswered beacon; a step runs one cycle.
             Row((State.PAUSED,), (reply(True, 'already paused'),)),
             Row((State.WAITING, State.RESTING), (_pause, _log_paused, reply(True, 'paused')),
                 State.PAUSED),
@@ -531,13 +531,13 @@ class BaseStation(StateMachine):
             Row(ANY, (_count_ack, _reject_number), guard=_number_taken,
                 outcome=Outcome.NUMBER_TAKEN),
             Row(ANY, (_count_ack,), guard=_duplicate_ack, outcome=Outcome.DUPLICATE),
-            # This cycle no longer collects acks; the user is registered for the next one.
+            # This cycle no longer collects acks; the user is registered for later ones.
             Row(NOT_BEACONING, (_count_ack, _register_user), outcome=Outcome.LATE_ACK),
             Row((State.BEACONING,), (_count_ack, _accept_ack, _grant), State.CONFIGURING,
                 guard=_last_ack),
             Row((State.BEACONING,), (_count_ack, _accept_ack))),
         *on(m.RhsConfiguration, 'configured', _OF_CYCLE | _OF_CODEBOOK)(
-            # A band's configurations, or the configuration of the beam.
+            # The report concerns the configurations of a band or the configuration of the beam.
             Row((State.CONFIGURING,), (_store_configured, _request_pilots), State.SOUNDING,
                 guard=_last_configuration),
             Row((State.CONFIGURING, State.SOUNDING), (_store_configured,), guard=_for_positioning),

@@ -22,7 +22,7 @@ from rhs_isac_ros.protocol.settings import Impairments, PendingSettings
 from rhs_isac_ros.support import streams
 
 # Number of users whose multipath is kept. With more users, the time between two cycles of a user
-# far exceeds the coherence time.
+# usually far exceeds the coherence time.
 _MAX_USERS = 32
 # Maximum number of messages of each kind that wait for related messages. Older ones belong to
 # cycles that can no longer be completed.
@@ -30,21 +30,21 @@ _MAX_PENDING = 256
 
 
 class Fading:
-    """Draws multipath gains, which are correlated over the cycles of a user.
+    """Draws multipath gains, which may be correlated over the cycles of a user.
 
     The gains of a cycle are rho h + sqrt(1 - rho^2) w, where h are the gains of the user's
     previous cycle, rho is the correlation of Eq. (4) for the time between the two cycles, and w is
     a new draw that depends only on the seed, the user, the cycle and the band. In each cycle, the
-    gains have the distribution of Eq. (2) to (4). Two consecutive cycles have the correlation of
-    Eq. (4), which is negative for some intervals. Over several cycles, the correlations multiply,
-    unlike in Eq. (4). To satisfy Eq. (4), a draw would need the gains of all earlier cycles.
+    gains have the distribution of Eq. (2) to (4). Consecutive cycles of a user have the
+    correlation of Eq. (4), which is negative for some intervals. For cycles further apart, the
+    correlations in between multiply. Draws that follow Eq. (4) would need all earlier gains.
 
     If the scenario has a channel file, the file replaces the multipath, and the gains are 0.
     """
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
         self._scenario, self._seed = scenario, seed
-        # The first draw factorises covariances, which would delay the first cycle.
+        # The first draw factorises covariances. Draw once now, so that no cycle is delayed.
         if not scenario.channel:
             draw_multipath(scenario, 0, 1, np.random.default_rng(0))
         # Time [s] and gains of the latest cycle of each user.
@@ -119,10 +119,10 @@ class _Cycle:
 class Channel(Role):
     """The role that emulates the radio channel, the surface and the loss of messages.
 
-    It answers pilots once it has received the true position of the user and the configuration of
-    the surface, in any order. To answer data, it also needs the beam. The position applies to the
-    whole cycle: the user hardly moves during the emulated signals, although messages take
-    longer. Changed impairments take effect with the next cycle.
+    It answers pilots once it has received the true position of the user and the configurations
+    for the band. It answers data once it has received the position, the beam and its
+    configuration. The position applies to the whole cycle, because the user hardly moves during
+    the emulated signals. Changed impairments take effect with the next cycle.
     """
 
     SENDS = (m.FeedSignals, m.Data)
@@ -148,7 +148,7 @@ class Channel(Role):
         self._serial = itertools.count()
 
     def _use(self, impairments: Impairments) -> None:
-        """Apply impairments; the seed determines the surface, so failed elements stay failed."""
+        """Apply impairments; draw the surface from the seed, so the same elements fail again."""
         self._deviating = impairments.applied_to(self._scenario)
         self._surface = (
             None if DeclaredElements(self._deviating).is_exact
@@ -159,7 +159,7 @@ class Channel(Role):
         return self._air.in_flight[0][0] if self._air.in_flight else None
 
     def status(self) -> Mapping[str, str]:
-        """Return the impairments in use and the pending ones, by name."""
+        """Return the impairments in use and the pending ones, for the diagnostics."""
         return self._settings.describe()
 
     def react(self, event: Event) -> None:
@@ -284,7 +284,7 @@ class Channel(Role):
             return None
         digital = beam.digital
         if cycle.factors is not None:
-            # Phases do not change the capacity.
+            # The phases of the factors do not change the capacity.
             digital = digital * np.abs(cycle.factors[beam.band, 0, 0])
         return float(actual_capacity(
             self._scenario, Beam(applied[0], digital, beam.band), cycle.truth.position[None],
@@ -292,6 +292,6 @@ class Channel(Role):
 
 
 def _is_from_other_instance(event: m.Pilot | m.Data, truth: m.GroundTruth) -> bool:
-    """Return whether a user's message comes from another instance than the sender of `truth`."""
+    """Return whether pilots or uplink data come from another instance than `truth`."""
     is_downlink = isinstance(event, m.Data) and event.direction is m.Direction.DOWNLINK
     return not is_downlink and not m.same_instance(event.sender, truth.sender)

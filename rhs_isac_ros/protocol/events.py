@@ -16,7 +16,7 @@ class Timeout:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CodebookOffered:
-    """A codebook is available for the next cycle."""
+    """A codebook is available to the role."""
 
     codebook: Codebook
 
@@ -64,7 +64,7 @@ class StepRequested:
 
 @dataclasses.dataclass(frozen=True)
 class LocateRequested:
-    """A client requests the position of a user, who is then served once before all others."""
+    """A client requests the position of a user, who is to be served once before all others."""
 
     user: int
 
@@ -137,9 +137,9 @@ Action = Send | LogMessage | Reply | BuildEstimator | RevertSettings | PublishTr
 
 
 class Kind(enum.Enum):
-    """Kind of an outcome; the value is the prefix of its counters in the diagnostics."""
+    """Kind of an outcome; the value precedes the name of the counter in the diagnostics."""
 
-    DROPPED = 'dropped'    # a message was ignored
+    DROPPED = 'dropped'    # a message was ignored, or repeated an earlier one
     REPEATED = 'retries'   # a step of a cycle was requested again
     LOST = 'cycles'        # a cycle ended without service
     IDLE = 'beacons'       # nobody answered a beacon, a user stopped answering, or beacons ceased
@@ -158,7 +158,7 @@ class Outcome(enum.Enum):
         member.kind = kind
         return member
 
-    # A message that belongs to no step of the current cycle, or that is rejected.
+    # A message that is late, repeated, rejected or discarded, or meant for another receiver.
     WRONG_CYCLE = 'wrong_cycle', Kind.DROPPED
     WRONG_USER = 'wrong_user', Kind.DROPPED
     WRONG_INSTANCE = 'wrong_instance', Kind.DROPPED
@@ -190,7 +190,7 @@ class Outcome(enum.Enum):
     POSITIONER_SILENT = 'positioner_silent', Kind.LOST
     TRANSMISSION_SILENT = 'transmission_silent', Kind.LOST
     DATA_LOST = 'data_lost', Kind.LOST
-    # A cycle that ended without service, as counted by its user.
+    # A cycle that ended without service to a user that answered, as counted by that user.
     NOT_GRANTED = 'not_granted', Kind.LOST
     ABANDONED = 'abandoned', Kind.LOST
     BS_SILENT = 'bs_silent', Kind.LOST

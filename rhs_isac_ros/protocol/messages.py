@@ -67,7 +67,7 @@ def check(message: 'Message', sizes: Mapping[str, int]) -> None:
 
 @functools.cache
 def _checks(kind: type) -> tuple[tuple[str, Callable[[Any, Mapping[str, int]], str]], ...]:
-    """Return the name of each restricted field, and a function that describes a violation."""
+    """Return the name of each field to check, and a function that describes a violation."""
     return tuple((field.name, functools.partial(_check_of(field.metadata), field.metadata))
                  for field in dataclasses.fields(kind) if field.metadata or field.type is float)
 
@@ -109,7 +109,7 @@ def _array_problem(
                               for d, e in zip(dims, expected, strict=True))
         return f'shape {list(value.shape)}, expected [{described}]'
     has_range = value.size and (declared.low > -math.inf or declared.high < math.inf)
-    # Comparisons with NaN are false, so most arrays with a range need no other check.
+    # A comparison with NaN is false, so an array that passes this check contains no NaN.
     if has_range and declared.low <= value.min() and value.max() <= declared.high:
         return ''
     finite = np.isfinite(value)
@@ -165,12 +165,12 @@ class Message:
     #: nanoseconds since 1970; 0 if unknown, as in messages sent by hand.
     sender: int = 0
     scenario_id: str = ''  #: `Scenario.id` of the sending node; empty if unknown.
-    #: Stamp of the header on the clock of the emulated world [ns]. Signals, and messages derived
+    #: Stamp of the header on the clock of the emulated world [ns]. Signals, and the estimates
     #: from them, carry the time of the measurement. If 0, the adapter inserts the current time.
     stamp_ns: int = 0
 
     def time_s(self, now_s: float) -> float:
-        """Return the stamp of the message [s], or `now_s` if the stamp is unknown."""
+        """Return the stamp of the message [s], or `now_s` if the stamp is 0."""
         return 1e-9 * self.stamp_ns if self.stamp_ns else now_s
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
@@ -198,7 +198,7 @@ MessageT = TypeVar('MessageT', bound=Message)
 def derive(kind: type[MessageT], source: object, **fields: Any) -> MessageT:
     """Return a message of the class `kind` with the cycle, user, band and codebook of a source.
 
-    The source is a message, or an object with such attributes. `fields` adds or replaces fields.
+    Attributes that the source or `kind` lacks are left out. `fields` adds or replaces fields.
     """
     shared = {name: getattr(source, name) for name in _SHARED
               if name in kind.__dataclass_fields__ and hasattr(source, name)}
@@ -231,7 +231,7 @@ class Grant(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class RhsCommand(Message):
-    """Command to apply the configurations of a codebook for a band."""
+    """Command to the RHS controller to apply the configurations of a codebook for a band."""
 
     band: int = index('N_B')
     codebook_id: str
@@ -239,7 +239,7 @@ class RhsCommand(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class RhsConfiguration(Message):
-    """Report of the configurations that the surface applies."""
+    """Report of the configurations that the RHS controller applies in one band."""
 
     mode: Mode
     band: int = index('N_B')
@@ -356,7 +356,7 @@ class Capacity(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class CapacityStatistics(Message):
-    """Lower quartile, median and upper quartile of the capacities of the latest beams."""
+    """Lower quartile, median and upper quartile of each figure in the latest capacity reports."""
 
     n_reports: int = number(1, 2**32 - 1)
     expected_bps: np.ndarray = array('3', low=0, high=_MAX_BITS)
@@ -388,7 +388,7 @@ class GroundTruths(Message):
         return {'USERS': len(self.users)}
 
     def each(self) -> Iterator[GroundTruth]:
-        """Yield the true position and velocity of each user."""
+        """Yield a `GroundTruth` for each user."""
         for user, position, velocity in zip(
                 self.users.tolist(), self.position, self.velocity, strict=True):
             yield GroundTruth(

@@ -34,28 +34,28 @@ from rhs_isac_ros.protocol.user_registry import MAX_NAMED, MAX_USERS
 
 @dataclasses.dataclass
 class _Track:
-    """A track, and the latest signals that continued it, which were measured at `time_s` [s]."""
+    """A track, and the latest signals that it includes, which were measured at `time_s` [s]."""
 
     tracker: Tracker
     latest: m.ReceivedSignals
     time_s: float
 
     def is_late(self, received: m.ReceivedSignals) -> bool:
-        """Return whether these signals, of the same base station, are not newer than `latest`."""
+        """Return whether signals have the same sender as `latest`, and are not newer."""
         return received.sender == self.latest.sender and (
             received.cycle_id <= self.latest.cycle_id)
 
     def may_continue(self, received: m.ReceivedSignals, now_s: float) -> bool:
-        """Return whether the user is the same instance, and the clock has not been reset."""
+        """Return whether the user may be the same instance, and the clock has not been reset."""
         return now_s >= self.time_s - MAX_GAP_S and m.same_instance(
             received.user_instance, self.latest.user_instance)
 
 
 class Tracks:
-    """One track for each user, derived from the signals alone.
+    """One track for each user, derived from the received signals.
 
-    A track ends after a gap, when another instance of the user appears, or after thousands of
-    other users have been located. Signals no newer than a track neither use nor change it.
+    A track ends after a gap of `MAX_GAP_S` or a reset of the clock, when another instance of the
+    user is located, or after `MAX_USERS` other users. Late signals neither use nor change a track.
     """
 
     def __init__(self) -> None:
@@ -70,8 +70,8 @@ class Tracks:
             now_s: float) -> Estimate:
         """Estimate the position of a user from signals that were measured at `now_s` [s].
 
-        If the signals continue a track, the result is a `TrackEstimate`. Tracks assume the typical
-        speed `speed_mps`. Raises SignalError if the signals cannot be used.
+        If the signals begin or continue a track, the result is a `TrackEstimate`. A new track
+        assumes the typical speed `speed_mps`. Raises SignalError if the signals are unusable.
         """
         signals = _stacked(received)
         # The oldest track comes first.
@@ -138,9 +138,9 @@ class ResidualWatch:
     def status(self) -> dict[str, str]:
         """Return values for the diagnostics, including the result of `diagnose`.
 
-        ``residual.ratio`` is the mean energy of the residuals relative to its expectation, and
-        ``residual.spread`` is the variance of the energy relative to the model. Both cover
-        ``residual.fixes`` fixes. ``warning.residual`` is the text of the current warning.
+        ``residual.ratio`` and ``residual.spread`` are the mean and the variance of the energies of
+        the residuals, relative to the model. Both cover ``residual.fixes`` residuals.
+        ``warning.residual`` is the text of the current warning.
         """
         values = diagnose(self._estimates, bool(self._warning), self._level_db[1])
         if self._all.n_fixes:
@@ -193,10 +193,10 @@ class Positioner(Role):
     """The role that estimates the positions of users.
 
     The codebook id of the received signals selects the estimator. Estimators are built one at a
-    time in the background. Meanwhile, existing estimators remain in use; if the estimator for the
-    latest signals is still missing, the signals wait. New settings take effect once an estimator
-    is built with them; if the build fails, the old estimator remains in use. The tracks of the
-    prior ``track`` do not survive a restart. `stopwatch` returns a time [s], to measure latencies.
+    time in the background. Meanwhile, existing estimators remain in use; the latest signals wait
+    if their estimator is being built. New settings take effect once an estimator is built with
+    them; if the build fails, the old settings and estimator remain in use. The tracks of the prior
+    ``track`` do not survive a restart. `stopwatch` returns a time [s], to measure latencies.
     """
 
     SENDS = (m.PositionEstimate, m.NoFix)
@@ -231,7 +231,7 @@ class Positioner(Role):
                 | {'codebook_id': self._estimators.in_use})
 
     def react(self, event: Event) -> None:
-        """Process an event: send an estimate, or request an estimator."""
+        """Process an event: answer received signals, or request or store an estimator."""
         match event:
             case events.CodebookOffered(codebook):
                 self._codebook = codebook
@@ -264,7 +264,7 @@ class Positioner(Role):
             self.act(events.BuildEstimator(job.codebook, job.settings))
 
     def _keep(self, job: _Job, estimator: Estimator, elapsed_s: float) -> None:
-        """Store an estimator, unless its settings are outdated and another one can serve."""
+        """Store an estimator, unless it is outdated and there is another one for the codebook."""
         codebook = job.codebook
         if job.settings != self._settings.latest and codebook.id in self._estimators:
             return
@@ -275,7 +275,7 @@ class Positioner(Role):
         self.log(f'{estimator.name} is ready for codebook {codebook.id} after {elapsed_s:.1f} s')
 
     def _revert(self, job: _Job, reason: str) -> None:
-        """Revert to the settings in use if new settings caused the failure."""
+        """Handle a failed build; if it had the latest settings, revert to the settings in use."""
         kept = self._settings.in_use
         if job.settings == kept:
             self.log(f'no estimator for codebook {job.codebook.id}: {reason}', warning=True)
@@ -351,7 +351,7 @@ class Positioner(Role):
         self._log_change(received, _Loss.NO_FIX, f'no fix of user {received.user}: {reason}')
 
     def _log_change(self, received: m.ReceivedSignals, loss: _Loss | None, text: str) -> None:
-        """Log when a user's signals stop yielding a position, and when they yield one again."""
+        """Log a new reason why a user's signals yield no position, and the end of such a loss."""
         before = self._lost.pop(received.user, None)
         if loss:
             self._lost.put(received.user, loss)
@@ -364,7 +364,7 @@ class Positioner(Role):
 def build_estimator(
         codebook: Codebook, make: Callable[[Codebook], Estimator],
         stopwatch: Callable[[], float]) -> EstimatorBuilt:
-    """Build the estimator that `BuildEstimator` requests; any thread may call this function."""
+    """Build an estimator, and return it or the reason for a failure; any thread may call this."""
     begin = stopwatch()
     try:
         estimator = make(codebook)

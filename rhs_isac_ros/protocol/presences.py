@@ -18,7 +18,7 @@ _MAX_OTHERS = 64
 _MAX_LOGGED = 16
 # Maximum length of the list of differences in the log.
 _MAX_LENGTH = 500
-# Instances that start further in the future than this are ignored: their clock is wrong [ns].
+# Instances that started further in the future are ignored, because their clock is wrong [ns].
 _MAX_AHEAD_NS = 3600 * 10**9
 
 
@@ -53,8 +53,8 @@ class Presences:
         # Latest announcement of each other node, and its time of arrival [s], by instance.
         self._known: NewestDict[int, tuple[Presence, float]] = NewestDict(_MAX_OTHERS)
         self._now_s = -math.inf
-        # The newest other node of the role, and the instance of the last older node that was
-        # logged, which is not logged again when it returns after a suspension.
+        # The newest other node of the role; and the instance of the older node that was logged
+        # last, so that it is not logged again when it returns after a suspension.
         self._rival: Presence | None = None
         self._logged_older = 0
         # Description of the differences from each other scenario, by scenario id.
@@ -83,7 +83,7 @@ class Presences:
         """Return the names of nodes that have announced a role, but no longer do so.
 
         They include a node that has been restarted after a crash and has not taken its role yet.
-        The graph still contains the publishers and subscriptions of its predecessor.
+        The ROS graph may still contain the publishers and subscriptions of its predecessor.
         """
         return {other.node for other, _ in self._known.values() if other.role} - {
             other.node for other in self._present() if other.role}
@@ -120,7 +120,7 @@ class Presences:
         return f'{"stands by for" if self.stands_by else "serves instead of"} {self._rival}'
 
     def _choose(self, present: list[Presence]) -> list[LogMessage]:
-        """Find the newest other node of the role; log a change of the node that serves."""
+        """Find the newest other node of the role; log a new one, or that this node resumes."""
         own, before = self.own, self._rival if self.stands_by else None
         rivals = [other for other in present
                   if other.role and other.role == own.role and not self._is_stranger(other)]

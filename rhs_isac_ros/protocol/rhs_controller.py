@@ -45,7 +45,7 @@ class RhsController(StateMachine):
         self._granted: NewestDict[int, int] = NewestDict(REMEMBERED_CYCLES)
         # Bands and codebooks of the commands executed in each cycle.
         self._applied: NewestDict[int, set[tuple[int, str]]] = NewestDict(REMEMBERED_CYCLES)
-        # Whether an unknown codebook has been logged since the last executed command.
+        # Whether a rejected codebook has been logged since the last executed command.
         self._unknown_logged = False
 
     def status(self) -> Mapping[str, str]:
@@ -101,7 +101,7 @@ class RhsController(StateMachine):
             m.RhsConfiguration, event, mode=m.Mode.TRANSMISSION, analog=event.analog[None]))
 
     def _log_unknown_codebook(self, event: m.RhsCommand | m.Beam) -> None:
-        """Log the first message with a codebook that cannot be applied."""
+        """Log that a codebook is rejected, but only once until the next executed command."""
         if not self._unknown_logged:
             self._unknown_logged = True
             self.log(f'codebook {event.codebook_id!r} rejected; in use: '
@@ -116,7 +116,7 @@ class RhsController(StateMachine):
         *on(m.RhsCommand, 'command')(
             Row(ANY, (_log_unknown_codebook,), guard=_unknown_codebook,
                 outcome=Outcome.WRONG_CODEBOOK),
-            # The base station repeats a command if its report may have been lost.
+            # The base station repeats a command if the answer may have been lost.
             Row(ANY, (_apply_band,), guard=_repeats_command, outcome=Outcome.DUPLICATE),
             Row(ANY, guard=_was_executed, outcome=Outcome.STALE_COMMAND),
             Row(ANY, (_apply_band,), State.POSITIONING)),

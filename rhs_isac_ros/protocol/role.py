@@ -12,12 +12,12 @@ from rhs_isac_ros.protocol.messages import Message
 
 
 class Role:
-    """A role of the protocol, which maps events to actions and does not read a clock.
+    """A role of the protocol, which maps events and their times to actions.
 
     A subclass defines `react`, which appends actions through `send`, `log` and `act`.
     """
 
-    # Messages that the role sends, and messages that it handles.
+    # Types of the messages that the role sends, and of those that it handles.
     SENDS: ClassVar[tuple[type[Message], ...]] = ()
     RECEIVES: ClassVar[tuple[type[Message], ...]] = ()
     # States in which the role lacks something that it needs.
@@ -26,7 +26,7 @@ class Role:
     WORLD_STATES: ClassVar[frozenset[enum.Enum]] = frozenset()
 
     def __init__(self) -> None:
-        # Number of times that each outcome and each kind of unexpected event occurred.
+        # Number of occurrences of each outcome, unexpected event or other condition, by counter.
         self.counters: collections.Counter[str] = collections.Counter()
         # Time of the latest event [s].
         self.now_s = 0.0
@@ -71,7 +71,7 @@ class Role:
         return {}
 
 
-# Number of cycles whose messages the roles remember; no older message is still in transit.
+# Number of cycles whose messages the roles remember. Older messages are no longer in transit.
 REMEMBERED_CYCLES = 8
 
 Key = TypeVar('Key')
@@ -107,7 +107,7 @@ class CodebookCache(NewestDict[str, Value]):
         self.in_use = ''  # id of the codebook whose item is in use; empty at first
 
     def put(self, codebook_id: str, item: Value) -> int:
-        """Store an item; if there are too many, discard the oldest one that is not in use."""
+        """Store an item as `NewestDict.put` does, but never discard the item in use."""
         if self.in_use:
             super().put(self.in_use, self[self.in_use])
         return super().put(codebook_id, item)
@@ -154,13 +154,13 @@ Drops = dict[Callable[..., bool], Outcome | None]
 
 
 class on(Generic[EventT]):
-    """Builds the rows for an event, in order: ``on(event, name of the event, drops)(*rows)``."""
+    """Builds the rows for one class of events: ``on(event, name of the event, drops)(*rows)``."""
 
     def __init__(self, event: type[EventT], name: str, drops: Drops | None = None) -> None:
         self._event, self._name, self._drops = event, name, drops or {}
 
     def __call__(self, *rows: Row[Any, EventT]) -> tuple[AnyRow, ...]:
-        """Return the rows that drop messages, followed by `rows`."""
+        """Return the rows for the event: those that drop messages, followed by `rows`."""
         drops = [Row[Any, EventT](ANY, guard=wrong, outcome=outcome)
                  for wrong, outcome in self._drops.items()]
         return tuple(dataclasses.replace(row, event=self._event, event_name=self._name)
@@ -170,19 +170,19 @@ class on(Generic[EventT]):
 class StateMachine(Role):
     """A role whose reactions depend on its state and are defined by `TABLE`.
 
-    `handle` applies the first row whose source, event class and guard match. An event without a
-    matching row changes nothing and is counted as ``unexpected_<name>``.
+    `handle` applies the first row whose source, event class and guard match. If no row matches,
+    the event changes nothing, and is counted as ``unexpected_<name>``.
     """
 
     STATES: ClassVar[type[enum.Enum]]
     TABLE: ClassVar[tuple[AnyRow, ...]]
-    # Names of all events in the counters of unexpected events; derived from the table.
+    # Name of each class of events, as in ``unexpected_<name>``; derived from the table.
     EVENT_NAMES: ClassVar[Mapping[type, str]]
 
     _rows: ClassVar[Mapping[tuple[enum.Enum | None, type], tuple[AnyRow, ...]]]
 
     def __init_subclass__(cls) -> None:
-        """Derive the events of a subclass from its table; group the rows by state and event."""
+        """If the subclass defines a table, derive its events, and group its rows."""
         super().__init_subclass__()
         if 'TABLE' in vars(cls):
             cls.EVENT_NAMES = {row.event: row.event_name for row in cls.TABLE}
@@ -208,7 +208,7 @@ class StateMachine(Role):
         return self._deadline_s
 
     def react(self, event: Event) -> None:
-        """Apply the first matching row; raise TypeError for an event that is not in the table."""
+        """Apply the first matching row, if any; raise TypeError if the table lacks the event."""
         kind = type(event)
         try:
             rows = self._rows[self.state, kind]

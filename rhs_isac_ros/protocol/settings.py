@@ -103,12 +103,12 @@ class TransmissionSettings:
 
 
 def shown(value: Any) -> str:
-    """Return a parameter value as ROS prints it."""
+    """Return a parameter value as text; booleans are in lower case, as in ROS."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _of_scenario(name: str) -> Any:
-    """Declare a setting that overrides the scenario field `name`."""
+    """Declare a setting that overrides the scenario field `name` unless it is negative."""
     declared = Scenario.__dataclass_fields__[name].metadata['declared']
     first_sentence = declared.text.partition('. ')[0].rstrip('.')
     return setting(
@@ -163,7 +163,7 @@ class PendingSettings(Generic[SettingsT]):
         self.latest = settings
 
     def apply(self) -> str:
-        """Put the latest settings into use, and return a description of the changes, if any."""
+        """Put the latest settings into use; return a description of the changes, '' if none."""
         described = ', '.join(f'{name} {text!r}' for name, text in self._pending().items())
         self.in_use = self.latest
         return f'settings applied: {described}' if described else ''

@@ -1,4 +1,4 @@
-"""The role ``transmission``: steers a beam to an estimated position, and reports capacities."""
+"""The role ``transmission``, which steers beams to estimated positions and reports capacities."""
 
 import collections
 import math
@@ -25,7 +25,7 @@ from rhs_isac_ros.protocol.settings import PendingSettings, TransmissionSettings
 
 # Fields of `Capacity`; `CapacityStatistics` contains their quartiles under the same names.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
-# Number of the latest reports in the statistics, limited in order to follow a changing network.
+# Maximum number of reports in the statistics; the limit lets them follow a changing network.
 _WINDOW = 1000
 # A report is computed once no message of a cycle has arrived for this time [s], so that it does
 # not delay a cycle if other roles run in the same process.
@@ -57,8 +57,8 @@ class Transmission(Role):
     """The role that steers the beam.
 
     The true position affects only the reported capacities, never the beam. A report takes as long
-    to compute as a beam, so reports are computed between cycles. `surface_of` takes the name of a
-    calibration file, and returns the surface in the file, or None for an empty name.
+    to compute as a beam, so reports are usually computed between cycles. `surface_of` takes the
+    name of a calibration file, and returns the surface in the file, or None for an empty name.
     """
 
     SENDS = (m.Beam, m.Capacity, m.CapacityStatistics)
@@ -94,7 +94,7 @@ class Transmission(Role):
                 self._codebooks.put(codebook.id, None)
                 self.log(f'serving: codebook {codebook.id}')
             case events.SettingsOffered(settings):
-                # A cycle that has a beam keeps its bands.
+                # A cycle that has a beam keeps its bands and its surface.
                 self._settings.latest = settings
                 self.log(self._settings.apply())
             case m.GroundTruth() if event.cycle_id:
@@ -157,7 +157,7 @@ class Transmission(Role):
             self._waiting.append(_Waiting(steered, applied, self.now_s + _MAX_DELAY_S))
 
     def _report_next(self) -> None:
-        """Report on the first beam to a user of known true position, else on the first beam."""
+        """Report on the first waiting beam to a user of known true position, else on the first."""
         waiting = next(filter(self._truth_of, self._waiting), self._waiting[0])
         self._waiting.remove(waiting)
         steered, applied, _ = waiting

@@ -11,7 +11,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome, PeersChanged, Timeout
 from rhs_isac_ros.protocol.role import ANY, REMEMBERED_CYCLES, NewestDict, Row, StateMachine, on
 
-# Number of consecutive steps in which a granted user receives nothing: the base station waits for
+# Number of consecutive steps in which a granted user may receive nothing: the steps that wait for
 # the signals of the last band, the position, the beam and the data.
 _SILENT_STEPS = 4
 
@@ -30,7 +30,7 @@ class User(StateMachine):
     """The role of the users of a node, which usually has only one user.
 
     A cycle serves one user, so one state is enough for all users of the node. `instance`
-    identifies the node, which ignores grants to other instances.
+    identifies the node, which rejects grants to other instances.
 
     Parameters
     ----------
@@ -55,12 +55,12 @@ class User(StateMachine):
         super().__init__(State.DISCONNECTED)
         self._step_s, self._beacon_s = step_s, beacon_s
         self.users, self._instance = tuple(sorted(mobilities)), instance
-        # Description of another node with the same number that is served instead, by user.
+        # Description of another node that is served under the same number, by user.
         self._conflicts: dict[int, str] = {}
         self._mobilities, self._world_s = mobilities, world_s
         self._crowd = Crowd([mobilities[user] for user in self.users])
         self._cycle_id = 0
-        # Cycle and bands of the last pilot request answered.
+        # Cycle, first band and last band of the pilot request that was answered last.
         self._sounded = (0, 0, 0)
         # The highest attempt received, by cycle, and the true position, by cycle and user.
         self._attempts: NewestDict[int, int] = NewestDict(REMEMBERED_CYCLES)
@@ -83,7 +83,7 @@ class User(StateMachine):
         return timeouts.get(state)
 
     def status(self) -> Mapping[str, str]:
-        """Return ``conflict.user_<n>`` while another node with the same number is served."""
+        """Return ``conflict.user_<n>`` for each number under which another node is served."""
         return {f'conflict.user_{user}': text for user, text in self._conflicts.items()}
 
     # Guards
@@ -127,7 +127,7 @@ class User(StateMachine):
         return event.cycle_id != self._cycle_id
 
     def _late_grant(self, event: m.Grant) -> bool:
-        """Return whether the cycle was granted before and has ended."""
+        """Return whether the cycle was granted to the user before and is over."""
         return (event.cycle_id, event.user) in self._truths and self.state is not State.GRANTED
 
     def _new_request(self, event: m.PilotRequest) -> bool:
@@ -197,7 +197,7 @@ class User(StateMachine):
         *on(m.Beacon, 'beacon')(
             Row(ANY, guard=_stale_beacon, outcome=Outcome.STALE_BEACON),
             Row((State.DISCONNECTED,)),
-            # A beacon to other users shows that the base station is active and the cycle is over.
+            # A beacon to other users shows that the base station is active, and the cycle is over.
             Row((State.LISTENING,), (_note_beacon,), guard=_invites_others, restart_timeout=True),
             Row((State.NO_BEACON,), (_log_resumed, _note_beacon), State.LISTENING,
                 guard=_invites_others),
@@ -216,7 +216,7 @@ class User(StateMachine):
             Row(ANY, (_log_other_instance,), guard=_other_instance, outcome=Outcome.NUMBER_TAKEN),
             Row(ANY, guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE),
             Row(ANY, guard=_late_grant, outcome=Outcome.LATE_GRANT),
-            # The base station may wait longer than the user does.
+            # The base station may wait longer than the user, so a grant may follow the timeout.
             Row((State.LISTENING, State.ACKNOWLEDGED), (_publish_position,), State.GRANTED),
             Row((State.NO_BEACON,), (_log_resumed, _publish_position), State.GRANTED),
             Row((State.GRANTED,))),

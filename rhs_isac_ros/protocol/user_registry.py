@@ -11,7 +11,7 @@ import numpy as np
 from rhs_isac_ros.protocol import messages as m
 
 POLICIES = ('round_robin', 'first', 'random')
-# Highest number of a user. It bounds the memory, whatever numbers the acks contain.
+# Highest user number that is ever accepted. It bounds the memory, whatever acks arrive.
 MAX_USERS = 4096
 LAST_NUMBER = 2**32 - 1
 # Number of registered users that the first beacon of a cycle invites, and the factor by which each
@@ -29,7 +29,7 @@ _CONFLICT_S = 5.0
 
 @dataclasses.dataclass
 class _User:
-    """A registered user, and the owner of its number: the first node that answered with it."""
+    """A registered user, and the node that owns its number."""
 
     # (turn, 1, number) if the user was last served in this turn; (turn, 0, number) if the user was
     # registered, or answered too late, after this turn and has not been served since then.
@@ -78,9 +78,9 @@ class UserRegistry:
     def invite(self, attempt: int) -> tuple[int, int]:
         """Choose the users to wait for, and return the first and the last number to invite.
 
-        The range contains the user whose turn it is. Over a round, the ranges cover all numbers,
-        so that new users are invited, too. `attempt` is the number of beacons in this cycle that
-        nobody answered; the range grows with it.
+        The range contains the user whose turn it is. As the turn passes on, the ranges cover all
+        numbers, so that new users are invited, too. `attempt` is the number of beacons in this
+        cycle that nobody answered; the range grows with it.
         """
         self.answered = {}
         numbers, size = self._numbers, INVITED * _EXTENSION**min(attempt, 8)
@@ -130,7 +130,7 @@ class UserRegistry:
         self._users[number].rejected += 1
 
     def register(self, number: int, instance: int = 0, now_s: float = 0.0) -> str:
-        """Register a user that may have answered too late for this cycle.
+        """Register a user that answered, even if too late for this cycle.
 
         With ``round_robin``, an invited user that answers too late loses the turn. Without this
         rule, a user that is always late would keep the turn forever, and users in other ranges
@@ -229,7 +229,7 @@ _RANGE = re.compile(r'\s*(\d+)\s*(?:-\s*(\d+)\s*)?')
 def parse_users(text: str) -> tuple[range, ...]:
     """Parse a possibly empty list of user numbers and ranges, such as ``1, 4, 10-20``.
 
-    Raises ValueError if a part is neither a positive number nor an ascending range.
+    Raises ValueError if a part is not a number from 1 to `LAST_NUMBER` or an ascending range.
     """
     return tuple(_parse_range(part) for part in text.split(',')) if text.strip() else ()
 
@@ -248,7 +248,7 @@ MAX_NAMED = 8
 
 
 def join_users(users: Iterable[int]) -> str:
-    """Return a list of up to `MAX_NAMED` users as text, such as ``1, 2, 3 and 4 others``."""
+    """Return user numbers as text, such as ``1, 2``; after `MAX_NAMED`, only count the others."""
     names = [str(user) for user in users]
     n_others = len(names) - MAX_NAMED
     others = f' and {n_others} other{"s" * (n_others > 1)}' if n_others > 0 else ''
