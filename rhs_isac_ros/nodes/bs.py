@@ -34,7 +34,7 @@ _MAX_GOALS = 100
 
 @dataclasses.dataclass(eq=False)
 class _Goal:
-    """A goal in progress; `cycle_id` is the cycle that positions its user, or 0 before that."""
+    """A goal in progress; `cycle_id` is the cycle that positions its user; 0 if there is none."""
 
     handle: Any
     future: Future
@@ -103,7 +103,7 @@ class LocateServer:
     def _cancel(self, handle: Any) -> CancelResponse:
         for goal in self._goals:
             if goal.handle.goal_id == handle.goal_id:
-                # Not yet: the handle enters the state CANCELING after this callback.
+                # Not at once: the handle enters the state CANCELING after this callback.
                 self._later(0.0, functools.partial(self._end, goal, 'canceled'))
         return CancelResponse.ACCEPT
 
@@ -223,7 +223,7 @@ class BsNode(RoleNode[BaseStation]):
 
 
 def _cycle_from_clock() -> int:
-    """Return the milliseconds since 1970, an unused cycle id, as every cycle takes over 1 ms."""
+    """Return the milliseconds since 1970: an unused id, because a cycle takes more than 1 ms."""
     return time.time_ns() // 1_000_000
 
 

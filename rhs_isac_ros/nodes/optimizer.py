@@ -72,7 +72,7 @@ def ros_parameters(values: Mapping[str, Any]) -> list[Parameter]:
 
 
 class PushError(RuntimeError):
-    """The optimizer did not accept a codebook."""
+    """No optimizer has accepted a codebook."""
 
 
 def push(node: Node, codebook: Codebook, timeout_s: float = 10.0) -> None:
@@ -221,10 +221,10 @@ def _given_codebook_values(changes: list[Parameter]) -> dict[str, Any]:
 def main(args: Sequence[str] | None = None) -> int:
     """Run the executable, and return its exit code.
 
-    Without options, hold a codebook. With options, first optimise one and write it to a file; with
-    ``--push``, send it to a running optimizer instead of holding it. The exit code is 0 on success
-    or after a signal, 1 if a network does not accept the codebook, and 2 if an argument or a file
-    is invalid.
+    Without options, hold a codebook. With ``--push-file``, send a codebook to a running optimizer.
+    With other options, optimise a codebook and write it to a file, then hold it or, with
+    ``--push``, send it. The exit code is 0 on success or after a signal, 1 if a network does not
+    accept the codebook, and 2 if an argument or a file is invalid.
     """
     args = sys.argv if args is None else [topics.OPTIMIZER_NODE, *args]
     parser = _parser()

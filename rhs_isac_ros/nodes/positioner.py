@@ -52,7 +52,7 @@ class PositionerNode(RoleNode[Positioner]):
         self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
 
     def make_settings(self, values: types.SimpleNamespace) -> PositionerSettings:
-        """Return the settings; raise ParameterError if a file or a plug-in cannot be loaded.
+        """Return the settings; raise ParameterError if they, a file or a plug-in cannot be used.
 
         A model is checked against the codebook only when the estimator is built.
         """

@@ -24,7 +24,7 @@ class TransmissionNode(RoleNode[Transmission]):
                    needs_codebook=True)
 
     def make_settings(self, values: types.SimpleNamespace) -> Any:
-        """Return the settings; raise ParameterError if they do not fit the scenario."""
+        """Return the settings; raise ParameterError for an invalid value or calibration file."""
         n_bands = self.scenario.n_bands
         if values.band >= n_bands:
             raise ParameterError(

@@ -53,7 +53,7 @@ class RobotMobility:
 
     @property
     def lack(self) -> str:
-        """Reason why there is currently no position; empty if there is a position."""
+        """Description of what is missing for a valid position; empty if the position is valid."""
         if self._error:
             return f'{self._source}: {self._error}'
         if time.monotonic() > self._arrived_s + self._timeout_s:
@@ -177,7 +177,7 @@ class UserNode(RoleNode[User]):
         return users
 
     def _mobility(self, user: int, position: np.ndarray | None) -> mobility.Mobility:
-        """Return the mobility of a user that starts at a position, by default a random one."""
+        """Return the mobility of a user, which starts at `position` unless this is None."""
         values = self.values
         if values.mobility in ROBOTS:
             if position is not None:

@@ -158,7 +158,7 @@ class TransformPublisher:
                       frame.orientation)]))
 
     def publish(self, transform: TransformStamped) -> None:
-        """Publish a transform that is not static."""
+        """Publish a transform that is not static, if transforms are `available`."""
         if self.available:
             self._dynamic.publish(self._message(transforms=[transform]))
 
@@ -198,7 +198,7 @@ class VisualizerNode(Node):
                 self._frame.from_surface(message.position), convert.stamp_of(message, self)))
 
     def _show(self) -> None:
-        """Publish the whole scene, so that late joiners receive it."""
+        """Publish all markers and paths, so that late joiners receive them."""
         for user in self._scene.discard_stale(time.monotonic() - self._forget_s):
             self._paths.remove(user)
         stamp = self.get_clock().now().to_msg()

@@ -1,1 +1,1 @@
-"""ROS 2 adapters of the protocol: topics, quality of service, conversions, parameters, nodes."""
+"""ROS 2 adapters for the protocol: topics, quality of service, conversions, parameters, nodes."""

@@ -1,4 +1,4 @@
-"""Encoding of the messages of the protocol as bytes, without intermediate ROS messages.
+"""Conversion of protocol messages to and from bytes, without intermediate ROS messages.
 
 Converting a ROS message calls a Python function for each field and nested message, which takes
 longer than the transport. Publishers and raw subscriptions of rclpy therefore exchange bytes, in
@@ -18,9 +18,9 @@ from rhs_isac_ros.protocol.messages import MessageError
 
 
 class Type(NamedTuple):
-    """The encoding of a ROS type as a series of items, given by `wire`.
+    """The encoding of a ROS type as a series of items, whose codes are in `wire`.
 
-    An item is a number (a type code of `struct`), a string (``s``) or a sequence (``*I``, ``*d``).
+    Numbers have the codes of `struct`; a string is ``s``, a sequence ``*I`` or ``*d``.
     """
 
     wire: tuple[str, ...]
@@ -63,7 +63,7 @@ def _numbers(n: int) -> Type:
 
 # Types that are one item on the wire.
 SCALARS = {'uint8': 'B', 'uint32': 'I', 'uint64': 'Q', 'double': 'd', 'string': 's'}
-# The other types.
+# The other supported types.
 TYPES = {
     'geometry_msgs/Point': _numbers(3),
     'geometry_msgs/Vector3': _numbers(3),
@@ -87,10 +87,10 @@ _SIZES = {'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
 
 
 class _Run(NamedTuple):
-    """Numbers of fixed size, followed by a string or a sequence of the type `tail`.
+    """Numbers of fixed size, followed by a string or a sequence with the code `tail`.
 
-    `layouts` contains the layout of the numbers for each position in the message modulo 8. The
-    `tail` of the last run is empty.
+    `layouts` contains the layout of the numbers, and of the size of the tail, for each position in
+    the message modulo 8. The last run has no tail: its `tail` is empty.
     """
 
     layouts: tuple[struct.Struct, ...]
@@ -114,9 +114,9 @@ class _Field(NamedTuple):
 class Codec:
     """Encodes and decodes one class of messages.
 
-    `kind` is a dataclass with the fields of the ROS type, and with ``stamp_ns`` if it keeps the
-    stamp of the header; `types` is the result of ``get_fields_and_field_types`` of the ROS type.
-    Raises TypeError if the type of a field is not supported.
+    `kind` is a dataclass with the fields of the ROS type except the header, and with ``stamp_ns``
+    if it keeps the stamp of the header; `types` is what ``get_fields_and_field_types`` of the ROS
+    type returns. Raises TypeError if the type of a field is not supported.
     """
 
     def __init__(self, kind: type[Any], types: dict[str, str]) -> None:
@@ -194,8 +194,8 @@ class Codec:
     def decode(self, data: bytes) -> Any:
         """Decode a message from bytes that begin with `HEADER`; its arrays are copies.
 
-        Raises MessageError if the bytes end too early, an array does not fill its shape, or the
-        value of an enumeration is undefined.
+        Raises MessageError if the bytes end too early, a string is not UTF-8, an array has the
+        wrong number of values, or the stamp or the value of an enumeration is invalid.
         """
         try:
             items = self._items(data)

@@ -21,9 +21,9 @@ from rhs_isac_ros.ros import cdr, frames
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.topics import NAMES, RHS_FRAME
 
-# Variance of an unknown angular velocity [rad^2/s^2], the value that ROS drivers use.
+# Variance of an unknown angular velocity [rad^2/s^2], a value that ROS drivers often use.
 _UNKNOWN_ROTATION_VARIANCE = 1e6
-# The identifier of the encoding; the option bytes that follow do not affect the encoding.
+# The identifier of the encoding, without the option bytes, which do not affect the encoding.
 _ENCODING = cdr.HEADER[:2]
 
 
@@ -47,7 +47,7 @@ class CodebookMessage:
             average_crlb_m2=codebook.average_crlb_m2)
 
     def codebook(self) -> Codebook:
-        """Return the codebook, or raise CodebookError."""
+        """Return the codebook, or raise CodebookError if it is invalid."""
         return Codebook(self.analog, self.digital, self.average_crlb_m2)
 
 
@@ -69,8 +69,8 @@ def to_bytes(
         frame: str = RHS_FRAME) -> bytes:
     """Serialize a message (CDR) for a publisher of `ros_type`.
 
-    If given, `identity` replaces the fields `sender` and `scenario_id` of the message.
-    Raises MessageError if a string has no UTF-8 encoding.
+    The header contains `stamp_ns` and `frame`. `identity`, if given, replaces the fields `sender`
+    and `scenario_id` of the message. Raises MessageError if a string has no UTF-8 encoding.
     """
     sender, scenario_id = identity or (message.sender, message.scenario_id)
     return _CODECS[type(message)].encode(message, frame, stamp_ns, sender, scenario_id)
@@ -79,9 +79,9 @@ def to_bytes(
 def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
     """Convert a serialized message (CDR) from a raw subscription.
 
-    Raises MessageError if the bytes are not a message of `ros_type`, an array does not fill its
-    shape, or the value of an enumeration is undefined. Subscriptions of rclpy that are not raw
-    silently drop bytes that they cannot deserialize.
+    Raises MessageError if the bytes are not a message of `ros_type`, an array has the wrong number
+    of values, or the stamp or the value of an enumeration is invalid. Subscriptions of rclpy that
+    are not raw silently drop bytes that they cannot deserialize.
     """
     if not serialized.startswith(_ENCODING):
         # A machine with another byte order may have sent the message.
@@ -109,7 +109,7 @@ def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
 def pose(estimate: PositionEstimate, stamp: Time, frame: Frame) -> PoseWithCovarianceStamped:
     """Return a position estimate in a frame, as a pose of unknown orientation.
 
-    Each rotation has the variance of an angle that is uniform between -pi and pi.
+    Each rotation angle has the variance of a uniform distribution from -pi to pi.
     """
     result = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=frame.name))
     result.pose.pose.position = frames.to_ros(Point, frame.from_surface(estimate.position))
@@ -120,7 +120,7 @@ def pose(estimate: PositionEstimate, stamp: Time, frame: Frame) -> PoseWithCovar
 
 def odometry(
         user: int, estimate: TrackEstimate, stamp: Time, frame: Frame) -> Odometry:
-    """Return the position and velocity of a track; orientation and angular velocity are unknown.
+    """Return a track as odometry, with unknown orientation and angular velocity.
 
     The child frame, in which the velocity is given, has the same axes as `frame`.
     """
@@ -135,7 +135,7 @@ def odometry(
 def true_odometry(
         user: int, position: np.ndarray, velocity: np.ndarray, stamp: Time, frame: Frame
 ) -> Odometry:
-    """Return a true position [3] [m] and velocity [3] [m/s] in a frame, without covariances."""
+    """Return a true position [3] [m] and velocity [3] [m/s] as odometry without covariances."""
     result = Odometry(header=Header(stamp=stamp, frame_id=frame.name),
                       child_frame_id=frame.user(user))
     result.pose.pose.position = frames.to_ros(Point, frame.from_surface(position))
@@ -144,7 +144,7 @@ def true_odometry(
 
 
 def _with_rotation(covariance: np.ndarray, variance: float) -> np.ndarray:
-    """Add independent rotations of equal variance to a covariance [3, 3]; return 36 entries."""
+    """Append three independent rotations of equal variance to a covariance [3, 3]; return [36]."""
     both = variance * np.eye(6)
     both[:3, :3] = covariance
     return both.ravel()

@@ -15,7 +15,7 @@ _PERIOD_S = 1.0
 
 
 def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
-    """Convert a report of the node with the full name `name` to one status, OK or WARN."""
+    """Convert a report to an array of one status, OK or WARN; `name` is the node's full name."""
     level = DiagnosticStatus.WARN if report.fault else DiagnosticStatus.OK
     values = [KeyValue(key=key, value=value) for key, value in report.values.items()]
     status = DiagnosticStatus(
@@ -34,7 +34,7 @@ def from_ros(message: DiagnosticArray, namespace: str) -> Iterator[tuple[str, Re
 
 
 def subscribe_reports(node: Node, on_report: Callable[[str, Report], None]) -> None:
-    """Call `on_report` with the name and report of each node in the namespace of `node`."""
+    """Call `on_report` with name and report when a node in the namespace of `node` reports."""
     namespace = node.get_namespace()
 
     def receive(message: DiagnosticArray) -> None:
@@ -44,7 +44,7 @@ def subscribe_reports(node: Node, on_report: Callable[[str, Report], None]) -> N
 
 
 def publish_reports(node: Node, report: Callable[[], Report]) -> None:
-    """Publish the report of a node once a second."""
+    """Call `report` once a second, and publish the result if the topic has subscribers."""
     publisher = endpoints.create_publisher(
         node, DiagnosticArray, topics.DIAGNOSTICS, endpoints.EXCHANGE)
 

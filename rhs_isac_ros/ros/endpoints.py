@@ -59,17 +59,17 @@ def profile_for(kind: type[m.Message], exchange: QoSProfile = EXCHANGE) -> QoSPr
     return LATCHED if kind in _LATCHED_MESSAGES else exchange
 
 _CreatedT = TypeVar('_CreatedT')
-# For each node: descriptions of refused endpoints, by kind and name.
+# For each node: descriptions of refused endpoints, timers and threads, by kind and name.
 _refusals: weakref.WeakKeyDictionary[Node, dict[str, str]] = weakref.WeakKeyDictionary()
 
 
 def refusals(node: Node) -> dict[str, str]:
-    """Return a description of each endpoint that was refused, by kind and name."""
+    """Return descriptions of refused endpoints, timers and threads, by kind and name."""
     return _refusals.get(node, {})
 
 
 def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> _CreatedT | None:
-    """Return the result of `create`; if the middleware refuses, log this once and return None."""
+    """Return the result of `create`, or None if it is refused; log a refusal once."""
     try:
         return create()
     # rclpy raises a ValueError for an action. RCLError and errors of threads are RuntimeErrors.
@@ -147,9 +147,9 @@ def create_publisher(
 
 
 def publish_if_subscribed(publishers: Iterable[Publisher], make: Callable[[], Any]) -> None:
-    """Publish the message that `make` returns on the topics with subscribers, if any.
+    """Publish the result of `make` on the topics that have subscribers; if none has, do nothing.
 
-    Topics for observers often have none, and making a message takes longer than publishing it.
+    Observer topics often lack subscribers, and making a message takes longer than publishing it.
     """
     if subscribed := [one for one in publishers if one.get_subscription_count()]:
         message = make()
@@ -182,20 +182,20 @@ def subscribe_messages(
         on_foreign: Callable[[m.Message], None] = lambda message: None,
         on_arrival: Callable[[type[m.Message]], None] = lambda kind: None,
         exchange: QoSProfile = EXCHANGE) -> None:
-    """Subscribe to messages of the protocol; malformed messages are dropped.
+    """Subscribe to messages of the protocol; drop malformed messages.
 
     Parameters
     ----------
     sizes
         Sizes that `check` expects, as in `Scenario.sizes`; None: no check.
     on_error
-        Called with the reason why a message was dropped; by default, the node logs it.
+        Called with the reason why a malformed message was dropped; by default, the node logs it.
     scenario_id, on_foreign
-        If `scenario_id` is given, messages of other scenarios are passed to `on_foreign`.
+        If `scenario_id` is given, messages of other scenarios are passed only to `on_foreign`.
     on_arrival
         Called with the class of each message before decoding.
     exchange
-        Quality of service of messages that are not latched.
+        Quality of service, as in `profile_for`.
     """
     def receive(kind: type[m.Message], serialized: bytes) -> None:
         on_arrival(kind)
@@ -219,7 +219,7 @@ class UserTopics:
     """Publishers for each user, created on first use.
 
     `kinds` contains the type of each topic by its name, with ``{user}`` for the user's number.
-    The highest number is `max_users`: numbers come from messages, and topics slow down discovery.
+    Users above `max_users` have none: numbers come from messages, and topics slow down discovery.
     """
 
     def __init__(self, node: Node, kinds: Mapping[str, type], max_users: int) -> None:
@@ -270,7 +270,7 @@ class BackgroundWorker:
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=node.get_name())
 
     def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
-        """Queue a job; the thread that spins the node passes its result to `on_result`.
+        """Queue a job; the thread that spins the node passes the result to `on_result`.
 
         That thread also raises exceptions of the job. The job is refused if no worker can start.
         """

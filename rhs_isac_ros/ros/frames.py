@@ -1,7 +1,7 @@
-"""The frame of a robot or a map, and the pose of the surface in it.
+"""The frame of standard messages, and the pose of the surface in it.
 
 The model, the region and the messages of the protocol are in the frame of the surface. Standard
-messages, such as poses and paths, are in the frame of the parameter ``frame_id``.
+messages, such as poses and paths, are in the frame given by the parameter ``frame_id``.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ def surface_frame(namespace: str) -> str:
 
 
 def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Return the matrix [3, 3] of a quaternion x, y, z, w of any length except 0."""
+    """Return the rotation matrix [3, 3] of a quaternion x, y, z, w of any length except 0."""
     x, y, z, w = quaternion / np.linalg.norm(quaternion)
     return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
                      [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],

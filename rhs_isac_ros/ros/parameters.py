@@ -57,7 +57,7 @@ class Parameter(Field):
 
     @property
     def default_text(self) -> str:
-        """Default as YAML, or ``empty``."""
+        """Default as YAML; ``empty`` for an empty text or list."""
         if self.default in ('', []):
             return 'empty'
         text = str(self.default)
@@ -183,7 +183,7 @@ CODEBOOK: Mapping[str, str] = {
 
 
 def declare(node: Node, executable: str) -> types.SimpleNamespace:
-    """Declare the parameters of an executable, and return their values by name.
+    """Declare the parameters of an executable in `NODES`, and return their values by name.
 
     Raises ParameterError if a value has the wrong type, is out of range, or is not allowed.
     """
@@ -197,7 +197,7 @@ def check_overrides(node: Node) -> None:
     Parameters of other executables are accepted, because nodes may share a parameter file.
     """
     known = known_names()
-    # rclpy gives no public access to all overrides. A publisher declares its qos_overrides.*.
+    # rclpy gives no public access to all overrides. An endpoint declares its qos_overrides.*.
     foreign = [f'{name}{hint(name)}' for name in sorted(node._parameter_overrides)
                if not (name in known or node.has_parameter(name)
                        or name.startswith('qos_overrides.'))]
@@ -236,8 +236,8 @@ def _declare_one(node: Node, parameter: Parameter) -> Any:
         raise ParameterError(
             f'{parameter.name}: {error}; expected {parameter.expected}') from None
     if value is None:
-        # If a parameter has no value, the node does not answer a request for several parameters,
-        # such as a request of `ros2 param dump`.
+        # If one parameter has no value, the node returns no values at all to a request for several
+        # parameters, such as a request of `ros2 param dump`.
         value = default
         node.set_parameters([RosParameter(parameter.name, typed, default)])
     if is_empty:
@@ -280,7 +280,7 @@ def same_value(one: RosParameter, other: RosParameter) -> bool:
 
 
 class ParameterizedNode(Node):
-    """A node that checks each change of its parameters as a whole and converts it to settings.
+    """A node that checks each change to its parameters as a whole and converts it to settings.
 
     The node declares the parameters of `executable`, which is also the default name of the node.
     `values` contains the initial values by name. Raises ParameterError if one is invalid.
@@ -307,15 +307,15 @@ class ParameterizedNode(Node):
         super().destroy_node()  # type: ignore[no-untyped-call]
 
     def make_settings(self, values: types.SimpleNamespace) -> Any:
-        """Return the settings of the role for these parameters, or raise ParameterError."""
+        """Return the role's settings, None if it has none; raise ParameterError if invalid."""
         settings = ROSTER[self._executable].settings
         return settings and settings_of(settings, values)
 
     def on_settings_changed(self, settings: Any) -> None:
-        """Handle the settings that result from a change of parameters."""
+        """Handle new settings after a change to parameters; by default, do nothing."""
 
     def revert_parameters(self, settings: Any) -> None:
-        """Reset the parameters to settings that were in use, without checking them again."""
+        """Reset dynamic parameters to earlier settings, without calling `on_settings_changed`."""
         self._is_reverting = True
         try:
             self.set_parameters_atomically([
@@ -326,7 +326,7 @@ class ParameterizedNode(Node):
 
     def set_parameters_atomically(
             self, parameter_list: list[RosParameter]) -> SetParametersResult:
-        """Set all parameters or none, as the parameter services do.
+        """Set all parameters or none; the parameter services call this method, too.
 
         Unlike in rclpy, the reason for a rejection contains the value and the valid range, and
         read-only parameters are accepted if they keep their values, as in a dump of the node.
@@ -338,7 +338,7 @@ class ParameterizedNode(Node):
             self._check_each(parameter_list)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        # A change of use_sim_time makes rclpy subscribe to the simulated time.
+        # A change to use_sim_time makes rclpy subscribe to the simulated time.
         what = f'subscription to {topics.CLOCK}'
         result = create_or_refuse(self, what, functools.partial(
             super().set_parameters_atomically, parameter_list))

@@ -22,8 +22,8 @@ from rhs_isac_ros.protocol.presences import PERIOD_S, Presence, Presences
 from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.ros.roster import ROSTER, identifying_endpoints
 
-# Poll periods [s]: while a role is missing or nodes are in conflict, and otherwise. A poll takes
-# half a millisecond, which adds up over many users.
+# Poll period while a role is missing or nodes are in conflict, and poll period otherwise [s]. A
+# poll takes half a millisecond, which adds up over many users.
 _POLL_S, _IDLE_POLL_S = 0.1, 1.0
 # Number of polls before the first report of missing roles, while discovery is still under way.
 _GRACE_POLLS = 10
@@ -47,16 +47,16 @@ def new_instance() -> int:
 
 
 class Peers:
-    """Polls the ROS graph for the roles that a node requires.
+    """Monitors the roles that a node requires, and other nodes with the same role.
 
     A role is missing if no node has all its `identifying_endpoints`. The role counts as present
-    once two polls in a row have found such a node, which then had time to discover this node.
+    once two polls in a row have found such a node, so that it has had time to discover this one.
 
     Nodes of unique roles also announce themselves periodically. A node that falls silent does not
     count, although it remains in the graph for some time. A restarted node of the same name counts
     once it has called `take_role`. Of two nodes with the same role, the newer one serves.
 
-    Pairs of endpoints are logged if one requests a quality of service that the other lacks.
+    Endpoints whose quality of service prevents messages to or from this node are logged.
 
     Parameters
     ----------
@@ -77,9 +77,9 @@ class Peers:
             on_rival: Callable[[bool], None]) -> None:
         self._node, self._on_missing, self._on_rival = node, on_missing, on_rival
         self._required = {name: identifying_endpoints(name) for name in ROSTER[role].needed}
-        # By role found so far: the number of endpoints of each topic at that time, and the nodes.
+        # For each role found so far: the number of endpoints of each topic then, and the nodes.
         self._present: dict[str, tuple[tuple[int, ...], set[str]]] = {}
-        # Numbers of endpoints at the last poll, by topic; incompatible ones, by topic and node.
+        # Numbers of endpoints at the last poll, by topic; incompatible ones by topic and node.
         self._counts: list[tuple[str, int, int]] = []
         self._incompatible: dict[tuple[str, str], str] = {}
         # Endpoints that were logged, which are not logged again if they are created again.
@@ -107,12 +107,12 @@ class Peers:
         self.restart()
 
     def take_role(self) -> None:
-        """Announce the role, once the node has created all its publishers and subscriptions."""
+        """Announce the role; called after the publishers and subscriptions have been created."""
         self._presences.own = dataclasses.replace(self._presences.own, role=self._role)
         self._changed.set()
 
     def close(self) -> None:
-        """End the announcements, before the node is destroyed."""
+        """End the announcements; called before the node is destroyed."""
         self._closed = True
         self._changed.set()
         if self._thread.is_alive():
@@ -262,7 +262,7 @@ class Peers:
             self._set_period(_POLL_S)
 
     def _apply(self, changes: list[LogMessage]) -> None:
-        """Log changes of the known nodes, and call `on_rival` if the rival has changed."""
+        """Log changes among other nodes, and call `on_rival` if the rival has changed."""
         logger = self._node.get_logger()
         for message in changes:
             # Two calls, because rclpy requires that a line of code always logs with one severity.
@@ -276,7 +276,7 @@ class Peers:
 
 
 def _owner(info: Any) -> str:
-    """Return the node of an endpoint, or the participant while the node is unknown.
+    """Return the full name of an endpoint's node, or the participant's id if the name is unknown.
 
     If the process was unreachable for longer than the lease of discovery, its endpoints are
     discovered again, but Fast DDS does not deliver the name of the node again.

@@ -21,8 +21,8 @@ from rhs_isac_ros import executables
 from rhs_isac_ros.executables import PARENT_ID
 from rhs_isac_ros.ros.startup import OVERRIDE
 
-# Maximum number of users with nodes of their own, unless more nodes are requested. More users
-# share one node, because every process takes memory and CPU time, even between cycles.
+# Maximum number of users for which `network`, `demo` and the launch file start one node each. More
+# users share one node, because every node takes memory, and CPU time even between cycles.
 MAX_USER_NODES = 16
 # Memory of the process of a node [bytes], and the number of nodes that a core can run.
 _MEMORY_BYTES = 67_000_000
@@ -34,7 +34,7 @@ _MAX_LOCAL_PARTICIPANTS = 32
 _DOMAINS = 101
 _MEMORY_FILE = Path('/proc/meminfo')
 _RANGE, _LOCALHOST = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST'
-# Signals sent in turn until a process ends, each with the time to wait for the exit [s].
+# Signals sent in turn until all processes end, each with the time to wait for the exit [s].
 _STOP_SIGNALS = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0))
 _STOP_POLL_S = 0.01
 # Modules that nodes import only after their start; ROS imports the first one for type supports.
@@ -84,7 +84,7 @@ def max_processes() -> int:
 
 def run_executable(
         command: Sequence[str], log: Path, environment: Mapping[str, str]) -> None:
-    """Run an executable as its command would, in this process, which is a new fork.
+    """Run an executable in this process, a new fork, as its command would, and exit.
 
     Output is appended to `log`. The caller has blocked SIGINT; this function unblocks it. SIGINT
     results in the exit code 0, even before the executable handles it.
@@ -139,7 +139,7 @@ class _Fork(ForkProcess):
 class Processes:
     """A context manager that runs executables of this package and ends them on exit.
 
-    Their output goes to ``<name>.log`` in the directory `logs`.
+    Their output goes to ``<name>.log`` in the directory `logs`; `environment` adds variables.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class Processes:
             self, logs: Path, environment: Mapping[str, str], fork: bool = False) -> None:
         self._logs, self._fork = logs, fork
         self._environment = {**os.environ, **environment, PARENT_ID: str(os.getpid())}
-        # The variable gives the enclave of this process, but each node has its own.
+        # The variable gives the enclave of this process, but each node has its own enclave.
         self._environment.pop(OVERRIDE, None)
         self._running: dict[str, subprocess.Popen[bytes] | _Fork] = {}
         self._commands: dict[str, list[str]] = {}

@@ -30,7 +30,7 @@ from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 # Separator between the message definitions of a schema, as in ROS 1 and 2.
 _SEPARATOR = '=' * 80
 _SCENARIO = 'scenario'
-# Maximum size of a record, and of the records of a chunk [bytes].
+# Maximum size of a record, and of a decompressed chunk [bytes].
 _MAX_BYTES = 2**26
 # Maximum number of characters of a scenario.
 _MAX_SCENARIO = 2**20
@@ -42,7 +42,7 @@ class RecordingError(Exception):
 
 
 def recorded_topics() -> dict[str, tuple[type, QoSProfile]]:
-    """Return the type and quality of service of each recorded topic, by relative name."""
+    """Return the type and quality of service of each recorded topic, by its name in `topics`."""
     found = {name: (convert.ros_type(kind), endpoints.profile_for(kind))
              for kind, name in topics.NAMES.items()}
     found[topics.POSITION] = PoseWithCovarianceStamped, endpoints.EXCHANGE
@@ -95,8 +95,8 @@ def _parts(text: str, package: str) -> Iterator[str]:
 class Recorder:
     """Writes the messages and the scenario of a network to a file.
 
-    The file is called ``<name>.part`` until it is complete, and remains after an interruption.
-    Raises RecordingError if mcap is not installed or the file cannot be written.
+    Until `close` completes the file, its name is ``<name>.part``; an incomplete file keeps it.
+    Raises RecordingError if mcap is not installed or the file cannot be created.
     """
 
     def __init__(self, path: str | Path, scenario: Scenario) -> None:
@@ -119,8 +119,8 @@ class Recorder:
             self, node: Node, on_message: Callable[[str, bytes], None] | None = None) -> None:
         """Record the topics of `recorded_topics` in the namespace of a node.
 
-        `on_message` is called with the relative name of the topic and the serialized message, once
-        the message is written or writing has failed.
+        `on_message` is called with the name of the topic, as in `recorded_topics`, and the
+        serialized message, once the message is written or writing has failed.
         """
         for name, (kind, profile) in recorded_topics().items():
             channel = self._writer.register_channel(
@@ -167,10 +167,10 @@ class Recorder:
 def read(
         path: str | Path, names: Collection[str] | None = None
 ) -> Iterator[tuple[str, bytes, float]]:
-    """Yield the topic, the bytes (CDR) and the time [s] of each message, as recorded.
+    """Yield the topic, the bytes (CDR) and the recorded time [s] of each message of a known type.
 
-    `names` selects topics by their full names; None selects all. Raises RecordingError if the file
-    cannot be read, or the fields of a recorded and an installed message differ.
+    The known types are those of `recorded_topics`. `names`, if given, selects topics by full name.
+    Raises RecordingError if the file cannot be read, or a type differs from the installed one.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
     schemas: dict[int, Any] = {}
@@ -213,7 +213,7 @@ def _fields(text: str) -> list[str]:
 def read_scenario(path: str | Path) -> Scenario | None:
     """Return the scenario of a recording; None if there is none, as with ``ros2 bag record``.
 
-    Raises RecordingError if the file cannot be read, ScenarioError if the scenario is invalid.
+    Raises RecordingError if the file or scenario is unreadable, ScenarioError if a value is wrong.
     """
     for record in _records(path):
         if type(record).__name__ == 'Metadata' and record.name == _SCENARIO:
@@ -289,7 +289,7 @@ class CycleObserver(Node):
         super().__init__('cycle_observer', **node_options)
         self.log = log or cycle_log.CycleLog()
         if recorder is not None:
-            # The log and the recording share a subscription, so that a replay yields the same
+            # The log and the recording share subscriptions, so that a replay yields the same
             # cycles in the same order.
             kinds = {topics.NAMES[kind]: kind for kind in cycle_log.RECEIVES}
             recorder.record_topics(self, lambda name, message: self._on_recorded(

@@ -76,7 +76,7 @@ class CodebookClient:
         self._request()
 
     def _fits(self, message: convert.CodebookMessage, codebook: Codebook) -> bool:
-        """Return whether a codebook fits the scenario; log once if it does not."""
+        """Return whether a codebook fits the scenario; if not, log the reason if it is new."""
         before, self._problem = self._problem, ''
         try:
             codebook.check(self._scenario)
@@ -150,7 +150,7 @@ class Clocks:
         return self._world_s
 
     def role_s(self, in_world: bool) -> float:
-        """Return the time of the roles [s]; if `in_world`, their state belongs to the world."""
+        """Return the time of the roles [s], which follows the world if `in_world` is True."""
         self._advance(in_world)
         return self._role_s
 
@@ -165,7 +165,7 @@ class Clocks:
         simulated_s = 1e-9 * self._clock.now().nanoseconds
         before_s = simulated_s if self._simulated_s is None else self._simulated_s
         self._simulated_s = simulated_s
-        # When a simulation restarts, its time goes back; the world then pauses once.
+        # When a simulation restarts, its time goes back; the time of the world then stands still.
         world_s = max(simulated_s - before_s, 0.0)
         self._world_s += world_s
         self._role_s += world_s if in_world else elapsed_s
@@ -239,7 +239,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                     self, convert.ros_type(kind), topics.NAMES[kind], endpoints.profile_for(kind))
 
     def subscribe(self) -> None:
-        """Create the subscriptions, so that the graph shows that the role is ready."""
+        """Create the subscriptions, which show that the role is ready, and announce the role."""
         kinds = [kind for kind in self.role.RECEIVES if kind not in self._receiving]
         self._receiving.update(kinds)
         endpoints.subscribe_messages(
@@ -357,7 +357,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         return True
 
     def execute(self, action: events.Action) -> None:
-        """Execute an action that only some roles have; their nodes override this method."""
+        """Raise TypeError; subclasses override this method to execute actions of their roles."""
         raise TypeError(f'{type(action).__name__} is not an action of {self.get_name()}')
 
     def _on_message(self, message: m.Message) -> None:

@@ -1,7 +1,7 @@
 """The roles of a network.
 
-Parameters, launch files, permissions, readiness, fault trials and the documented topics derive
-from the declarations of the roles in `ROSTER`.
+Parameters, the launch file, DDS permissions, the checks for missing roles, and tests derive from
+the declarations in `ROSTER`.
 """
 
 import dataclasses
@@ -43,7 +43,7 @@ class Member:
 
     @property
     def received(self) -> tuple[str, ...]:
-        """Topics to which nodes of the role subscribe; topics of protocol messages come first."""
+        """Topics of the network to which nodes of the role subscribe; protocol messages first."""
         return (*(topics.NAMES[kind] for kind in (self.role.RECEIVES if self.role else ())),
                 *((topics.CODEBOOK,) if self.has_codebook else ()),
                 *((topics.PRESENCE,) if self.is_unique else ()))
@@ -54,7 +54,7 @@ class Member:
         return (*self.requires, *((topics.OPTIMIZER_NODE,) if self.has_codebook else ()))
 
 
-# The nodes of a network start in this order.
+# The launch file and `demo` start the nodes in this order.
 ROSTER: Mapping[str, Member] = {
     'rhs_controller': Member(role=RhsController, has_codebook=True),
     'positioner': Member(
@@ -77,8 +77,8 @@ UNIQUE = tuple(name for name, member in ROSTER.items() if member.is_unique)
 def identifying_endpoints(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return two tuples of topics, published and subscribed, that show that a role is present.
 
-    Each tuple contains at most one topic, the first that no other role publishes or subscribes to.
-    One is enough, because a node creates its publishers together, and likewise its subscriptions.
+    Each contains the first topic that only this role publishes or subscribes to, if any. One
+    is enough, because a node creates its publishers together, and likewise its subscriptions.
     """
     others = [member for other, member in ROSTER.items() if other != name]
     sent = {topic for member in others for topic in member.sent}

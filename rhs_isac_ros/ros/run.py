@@ -26,7 +26,7 @@ from rhs_isac_ros.ros.startup import SecurityError, leave, one_line, prepare, us
 from rhs_isac_ros.support.arguments import ArgumentParser
 from rhs_isac_ros.support.fields import ParameterError
 
-# The highest domain whose ports exist.
+# The highest domain whose port numbers are valid.
 _MAX_DOMAIN = 232
 # Parameters that rclpy declares for each node.
 _OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
@@ -87,7 +87,7 @@ def _names(executable: str) -> list[str]:
 
 
 def _assigned(arguments: Sequence[str]) -> Iterator[str]:
-    """Yield the parameters that the options set for all nodes of the process."""
+    """Yield the names of parameters that ``-p`` options set for all nodes of the process."""
     in_ros_arguments = False
     for word, following in itertools.pairwise(arguments):
         if word in ('--ros-args', '--'):
@@ -129,7 +129,7 @@ def _describe(parameter: Parameter) -> str:
 
 
 def _example(parameters: Sequence[Parameter]) -> str:
-    """Return an assignment to the first parameter that is not common to most executables."""
+    """Return an assignment to the first parameter, preferably not the scenario file or seed."""
     chosen = next((parameter for parameter in parameters
                    if parameter.name not in ('scenario_file', 'seed')), parameters[0])
     value = 'my.yaml' if chosen.default == '' else chosen.default_text
@@ -144,7 +144,7 @@ _POLL_S = 0.1
 
 
 def collect_signals() -> list[int]:
-    """Handle SIGINT and SIGTERM: return a list to which each signal that arrives is appended."""
+    """Handle SIGINT and SIGTERM; return the list to which the handlers append each signal."""
     # A handler may interrupt the other one, so it must not take a lock.
     signals: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -156,10 +156,10 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         done: Callable[[], bool] = lambda: False) -> int:
     """Create nodes, spin them until a signal arrives or `done` returns True, and destroy them.
 
-    SIGINT and SIGTERM only set a flag, because the handlers of rclpy would invalidate the context
-    while a callback publishes. `args` is a command line with the name of the program, by default
-    the command line of the process. The returned exit code is 2 if a parameter or a file is
-    invalid, otherwise 0.
+    The handlers for SIGINT and SIGTERM only record the signal, because those of rclpy would
+    invalidate the context while a callback publishes. `args` is a command line with the name of
+    the program, by default the command line of the process. The returned exit code is 2 if a
+    parameter, a file or the security set-up is invalid, otherwise 0.
     """
     program = os.path.basename(args[0]) if args else ''
     signals = collect_signals()
@@ -197,8 +197,8 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         print_error(error, program)
         return 2
     finally:
-        # The default action also ends a process that is deadlocked in the middleware, where a
-        # Python handler would never run.
+        # The default action of SIGALRM also ends a process that is deadlocked in the middleware,
+        # where a Python handler would never run.
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(_DESTRUCTION_S)
         leave()

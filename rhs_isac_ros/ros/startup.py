@@ -24,11 +24,11 @@ from rhs_isac_ros.executables import EXECUTABLES
 
 # Environment variable with the profile file of Fast DDS.
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-# Options of nodes that need no services; access control then need not permit any.
+# Options for nodes that need no services; access control then need not permit any.
 WITHOUT_SERVICES: Mapping[str, Any] = {
     'start_parameter_services': False,
     'parameter_overrides': [Parameter('start_type_description_service', value=False)]}
-# The hidden node, which keeps the participant of this process alive until there are other nodes.
+# The hidden node, if any. It keeps the participant of this process alive until other nodes exist.
 _holders: list[Node] = []
 
 
@@ -60,7 +60,7 @@ def join(args: list[str]) -> None:
 
 
 def leave() -> None:
-    """Destroy the hidden node, if any; other nodes of the process keep the participant."""
+    """Destroy the hidden node, if any; other nodes of the process keep the participant alive."""
     while _holders:
         _holders.pop().destroy_node()
 
@@ -87,9 +87,9 @@ def is_enabled() -> bool:
 def prepare(args: Sequence[str]) -> list[str]:
     """Return the command line `args`, with an enclave if DDS security is enabled.
 
-    The command line begins with the name of the program. By default, the enclave of a node is the
-    full name of the node, and the enclave of every tool is ``operator``. The environment is
-    checked here, because ROS reports errors in it with a traceback or not at all.
+    The command line begins with the name of the program. By default, nodes and ``replay`` have
+    their full names as enclaves; all other tools share ``operator`` in their namespace. The
+    environment is checked here, because ROS reports errors in it with a traceback or not at all.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def prepare(args: Sequence[str]) -> list[str]:
     """
     for name, values in ((_ENABLE, ('', 'true', 'false')), (_STRATEGY, (
             '', 'Enforce', 'Permissive'))):
-        # ROS ignores other values, and runs without security.
+        # ROS accepts any other value, but then runs without security or does not enforce it.
         if os.environ.get(name, '') not in values:
             raise SecurityError(
                 f'{name}: {os.environ[name]!r}, expected {" or ".join(values[1:])}')
@@ -149,7 +149,7 @@ def _check_enclave(enclave: str) -> None:
 
 @contextlib.contextmanager
 def one_line() -> Iterator[None]:
-    """Raise `SecurityError`, not a ROS error, if DDS security refuses a node or an endpoint."""
+    """If DDS security is enabled, convert an error of rcl to a `SecurityError` of one line."""
     try:
         with warnings.catch_warnings():
             # ROS warns when it destroys the incomplete node.

@@ -1,4 +1,4 @@
-"""The names of all topics. Most are relative, so that namespaces and remapping apply."""
+"""Names of topics, services and frames. Most topic names are relative to the namespace."""
 
 from collections.abc import Mapping
 
@@ -46,7 +46,7 @@ TF_STATIC = '/tf_static'
 # Simulated time; absolute, because rclpy expects this name.
 CLOCK = '/clock'
 
-# Action of the base station, and its services.
+# Action and services of the base station.
 LOCATE = 'locate'
 PAUSE = '~/pause'
 RESUME = '~/resume'

@@ -52,7 +52,7 @@ _N_COMPARED = 200
 
 
 class PilotLog:
-    """Collects codebooks, and the signals and true positions of one user, or of all for user 0.
+    """Collects codebooks, and signals and true positions of one user, or of all if `user` is 0.
 
     Unlike `CycleLog`, it keeps cycles without a fix, because a fix may require the calibration.
     """
@@ -90,7 +90,7 @@ class PilotLog:
                       - self.codebooks.keys())
 
     def pilots(self) -> list[Pilots]:
-        """Return the pilots, grouped by codebook."""
+        """Return the pilots whose position and codebook are known, grouped by codebook."""
         groups: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
         for signals in self._signals.values():
             truth = self._truth_of(signals)
@@ -196,7 +196,7 @@ def _survey(scenario: Scenario, pilots: Sequence[Pilots], options: argparse.Name
 
 
 def _error(scenario: Scenario, pilots: Sequence[Pilots], surface: SurfaceEstimate | None) -> str:
-    """Return the root mean square error and the number of missing fixes as text."""
+    """Return the rms error and the number of missing fixes, over the first pilots, as text."""
     distances = np.empty(0)
     for group in pilots:
         left = _N_COMPARED - len(distances)

@@ -39,7 +39,7 @@ from rhs_isac_ros.support.arguments import check_distinct, input_file
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.optional import MissingLibraryError
 
-# Period of polling the graph [s], because changes of the graph do not wake the executor.
+# Period of polling the graph [s], because changes to the graph do not wake the executor.
 _POLL_PERIOD_S = 0.02
 # Discovery is complete when the graph has not changed for this time [s]. With DDS security,
 # discovery pauses while keys are exchanged.
@@ -112,7 +112,7 @@ def print_now(*values: object, end: str = '\n') -> None:
 
 
 def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> str:
-    """Return a text table; `align` has ``<`` or ``>`` per column; heads may have line breaks."""
+    """Return a text table; heads may have line breaks; `align` has a ``<`` or ``>`` per column."""
     lines = [*itertools.zip_longest(*(head.split('\n') for head in heads), fillvalue=''), *rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return '\n'.join('  '.join(
@@ -173,9 +173,9 @@ def recorded(
 ) -> Iterator[tuple[Any, float]]:
     """Yield the recorded messages of a network and their times [s], in order.
 
-    `kinds` may contain message classes, `Codebook` and `Report`. A report is yielded in a pair
-    with the name of its node. Raises RecordingError if the file is not a recording, or a message
-    is malformed or does not fit the scenario.
+    `kinds` may contain message classes, `Codebook` and `Report`. A report is yielded as a pair
+    (node name, report). Raises RecordingError if the file is not a recording, or a message is
+    malformed or does not fit the scenario.
     """
     prefix = topic_prefix(namespace)
     names: dict[type, str] = {**topics.NAMES, Codebook: topics.CODEBOOK}
@@ -199,7 +199,7 @@ def recorded(
 
 
 class Session(contextlib.AbstractContextManager['Session']):
-    """A context manager with a node that the command itself spins."""
+    """A context manager with a node, which `spin_until` and `discover` spin."""
 
     def __init__(self, arguments: Sequence[str] = ('',)) -> None:
         startup.use_discovery_profile()

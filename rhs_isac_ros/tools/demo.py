@@ -62,7 +62,7 @@ def add_network_options(parser: argparse.ArgumentParser) -> None:
 
 
 def max_user_processes() -> int:
-    """Return the number of users that this machine can run as separate processes."""
+    """Return the number of users that this machine can run as processes beside other nodes."""
     return max_processes() - len(UNIQUE)
 
 
@@ -84,7 +84,7 @@ def start_network(
 
     Users walk at random at the scenario's maximum speed. Each parameter in `given` applies to all
     nodes that have it; None selects its default. A scenario other than Table I must also be given
-    as ``scenario_file``. With ``first_cycle=1``, cycles are reproducible for a seed.
+    as ``scenario_file``. With ``first_cycle=1``, the seed determines multipath and noise.
     """
     for role, member in ROSTER.items():
         known = {parameter.name for parameter in parameters.NODES[role]}
@@ -103,10 +103,10 @@ def start_network(
 def watch(
         observer: CycleObserver, processes: Processes, cycles: int,
         on_progress: Callable[[int, int], None]) -> str:
-    """Spin an observer until it has received a number of complete cycles.
+    """Spin an observer until it has received `cycles` complete cycles.
 
-    Whenever their number changes, `on_progress` is called with this number and with `cycles`.
-    Returns the error that ended the wait, or ''.
+    At first and whenever their number changes, `on_progress` is called with this number and with
+    `cycles`. Returns the error that ended the wait, or ''.
     """
     seen, changed_s = -1, time.monotonic()
     while seen < cycles:

@@ -1,4 +1,4 @@
-"""``scripts/param``: replaces ``ros2 param``, which has no wheel; the output is the same."""
+"""``scripts/param``: commands of ``ros2 param``, which has no wheel, with the same output."""
 
 import argparse
 import sys

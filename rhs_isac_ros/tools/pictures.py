@@ -149,7 +149,7 @@ def _draw_room(axes: Any, plane: list[int], scenario: Scenario) -> None:
 
 def _draw_ellipse(
         axes: Any, plane: list[int], estimate: m.PositionEstimate, **style: Any) -> None:
-    """Draw the ellipse that contains 95 % of the posterior in a plane of two coordinates."""
+    """Draw an estimate's 95 % ellipse, as of a Gaussian, in a plane of two coordinates."""
     from matplotlib.patches import Ellipse
 
     half_m, directions = shapes.axes_95(estimate.covariance_m2[np.ix_(plane, plane)])

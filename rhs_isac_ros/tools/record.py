@@ -1,4 +1,4 @@
-"""``scripts/record FILE``: records all topics of a network."""
+"""``scripts/record FILE``: records the messages and the scenario of a network."""
 
 import argparse
 
@@ -11,7 +11,7 @@ from rhs_isac_ros.tools.command import ToolError, choose_scenario, entry, observ
 
 
 class RecorderNode(Node):
-    """Records the topics in its namespace; the caller closes the file."""
+    """Records the network in its namespace; the caller closes the file."""
 
     def __init__(self, recorder: Recorder) -> None:
         super().__init__('recorder', **WITHOUT_SERVICES)

@@ -1,6 +1,6 @@
 """``scripts/replay FILE``: passes the received signals in a recording to estimators.
 
-With ``--publish``, it publishes the signals to running nodes instead.
+With ``--publish``, it publishes the signals, or other topics, to running nodes instead.
 """
 
 import argparse
@@ -56,7 +56,7 @@ _SECURE_DISCOVERY_TIMEOUT_S = 8.0
 # time [s]. Another publisher may be discovered after the first subscriber.
 _SETTLING_TIME_S = 1.0
 _ACK_TIMEOUT = Duration(seconds=5)
-# Topics that can be published again. The codebook is sent as a parameter; recorded diagnostics and
+# Topics that can be published again. The codebook is set as parameters; recorded diagnostics and
 # announcements would contradict the running nodes.
 _TOPICS = sorted(set(recorded_topics()) - {topics.CODEBOOK, topics.DIAGNOSTICS, topics.PRESENCE})
 # Defaults of the options for running nodes.
@@ -65,12 +65,12 @@ _TIMEOUT_S = 60.0
 
 
 class RepublisherNode(Node):
-    """Publishes messages at their recorded times, once all topics have subscribers.
+    """Publishes messages with their recorded timing, once all topics have subscribers.
 
     `messages` contains the topic, the content and the time [s] of each message, sorted by time.
     `names` are the relative names of the topics. `rate` is the speed relative to the recording.
-    `optimizer` receives the codebooks, or is None if another node provides them. `waits_for` is
-    the first topic without subscribers, or ''. `count` is the number of published messages.
+    `optimizer`, unless it is None, receives the codebooks. `waits_for` is the first topic without
+    the expected subscribers, or ''. `count` is the number of published messages.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class RepublisherNode(Node):
                     ros_parameters(codebook.to_parameters()))
 
     def check(self, end_s: float, timeout_s: float) -> None:
-        """Raise ToolError if a topic has another publisher, or no subscriber in time."""
+        """Raise ToolError if a topic has another publisher, or lacks subscribers after `end_s`."""
         for name, publisher in self._message_publishers.items():
             if self.count_publishers(publisher.topic_name) > 1:
                 raise ToolError(f'{name}: already published by another node')
@@ -247,8 +247,8 @@ class Recording:
 def load(path: Path, namespace: str = '/', config: Path | None = None) -> Recording:
     """Load the complete cycles of a network from a recording.
 
-    The scenario file `config` replaces the recorded scenario. Raises RecordingError or
-    ScenarioError if a file is invalid, or there is no complete cycle in the namespace.
+    The scenario file `config` replaces the recorded scenario. Raises ScenarioError if the scenario
+    is invalid, RecordingError if the recording is, or has no complete cycle in the namespace.
     """
     scenario = command.choose_scenario(config, path)
     log = CycleLog()
@@ -270,7 +270,7 @@ def errors_m(
     """Repeat the position estimate of each cycle, and return the errors, float64 [N] [m].
 
     Without a fix, the error is NaN. The keys of `estimators` are ids of codebooks. If the typical
-    speed `track_speed_mps` is given, users are tracked over the cycles.
+    speed `track_speed_mps` [m/s] is given, users are tracked over the cycles.
     """
     tracks, errors = Tracks(), []
     for cycle in cycles:

@@ -14,7 +14,7 @@ from rhs_isac_ros.monitoring import network_view, shapes
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 _VERSION = '0.22'
-# The timeline of the viewer.
+# Name of the timeline in the viewer.
 _TIMELINE = 'cycle'
 # Number of coordinates in a plane.
 _PLANE = 2

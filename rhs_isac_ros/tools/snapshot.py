@@ -21,8 +21,8 @@ from rhs_isac_ros.tools.command import ToolError
 from rhs_isac_ros.tools.pictures import compose_scene
 
 _PROGRAM = 'snapshot'
-# Every user publishes its true position within this time [s]. The surface publishes its
-# configuration within twice this time.
+# By default, every user publishes its true position within this time [s]. While cycles run, the
+# surface publishes its configuration within twice this time.
 _REPORT_PERIOD_S = 0.5
 
 

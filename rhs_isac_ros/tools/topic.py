@@ -1,4 +1,4 @@
-"""``scripts/topic``: replaces ``ros2 topic``, which has no wheel; the output is the same."""
+"""``scripts/topic``: commands of ``ros2 topic``, which has no wheel, with the same output."""
 
 import argparse
 import array
@@ -107,7 +107,7 @@ def echo(session: Session, options: argparse.Namespace) -> None:
                 else f'{value}\n')
         print_now(f'{text}---')
         printed += 1
-    # The strictest profile that all publishers match, or one that any future publisher matches.
+    # The strictest profile that suits all publishers, or one that suits any future publisher.
     profile = (QoSPresetProfiles.BEST_AVAILABLE.value
                if session.node.get_publishers_info_by_topic(name) else qos_profile_sensor_data)
     subscription = session.node.create_subscription(kind, name, show, profile)

@@ -1,4 +1,4 @@
-"""``scripts/view``: shows a running network or a recording in the browser."""
+"""``scripts/view``: shows a network or a recording in the browser, or writes it to a file."""
 
 import argparse
 import contextlib
@@ -55,7 +55,7 @@ from rhs_isac_ros.tools.rerun_stream import RerunStream
 
 # Maximum number of codebooks, whose tables take some megabytes each.
 _MAX_CODEBOOKS = 32
-# Number of positioning phases for a bound, whose root has a standard error of 2.4 % with Table I.
+# Number of positioning phases for a bound. With Table I, its root has a standard error of 2.4 %.
 _N_PHASES = 256
 # Time to wait for the first cycle before the reason for its absence is logged [s].
 _SILENCE_S = 5.0
@@ -72,7 +72,7 @@ _SWITCH_INTERVAL_S = 5e-4
 class Posteriors:
     """Computes tracks and the modes of posteriors from signals, for the latest codebooks.
 
-    The messages of a network do not contain the modes, which would lengthen every cycle.
+    Messages do not contain the modes, because computing them would lengthen every cycle.
     `surface` is as in `make_estimator`.
     """
 
@@ -96,7 +96,7 @@ class Posteriors:
             self._scenario, codebook, np.random.default_rng(0), _N_PHASES).value
 
     def modes(self, received: m.ReceivedSignals) -> WeightedModes | None:
-        """Return the modes of the posterior, or None without a fix or with an unknown codebook."""
+        """Return the modes; None without a fix, with unusable signals or an unknown codebook."""
         estimator = self._estimators.get(received.codebook_id)
         with contextlib.suppress(SignalError):
             return weighted_modes(estimator, received.signals) if estimator else None
@@ -107,8 +107,8 @@ class Posteriors:
     ) -> TrackEstimate | None:
         """Continue the track of a user with signals that arrived at `now_s` [s].
 
-        The typical speed of users is `speed_mps`. Returns None before the second position, without
-        a fix, or with an unknown codebook.
+        The typical speed of users is `speed_mps` [m/s]. Returns None if the signals are late or
+        unusable, without a fix, or with an unknown codebook.
         """
         estimator = self._estimators.get(received.codebook_id)
         with contextlib.suppress(SignalError):
@@ -243,9 +243,9 @@ def entries(
         track_speed_mps: float | None = None, max_cycles: int = 0) -> Iterator[Entry]:
     """Yield the entries for a recording, whose codebooks are added to `posteriors`.
 
-    If the typical speed `track_speed_mps` is given, users are tracked. `max_cycles` limits the
-    number of cycles unless it is 0. Raises RecordingError if the file is invalid, or there is no
-    cycle in the namespace.
+    If the typical speed `track_speed_mps` [m/s] is given, users are tracked. `max_cycles` limits
+    the number of cycles unless it is 0. Raises RecordingError if the file is invalid, has another
+    scenario, or has no cycle in the namespace.
     """
     view = NetworkView(scenario)
     for codebook, _ in command.recorded(path, namespace, scenario, [Codebook]):

@@ -72,7 +72,7 @@ def _table(title: str, justify: Literal['left', 'right'], *heads: str) -> 'Table
 def _users(overview: Overview, now_s: float) -> 'RenderableType':
     table = _table('Users', 'right', 'user', 'position\n[m]', 'error\n[m]', 'sigma\n[m]',
                    'out/blk\n[%]', 'capacity\n[Mbit/s]', 'loss\n[%]', 'age\n[s]')
-    # Sorted, so that each user keeps the same row.
+    # Sorted, so that users keep their order.
     for user, cycle in sorted(overview.users.items())[:_MAX_USERS]:
         table.add_row(str(user), *(_results(cycle, now_s) if cycle else ['no fix yet']))
     notes = [f'and {len(overview.users) - _MAX_USERS} more'] * (len(overview.users) > _MAX_USERS)
