@@ -9,13 +9,13 @@ combines successive positioning phases of a moving user.
 The modules, in reading order:
 
 * `estimate`: the interface; `estimators`: `bayes` and `ml`, from signals to positions
-* `coordinates` and `lattice`: the coordinates and lengths in which signals differ
+* `coordinates`: range and direction; `lattice`: lengths over which signals change, and the grid
 * `likelihood`: the likelihood of positions and nuisance parameters
 * `grid`: starts of the search; `search`: ascent from the starts to the modes; `failures`: modes if
   elements have failed
 * `posterior`: from modes to samples; `draws`: samples without modes; `alternatives`: users outside
   or blocked; `diagnosis`: tests of the fit between signals and model
-* `tracking`; `neural`: the paper's network; `store`: tables in files
+* `tracking`: moving users; `neural`: the paper's network; `store`: tables in files
 """
 
 from collections.abc import Callable, Mapping
@@ -59,9 +59,9 @@ def make_estimator(
     `Network` or its file. Plug-ins define their own options.
 
     Raises ValueError if there is no estimator of that name; PluginError if a plug-in cannot be
-    loaded, fails, or does not return an estimator; ModelError if a model cannot be read or was
-    trained for another codebook or scenario; and CodebookError if the codebook does not fit the
-    scenario.
+    loaded, fails, or does not return an estimator; ModelError if a model is missing, cannot be
+    read, or was trained for another codebook or scenario; and CodebookError if the codebook does
+    not fit the scenario.
     """
     if name in ESTIMATORS:
         return ESTIMATORS[name](scenario, codebook, **options)

@@ -28,7 +28,7 @@ from rhs_isac_ros.support.progress import progress_bar
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, 2 if an argument or a file is invalid, or 130 after Ctrl-C."""
+    """Run the command; return its exit code: 0, 2 after an error, or 130 after Ctrl-C."""
     parser = ArgumentParser(
         prog='python3 -m rhs_isac_ros.positioning', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)

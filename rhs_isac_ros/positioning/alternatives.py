@@ -64,7 +64,7 @@ class Alternative(Protocol):
     """An alternative to a user in the region with a direct path."""
 
     name: str  # `Estimate` has the field ``<name>_probability``.
-    reason: str  # Why there is no fix.
+    reason: str  # Beginning of the reason why there is no fix.
     limit: float  # Largest probability at which there is a fix, if this is the only alternative.
     log_odds: float  # Logarithm of the prior odds relative to a user inside and in sight.
 
@@ -86,9 +86,9 @@ class Alternative(Protocol):
 class Blocked:
     """A user without a direct path, whose signals are multipath of an unknown level.
 
-    The evidence for a user in sight is computed as if all users had the same level, with a
-    covariance that a survey inflates. An average over the levels would multiply this evidence by
-    a factor. Instead, the evidence for a blocked user is divided by it: only the ratio counts.
+    The evidence for a user in sight is computed as if all users had the same level. An average
+    over their levels would multiply this evidence by a factor. Only the ratio of both evidences
+    counts, so the evidence for a blocked user is divided by this factor instead.
     """
 
     name, reason, limit = 'blocked', 'blocked', BLOCKED_LIMIT
@@ -238,7 +238,7 @@ def describe_doubts(estimate: object) -> str:
 
 
 def rejection(alternative: Alternative, probability: float) -> str:
-    """Return the reason why an alternative of this probability rules out a fix; '' if not."""
+    """Return why an alternative of this probability rules out a fix, or '' if it does not."""
     if probability <= alternative.limit:
         return ''
     return (f'{alternative.reason}: probability {probability:.6g}, expected at most '

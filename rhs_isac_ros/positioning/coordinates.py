@@ -1,4 +1,4 @@
-"""Positions as range and direction cosines, in which the likelihood is nearly Gaussian.
+"""Positions as range and direction cosines, in which likelihood modes are nearly Gaussian.
 
 The signals determine the range to a fraction of a wavelength, but the direction only to a fraction
 of a beam. In Cartesian coordinates, the modes of the likelihood are therefore curved.
@@ -38,7 +38,7 @@ def is_inside(positions: np.ndarray, bounds: np.ndarray) -> np.ndarray:
 
 def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,
                   tolerance_m: float) -> np.ndarray:
-    """Compute the offsets from modes to the nearest points of the region of interest.
+    """Compute the offsets, [M, 3], from modes into the region of interest; 0 for modes inside it.
 
     The offset follows the sphere of the mode's range, because the signals determine the range
     best. The range then changes with the direction to keep the likelihood as high as possible.

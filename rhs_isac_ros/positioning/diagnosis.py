@@ -96,7 +96,7 @@ class FitTest:
         return f'{excess} of signals weaker than the multipath'
 
     def residual_test(self, residual: float) -> str:
-        """Reject signals whose residual at the best position has more energy than noise."""
+        """Reject signals whose residual at the best position exceeds the limit for noise."""
         return _excess(_RESIDUAL, residual, self.max_residual)
 
 
@@ -107,16 +107,16 @@ def _excess(subject: str, value: float, limit: float) -> str:
 class InnovationTest:
     """A test of whether the energies of the latest residuals have the expected mean and variance.
 
-    Twice an energy has approximately a chi-square distribution; `Estimate.expected_residual` is
-    half its mean. With a measured covariance, the energy is also multiplied by the level of the
-    multipath, a log-normal power with the median and the standard deviation `level_db`. The level
-    does not change for users at rest, or in one part of the hall, so it may be the same in all
-    residuals. Raises ValueError if the window is shorter than `MIN_RETURN`, because then no
-    warning could end.
+    Twice an energy has approximately a chi-square distribution, whose mean is twice
+    `Estimate.expected_residual`. With a measured covariance, the energy is also multiplied by the
+    level of the multipath, a log-normal power with the median and standard deviation `level_db`.
+    The level does not change for users at rest, or in one part of the region, so it may be the
+    same in all residuals. Raises ValueError if the window is shorter than `MIN_RETURN`, because
+    then no warning could end.
     """
 
     #: Whether the residuals deviate from the model. It is set when their mean or variance over the
-    #: window is improbable, and reset when both are probable for the latest `MIN_RETURN` ones.
+    #: window is improbable, and reset when both are probable over the latest `MIN_RETURN` of them.
     drifts: bool
 
     def __init__(
@@ -133,7 +133,7 @@ class InnovationTest:
         self.drifts = False
 
     def add(self, energy: float, expected: float) -> None:
-        """Add the energy of a residual and its expectation; if one of them is NaN, do nothing."""
+        """Add a residual's energy and its expectation, unless one is NaN, and update `drifts`."""
         if np.isnan(energy) or np.isnan(expected):
             return
         scale = max(expected, 1.0)

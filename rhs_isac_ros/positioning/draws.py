@@ -38,9 +38,9 @@ _N_EFFECTIVE = 150.0
 _SHARE_OF_BOUNDS = 0.7
 # Exponent of the bounds of the likelihood, below 1 so that cells with low bounds are drawn, too.
 _POWER = 0.8
-# Range windows are omitted if their log-likelihood is below the best average by more than this.
+# Range windows are omitted if their bound is below the best window's average by more than this.
 _MARGIN = 12.0
-# Smallest number of range steps per wavelength. A narrow peak has one per two standard deviations.
+# Smallest number of range steps per wavelength. Narrow peaks get one per two standard deviations.
 _MIN_STEPS = 8
 # Number of range steps to evaluate at a time.
 _BLOCK = 1 << 20
@@ -59,7 +59,7 @@ class _Rays(NamedTuple):
     log_mass: np.ndarray  # Logarithm of the integral, float64 [R]; -inf outside of the region.
     range_m: np.ndarray  # Mean range, float64 [R] [m].
     variance_m2: np.ndarray  # Variance of the range, float64 [R] [m^2].
-    average: np.ndarray  # Mean log-likelihood, float64 [R].
+    average: np.ndarray  # Mean log-likelihood, weighted by the likelihood, float64 [R].
     highest: np.ndarray  # Highest log-likelihood, float64 [R].
 
 
@@ -82,7 +82,7 @@ class DrawnPosterior:
         self._log_volume = np.log(volume) + self._log_area
 
     def of(self, query: Query, phase: int) -> Fit | None:
-        """Draw positions for a phase; return None if their effective number stays too small."""
+        """Compute the posterior of a phase, or None if too few draws are effective."""
         probability = bounds = self._probabilities(query, phase)
         cells, log_weights, parts, total_share = np.empty(0, int), np.empty(0), [], 0.0
         for n_rounds in range(1, _MAX_ROUNDS + 1):
@@ -111,7 +111,7 @@ class DrawnPosterior:
         mean, covariance = moments(weights, places)
         along = weights * rays.variance_m2
         covariance += (along[:, None] * rays.direction).T @ rays.direction
-        # Log-likelihoods are relative to that of an absent signal.
+        # The log-likelihoods of the rays omit the energy of the signals.
         energy, best = float(query.energies[phase]), float(rays.highest[weights > 0].max())
         return Fit(
             mean, symmetric(covariance * (1 + variance)),

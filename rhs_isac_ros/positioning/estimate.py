@@ -20,7 +20,7 @@ Located: TypeAlias = (
 
 
 class SignalError(ValueError):
-    """Received signals cannot be used: wrong shape, not finite, or too large."""
+    """Received signals cannot be used: wrong type or shape, not finite, or too large."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -36,14 +36,14 @@ class Estimate:
     reason: str | tuple[str, ...] = ''
     #: Energy of the whitened residual at the best position, float64 [] or [N]; or NaN.
     residual: float | np.ndarray = np.nan
-    #: Expected `residual` of signals that match the model, given the modes of the posterior,
-    #: float64 [] or [N]; NaN without a residual, or if the user may be outside or blocked.
+    #: Expected `residual` of signals that match the model, float64 [] or [N]; NaN without one, if
+    #: the user may be outside or blocked, or if the signals are weaker than the multipath.
     expected_residual: float | np.ndarray = np.nan
     #: Probability that the user is outside of the region, float64 [] or [N]; NaN if the estimator
-    #: assumes a user inside.
+    #: assumes a user inside, or if the signals are weaker than noise.
     outside_probability: float | np.ndarray = np.nan
     #: Probability that there is no direct path, float64 [] or [N]; NaN if the estimator assumes a
-    #: direct path.
+    #: direct path, or if the signals are weaker than noise.
     blocked_probability: float | np.ndarray = np.nan
 
     @property
@@ -53,7 +53,7 @@ class Estimate:
 
 
 class Fit(NamedTuple):
-    """The posterior of one phase, on the assumption that the user is inside the region."""
+    """The posterior of one phase, for a user who is inside the region and in sight."""
 
     mean: np.ndarray  # Float64 [3] [m].
     covariance: np.ndarray  # Float64 [3, 3] [m^2].
@@ -73,8 +73,8 @@ class Estimator(Protocol):
 
         The signals are complex128 [N_B, N_SB F], or [N, N_B, N_SB F] for N positions,
         sub-band-major; the estimate has a leading dimension N if the signals have one. An
-        estimate in a batch may differ from the estimate of the same phase alone. One in a thousand
-        differs by more than five hundredths of a standard deviation.
+        estimate in a batch may differ from the estimate of the same phase alone, but rarely by
+        more than a few hundredths of a standard deviation.
         """
         ...
 
@@ -86,7 +86,7 @@ def estimate_each(
 
     `locate` takes checked signals, [N, N_B, N_SB F], and yields a `Located` for each phase. If
     the reason is not empty, mean and covariance are ignored. Raises SignalError if the shape is
-    wrong, a value is not finite, or a magnitude exceeds 1000.
+    wrong, a value is not a finite number, or a magnitude exceeds 1000.
     """
     batch = checked_received(codebook, received)
     mean, covariance = np.full((len(batch), 3), np.nan), np.full((len(batch), 3, 3), np.nan)

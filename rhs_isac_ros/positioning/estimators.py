@@ -75,14 +75,14 @@ class SearchEstimator(abc.ABC):
 
     If the model cannot explain the signals even at the best mode, there is no fix; see
     `diagnosis`. If the scenario has a `blocked_probability`, users may lack the direct path; see
-    `alternatives`. Tables are kept in `table_folder` between runs.
+    `alternatives`. Tables are kept between runs in `table_folder`, if it is given.
 
     Parameters
     ----------
     reject_outside
-        Whether the user may also be outside of the region. If the probability of this exceeds
-        `alternatives.OUTSIDE_LIMIT`, there is no fix. Otherwise, the estimate contains the
-        probability, and its position and covariance apply to a user inside.
+        Whether the user may also be outside of the region. The estimate then contains the
+        probability of this; if it exceeds `alternatives.OUTSIDE_LIMIT`, there is no fix. Position
+        and covariance always apply to a user inside.
     surface
         Knowledge of the surface, such as a calibration; see `MeasurementModel`.
     progress
@@ -222,8 +222,8 @@ class SearchEstimator(abc.ABC):
         samples = WeightedSamples.of(drawn, modes)
         means, covariances = self._moments(modes, samples)
         log_evidence = samples.log_evidence(likelihood.resolution.volume_m3)
-        # If the model holds, the residual energy averaged over the posterior has the mean of a
-        # chi-square variable. At the best of several modes, it is smaller than the average.
+        # If the model holds, twice the residual energy, averaged over the posterior, has the mean
+        # of a chi-square variable. At the best of several modes, it is smaller than the average.
         expected = self._mean_residual - samples.average(modes.residual)
         value = modes.roi_log_likelihood
         ends = [*samples.starts[1:].tolist(), len(modes.phases)]
@@ -255,7 +255,7 @@ class SearchEstimator(abc.ABC):
     def _covariance(self, fit: Fit) -> np.ndarray:
         """Return the covariance, scaled to the multipath level that the residual indicates."""
         relative = max(fit.residual, 1e-9) / (self._level * max(fit.expected, 0.5))
-        # The covariance of a position never exceeds the prior's.
+        # The scaled covariance does not exceed the prior's, unless the original one does.
         largest = max(self._prior_m2 / float(fit.covariance.trace()), 1.0)
         return min(relative**self._level_share, largest) * fit.covariance
 
@@ -275,7 +275,7 @@ class SearchEstimator(abc.ABC):
 
 
 class BayesEstimator(SearchEstimator):
-    """Mean and covariance of the posterior, from the Gaussians of all modes inside the region."""
+    """Mean and covariance of the posterior, from samples inside the region."""
 
     name = 'bayes'
 
@@ -316,11 +316,11 @@ class WeightedModes(NamedTuple):
 
 @one_blas_thread
 def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> WeightedModes | None:
-    """Compute the mixture of modes for one phase, complex128 [N_B, N_SB F] or [N_B, N_SB, F].
+    """Compute the mixture of modes for signals of one phase, [N_B, N_SB F] or [N_B, N_SB, F].
 
-    The mixture has the mean and covariance that `BayesEstimator` estimates, up to the sampling
-    error of the mean, unless `BayesEstimator` averages over draws. The result is None if there is
-    no position. Raises `SignalError` if the signals cannot be used.
+    The mixture has the mean and covariance that `BayesEstimator` estimates, up to sampling errors,
+    unless the latter averages over draws, bands have unknown phases, or multipath levels vary.
+    Returns None without a position. Raises `SignalError` if the signals cannot be used.
     """
     modes = estimator.posterior(received.reshape(len(received), -1)).modes
     if modes is None:

@@ -1,9 +1,9 @@
 """Modes of the posterior as a mixture over sets of failed elements.
 
 `DispersedLikelihood` replaces the mixture by one Gaussian for each number of failures. It ignores
-what the signals reveal about the set of failed elements, although the effect of even a single
-failure is far above the nulls of the multipath. This module finds the sets with a substantial
-weight by adding elements to the most probable sets, one at a time.
+what the signals reveal about the set of failed elements. Yet even a single failure has an effect
+far above the multipath in the nulls of its covariance. This module finds the sets with a
+substantial weight by adding elements to the most probable sets, one at a time.
 
 A failed element is stuck at an amplitude that is uniform in [0, 1]. If its amplitude is treated as
 Gaussian, with mean 1/2 and variance 1/12, the signals are Gaussian. In the direct path, the
@@ -76,12 +76,12 @@ Key: TypeAlias = tuple[Failed, int]
 
 
 def can_enumerate(scenario: Scenario) -> bool:
-    """Return whether declared failures are so rare that their sets can be searched."""
+    """Return whether failures are declared, and so rare that their sets can be searched."""
     return 0 < scenario.failed_element_share * scenario.n_elements <= _MAX_EXPECTED
 
 
 class FailedElements:
-    """The posterior of positions if a few elements of the surface may have failed."""
+    """Refinement of modes if a few elements of the surface may have failed."""
 
     # Extra margin of the search for modes, which averages over sets and thus misjudges each set.
     search_margin = 10.0
@@ -91,7 +91,7 @@ class FailedElements:
         self._model = FailureModel(likelihood)
 
     def _search(self, modes: Modes, signals: Signals) -> 'FailureSearch':
-        """Search for probable sets of failed elements, at the modes and elsewhere."""
+        """Search for probable sets of failed elements at the modes and, if needed, elsewhere."""
         order = np.argsort(-modes.roi_log_likelihood)
         search = FailureSearch(self._model, signals)
         keys = search.add(modes.roi_points[order], modes.values[order])
@@ -180,7 +180,7 @@ class Site:
         return self.model.elements_at(self.point)
 
     def columns_of(self, failed: Failed) -> tuple[np.ndarray, np.ndarray]:
-        """Return the columns with failed elements, and the columns for the amplitudes of these."""
+        """Return the columns with failed elements, and the columns for their amplitudes."""
         if not failed:
             return self.columns, self.columns[:0]
         changes, amplitudes = self.elements
@@ -327,7 +327,7 @@ class FailureModel:
 
     def _predicted(self, values: np.ndarray, columns: np.ndarray, whitening: Whitening,
                    n_failed: int) -> np.ndarray:
-        """Predict the log-likelihood of H sets after a Newton step from columns [H, C, N_B, R]."""
+        """Predict log-likelihoods [H] after a Newton step from columns [H, C, N_B, N_SB F]."""
         n = len(columns)
         white = np.matmul(np.moveaxis(columns, 2, 0), np.swapaxes(whitening.whitener, 2, 3))
         white = np.moveaxis(white, 0, 2).reshape(n, columns.shape[1], -1)
@@ -364,8 +364,8 @@ class FailureSearch:
     more failures; see `FailureModel.weigh_extensions`. If it did not, and two elements had failed,
     the first element added would often be a third one that imitates the sum of both.
 
-    Growth ends when all new sets are less probable than the best set by a margin, but not before
-    the deviance of some hypothesis is as low as usual.
+    Growth ends when all new sets are less probable than the best set by a margin, and the deviance
+    of some hypothesis is as low as usual, or else after `_MAX_GROWTH` elements.
     """
 
     def __init__(self, model: FailureModel, signals: Signals) -> None:
@@ -391,7 +391,7 @@ class FailureSearch:
         return self._weigh((failed, index) for index in range(first, len(self.sites)))
 
     def grow(self, parents: list[Key], remainder: float = 0.0) -> None:
-        """Add failures to hypotheses until the results are improbable.
+        """Add failures to hypotheses until the results are improbable; see `FailureSearch`.
 
         `remainder` is the argument of `FailureModel.weigh_extensions`.
         """
@@ -410,7 +410,7 @@ class FailureSearch:
             parents = _diverse(ranked)
 
     def try_neighbours(self, key: Key) -> None:
-        """Weigh the sets in which one element is added, removed or exchanged."""
+        """Weigh the sets in which one element is added, removed or replaced."""
         failed, index = key
         smaller = [tuple(sorted(set(failed) - {element})) for element in failed]
         self._weigh((one, index) for one in smaller)

@@ -50,11 +50,11 @@ _N_OUTPUTS = 1 << 18
 _N_FIRST = 48
 # Number of other relevant cells above which positions are drawn, without a search for modes.
 _MAX_CELLS = 100
-# Largest log-likelihood, relative to no signal, of signals for which positions are drawn. Peaks of
+# Largest log-likelihood, relative to no direct path, at which positions are drawn. Peaks of
 # stronger signals are so narrow that draws may hit some of them and miss others.
 _MAX_DRAWN = 100.0
 # Largest number of peaks of a phase that are kept, to limit memory and time. Only signals below
-# the noise have more, and the remaining peaks have little weight.
+# the noise have more, and the peaks left out have little weight.
 _MAX_PEAKS = 8192
 # Squared Mahalanobis distance below which points belong to the same mode.
 _SAME_MODE = 2.0
@@ -264,7 +264,7 @@ class TemplateTable:
         return points
 
     def _bound(self, query: 'Query') -> np.ndarray:
-        """Bound the log-likelihood in all cells, as if all bands were in phase, float32 [N, C]."""
+        """Bound the log-likelihood in all cells, as if all bands were in phase, [N, C]."""
         grid, outputs = self.grid, query.outputs
         amplitude = np.empty((len(outputs), len(grid.node)), np.float32)
         turns = np.swapaxes(self._cell_turns, 1, 2)
@@ -403,7 +403,7 @@ class TemplateTable:
 
     def _loss_outside(self, phases: np.ndarray, points: np.ndarray, cells: np.ndarray,
                       value: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Return the log-likelihood lost by moves into the region, [P]; inf if unlikely."""
+        """Return the log-likelihood lost by moves into the region, [P]; inf for unlikely moves."""
         inside = is_inside(to_positions(points), self._bounds)
         result = np.where(inside, 0.0, np.inf)
         best = np.full(phases.max(initial=0) + 1, -np.inf)
@@ -432,7 +432,7 @@ class Query(NamedTuple):
     signals: np.ndarray  # Weighted with the inverse covariance, complex64 [N, N_B, N_SB, F].
     outputs: np.ndarray  # Filter outputs for all templates, complex64 [N, N_B, N_SB, G].
     energies: np.ndarray  # Energies of the whitened signals, float64 [N].
-    bound: np.ndarray  # Bound of the log-likelihood in each cell, float32 [N, C].
+    bound: np.ndarray  # Bound of the log-likelihood in each cell, [N, C].
     prior: NuisancePrior
     margin: float
 

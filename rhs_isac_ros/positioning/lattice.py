@@ -1,8 +1,7 @@
 """The lengths over which signals from the region differ, and the grid that follows from them.
 
-The lengths follow from wavelength, aperture, bandwidth and region. The grid of the search has as
-many points as there are distinguishable positions. Points that are closer together share one
-evaluation of the model.
+The lengths follow from wavelength, aperture, bandwidth and region. The grid of the search is as
+coarse as they permit. Points in nearly the same direction share one expansion of the mean signals.
 """
 
 import functools
@@ -19,7 +18,7 @@ from rhs_isac_ros.model.geometry import (
 )
 from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
 
-# Largest sine of the angle from boresight on the grid; at the rim, directions have no derivative.
+# Largest sine of the angle from boresight on the grid; at 1, derivatives are infinite.
 _MAX_SINE = 0.995
 # Distance in range up to which a point counts as inside the region, in wavelengths.
 _TOLERANCE_WAVELENGTHS = 0.2
@@ -39,7 +38,7 @@ _SEPARATION_WAVELENGTHS = 0.37
 _SEPARATION_RAD = 0.57
 # Steps and radii in range, in cells, if the phases of the bands do not constrain the range.
 _COARSE_CELLS = 0.75
-# Largest value of `Resolution.direction`. It applies to apertures below a few wavelengths, where
+# Largest value of `Resolution.direction`. It applies to apertures below one wavelength, where
 # the gains of elements and of the user also change with the direction.
 _MAX_DIRECTION = 0.4
 # Smallest thickness of the region, in wavelengths.
@@ -59,7 +58,7 @@ class Resolution(NamedTuple):
     # Changes of (u, v) that turn the phase at the edge of the aperture by one radian, [2].
     direction: np.ndarray
     curvature_m: float  # Phase [rad] at a corner of the aperture per change of 1 / r.
-    delay_m: float  # Change of the range that turns the phase at the edge of a band by 1 rad.
+    delay_m: float  # Change of the range that turns the edge of a band by 1 rad from its centre.
     nearest_m: float
     farthest_m: float
     directions: np.ndarray  # Extent of the region in u and in v, float64 [2, 2].
@@ -193,7 +192,7 @@ def lay_grid(scenario: Scenario) -> Grid:
 
 
 def groups(n: int, fits: Callable[[int, int], bool]) -> list[tuple[int, int]]:
-    """Divide n successive items into the longest groups (first, end) for which `fits` is true."""
+    """Divide n items into groups (first, end), each as long as `fits` allows, or of one item."""
     result, first = [], 0
     for end in range(1, n + 1):
         if end == n or not fits(first, end + 1):
@@ -256,7 +255,7 @@ def whiten(model: MeasurementModel, mean: np.ndarray, slopes: np.ndarray) -> np.
 class Means:
     """Mean signals and their derivatives; points in nearly the same direction share an expansion.
 
-    This pays because the modes of the posterior line up along the range.
+    This saves time, because many modes of the posterior differ little except in range.
     """
 
     def __init__(self, model: MeasurementModel) -> None:

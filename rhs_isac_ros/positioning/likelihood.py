@@ -1,14 +1,14 @@
 """The likelihood of positions and nuisance parameters: one Gaussian for each state of the surface.
 
 Nuisance parameters z multiply the direct path and the multipath in the signals y by exp(z P); see
-`model.impairments`. Thermal noise is far weaker than the multipath. The divided signals y exp(-z
-P) therefore have the distribution of the model without the factor, apart from the change of
-volume. With mean mu(p) and covariance Lambda at a position p, the log-likelihood is, up to a
-constant, ``-|W (y exp(-z P) - mu(p))|^2 - 2 Re(sum z P) - log det Lambda`` with ``W^H W =
+`model.impairments`. Thermal noise is assumed to be far weaker than the multipath. The divided
+signals y exp(-z P) then have the distribution of the model without the factor, apart from the
+change of volume. With mean mu(p) and covariance Lambda at a position p, the log-likelihood is, up
+to a constant, ``-|W (y exp(-z P) - mu(p))|^2 - 2 Re(sum z P) - log det Lambda`` with ``W^H W =
 Lambda^-1``.
 
-A `Conditional` evaluates the log-likelihood and its derivatives for one state of the surface.
-The search, the posterior and the tracker use only a `Conditional`, whatever the impairments are.
+A `Conditional` evaluates the log-likelihood and its derivatives. The search, the posterior and the
+tracker use this interface for all impairments and errors of elements.
 """
 
 import dataclasses
@@ -27,16 +27,16 @@ from rhs_isac_ros.positioning.lattice import Means, Resolution, whiten
 
 # Standard deviation of a Gaussian whose density at its centre equals that of a uniform phase.
 _UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
-# Standard deviation above which the search treats the phases of the bands as uniform. Their joint
+# Standard deviation from which the search treats the phases of the bands as uniform. Their joint
 # density then has many peaks along the range, too narrow for Gaussians. Its information is added
 # to the samples of the posterior afterwards.
 COARSE_STD_RAD = 0.75
-# Grid on which parameters with several maxima are compared: reach in standard deviations, number
-# of points by number of parameters, and refinements of the best point.
+# Grid on which parameters with several maxima are compared: reach in standard deviations, points
+# per parameter by number of parameters, and refinements of the best point.
 _REACH = 4.0
 _N_GRID = {1: 513, 2: 49, 3: 13}
 _N_REFINEMENTS = 4
-# Profile over the gain: number of gains and of amplitudes in its table, and its reach.
+# Profile over the gain: numbers of gains and amplitudes, and reach in standard deviations.
 _N_GAIN = 161
 _N_AMPLITUDE = 256
 _GAIN_REACH = 4.5
@@ -45,7 +45,7 @@ _MIN_GAIN_STD = 1e-9
 # Numbers of failures to average over: smallest probability of each, and how many at most.
 _MIN_PROBABILITY = 1e-5
 _MAX_COUNTS = 12
-# Up to this share of the whitened energy, errors of an estimated surface have one covariance.
+# Up to this share of the whitened energy, an estimated surface needs no covariance per position.
 _MIN_ERROR_SHARE = 0.05
 
 
@@ -63,14 +63,14 @@ class Local(NamedTuple):
     curvatures of range and phase nearly cancel, and noise would spoil their difference.
     """
 
-    value: np.ndarray  # Logarithm of likelihood and prior of the parameters, float64 [M].
+    value: np.ndarray  # Logarithm of the likelihood times the parameters' prior, float64 [M].
     gradient: np.ndarray  # Float64 [M, 3 + Q].
     information: np.ndarray  # Float64 [M, 3 + Q, 3 + Q].
     residual: np.ndarray  # Energy of the whitened residual, float64 [M].
 
 
 class Conditional(Protocol):
-    """The likelihood given one state of the surface."""
+    """The likelihood for one state of the surface, or averaged over several."""
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate the likelihood at points [M, 3] and parameters [M, Q] for one or M phases."""
@@ -80,9 +80,9 @@ class Conditional(Protocol):
 class NuisancePrior(Exponents):
     """Prior and effect of the nuisance parameters, in units in which they are standard normal.
 
-    A uniform phase has no prior, and its unit is `_UNIFORM_EQUIVALENT`. If the phases of the bands
-    are nearly independent, a uniform phase of each band replaces all parameters that rotate whole
-    bands; the range then follows from delays, amplitudes and wavefronts only.
+    A uniform phase has no prior, and its unit is `_UNIFORM_EQUIVALENT`. If the relative phases of
+    bands vary by `COARSE_STD_RAD` or more, uniform phases of all bands replace the parameters that
+    rotate whole bands; the range then follows from delays, amplitudes and wavefronts only.
     """
 
     def __init__(self, model: MeasurementModel) -> None:
@@ -96,7 +96,7 @@ class NuisancePrior(Exponents):
         # If all bands share one phase, only rounding errors remain.
         is_shared = relative <= 1e-9 * np.trace(self.phase_covariance)
         self.relative_phase_std_rad = 0.0 if is_shared else float(np.sqrt(relative))
-        # Whether every band has a uniform phase.
+        # Whether every band is given a uniform phase.
         self.is_coarse = self.relative_phase_std_rad >= COARSE_STD_RAD
         keeps = np.ones(len(nuisance), bool)
         if self.is_coarse:
@@ -130,24 +130,24 @@ class NuisancePrior(Exponents):
         self.floor = Resolution.of(model.scenario).curvature_floor
 
     def information_of(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
-        """Compute the Fisher information of a covariance, tr(L^-1 dL L^-1 dL'), float64 [Q, Q]."""
+        """Compute the Fisher information of a covariance about the parameters, [Q, Q]."""
         # The multipath reveals gains and offsets of carrier and timing, but no phase.
         operators = self._multiplying(root, whitener)
         both = operators + np.conj(np.swapaxes(operators, 2, 3))
         return np.einsum('aimn,binm->ab', both, both, optimize=True).real
 
     def _multiplying(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
-        """Compute W P W^-1, which multiplies whitened signals, [Q, N_B, N_SB F, N_SB F]."""
+        """Compute W P W^-1, which applies P to whitened signals, [Q, N_B, N_SB F, N_SB F]."""
         return np.matmul(whitener * self.scaled_patterns[:, :, None], root)
 
     def columns(self, values: np.ndarray, received: np.ndarray, mean: np.ndarray,
                 slopes: np.ndarray, *linear: np.ndarray) -> np.ndarray:
         """Return the residual and derivatives at M points, complex128 [M, C, N_B, N_SB F].
 
-        Four groups follow the residual: derivatives of the mean with respect to the point; the
-        informative derivatives with respect to the parameters; `linear`, derivatives of the mean
-        with respect to further parameters; and derivatives of the divided signals with respect to
-        the parameters.
+        Four groups follow the residual: `slopes`, derivatives of the mean with respect to the
+        point; derivatives of the signals with respect to the parameters, from `derivatives`;
+        `linear`, derivatives of the mean with respect to further parameters; and the divided
+        signals times the exponents of the parameters.
         """
         divided = self.divide(received, values)
         return np.concatenate([
@@ -155,7 +155,7 @@ class NuisancePrior(Exponents):
             self.scaled_patterns * divided[:, None]], axis=1)
 
     def slopes(self, whitened: np.ndarray) -> np.ndarray:
-        """Compute W P W^-1 times whitened signals [M, N_B, N_SB F], [M, Q, N_B N_SB F]."""
+        """Multiply whitened signals [M, N_B, N_SB F] by W P W^-1; return [M, Q, N_B N_SB F]."""
         slopes = np.einsum('qimn,kin->kqim', self._operators, whitened, optimize=True)
         return slopes.reshape(*slopes.shape[:2], -1)
 
@@ -164,13 +164,13 @@ class NuisancePrior(Exponents):
         return -(values**2 @ self.precision / 2 + values @ self.volume)
 
     def log_evidence_of_aligned(self, aligned: np.ndarray) -> float:
-        """Return the log integral over the parameters that move the multipath, near `aligned`."""
+        """Return the log of Laplace's integral over the parameters that move the multipath."""
         (moves,) = np.nonzero(self.moves_multipath)
         curvature = self.information[np.ix_(moves, moves)] + np.diag(self.precision[moves])
         return float(-self.precision @ aligned**2 - np.linalg.slogdet(curvature)[1]) / 2
 
     def amplitude(self, outputs: np.ndarray) -> np.ndarray:
-        """Sum the bands' matched-filter outputs, [N_B, ...], after their most likely rotations."""
+        """Add up the bands' matched-filter outputs, [N_B, ...], rotated as in `_in_phase`."""
         if not self.relative_phase_std_rad:
             return _in_phase(outputs.sum(axis=0), float(self.phase_std_rad[0]))
         parts = [_in_phase(output, float(std))
@@ -182,8 +182,8 @@ class NuisancePrior(Exponents):
         """Maximise the log-likelihood, without the template's energy, over the gain.
 
         If signals y are multiplied by h, the log-likelihood at the amplitude A, of any shape, is
-        ``-h^2 |y|^2 + 2 h A + 2 n log h`` plus the prior of the gain; n is `n_rows`. Returns its
-        maximum and the gain [nepers]. If the gain is known, the maximum omits the energy.
+        ``-h^2 |y|^2 + 2 h A + 2 n log h`` plus the prior of the gain, -log h; n is `n_rows`.
+        Returns its maximum and the gain [nepers]; if the gain is known, 2 A and a single 0.
         """
         if not self.gain_std:
             return 2 * amplitude, np.zeros(1)
@@ -210,7 +210,7 @@ class NuisancePrior(Exponents):
 
 
 class Likelihood:
-    """The likelihood with a single covariance, an average over the region and over surfaces."""
+    """The likelihood with one covariance, in which element errors are averaged over the region."""
 
     def __init__(self, scenario: Scenario, codebook: Codebook,
                  surface: Surface | None = None) -> None:
@@ -262,8 +262,8 @@ def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
              information_of_covariance: np.ndarray | None = None, n_linear: int = 0) -> Local:
     """Combine whitened columns into the likelihood and its derivatives at parameters [M, Q].
 
-    `white`, complex128 [M, C, n], contains the whitened `NuisancePrior.columns`. If the last Q are
-    absent, the gradient uses derivatives of the mean, and never predicts an energy below 0.
+    `white`, complex128 [M, C, n], contains the whitened `NuisancePrior.columns`. Without the last
+    Q, gradient and information use the same derivatives, and never predict an energy below 0.
     `information_of_covariance`, float64 [Q, Q], is the information of the covariance about the
     parameters, by default that of the average covariance. `n_linear` is the number of further
     standard normal parameters, in which the mean is linear; they are integrated out.
@@ -300,9 +300,9 @@ def log_determinant(roots: np.ndarray) -> np.ndarray:
 
 
 def whiten_each(roots: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whiten columns [M, C, N_B, N_SB F] by Cholesky factors of each point, [M, C, N_B N_SB F].
+    """Whiten columns [M, C, N_B, N_SB F] by the Cholesky factors of each point.
 
-    Also return the logarithms of the determinants, float64 [M].
+    Returns [M, C, N_B N_SB F], and the logarithms of the determinants, float64 [M].
     """
     white = np.linalg.solve(roots, np.moveaxis(columns, 1, 3))
     return (np.moveaxis(white, 3, 1).reshape(*columns.shape[:2], -1),
@@ -337,7 +337,7 @@ class DispersedLikelihood:
 
     @classmethod
     def of(cls, likelihood: Likelihood) -> 'DispersedLikelihood | None':
-        """Return this likelihood for a model, or None if element errors are negligible."""
+        """Return this likelihood, or None if element errors are known or accurately estimated."""
         model = likelihood.model
         if model.elements.is_exact:
             return None
@@ -418,8 +418,8 @@ class Alignment:
     """Estimates of the parameters that move the multipath, from the signals alone.
 
     Offsets of carrier and timing move the multipath out of the nulls of its covariance, so they
-    must be known before the search. `spread`, from `tabulate`, is the covariance of the mean
-    signals over the region, and accounts for the unknown position.
+    must be known before the search. `spread`, from `tabulate`, contains the second moments of the
+    whitened means over the region, and accounts for the unknown position.
     """
 
     def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:

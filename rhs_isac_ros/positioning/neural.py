@@ -3,10 +3,10 @@
 The paper mentions "256 nodes" in its description of Fig. 4; they are taken to be the units of the
 hidden layer. The paper does not specify the rest. Here, the inputs are the real and imaginary
 parts of the signals, or their magnitudes. The activation is ReLU, the loss is the squared position
-error, and the optimiser is Adam with a learning rate of 10^-3. The 10^5 simulated pairs are split
-7 : 1.5 : 1.5 for training, validation and test. If the validation error has not decreased for
-some epochs, the batch size grows, which reduces the noise of the steps. Training stops after the
-largest batches, and the weights of the best epoch are used.
+error, and the optimiser is Adam with a learning rate of 10^-3. The simulated pairs, 10^5 by
+default, are split 7 : 1.5 : 1.5 for training, validation and test. If the validation error has not
+decreased for some epochs, the batch size grows, which reduces the noise of the steps. Training
+stops after the largest batches or the last epoch, and the weights of the best epoch are used.
 """
 
 import copy
@@ -59,7 +59,7 @@ INPUTS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 class ModelError(ValueError):
-    """A trained model cannot be read, or belongs to another codebook or scenario."""
+    """A trained model is missing or invalid, or belongs to another codebook or scenario."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -80,13 +80,13 @@ class Network:
     center: np.ndarray  #: Centre of the region of interest, float64 [3] [m].
     covariance: np.ndarray  #: Second moments of the validation residuals, float64 [3, 3] [m^2].
     max_energy: float  #: Largest energy of a whitened mean signal over the simulated positions.
-    #: ``codebook``, the id of the codebook; ``scenario``, the fields that differ from Table I;
-    #: ``seed``, ``pairs``, ``epochs``, ``version``; ``validation_mse_m2`` and ``test_mse_m2``.
+    #: ``codebook``, its id; ``scenario``, the fields that differ from Table I; ``epochs``, the
+    #: best epoch; ``seed``, ``pairs``, ``version``; ``validation_mse_m2`` and ``test_mse_m2``.
     about: dict[str, Any]
     inputs: str = 'parts'  #: One of `INPUTS`.
 
     def __post_init__(self) -> None:
-        """Check that sizes agree and numbers are finite."""
+        """Check that the inputs are known, sizes agree and numbers are finite."""
         if self.inputs not in INPUTS:
             raise ModelError(f'inputs: {self.inputs!r}, expected one of {sorted(INPUTS)}')
         n_inputs, n_hidden = np.shape(self.w_in) if np.ndim(self.w_in) == 2 else (0, 0)
@@ -120,10 +120,10 @@ class Network:
 class NeuralEstimator:
     """Positions from a trained network, all with the covariance of the validation residuals.
 
-    The network cannot test whether signals fit the position it computes. It rejects only signals
-    that are weaker than noise, or stronger than any position could explain. Raises CodebookError
-    if the codebook does not fit the scenario, and ModelError if the model cannot be read or was
-    trained for another codebook or scenario.
+    The estimator does not test whether signals fit the position. It rejects only signals that are
+    weaker than multipath and noise alone, or stronger than any position could explain. Raises
+    CodebookError if the codebook does not fit the scenario, and ModelError if the model is
+    missing, cannot be read, or was trained for another codebook or scenario.
     """
 
     name = 'neural'
@@ -181,11 +181,11 @@ def train(
         progress: Callable[[int, float], None] | None = None, inputs: str = 'parts') -> Network:
     """Train a network, and return the state with the smallest validation error.
 
-    The seed determines the pairs (at least 20), their order and the initial weights. `n_hidden` is
-    the number of hidden units, and `inputs` a key of `INPUTS`. `progress` is called with the
-    number of each epoch and its validation error [m^2]. Raises CodebookError if the codebook does
-    not fit the scenario, ValueError if a number is too small or the inputs are unknown, and
-    MissingLibraryError if scikit-learn is not installed.
+    The seed determines the pairs, their order and the initial weights. `n_pairs` is at least 20,
+    `n_hidden` is the number of hidden units, and `inputs` is a key of `INPUTS`. `progress` is
+    called with the number of each epoch and its validation error [m^2]. Raises CodebookError if
+    the codebook does not fit the scenario, ValueError if a number is too small or the inputs are
+    unknown, and MissingLibraryError if scikit-learn is not installed.
     """
     for name, value, minimum in (('n_pairs', n_pairs, 20), ('n_hidden', n_hidden, 1),
                                  ('max_epochs', max_epochs, 1)):

@@ -1,10 +1,10 @@
 """The posterior of a position: weighted samples of its modes, in the region of interest.
 
-A mode is usually Gaussian, and its samples inside the region have equal weights. If the phases of
-the bands are unknown, only delays, amplitudes and the curvature of the wavefront determine the
-range. A mode then extends over metres, across which the log-likelihood is not quadratic and the
-volume element changes. Its samples become a proposal: each is weighted by the posterior relative
-to the mixture of all Gaussians, so modes may overlap.
+A mode is usually Gaussian. If it is inside the region, its samples there have equal weights. If
+every band has an unknown phase of its own, only delays, amplitudes and the curvature of the
+wavefront determine the range. A mode then extends over metres, across which the log-likelihood is
+not quadratic and the volume element changes. Samples are then drawn from wider Gaussians, and each
+is weighted by the posterior relative to the sum of their densities, so modes may overlap.
 """
 
 from collections.abc import Sequence
@@ -35,10 +35,10 @@ _SPREAD = 1.3
 _LIKELY_MARGIN = 20.0
 # Averages over the phases of the bands: spacing of the ranges, in standard deviations of the
 # product of the bands' factors; and number of values of a phase that all bands share, few because
-# the average over the range nearly removes this phase.
+# the average over the range nearly removes the effect of this phase.
 _SPACING = 1.5
 _N_COMMON = 8
-# Standard deviation of a nearly uniform wrapped phase. Below it, wraps by one turn suffice.
+# Largest standard deviation of a wrapped phase: it is nearly uniform, and one wrap suffices.
 _MAX_STD_RAD = 3.0
 
 
@@ -61,7 +61,8 @@ class Samples(NamedTuple):
 def draw_samples(modes: Modes, normal: np.ndarray, bounds: np.ndarray) -> Samples:
     """Represent the modes by samples, for a uniform prior between the bounds [2, 3] of the region.
 
-    `normal`, float64 [S, 3], contains points that represent a standard Gaussian.
+    `normal`, float64 [S, 3], contains points that represent a standard Gaussian. If no sample of a
+    phase is inside the region, all of them are moved onto its border.
     """
     points, curvature, roi_offset = modes.points, modes.curvature, modes.roi_offset
     starts = first_of_each(modes.phases)
@@ -69,8 +70,8 @@ def draw_samples(modes: Modes, normal: np.ndarray, bounds: np.ndarray) -> Sample
     log_mass = (modes.log_likelihood + np.log(np.linalg.det(jacobians))
                 - np.log(np.linalg.det(curvature)) / 2)
     factors = np.linalg.inv(np.swapaxes(np.linalg.cholesky(curvature), 1, 2))
-    # The Gaussian of a mode outside the region is sampled around the point where it enters
-    # the region; the weights of the samples correct for the shift.
+    # The Gaussian of a mode outside the region is sampled around its most likely point inside;
+    # the weights of the samples correct for the shift.
     shift = np.linalg.solve(factors, roi_offset[..., None])[..., 0]
     log_weights = (log_mass[:, None] - shift @ normal.T
                    - likelihood_loss(roi_offset, curvature)[:, None])
@@ -133,7 +134,7 @@ class WeightedSamples(NamedTuple):
 def draw_broad_samples(
         likelihood: Likelihood, conditionals: Sequence[Conditional], phases: 'BandPhases',
         signals: Signals, modes: Modes, normal: np.ndarray) -> Samples:
-    """Represent the modes of one phase by samples with the weights of the posterior.
+    """Represent the posterior of one phase by weighted samples of its widened modes.
 
     `conditionals` contains the likelihood for each state of the surface.
     """
@@ -164,7 +165,7 @@ def draw_broad_samples(
 
 def _log_proposal(points: np.ndarray, modes: Modes) -> np.ndarray:
     """Return the logarithm of the summed densities from which samples are drawn, [P]."""
-    # Expanded about a common centre, squares are matrix products, which take far less time.
+    # Expanded about a common centre, squared distances are matrix products, which are faster.
     centre = modes.roi_points.mean(axis=0)
     points, means = points - centre, modes.roi_points - centre
     spread = np.einsum('mab,mb->ma', modes.curvature, means)
@@ -177,19 +178,19 @@ def _log_proposal(points: np.ndarray, modes: Modes) -> np.ndarray:
 
 
 class BandPhases:
-    """The information in phases of the bands that are neither known nor uniform.
+    """The information in band phases that the search treats as uniform although they are not.
 
     Compared with uniform phases, the likelihood of a position has one more factor per band: the
-    density of the phase of the matched filter's output, which is a wrapped normal distribution
-    broadened by noise. Along the range, the product of these factors oscillates with the carriers,
-    far faster than the rest of the posterior. The product is therefore averaged over one
-    wavelength around each sample.
+    density of the phase of its matched filter's output, a wrapped normal density that noise
+    broadens. Along the range, the product of these factors oscillates with the carriers, far
+    faster than the rest of the posterior. The product is therefore averaged over one wavelength
+    around each sample.
     """
 
     def __init__(self, likelihood: Likelihood) -> None:
         prior = likelihood.nuisance
         self._std = prior.relative_phase_std_rad
-        # Whether the search has ignored this information; if not, there are no factors.
+        # Whether there is information that the search ignores; if not, there are no factors.
         self.is_informative = prior.is_coarse and self._std <= UNIFORM_STD_RAD
         if not self.is_informative:
             return
@@ -218,7 +219,7 @@ class BandPhases:
         return log_total, weights.sum(axis=2) @ self._ranges_m
 
     def _broadened(self, magnitude: np.ndarray) -> np.ndarray:
-        """Return the standard deviation of the phase of noisy outputs with these magnitudes."""
+        """Return the standard deviation of the phase of noisy outputs, at most `_MAX_STD_RAD`."""
         # Noise gives the phase a von Mises density, which is approximated by the wrapped normal
         # density with the same first harmonic.
         from scipy.special import i0e, i1e

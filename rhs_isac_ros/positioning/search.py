@@ -39,12 +39,12 @@ class Modes(NamedTuple):
     phases: np.ndarray  # Positioning phase of each mode, int [M], ascending.
     points: np.ndarray  # (r [m], u, v), float64 [M, 3].
     curvature: np.ndarray  # Curvature of the marginal log-likelihood there, float64 [M, 3, 3].
-    # Marginal log-likelihood, up to a constant, float64 [M]. Without nuisance parameters, it is
-    # minus the energy of the whitened residual.
+    # Marginal log-likelihood, up to a constant, float64 [M]. Without nuisance parameters and
+    # errors of the elements, it is minus the energy of the whitened residual at `points`.
     log_likelihood: np.ndarray
     roi_offset: np.ndarray  # Offset to the region, from `offset_to_roi`, float64 [M, 3].
     values: np.ndarray  # Nuisance parameters, float64 [M, Q].
-    residual: np.ndarray  # Energy of the whitened residual, float64 [M].
+    residual: np.ndarray  # Energy of the whitened residual at `roi_points`, float64 [M].
     state: np.ndarray  # Number of the state of the surface, int [M]; 0 if there is only one.
 
     @property
@@ -76,10 +76,10 @@ def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
                draw: Callable[[Query, int], bool] | None = None) -> Modes | None:
     """Find the modes with a substantial weight in the posterior of each of N phases.
 
-    Each phase has at least one mode, and the most likely mode comes first. `aligned`, float64
-    [N, Q], contains the parameters that follow from the signals alone, and 0 for the others.
-    `extra_margin` admits modes that are less likely than usual. With `draw`, phases may have no
-    modes, as `TemplateTable.starts` describes; the result is None if no phase has any.
+    The most likely mode of each phase comes first. `aligned`, float64 [N, Q], contains the
+    parameters that follow from the signals alone, and 0 for the others. `extra_margin` admits
+    modes that are less likely than usual. With `draw`, a phase may have no modes, as
+    `TemplateTable.starts` describes; the result is None if no phase has any.
     """
     starts = grid.starts(likelihood.whitened(aligned, signals), likelihood.nuisance,
                          GRID_MARGIN + extra_margin, draw)
@@ -91,10 +91,10 @@ def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
 
 def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
            n_steps: int, margin: float = EXACT_MARGIN, state: int = 0) -> Modes:
-    """Take Gauss-Newton steps from points to the modes of the posterior.
+    """Take up to `n_steps` Gauss-Newton steps from the starts to the modes of the posterior.
 
-    `conditional` is the likelihood for the state of the surface with the number `state`. A mode is
-    dropped if it is less likely than the best mode of its phase by more than the margin.
+    `conditional` is the likelihood for the state of the surface with the number `state`. `margin`
+    is the negative logarithm of the share of the posterior that discarded modes may have.
     """
     def step(starts: Starts, moves: bool = True) -> tuple[Modes, np.ndarray]:
         return _step(conditional, likelihood, starts, select(signals, starts.phases), state,
@@ -122,7 +122,7 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
 
 def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
                 values: np.ndarray, signals: Signals) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the marginal log-likelihood of points [M, 3], [M], and the best parameters, [M, Q].
+    """Compute the marginal log-likelihood at M points, [M], and the best parameters, [M, Q].
 
     Newton steps start from the approximate parameters `values`, [M, Q].
     """
@@ -137,7 +137,7 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
 
 def _step(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
           state: int, moves: bool = True) -> tuple[Modes, np.ndarray]:
-    """Take a scoring step, or none without `moves`; also return the log-likelihood gains, [M]."""
+    """Take a Gauss-Newton step, or none without `moves`; return the modes and gains, [M]."""
     points = starts.points
     values = likelihood.settle(points, starts.values, signals)
     local = conditional.local(points, values, signals)
@@ -157,7 +157,7 @@ def _step(conditional: Conditional, likelihood: Likelihood, starts: Starts, sign
 
 
 def predict(local: Local, likelihood: Likelihood) -> np.ndarray:
-    """Compute the marginal log-likelihood after a Gauss-Newton step, float64 [M]."""
+    """Predict the marginal log-likelihood after a Gauss-Newton step, float64 [M]."""
     marginal, _, rise = _newton(local, likelihood)
     return local.value + marginal.log_volume + rise
 

@@ -68,7 +68,7 @@ def table_key(model: MeasurementModel, codebook_id: str) -> str:
 
 
 def _write(path: Path, key: str, table: Mapping[str, np.ndarray]) -> None:
-    """Write a table atomically, and delete the least recently used tables."""
+    """Write a table atomically; delete the least recently used ones beyond `_MAX_TABLES`."""
     # The file has one record: key, digest and arrays. Arrays of wide numbers come first, so that
     # all arrays are aligned.
     names = sorted(table, key=lambda name: -table[name].real.itemsize)

@@ -37,7 +37,7 @@ from rhs_isac_ros.support.threads import one_blas_thread
 
 # Maximum number of components between phases.
 MAX_COMPONENTS = 48
-# A track ends after this time without a position [s].
+# A track ends after this time without an update [s].
 MAX_GAP_S = 10.0
 # Rate at which a track is assumed to be wrong [1/s]; the user is then anywhere in the region.
 _LOSS_RATE_HZ = 1e-3
@@ -48,8 +48,8 @@ _MIN_INSIDE = 0.02
 _MIN_SHARE = 0.25
 # Components with a smaller weight do not contribute to the estimate.
 _MIN_LOG_WEIGHT = -9.0
-# Maximum number of pairs of a component and a mode, and smallest log-weight of a pair relative to
-# the heaviest.
+# Maximum number of pairs of a component and a mode, and largest difference between the log-weights
+# of the heaviest pair and another.
 _MAX_PAIRS = 160
 _PAIR_MARGIN = 18.0
 # Number of pairs whose likelihood is evaluated with the exact model. Errors of the Gaussians alone
@@ -84,7 +84,7 @@ class Mixture(NamedTuple):
         return self.weighted(-log_sum(self.log_weights))
 
     def weighted(self, log_factor: float | np.ndarray) -> 'Mixture':
-        """Return the mixture with its weights multiplied by a factor."""
+        """Return the mixture with its weights multiplied by a factor, given as its logarithm."""
         return self._replace(log_weights=self.log_weights + log_factor)
 
     def velocity(self) -> tuple[np.ndarray, np.ndarray]:
@@ -98,7 +98,7 @@ class Mixture(NamedTuple):
 
 
 def reduce(mixture: Mixture, max_components: int) -> Mixture:
-    """Merge components that are close to a heavier one, and discard those of little weight."""
+    """Merge components close to a heavier one; discard light ones and any beyond the maximum."""
     order = np.argsort(-mixture.log_weights)
     order = order[mixture.log_weights[order] >= mixture.log_weights[order[0]] - _WEIGHT_MARGIN]
     mixture = select(mixture, order)
@@ -148,7 +148,7 @@ class Motion:
     turn_s: float = 2.0  #: Mean time between turns.
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
+        """Raise ValueError unless all fields are positive and finite."""
         for name in ('speed_mps', 'memory_s', 'turn_s'):
             value = getattr(self, name)
             if not 0 < value < np.inf:
@@ -171,9 +171,9 @@ class Motion:
     def predict(self, mixture: Mixture, elapsed_s: float) -> Mixture:
         """Return the mixture after a time [s].
 
-        Every component splits into one without a turn and one with a turn in each of the
-        `_TURN_INTERVALS`. Means move in straight lines; the covariances neglect the curvature of
-        the coordinates.
+        Every component splits into one without a turn and, unless its weight is low, one with a
+        turn in each of the `_TURN_INTERVALS`. Means move in straight lines; the covariances
+        neglect the curvature of the coordinates.
         """
         log_no_turn = -elapsed_s / self.turn_s
         turn = -np.expm1(log_no_turn)
@@ -205,10 +205,10 @@ class Motion:
         return moved
 
     def _noise(self, elapsed_s: float, decay: float) -> np.ndarray:
-        """Return the covariance of position and velocity along an axis, float64 [2, 2]."""
+        """Return the noise covariance of position and velocity along an axis, float64 [2, 2]."""
         variance, memory_s = self.velocity_variance, self.memory_s
         ratio = elapsed_s / memory_s
-        # The difference cancels for short times; its leading term is 2 ratio^3 / 3.
+        # For short times, the terms nearly cancel; their sum is then 2 ratio^3 / 3.
         drift = 2 * ratio - 3 + 4 * decay - decay**2 if ratio > 1e-3 else 2 * ratio**3 / 3
         return variance * np.array([
             [memory_s**2 * drift, memory_s * (1 - decay)**2],
@@ -254,7 +254,7 @@ class Tracker:
 
     The first position of a track is the estimate itself. A track ends after a gap of more than
     `MAX_GAP_S`. A phase does not change the track if it has no position, or if its multipath is
-    almost the same as in the previous phase. While the user is blocked, the position is a
+    almost the same as in the latest phase that did. While the user is blocked, the position is a
     prediction. Positions are inside the region of interest.
 
     The attribute `estimator` may be replaced between phases, for example for another codebook. The
@@ -270,7 +270,7 @@ class Tracker:
 
     @one_blas_thread
     def update(self, time_s: float, received: np.ndarray) -> TrackEstimate:
-        """Estimate position and velocity at the time [s] of a phase, also from earlier phases.
+        """Estimate position and velocity at the time [s] of a phase from this and earlier phases.
 
         Takes signals, complex128 [N_B, N_SB F]; raises `SignalError` if they are unusable. If the
         phase is not later than the previous one, its position follows from its own signals alone,
@@ -341,7 +341,7 @@ class Tracker:
         return reduce(concatenate(*parts, lost), MAX_COMPONENTS).normalised()
 
     def _inside(self, mixture: Mixture) -> tuple[Mixture, np.ndarray, np.ndarray]:
-        """Return the components that reach the region, and their mean and covariance inside."""
+        """Return the mixture without components outside the region; mean and covariance inside."""
         heavy = mixture.log_weights >= _MIN_LOG_WEIGHT
         mixture, light = select(mixture, heavy), select(mixture, ~heavy)
         factors = np.linalg.cholesky(mixture.covariances[:, :3, :3])
@@ -388,10 +388,10 @@ def update(
         signals: Signals) -> Mixture:
     """Return the product of a predicted mixture and the likelihood of a phase, not normalised.
 
-    Every mode updates every component. Each component is also kept without an update, in case the
-    search has missed an unlikely mode inside it that is as wide as the best one. `share`, from 0
-    to 1, is the exponent of the likelihood; it is below 1 if the multipath resembles the previous
-    phase's. The heaviest pairs of mode and component are evaluated with `likelihood`, if given.
+    Every mode updates every component, and the heaviest results are kept. `likelihood`, if given,
+    evaluates the heaviest of all. Each component is also kept without an update, for an unlikely
+    mode that the search may have missed; it is assumed to be as wide as the best mode. `share`,
+    from 0 to 1, is the exponent of the likelihood: below 1 if successive multipath is similar.
     """
     spread = np.linalg.inv(modes.curvature) / share
     offsets = modes.points[:, None] - predicted.means[:, :3]
@@ -433,7 +433,7 @@ def _exact_update(
 
 
 def _is_first(updated: Mixture, component: np.ndarray) -> np.ndarray:
-    """Mark the components that differ from all earlier ones, bool [C]."""
+    """Mark the updates that differ from all earlier updates of the same component, bool [C]."""
     # Several modes that have not converged may lead one predicted component, given by its index,
     # to the same maximum, which must not count twice.
     points = updated.means[:, :3]
