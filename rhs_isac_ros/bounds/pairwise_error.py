@@ -82,7 +82,8 @@ class PairwiseErrorCost(Average):
         if not 1 <= n <= total:
             raise ValueError(f'n: {n}, expected 1 to {total}, the number of pairs')
         if not isinstance(self.rows, CompressedRows):
-            raise ValueError('tolerance: 0, expected compressed differences to draw a sample of')
+            raise ValueError('differences: not compressed, expected a tolerance above 0 and more '
+                             'pairs to draw a sample of')
         costs = self.losses(codebook)
         shares = np.full(total, 1 / total)
         if costs.any():

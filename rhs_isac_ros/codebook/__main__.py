@@ -212,7 +212,8 @@ def _choose_bands(
 
 
 def _save_plan(path: Path, scenario: Scenario) -> None:
-    changes = yaml.safe_dump(scenario.changes(), sort_keys=False, default_flow_style=None)
+    changes = yaml.safe_dump(
+        scenario.changes(path.parent), sort_keys=False, default_flow_style=None)
     write_whole(path, f'# Chosen by python3 -m rhs_isac_ros.codebook --spectrum. Omitted '
                       f'fields have the values of Table I.\n{changes}')
 

@@ -56,7 +56,7 @@ def ambiguity(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
         tick: Tick = no_tick) -> Average:
     """Objective [m^2]: mean cost of confusing sampled positions with ones of similar signals."""
-    first_positions = np.repeat(positions, _PAIRS_PER_POSITION, axis=0)
+    first_positions = np.repeat(checked_positions(positions), _PAIRS_PER_POSITION, axis=0)
     second_positions = draw_confusable(scenario, first_positions, rng)
     return PairwiseErrorCost(
         scenario, first_positions, second_positions, tolerance=ROW_TOLERANCE, tick=tick)

@@ -111,10 +111,11 @@ def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, An
     """
     world, book = Scenario(**scenario), Codebook.from_parameters(dict(codebook))
     if family == BOUND:
+        # The bound needs at least two phases.
         bound = global_bound(
-            world, book, streams.generator(seed, streams.HELD_OUT, first), n)
+            world, book, streams.generator(seed, streams.HELD_OUT, first), max(n, 2))
         loose = bound.coarseness > _MAX_COARSENESS
-        return {'bound_m2': [np.nan] * n if loose else bound.squared_errors.tolist()}
+        return {'bound_m2': [np.nan] * n if loose else bound.squared_errors[:n].tolist()}
     positions, received = simulate_pairs(world, book, n, seed, first)
     if family == CRLB:
         return {'crlb_m2': crlb(world, book, positions).tolist()}

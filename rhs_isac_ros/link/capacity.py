@@ -41,11 +41,17 @@ def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarra
     return capacities(scenario, [beam], positions)[0]
 
 
-def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray) -> np.ndarray:
-    """Compute `capacity` for several beams, float64 [n, N] [bit/s]."""
+def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray,
+               blocked: np.ndarray | None = None) -> np.ndarray:
+    """Compute `capacity` for several beams, float64 [n, N] [bit/s].
+
+    `blocked`, bool [N], marks users without a direct path.
+    """
     bands = [beam.band for beam in beams]
     radiation = np.stack([_radiation(scenario, beam) for beam in beams])
     direct = np.abs(los_sums(scenario, positions, bands, radiation))**2
+    if blocked is not None:
+        direct[:, blocked] = 0
     through = spatial_covariance(scenario)[band_index(bands)].scatter(radiation)
     scattered = np.sum((through * np.conj(radiation)).real, axis=-1)[:, None]
     return _rate(scenario, direct + scattered)
@@ -54,12 +60,12 @@ def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray)
 @one_blas_thread
 def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray,
                     blocked: np.ndarray | None = None) -> np.ndarray:
-    """Compute the capacity over the paths of the channel file, or else `capacity`.
+    """Compute the capacity over the paths of the channel file, or else by Eq. (10).
 
-    `blocked`, bool [N], marks users without a direct path. Without a file, it has no effect.
+    `blocked`, bool [N], marks users without a direct path.
     """
     if not scenario.channel:
-        return capacity(scenario, beam, positions)
+        return capacities(scenario, [beam], positions, blocked)[0]
     gains = direct_gain(scenario, positions, beam.band, blocked)
     signals = np.einsum('njm,jm->nj', gains, _radiation(scenario, beam))
     return _rate(scenario, np.abs(signals)**2)

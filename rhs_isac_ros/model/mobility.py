@@ -13,6 +13,8 @@ from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.support import plugins
 
 KINDS = ('static', 'waypoints', 'random_walk')
+# Duration of a leg without length.
+_STAND_S = 1.0
 
 
 class Mobility(Protocol):
@@ -121,7 +123,8 @@ class Waypoints:
 class RandomWalk(StraightMobility):
     """A user that walks straight between random positions from `Scenario.sample_positions`.
 
-    The first position is also random, unless it is given as `start`, float64 [3] [m].
+    The first position is also random, unless it is given as `start`, float64 [3] [m]. If the same
+    position is drawn twice, the user stands there for `_STAND_S`.
     """
 
     def __init__(
@@ -151,6 +154,9 @@ class RandomWalk(StraightMobility):
         """Compute the velocity and duration once per leg, because a node may have many users."""
         leg = self._target - self._origin
         length = float(np.linalg.norm(leg))
+        if length == 0:
+            self._velocity, self._duration_s = leg, _STAND_S
+            return
         self._velocity = leg / length * self._speed_mps
         self._duration_s = length / self._speed_mps if self._speed_mps else math.inf
 

@@ -7,6 +7,7 @@ import hashlib
 import itertools
 import json
 import operator
+import os
 from pathlib import Path
 from typing import Any
 
@@ -212,7 +213,7 @@ class Scenario(Extensions, Table1):
 
     A scenario has the fields of `Table1` and those of `Extensions`.
 
-    Lengths are in metres in the frame ``map``: the surface lies in the plane x = 0, centred on
+    Lengths are in metres in the frame of the surface, which lies in the plane x = 0, centred on
     the origin, with x pointing outward and z up.
 
     A gain is a number, a `GainPattern`, a function of the angle from boresight, or the name of an
@@ -277,14 +278,19 @@ class Scenario(Extensions, Table1):
         with translated(ScenarioError, ScenarioError, path):
             return cls(**content)
 
-    def changes(self) -> dict[str, Any]:
+    def changes(self, folder: str | Path | None = None) -> dict[str, Any]:
         """Return the fields that differ from their defaults, as values that `from_yaml` can read.
 
-        Gain patterns are written as name and digest, and files as path and digest. A pattern that
-        is not a plug-in cannot be read back, and neither can arrays that are not in a file.
+        Gain patterns are written as name and digest, and files as path and digest. Given the
+        `folder` of a scenario file, paths are relative to it. A pattern that is not a plug-in
+        cannot be read back, and neither can arrays that are not in a file.
         """
-        return {field.name: _plain(value) for field in dataclasses.fields(self)
-                if (value := getattr(self, field.name)) != field.default}
+        changes = {field.name: _plain(value) for field in dataclasses.fields(self)
+                   if (value := getattr(self, field.name)) != field.default}
+        if folder is not None:
+            changes |= {name: os.path.relpath(changes[name], folder)
+                        for name in _FILES if name in changes}
+        return changes
 
     def fields(self) -> dict[str, Any]:
         """Return all fields by name, as plain values; see `changes`."""

@@ -469,8 +469,8 @@ class BaseStation(StateMachine):
             Row(ANY, (_store_settings,))),
         *on(events.StoodBy, 'stood_by')(
             # A pause persists while another base station serves.
-            Row(ANY, (_forget_peers,), State.PAUSED, guard=_pausing),
-            Row(ANY, (_forget_peers,), State.WAITING)),
+            Row(ANY, (_forget_peers, _apply_settings), State.PAUSED, guard=_pausing),
+            Row(ANY, (_forget_peers, _apply_settings), State.WAITING)),
         *on(events.Resumed, 'resumed')(
             Row((State.WAITING, State.PAUSED), (_skip_cycles,))),
         *on(events.PauseRequested, 'pause')(
@@ -500,7 +500,8 @@ class BaseStation(StateMachine):
             Row((State.BEACONING,), (_grant,), State.CONFIGURING, guard=_some_acks),
             Row((State.BEACONING,), (_apply_settings, _log_unanswered), State.PAUSED,
                 guard=_pausing),
-            Row((State.BEACONING,), (_log_not_ready,), State.WAITING, guard=_not_ready),
+            Row((State.BEACONING,), (_apply_settings, _log_not_ready), State.WAITING,
+                guard=_not_ready),
             Row((State.BEACONING,), (_apply_settings, _beacon_again), outcome=Outcome.UNANSWERED,
                 restart_timeout=True),
             Row((State.CONFIGURING,), (_command_bands,), guard=_may_retry,

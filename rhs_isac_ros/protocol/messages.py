@@ -186,8 +186,14 @@ def same_instance(one: int, other: int) -> bool:
 def same(one: Message, other: Message) -> bool:
     """Return whether two messages have the same class and equal fields, apart from the stamps."""
     return type(one) is type(other) and all(
-        np.array_equal(getattr(one, field.name), getattr(other, field.name))
+        _equal(getattr(one, field.name), getattr(other, field.name))
         for field in dataclasses.fields(one) if field.name != 'stamp_ns')
+
+
+def _equal(one: object, other: object) -> bool:
+    """Compare values or arrays; NaN equals NaN."""
+    can_be_nan = np.asarray(one).dtype.kind in 'fc'
+    return np.array_equal(one, other, equal_nan=can_be_nan)  # type: ignore[arg-type]
 
 
 # Fields that the messages of a cycle share.

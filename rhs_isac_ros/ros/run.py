@@ -111,9 +111,9 @@ def parameter_help(executable: str) -> str:
     if executable == 'optimizer':
         lines += [f'  {name}\n      {text}' for name, text in CODEBOOK.items()]
     elif composed := _composed(executable):
-        # `network` sets user_id itself.
+        # `network` sets these itself.
         others = {parameter.name: parameter for name in composed for parameter in NODES[name]
-                  if parameter.name != 'user_id'}
+                  if parameter.name not in ('user_id', 'user_count')}
         lines += ['', 'ROS parameters of the composed nodes:', *map(_describe, others.values())]
     example = _example(own)
     return '\n'.join([*lines, '', f'example: {executable} --ros-args -p {example}'])

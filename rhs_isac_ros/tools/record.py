@@ -1,4 +1,4 @@
-"""``scripts/record FILE``: records the messages and the scenario of a network."""
+"""``scripts/record FILE``: records topics and the scenario of a network."""
 
 import argparse
 

@@ -225,7 +225,7 @@ def _first_codebook(options: argparse.Namespace) -> Codebook:
 def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
         file = Path(folder) / 'scenario.yaml'
-        file.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
+        file.write_text(yaml.safe_dump(scenario.changes(folder)), encoding='utf-8')
         return OptimizerNode(parameter_overrides=ros_parameters(
             {'scenario_file': str(file), **codebook.to_parameters()}))
 

@@ -267,7 +267,7 @@ def test_a_sample_of_another_number_of_pairs_is_an_error(many, codebook, n):
 
 
 def test_exact_differences_are_not_sampled(scenario, codebook, pairs):
-    with pytest.raises(ValueError, match='^tolerance: 0, expected compressed differences'):
+    with pytest.raises(ValueError, match='^differences: not compressed'):
         PairwiseErrorCost(scenario, *pairs).sample(codebook, 2, np.random.default_rng(0))
 
 

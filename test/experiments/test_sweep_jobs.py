@@ -88,6 +88,7 @@ def test_the_global_bound_of_a_coarse_lattice_is_missing(case, monkeypatch):
     assert len(found) == 4
     assert np.isfinite(found).all()
     assert found != evaluate('bound', **case, first=250, n=4)['bound_m2']
+    assert len(evaluate('bound', **case, first=250, n=1)['bound_m2']) == 1
     monkeypatch.setattr(sweep_jobs, '_MAX_COARSENESS', 0.5)
     assert np.isnan(evaluate('bound', **case, first=0, n=4)['bound_m2']).all()
 

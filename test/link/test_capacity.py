@@ -259,6 +259,9 @@ def test_the_actual_capacity_is_that_of_the_paths(small):
     beam, users = random_beam(scenario, rng), scenario.sample_positions(3, rng)
     assert actual_capacity(scenario, beam, users) == pytest.approx(
         capacity(scenario, beam, users))
+    blocked = np.array([False, True, False])
+    assert actual_capacity(scenario, beam, users, blocked) == pytest.approx(
+        np.where(blocked, capacity(scenario, beam, 1e9 * users), capacity(scenario, beam, users)))
     f0 = scenario.center_frequencies_hz[0]
     distance = np.linalg.norm(users, axis=1)[:, None]
     a = np.tile(299_792_458 / (4 * np.pi * f0 * distance), (1, 2)) + 0j

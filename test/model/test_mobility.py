@@ -36,6 +36,16 @@ def test_a_traced_user_is_at_the_nearest_traced_position():
     np.testing.assert_array_equal(velocities, [[1, 0, 0]] * 5)
 
 
+def test_a_walk_between_equal_positions_stands():
+    users = np.array([[6.0, 0, 0]])
+    paths = PathChannel(users, np.full((1, 1), 1e-4 + 0j), users[:, None],
+                        np.zeros((1, 1), int), 2.75e9)
+    walk = mobility.RandomWalk(Scenario(channel=paths), 1.0, np.random.default_rng(0))
+    positions, velocities = track(walk, [0.0, 0.4, 5.0])
+    np.testing.assert_array_equal(positions, users[[0, 0, 0]])
+    np.testing.assert_array_equal(velocities, np.zeros((3, 3)))
+
+
 @pytest.mark.parametrize('make', [
     lambda: mobility.Static((7, -1, 0)),
     lambda: mobility.Waypoints(SQUARE, 0.0),

@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario, ScenarioError
+from rhs_isac_ros.model.hall import PathChannel
 from rhs_isac_ros.support import plugins
 
 
@@ -230,6 +231,18 @@ def test_changes_written_to_a_file_give_the_same_scenario(tmp_path, changes):
     path, scenario = tmp_path / 'scenario.yaml', Scenario(**changes)
     path.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
     assert Scenario.from_yaml(path) == scenario
+
+
+def test_paths_are_relative_to_the_folder_of_the_file(tmp_path, monkeypatch):
+    users = np.array([[7.0, 0, 0]])
+    PathChannel(users, np.full((1, 1), 1e-4 + 0j), users[:, None], np.zeros((1, 1), int),
+                2.75e9).save(tmp_path / 'paths.npz')
+    monkeypatch.chdir(tmp_path)
+    scenario = Scenario(channel='paths.npz')
+    (tmp_path / 'plans').mkdir()
+    path = tmp_path / 'plans' / 'plan.yaml'
+    path.write_text(yaml.safe_dump(scenario.changes(path.parent)), encoding='utf-8')
+    assert Scenario.from_yaml(path).id == scenario.id
 
 
 def test_a_given_default_is_not_a_change(case):

@@ -51,6 +51,9 @@ def test_messages_are_the_same_if_all_fields_are_equal(example):
     for changes in ({'cycle_id': 4}, {'user': 2}, {'analog': one.analog + 0.5}):
         assert not m.same(one, dataclasses.replace(one, **changes))
     assert not m.same(m.Ack(cycle_id=1, user=2), m.Grant(cycle_id=1, user=2))
+    unknown = example(m.PositionEstimate, crlb_m2=np.nan)
+    assert m.same(unknown, dataclasses.replace(unknown))
+    assert not m.same(unknown, dataclasses.replace(unknown, crlb_m2=0.5))
 
 
 def test_a_message_takes_the_fields_of_its_cycle_from_another():

@@ -6,6 +6,7 @@ import pytest
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.events import PeersChanged, StoodBy
 from rhs_isac_ros.protocol.settings import Impairments, PositionerSettings
 
 pytestmark = pytest.mark.usefixtures('plain_beams')
@@ -73,6 +74,24 @@ def test_a_list_of_users_without_any_present_user_can_be_corrected(network):
     net.change('bs', allowed_users='2')
     net.run_cycles(2)
     assert net.served() == [2, 2]
+
+
+def test_settings_take_effect_when_an_unanswered_cycle_is_given_up(network):
+    net = network(1, allowed_users='99')
+    net.run_to(State.BEACONING)
+    net.change('bs', policy='random')
+    net.dispatch('bs', PeersChanged(('positioner',)))
+    net.run(limit_s=2.0)
+    assert net['bs'].state is State.WAITING
+    assert status_of(net, 'bs', 'pending') == {}
+
+
+def test_settings_take_effect_when_another_base_station_serves(network):
+    net = network()
+    net.run_to(State.SOUNDING)
+    net.change('bs', policy='random')
+    net.dispatch('bs', StoodBy())
+    assert status_of(net, 'bs', 'pending') == {}
 
 
 def test_a_long_pause_ends_when_it_is_shortened(network):
