@@ -12,6 +12,7 @@ amplitude adds to the covariance. The search for sets uses the average covarianc
 errors, and the likelihood of a set uses their covariance at each point.
 """
 
+import collections
 import dataclasses
 import functools
 import itertools
@@ -103,9 +104,11 @@ class FailedElements:
             found = self._grid.starts(
                 self._likelihood.whitened(aligned, signals), self._likelihood.nuisance,
                 _POINT_MARGIN)
-            keys = [((), index) for index in range(len(search.sites))]
-            keys += search.add(found.points[:_MAX_POINTS], found.values[:_MAX_POINTS] + aligned)
-            search.grow(keys[:_N_SITES], _REMAINDER)
+            search.add(found.points[:_MAX_POINTS], found.values[:_MAX_POINTS] + aligned)
+            chosen = first_sites(
+                np.stack([site.point for site in search.sites]),
+                self._likelihood.resolution.separation(self._likelihood.nuisance.is_coarse))
+            search.grow([((), index) for index in chosen], _REMAINDER)
         search.try_neighbours(search.best)
         return search
 
@@ -132,6 +135,22 @@ class FailedElements:
         modes = concatenate(*parts)
         order = np.argsort(-modes.roi_log_likelihood)[:_MAX_HYPOTHESES]
         return select(modes, order), conditionals
+
+
+def first_sites(points: np.ndarray, radii: np.ndarray) -> list[int]:
+    """Return indices of points (r, u, v), float64 [P, 3], from which sets of failures grow.
+
+    Half of them are the first points. The others are the first points of as many directions as
+    possible, because the ranges in one direction have nearly the same probable sets. Directions
+    differ by the `radii`, float64 [3].
+    """
+    seen = collections.Counter[tuple[int, ...]]()
+    turns = np.empty(len(points))
+    for index, cell in enumerate(map(tuple, np.floor(points[:, 1:] / radii[1:]).tolist())):
+        turns[index] = seen[cell]
+        seen[cell] += 1
+    turns[:_N_SITES // 2] = -1
+    return np.argsort(turns, kind='stable')[:_N_SITES].tolist()
 
 
 class Surface(NamedTuple):

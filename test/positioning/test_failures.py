@@ -16,6 +16,7 @@ from rhs_isac_ros.positioning.failures import (
     FailureSearch,
     Whitening,
     can_enumerate,
+    first_sites,
 )
 from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
 
@@ -293,3 +294,15 @@ def test_neighbours_differ_by_one_element(ambiguous):
     assert {17} in sets
     assert all(len(one ^ {3, 17}) <= 2 for one in sets)
     assert any(len(one) == 3 for one in sets)
+
+
+def test_sets_grow_from_the_best_points_and_from_the_best_of_each_direction():
+    # 100 ranges in each of three directions, the more probable direction first.
+    points = np.array([(4 + 0.01 * n, u, 0.1) for u in (0.05, 0.35, 0.65) for n in range(100)])
+    chosen = first_sites(points, np.array([0.1, 0.1, 0.1]))
+    assert len(set(chosen)) == 64
+    assert chosen[:32] == list(range(32))
+    # The first direction has had its turns.
+    assert chosen[32:] == [n for pair in zip(range(100, 116), range(200, 216), strict=True)
+                           for n in pair]
+    assert first_sites(points[:5], np.ones(3)) == list(range(5))
