@@ -36,8 +36,9 @@ def plot_optimization(
     Returns a `matplotlib.figure.Figure`. Raises MissingLibraryError without Matplotlib.
     """
     rows = -(-scenario.n_bands // _N_COLUMNS)
-    figure = new_figure(PAGE_IN, 2.7 + 2.3 * rows)
-    above, below = figure.add_gridspec(2, 1, height_ratios=(2.7, 2.3 * rows))
+    heights_in = 2.7, 2.3 * rows
+    figure = new_figure(PAGE_IN, sum(heights_in))
+    above, below = figure.add_gridspec(2, 1, height_ratios=heights_in)
     left, right = above.subgridspec(1, 2).subplots()
     _draw_convergence(left, history)
     _draw_bound(right, scenario, codebook)

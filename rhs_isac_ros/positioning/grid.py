@@ -364,7 +364,7 @@ class TemplateTable:
 
     def _step(self, query: 'Query', peaks: '_Peaks', points: np.ndarray, values: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute Gauss-Newton steps from peaks, [P, 3], and predicted log-likelihoods, [P]."""
+        """Return Gauss-Newton steps [P, 3] from peaks, and log-likelihoods [P] predicted after them."""
         grid, prior, node = self.grid, query.prior, self.grid.node[peaks.cell]
         pairs, index = np.unique(peaks.phases * len(grid.nodes) + node, return_inverse=True)
         phase, its_node = np.divmod(pairs, len(grid.nodes))

@@ -188,6 +188,19 @@ def test_the_bands_are_chosen_with_the_codebook(call, files, scenario, capsys, m
     assert Provenance.parse(codebook.provenance).objective == 'error'
     assert f'{plan}: ' in capsys.readouterr().out
 
+    def first_of_two(scenario, candidates, search, *rest):
+        best = band_plan.best_of(scenario, candidates[:1], search, *rest)
+        search(band_plan.with_bands(scenario, candidates[1].frequencies_hz))
+        return best
+    monkeypatch.setattr(__main__, 'best_of', first_of_two)
+    assert call('--spectrum', '2.5e9:2.52e9', '3e9:3e9', '--bands', 2, '--raster', 5e6,
+                '--steps', 3, '--plan', plan) == 0
+    Codebook.load(files / 'codebook.yaml').check(Scenario.from_yaml(plan))
+    (_, line) = [line for line in capsys.readouterr().out.splitlines() if 'GHz' in line][-1].split(
+        ': ')
+    assert line.startswith(', '.join(
+        f'{frequency / 1e9:g}' for frequency in Scenario.from_yaml(plan).center_frequencies_hz))
+
 
 @pytest.mark.parametrize(('arguments', 'words'), [
     (['--spectrum', '2.5e9:3e9'], ['--bands: expected together with --spectrum']),

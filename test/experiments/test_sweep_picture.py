@@ -97,7 +97,7 @@ def test_lists_and_names_are_places_in_their_order():
 
 
 @pytest.mark.parametrize(('largest', 'scale', 'unit'), [
-    (2e5, 'linear', 'kbit/s'), (2e8, 'linear', 'Mbit/s')])
+    (2e5, 'linear', 'kbit/s'), (1e6, 'linear', 'Mbit/s'), (2e8, 'linear', 'Mbit/s')])
 def test_capacities_have_a_prefix(largest, scale, unit):
     (panel,) = panels_of(drawn('n_frames=1,100', panels=[['capacity']],
                                value=lambda scenario: largest / scenario.n_frames))

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -59,6 +60,20 @@ def test_results_come_in_the_order_of_the_jobs(tmp_path):
     worker = Worker()
     assert run_jobs(worker, JOBS, tmp_path / 'new' / 'folder', n_jobs=1) == SQUARES
     assert worker.seen == [0, 1, 2, 3]
+
+
+def test_jobs_run_at_the_same_time(tmp_path):
+    def meet(number):
+        """Wait for the other job."""
+        (tmp_path / f'here-{number}').touch()
+        deadline = time.monotonic() + 60
+        while not (tmp_path / f'here-{1 - number}').exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        return {}
+
+    jobs = [Job(str(number), {'number': number}) for number in range(2)]
+    assert run_jobs(meet, jobs, tmp_path, n_jobs=2) == [{}, {}]
 
 
 def test_finished_jobs_are_not_repeated(tmp_path):

@@ -2,8 +2,15 @@
 
 import numpy as np
 import pytest
+from scipy.special import logsumexp
+from scipy.stats import norm
 
-from rhs_isac_ros.model.gaussian import marginalise, quadratic_form, step_to_maximum
+from rhs_isac_ros.model.gaussian import (
+    log_evidence_of_level,
+    marginalise,
+    quadratic_form,
+    step_to_maximum,
+)
 
 N = 6
 
@@ -98,3 +105,15 @@ def test_a_step_leads_to_the_maximum():
     information, gradient = np.array([[[2.0, 1.0], [1.0, 3.0]]]), np.array([[4.0, 5.0]])
     step = step_to_maximum(information, gradient)
     np.testing.assert_allclose(information[0] @ step[0], gradient[0])
+
+
+@pytest.mark.parametrize('median_db', [0.0, -6.0])
+def test_the_evidence_of_a_level_is_the_average_over_it(median_db):
+    energy, n, std_db = np.array([0.1, 50.0, 5e3]), 512, 12.0
+    db = np.linspace(-60, 60, 200_001)
+    level = db * np.log(10) / 10
+    expected = logsumexp(
+        -energy[:, None] * np.exp(-level) - n * level + norm(median_db, std_db).logpdf(db),
+        axis=1) + np.log(db[1] - db[0])
+    np.testing.assert_allclose(
+        log_evidence_of_level(energy, n, std_db, median_db), expected, atol=0.05)

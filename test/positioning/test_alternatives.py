@@ -8,7 +8,6 @@ from scipy.special import ive, logsumexp
 from scipy.stats import norm
 
 from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
-from rhs_isac_ros.model.gaussian import log_evidence_of_level
 from rhs_isac_ros.model.hall import CONDITIONS, MultipathEstimate
 from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.model.los import draw_blocked
@@ -200,18 +199,6 @@ def signals_of(scenario, codebook, seed):
     draw_impairments(scenario, N_USERS, rng)
     blocked = draw_blocked(scenario, N_USERS, rng)
     return positions, received, blocked
-
-
-@pytest.mark.parametrize('median_db', [0.0, -6.0])
-def test_the_evidence_of_a_level_is_the_average_over_it(median_db):
-    energy, n, std_db = np.array([0.1, 50.0, 5e3]), 512, 12.0
-    db = np.linspace(-60, 60, 200_001)
-    level = db * np.log(10) / 10
-    expected = logsumexp(
-        -energy[:, None] * np.exp(-level) - n * level + norm(median_db, std_db).logpdf(db),
-        axis=1) + np.log(db[1] - db[0])
-    np.testing.assert_allclose(
-        log_evidence_of_level(energy, n, std_db, median_db), expected, atol=0.05)
 
 
 def test_blocked_users_have_the_multipath_alone(shipped):
