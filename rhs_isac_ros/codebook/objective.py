@@ -55,7 +55,7 @@ def nuisance(
 def ambiguity(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
         tick: Tick = no_tick) -> Average:
-    """Objective [m^2]: mean cost of confusing sampled positions with others that have similar signals."""
+    """Objective [m^2]: mean cost of mistaking sampled positions for ones with similar signals."""
     first_positions = np.repeat(checked_positions(positions), _PAIRS_PER_POSITION, axis=0)
     second_positions = draw_confusable(scenario, first_positions, rng)
     return PairwiseErrorCost(

@@ -364,7 +364,7 @@ class TemplateTable:
 
     def _step(self, query: 'Query', peaks: '_Peaks', points: np.ndarray, values: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:
-        """Return Gauss-Newton steps [P, 3] from peaks, and log-likelihoods [P] predicted after them."""
+        """Compute a Gauss-Newton step [P, 3] for each peak; predict its new log-likelihood [P]."""
         grid, prior, node = self.grid, query.prior, self.grid.node[peaks.cell]
         pairs, index = np.unique(peaks.phases * len(grid.nodes) + node, return_inverse=True)
         phase, its_node = np.divmod(pairs, len(grid.nodes))
