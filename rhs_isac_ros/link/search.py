@@ -151,7 +151,7 @@ def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
 
 def _scattered_configurations(
         paths: np.ndarray, fixed: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Search from random pairs of waves for configurations that suit the multipath alone."""
+    """From random pairs of waves, search for configurations that suit the multipath alone."""
     shape = (len(paths), _N_STARTS, *paths.shape[2:])
     on_board = _complex_normal((*shape[:-1], 1), rng)
     in_air = _complex_normal((*shape[:-2], 1, shape[-1]), rng)

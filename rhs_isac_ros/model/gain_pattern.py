@@ -34,7 +34,7 @@ class GainPattern(External):
 
     Two patterns are equal if their gains, and their slopes if given, agree in single precision.
     Raises PatternError if a function fails or does not return real numbers in the right shape, if
-    a gain is out of range, or if all gains below pi/2 are 0.
+    a gain is out of range, or if the gain is 0 at all angles below pi/2.
 
     Parameters
     ----------

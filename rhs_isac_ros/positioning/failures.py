@@ -366,7 +366,7 @@ class FailureModel:
         return self._extensions[failed, remainder]
 
     def _growth(self, surface: Surface, elements: slice = slice(None)) -> np.ndarray:
-        """Return the change of a surface's covariance due to each failure, [N_E, N_B, S, S]."""
+        """Return how each failure changes a surface's covariance, [N_E, N_B, N_SB F, N_SB F]."""
         shift, spread = self._shift[elements], self.amplitudes[elements]
         power = np.diagonal(self._spatial, axis1=1, axis2=2).real.T[elements, :, None]
         cross = np.moveaxis(surface.scattered[..., elements], 2, 0) + power / 2 * shift

@@ -28,9 +28,9 @@ GRID_MARGIN = 8.0
 EXACT_MARGIN = 7.0
 # A mode has converged when its last step gained less log-likelihood than this.
 _MIN_GAIN = 0.05
-# Maximum number of exact steps. Few modes need more than two, unless signals are strong.
+# Maximum number of exact steps. Few modes need more than two, unless signals are strong. At the
+# border of the region, small gains may alternate.
 MAX_STEPS = 8
-_N_USUAL_STEPS = 4
 
 
 class Modes(NamedTuple):
@@ -104,8 +104,7 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     for number in range(n_steps):
         chosen = _prune(likelihood, modes, gain, margin)
         modes, gain = select(modes, chosen), gain[chosen]
-        # At the border of the region, small gains may alternate forever.
-        (moving,) = np.nonzero(gain > (_MIN_GAIN if number < _N_USUAL_STEPS else 1.0))
+        (moving,) = np.nonzero(gain > _MIN_GAIN)
         if not len(moving) or number == n_steps - 1:
             break
         moved, gain[moving] = step(select(modes, moving).starts())

@@ -110,7 +110,7 @@ class User(StateMachine):
         return self._other_user(event) and event.cycle_id == self._cycle_id
 
     def _other_instance_granted(self, event: m.Grant) -> bool:
-        """Return whether the acknowledged cycle is granted to another node with the user number."""
+        """Return whether the acknowledged cycle is granted to another node of the same user."""
         return self._other_instance(event) and event.cycle_id == self._cycle_id
 
     def _other_instance(self, event: m.Grant | m.PilotRequest) -> bool:

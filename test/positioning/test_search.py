@@ -134,6 +134,16 @@ def test_noiseless_signals_give_the_exact_position(codebook):
         assert modes.residual[0] == pytest.approx(0, abs=1e-2)
 
 
+def test_steps_continue_until_they_gain_nothing(codebook):
+    likelihood = Likelihood(SCENARIO, codebook)
+    points = to_polar(SCENARIO.sample_positions(50, np.random.default_rng(2)))
+    signals = likelihood.signals(likelihood.model.mean(to_positions(points)))
+    # A tenth of a wavelength.
+    starts = Starts(np.arange(50), points + [0.012, 0.0, 0.0], np.zeros((50, 0)))
+    modes = ascend(likelihood, likelihood, starts, signals, 8)
+    assert np.abs(modes.points - points[modes.phases]).max() < 5e-5
+
+
 @pytest.mark.parametrize('changes', [{'user_gain_std_db': 1.0}, {'phase_std_rad': 0.5}], ids=str)
 def test_the_likelihood_of_a_mode_is_the_average_over_the_parameter(codebook, changes):
     """The reference integrates numerically at the position of the mode."""
