@@ -208,6 +208,8 @@ def test_the_bands_are_chosen_with_the_codebook(call, files, scenario, capsys, m
     (['--spectrum', '3e9:2e9', '--bands', '2'], ["--spectrum: '3e9:2e9', expected LOW:HIGH"]),
     (['--spectrum', '3e9', '--bands', '2'], ["--spectrum: '3e9', expected LOW:HIGH"]),
     (['--spectrum', '2e9:3e9', '--bands', '2', '--start', 'random'], ['not allowed with']),
+    (['--spectrum', '2e9:3e9', '--bands', '2', '--calibration', __file__],
+     ['--calibration: not allowed with --spectrum']),
     (['--spectrum', '2e9:3e9', '--bands', '3'], ['bands: 3, expected a divisor of 2'])])
 def test_invalid_band_plans_are_errors(call, files, capsys, arguments, words):
     fails_with(call, capsys, words, '--plan', files / 'plan.yaml', *arguments)

@@ -190,6 +190,13 @@ def test_bounds_are_inclusive(field, value):
     assert getattr(Scenario(**{field: value}), field) == value
 
 
+@pytest.mark.parametrize('field', ['failed_element_share', 'blocked_probability'])
+def test_probabilities_are_at_most_one(field):
+    assert getattr(Scenario(**{field: 1.0}), field) == 1
+    with pytest.raises(ScenarioError, match=f'^{field}: .*, expected .*0 to 1'):
+        Scenario(**{field: 1.01})
+
+
 @pytest.mark.parametrize(('field', 'value'), [('n_feeds', 10**400), ('max_power_w', 10**400)],
                          ids=['integer', 'number'])
 def test_an_integer_too_large_for_a_float_is_out_of_range(field, value):

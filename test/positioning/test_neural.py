@@ -16,6 +16,7 @@ from rhs_isac_ros.positioning import (
     NeuralEstimator,
     SignalError,
     make_estimator,
+    neural,
     simulate_pairs,
     train,
 )
@@ -109,6 +110,24 @@ def test_training_stops_when_the_validation_error_does_not_fall(scenario, codebo
     epochs = []
     network = train(scenario, codebook, 40, 0, 64, 2000, lambda *epoch: epochs.append(epoch))
     assert network.about['epochs'] + 4 <= len(epochs) < 2000
+
+
+def test_batches_grow_when_the_validation_error_does_not_fall(scenario, codebook, monkeypatch):
+    sizes, make = [], neural._regressor
+
+    def recorded(*arguments):
+        regressor = make(*arguments)
+        fit = regressor.partial_fit
+
+        def partial_fit(inputs, targets):
+            sizes.append(regressor.batch_size)
+            return fit(inputs, targets)
+        regressor.partial_fit = partial_fit
+        return regressor
+    monkeypatch.setattr(neural, '_regressor', recorded)
+    train(scenario, codebook, 300, 0, 64, 2000)
+    # 210 pairs are for training.
+    assert list(dict.fromkeys(sizes)) == [128, 210]
 
 
 def test_a_single_phase_has_the_same_estimate_as_in_a_batch(scenario, codebook, training):
