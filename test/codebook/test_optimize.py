@@ -245,6 +245,11 @@ def test_the_provenance_after_an_interrupt_is_complete(scenario, positions, monk
     assert made.evaluations in (51, 52)
 
 
+def test_the_genetic_algorithm_has_ten_generations(scenario, positions, monkeypatch):
+    monkeypatch.setattr(Problem, 'value', lambda problem, variables: float(np.sum(variables)))
+    assert optimize(scenario, positions, 'genetic', seed=3).history[-1].step == 10
+
+
 def test_an_interrupt_in_the_progress_callback_returns_the_best_so_far(scenario, positions):
     def interrupt(entry):
         if entry.step == 3:

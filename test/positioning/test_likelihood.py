@@ -246,3 +246,15 @@ def test_nuisance_parameters_and_element_errors_combine(codebook, changes):
     prior = values[0] @ values[0] / 2 + 2 * received.size * gain
     assert found.value[0] == pytest.approx(expected.value[0] - prior, rel=1e-9)
     assert found.residual[0] == pytest.approx(expected.residual[0], rel=1e-9)
+
+
+def test_the_profile_over_the_gain_is_the_maximum_with_its_prior(codebook):
+    prior = Likelihood(declaring(user_gain_std_db=3.0), codebook).nuisance
+    std, energy, n_rows = 3 * np.log(10) / 20, 40.0, 30
+    amplitude = np.linspace(5.0, 80.0, 200)
+    gain = np.linspace(-4 * std, 4 * std, 20_001)
+    values = (-np.exp(-2 * gain) * energy + 2 * np.exp(-gain) * amplitude[:, None]
+              - 2 * n_rows * gain - gain**2 / (2 * std**2))
+    value, found = prior.over_gain(amplitude, energy, n_rows)
+    np.testing.assert_allclose(value, values.max(axis=1), atol=0.05)
+    np.testing.assert_allclose(found, gain[values.argmax(axis=1)], atol=0.05 * std)
