@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.gaussian import step_to_maximum
 from rhs_isac_ros.model.multipath import time_correlation
 from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT
@@ -89,7 +90,7 @@ class Mixture(NamedTuple):
 
     def velocity(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean, float64 [3] [m/s], and covariance, float64 [3, 3], of the velocity."""
-        weights = np.exp(self.log_weights - log_sum(self.log_weights))
+        weights, _ = mixture_weights(self.log_weights)
         by_rate = jacobian(self.means[:, :3])
         within = np.matmul(np.matmul(by_rate, self.covariances[:, 3:, 3:]),
                            np.swapaxes(by_rate, 1, 2))
@@ -102,36 +103,28 @@ def reduce(mixture: Mixture, max_components: int) -> Mixture:
     order = np.argsort(-mixture.log_weights)
     order = order[mixture.log_weights[order] >= mixture.log_weights[order[0]] - _WEIGHT_MARGIN]
     mixture = select(mixture, order)
-    means = mixture.means
     precisions = np.linalg.inv(mixture.covariances)
-    free = np.ones(len(means), bool)
-    group = np.full(len(means), -1)
-    n_groups = 0
-    while free.any() and n_groups < max_components:
+    group = np.full(len(order), -1)
+    for number in range(max_components):
+        free = group < 0
+        if not free.any():
+            break
         leader = int(np.argmax(free))
-        offsets = means - means[leader]
+        offsets = mixture.means - mixture.means[leader]
         distance = np.einsum('cp,cp->c', offsets @ precisions[leader], offsets)
-        members = free & (distance < _MERGE_DISTANCE)
-        group[members] = n_groups
-        free[members] = False
-        n_groups += 1
-    return _merge(mixture, group, n_groups)
+        group[free & (distance < _MERGE_DISTANCE)] = number
+    return _merge(mixture, group)
 
 
-def _merge(mixture: Mixture, group: np.ndarray, n_groups: int) -> Mixture:
+def _merge(mixture: Mixture, group: np.ndarray) -> Mixture:
     """Merge the components of each group, preserving mean and covariance; discard group -1."""
-    mixture = select(mixture, group >= 0)
-    group = group[group >= 0]
-    member = np.equal.outer(np.arange(n_groups), group)
-    weights = np.exp(mixture.log_weights - mixture.log_weights.max())
-    shares = member * weights
-    total = shares.sum(axis=1)
-    shares /= total[:, None]
+    members = np.equal.outer(np.arange(group.max() + 1), group)
+    shares, log_weights = mixture_weights(np.where(members, mixture.log_weights, -np.inf))
     means = shares @ mixture.means
     offsets = mixture.means - means[group]
     spread = mixture.covariances + offsets[:, :, None] * offsets[:, None, :]
-    covariances = (shares @ spread.reshape(len(group), -1)).reshape(n_groups, 6, 6)
-    return Mixture(np.log(total) + mixture.log_weights.max(), means, covariances)
+    covariances = (shares @ spread.reshape(len(group), -1)).reshape(-1, 6, 6)
+    return Mixture(log_weights, means, covariances)
 
 
 @dataclasses.dataclass(frozen=True)
