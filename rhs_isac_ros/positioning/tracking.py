@@ -56,8 +56,6 @@ _PAIR_MARGIN = 18.0
 # Number of pairs whose likelihood is evaluated with the exact model. Errors of the Gaussians alone
 # accumulate over the phases and favour wrong modes.
 _N_EXACT = 16
-# Squared Mahalanobis distance below which two updates of a component are the same maximum.
-_SAME_MAXIMUM = 1.0
 # Log-likelihood of a mode that the search has missed, relative to the best mode. The search finds
 # all modes above this value.
 _FLOOR = -EXACT_MARGIN
@@ -398,12 +396,10 @@ def update(
                        precision[mode, component], offsets[mode, component])
     if likelihood is not None:
         # The heaviest pairs come first.
-        head = np.arange(min(_N_EXACT, len(order)))
         exact = _exact_update(
-            select(predicted, component[head]), updated.means[head, :3], share, likelihood,
-            signals)
-        exact = select(exact, _is_first(exact, component[head]))
-        updated = concatenate(exact, select(updated, slice(len(head), None)))
+            select(predicted, component[:_N_EXACT]), updated.means[:_N_EXACT, :3], share,
+            likelihood, signals)
+        updated = concatenate(exact, select(updated, slice(_N_EXACT, None)))
     best = int(np.argmax(modes.roi_log_likelihood))
     floor, _ = _evidence(np.zeros(3), predicted.covariances[:, :3, :3], spread[best])
     floor += share * (modes.roi_log_likelihood[best] + _FLOOR)
@@ -423,18 +419,6 @@ def _exact_update(
     log_weights += share * (value + np.sum(gradient * step, axis=1) / 2)
     log_weights += predicted.log_weights
     return _shifted(predicted._replace(log_weights=log_weights), precision, offsets)
-
-
-def _is_first(updated: Mixture, component: np.ndarray) -> np.ndarray:
-    """Mark the updates that differ from all earlier updates of the same component, bool [C]."""
-    # Several modes that have not converged may lead one predicted component, given by its index,
-    # to the same maximum, which must not count twice.
-    points = updated.means[:, :3]
-    offsets = points[:, None] - points
-    precision = np.linalg.inv(updated.covariances[:, :3, :3])
-    distance = np.einsum('abp,apq,abq->ab', offsets, precision, offsets)
-    same = (distance < _SAME_MAXIMUM) & (component[:, None] == component)
-    return ~np.tril(same, -1).any(axis=1)
 
 
 def _evidence(
