@@ -49,10 +49,8 @@ _MIN_INSIDE = 0.02
 _MIN_SHARE = 0.25
 # Components with a smaller weight do not contribute to the estimate.
 _MIN_LOG_WEIGHT = -9.0
-# Maximum number of pairs of a component and a mode, and largest difference between the log-weights
-# of the heaviest pair and another.
+# Maximum number of pairs of a component and a mode.
 _MAX_PAIRS = 160
-_PAIR_MARGIN = 18.0
 # Number of pairs whose likelihood is evaluated with the exact model. Errors of the Gaussians alone
 # accumulate over the phases and favour wrong modes.
 _N_EXACT = 16
@@ -388,12 +386,10 @@ def update(
     offsets = modes.points[:, None] - predicted.means[:, :3]
     log_weights, precision = _evidence(offsets, predicted.covariances[:, :3, :3], spread[:, None])
     log_weights += share * modes.log_likelihood[:, None] + predicted.log_weights
-    flat = log_weights.ravel()
-    order = np.argsort(-flat)[:_MAX_PAIRS]
-    order = order[flat[order] >= flat[order[0]] - _PAIR_MARGIN]
-    mode, component = np.unravel_index(order, log_weights.shape)
-    updated = _shifted(select(predicted, component)._replace(log_weights=flat[order]),
-                       precision[mode, component], offsets[mode, component])
+    mode, component = np.unravel_index(
+        np.argsort(-log_weights, axis=None)[:_MAX_PAIRS], log_weights.shape)
+    chosen = select(predicted, component)._replace(log_weights=log_weights[mode, component])
+    updated = _shifted(chosen, precision[mode, component], offsets[mode, component])
     if likelihood is not None:
         # The heaviest pairs come first.
         exact = _exact_update(
