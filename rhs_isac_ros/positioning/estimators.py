@@ -225,14 +225,12 @@ class SearchEstimator(abc.ABC):
         # If the model holds, twice the residual energy, averaged over the posterior, has the mean
         # of a chi-square variable. At the best of several modes, it is smaller than the average.
         expected = self._mean_residual - samples.average(modes.residual)
-        value = modes.roi_log_likelihood
-        ends = [*samples.starts[1:].tolist(), len(modes.phases)]
-        for row, (start, end) in enumerate(zip(samples.starts.tolist(), ends, strict=True)):
-            best = start + int(np.argmax(value[start:end]))
+        # The best mode of each phase comes first.
+        for row, (phase, best) in enumerate(zip(rows, samples.starts.tolist(), strict=True)):
             residual = float(modes.residual[best])
             fit = Fit(means[row], covariances[row], float(log_evidence[row]), residual,
                       expected[row] + residual, modes.values[best] @ likelihood.nuisance.gain)
-            yield fit, select(modes, slice(start, end))
+            yield fit, modes.of_phase(phase)
 
     def _judge(self, fit: Fit, whitened: np.ndarray, aligned: np.ndarray) -> Located:
         """Return the position of one phase, or the reason why there is none."""
@@ -296,12 +294,11 @@ class MlEstimator(SearchEstimator):
     name, averages = 'ml', False
 
     def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
-        order = np.lexsort((-modes.roi_log_likelihood, modes.phases))
-        best = order[samples.starts]
-        points = modes.roi_points[best]
+        best = select(modes, samples.starts)
+        points = best.roi_points
         by_point = jacobian(points)
         covariance = np.matmul(
-            by_point, np.linalg.solve(modes.curvature[best], np.swapaxes(by_point, 1, 2)))
+            by_point, np.linalg.solve(best.curvature, np.swapaxes(by_point, 1, 2)))
         positions = np.clip(to_positions(points), *self._bounds)
         return positions, symmetric(covariance)
 

@@ -396,9 +396,9 @@ def update(
             select(predicted, component[:_N_EXACT]), updated.means[:_N_EXACT, :3], share,
             likelihood, signals)
         updated = concatenate(exact, select(updated, slice(_N_EXACT, None)))
-    best = int(np.argmax(modes.roi_log_likelihood))
-    floor, _ = _evidence(np.zeros(3), predicted.covariances[:, :3, :3], spread[best])
-    floor += share * (modes.roi_log_likelihood[best] + _FLOOR)
+    # The best mode comes first.
+    floor, _ = _evidence(np.zeros(3), predicted.covariances[:, :3, :3], spread[0])
+    floor += share * (modes.roi_log_likelihood[0] + _FLOOR)
     return concatenate(updated, predicted.weighted(floor))
 
 
