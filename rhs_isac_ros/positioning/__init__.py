@@ -30,7 +30,6 @@ from rhs_isac_ros.positioning.estimators import (
     MlEstimator,
     SearchEstimator,
     WeightedModes,
-    surface_of,
     weighted_modes,
 )
 from rhs_isac_ros.positioning.neural import ModelError, Network, NeuralEstimator, train
@@ -47,7 +46,7 @@ __all__ = [
     'ESTIMATORS', 'REGION_ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'MlEstimator',
     'ModelError', 'Motion', 'Network', 'NeuralEstimator', 'SearchEstimator', 'SignalError',
     'TrackEstimate', 'Tracker', 'WeightedModes', 'estimate_each', 'file_options',
-    'make_estimator', 'simulate_pairs', 'surface_of', 'train', 'weighted_modes',
+    'make_estimator', 'simulate_pairs', 'train', 'weighted_modes',
 ]
 
 

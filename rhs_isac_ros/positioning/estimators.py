@@ -32,7 +32,6 @@ from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.draws import DrawnPosterior
 from rhs_isac_ros.positioning.estimate import (
     Estimate,
-    Estimator,
     Fit,
     Located,
     checked_received,
@@ -328,11 +327,6 @@ def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> Weighted
     order = np.argsort(-shares)[:np.count_nonzero(shares)]
     weights = samples.weights[order] / shares[order, None]
     return WeightedModes(shares[order], *moments(weights, samples.positions[order]))
-
-
-def surface_of(estimator: Estimator) -> Surface | None:
-    """Return the surface that a `SearchEstimator` assumes; None for other estimators."""
-    return estimator.surface if isinstance(estimator, SearchEstimator) else None
 
 
 def _no_fix() -> tuple[np.ndarray, np.ndarray]:

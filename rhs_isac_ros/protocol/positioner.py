@@ -19,7 +19,6 @@ from rhs_isac_ros.positioning import (
     SignalError,
     Tracker,
     TrackEstimate,
-    surface_of,
 )
 from rhs_isac_ros.positioning.alternatives import describe_doubts, probabilities_of
 from rhs_isac_ros.positioning.diagnosis import WINDOW, InnovationTest, diagnose
@@ -268,7 +267,8 @@ class Positioner(Role):
         codebook = job.codebook
         if job.settings != self._settings.latest and codebook.id in self._estimators:
             return
-        model = MeasurementModel(self._scenario, codebook, surface_of(estimator)).prepare()
+        surface = estimator.surface if isinstance(estimator, SearchEstimator) else None
+        model = MeasurementModel(self._scenario, codebook, surface).prepare()
         self._estimators.put(codebook.id, _Built(job, model, estimator))
         self._settings.in_use = job.settings
         self._residuals.clear()
