@@ -8,7 +8,7 @@ prior odds are even although most users are inside, and these users should not l
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 
@@ -60,35 +60,14 @@ _MAX_SINE = 0.998
 _MARGIN = 30.0
 
 
-class Alternative(Protocol):
-    """An alternative to a user in the region with a direct path."""
-
-    name: str  # `Estimate` has the field ``<name>_probability``.
-    reason: str  # Beginning of the reason why there is no fix.
-    limit: float  # Largest probability at which there is a fix, if this is the only alternative.
-    log_odds: float  # Logarithm of the prior odds relative to a user inside and in sight.
-
-    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
-                        prior: NuisancePrior) -> float:
-        """Compute the logarithm of the evidence with the nuisance parameters integrated out.
-
-        `aligned`, float64 [Q], contains the parameters that follow from the signals alone, and 0
-        for the others. `whitened`, complex128 [N_B, N_SB F], are the signals of one phase without
-        the factors of `aligned`. `residual` is the residual energy at the best position inside.
-        """
-        ...
-
-    def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
-        """Return whether the alternative explains the signals up to this residual energy."""
-        ...
-
-
 class Blocked:
     """A user without a direct path, whose signals are multipath of an unknown level.
 
     The evidence for a user in sight is computed as if all users had the same level. An average
     over their levels would multiply this evidence by a factor. Only the ratio of both evidences
     counts, so the evidence for a blocked user is divided by this factor instead.
+
+    The attributes are those of `Outside`.
     """
 
     name, reason, limit = 'blocked', 'blocked', BLOCKED_LIMIT
@@ -100,7 +79,7 @@ class Blocked:
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
                         prior: NuisancePrior) -> float:
-        """Compute the log evidence from the energies of the signals; see `Alternative`."""
+        """Compute the log evidence from the energies of the signals; see `Outside`."""
         energy = np.array([residual, np.sum(np.abs(whitened)**2)])
         # The gain of the user is part of the level.
         std_db = math.hypot(BLOCKED_STD_DB, self._std_db, _DB_PER_NEPER * prior.gain_std)
@@ -110,7 +89,7 @@ class Blocked:
         return blocked - (in_sight + residual) + prior.log_evidence_of_aligned(aligned)
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
-        """Return whether a plausible level explains the signals; see `Alternative`."""
+        """Return whether a plausible level explains signals up to this residual energy."""
         energy = float(np.sum(np.abs(whitened)**2))
         return energy <= max_residual * 10**(_LEVEL_REACH * BLOCKED_STD_DB / 10)
 
@@ -163,8 +142,11 @@ class Outside:
     templates t_i and signals y_i. All other factors are smooth, so a coarse grid suffices.
     """
 
-    name, reason, limit = 'outside', 'position outside of the region', OUTSIDE_LIMIT
-    # Even prior odds, as if half of the users were outside.
+    name = 'outside'  # `Estimate` has the field ``<name>_probability``.
+    reason = 'position outside of the region'  # Beginning of the reason why there is no fix.
+    limit = OUTSIDE_LIMIT  # Largest probability at which there is a fix.
+    # Logarithm of the prior odds relative to a user inside and in sight: half of the users are
+    # outside.
     log_odds = 0.0
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
@@ -180,7 +162,12 @@ class Outside:
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
                         prior: NuisancePrior) -> float:
-        """Compute the log evidence, which does not depend on carrier phases; see `Alternative`."""
+        """Compute the logarithm of the evidence with the nuisance parameters integrated out.
+
+        `aligned`, float64 [Q], contains the parameters that follow from the signals alone, and 0
+        for the others. `whitened`, complex128 [N_B, N_SB F], are the signals of one phase without
+        the factors of `aligned`. `residual` is the residual energy at the best position inside.
+        """
         gain = np.zeros(1)
         if prior.gain_std:
             n_points = 2 * int(np.ceil(_GAIN_REACH * prior.gain_std / _GAIN_STEP)) + 3
@@ -208,7 +195,7 @@ class Outside:
         return np.array(values)
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
-        """Return whether some position explains the signals; see `Alternative`."""
+        """Return whether some position explains the signals up to this residual energy."""
         amplitude = np.sum(self._filter(whitened), axis=0)[self._index] * self._scale
         residual = np.sum(np.abs(whitened)**2) - amplitude + self._energy
         tolerated = max_residual + _GRID_ERROR * self._energy
@@ -221,7 +208,8 @@ class Outside:
         return filtered.reshape(len(filtered), -1, self._energy.shape[1])
 
 
-ALTERNATIVES: tuple[type[Outside] | type[Blocked], ...] = (Outside, Blocked)
+Alternative: TypeAlias = Outside | Blocked
+ALTERNATIVES: tuple[type[Alternative], ...] = (Outside, Blocked)
 
 
 def probabilities_of(estimate: object) -> dict[str, float]:
