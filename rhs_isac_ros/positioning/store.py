@@ -49,7 +49,6 @@ def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = 
         _write(path, key, table)
     except OSError as error:
         warnings.warn(f'the table cannot be stored: {error}', RuntimeWarning, stacklevel=2)
-        return table
     return _read(path, key) or table
 
 
@@ -69,15 +68,10 @@ def table_key(model: MeasurementModel, codebook_id: str) -> str:
 
 def _write(path: Path, key: str, table: Mapping[str, np.ndarray]) -> None:
     """Write a table atomically; delete the least recently used ones beyond `_MAX_TABLES`."""
-    # The file has one record: key, digest and arrays. Arrays of wide numbers come first, so that
-    # all arrays are aligned.
-    names = sorted(table, key=lambda name: -table[name].real.itemsize)
-    dtype = np.dtype([('key', 'S32'), ('digest', 'S32')]
-                     + [(name, table[name].dtype, table[name].shape) for name in names])
-    record = np.zeros(1, dtype)
-    for name in names:
-        record[name] = table[name]
-    record['key'] = key.encode()
+    # The file has one record: key, digest and arrays.
+    fields = [(name, array.dtype, array.shape) for name, array in table.items()]
+    dtype = np.dtype([('key', 'S32'), ('digest', 'S32'), *fields], align=True)
+    record = np.array([(key.encode(), b'', *table.values())], dtype)
     record['digest'] = _digest(record)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, lambda stream: np.save(stream, record, allow_pickle=False))
