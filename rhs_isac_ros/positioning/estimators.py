@@ -10,7 +10,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.arrays import mixture_weights
+from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.gaussian import share_of_level
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.alternatives import (
@@ -58,8 +58,6 @@ from rhs_isac_ros.positioning.search import Modes, ascend, find_modes
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
-# Number of coordinates fitted to the signals of each phase.
-_N_COORDINATES = 3
 # Number of phases that are located together.
 _BLOCK = 128
 # Samples per mode if the phases of the bands carry information. The density then has several peaks
@@ -120,8 +118,8 @@ class SearchEstimator(abc.ABC):
                           if surface is None and can_enumerate(scenario) else None)
         self._dispersed = None if self._failures else DispersedLikelihood.of(likelihood)
         # Twice an energy has two degrees of freedom for each complex measurement, less one for
-        # each fitted parameter.
-        n_fitted = _N_COORDINATES + len(prior)
+        # each fitted coordinate or parameter.
+        n_fitted = 3 + len(prior)
         self._mean_residual = max(n_measurements - n_fitted / 2, 0.5)
         # Points that represent a standard Gaussian, float64 [128, 3].
         self.normal = self._grid.normal
@@ -152,11 +150,10 @@ class SearchEstimator(abc.ABC):
 
     def _locate(self, batch: np.ndarray) -> Iterable[Located]:
         signals = self._likelihood.signals(batch)
-        blocks = map_blocks(
-            lambda start: self._locate_block(
-                select(signals, slice(start, start + _BLOCK)), draws=True),
-            range(0, len(batch), _BLOCK))
-        return (located for located, _ in itertools.chain.from_iterable(blocks))
+        parts = map_blocks(
+            lambda block: self._locate_block(select(signals, block), draws=True),
+            blocks(len(batch), _BLOCK))
+        return (located for located, _ in itertools.chain.from_iterable(parts))
 
     def _locate_block(self, signals: Signals, draws: bool
                       ) -> list[tuple[Located, Modes | None]]:
