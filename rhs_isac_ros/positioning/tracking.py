@@ -176,9 +176,14 @@ class Motion:
               for begin, end in itertools.pairwise(_TURN_INTERVALS)))
 
     def _straight(self, mixture: Mixture, elapsed_s: float) -> Mixture:
-        decay = np.exp(-elapsed_s / self.memory_s)
-        return _moved(
-            mixture, self.memory_s * (1 - decay), decay, self._noise(elapsed_s, decay))
+        memory_s, ratio = self.memory_s, elapsed_s / self.memory_s
+        decay = np.exp(-ratio)
+        # For short times, the terms nearly cancel; their sum is then 2 ratio^3 / 3.
+        drift = 2 * ratio - 3 + 4 * decay - decay**2 if ratio > 1e-3 else 2 * ratio**3 / 3
+        noise = self.velocity_variance * np.array([
+            [memory_s**2 * drift, memory_s * (1 - decay)**2],
+            [memory_s * (1 - decay)**2, 1 - decay**2]])
+        return _moved(mixture, memory_s * (1 - decay), decay, noise)
 
     def _turned(self, mixture: Mixture, begin_s: float, end_s: float, elapsed_s: float) -> Mixture:
         """Return the mixture of users who have turned once, at a random time in an interval."""
@@ -193,19 +198,12 @@ class Motion:
             within + rates[:, :, None] * rates[:, None])
         return moved
 
-    def _noise(self, elapsed_s: float, decay: float) -> np.ndarray:
-        """Return the noise covariance of position and velocity along an axis, float64 [2, 2]."""
-        variance, memory_s = self.velocity_variance, self.memory_s
-        ratio = elapsed_s / memory_s
-        # For short times, the terms nearly cancel; their sum is then 2 ratio^3 / 3.
-        drift = 2 * ratio - 3 + 4 * decay - decay**2 if ratio > 1e-3 else 2 * ratio**3 / 3
-        return variance * np.array([
-            [memory_s**2 * drift, memory_s * (1 - decay)**2],
-            [memory_s * (1 - decay)**2, 1 - decay**2]])
-
 
 def _moved(mixture: Mixture, reach_s: float, decay: float, noise: np.ndarray) -> Mixture:
-    """Move by `reach_s` times the velocity, scale velocities by `decay`, and add noise [2, 2]."""
+    """Move by `reach_s` times the velocity, and scale velocities by `decay`.
+
+    `noise`, [2, 2], is the covariance of position and velocity that each axis gains.
+    """
     points = mixture.means[:, :3]
     velocities = np.matmul(jacobian(points), mixture.means[:, 3:, None])
     positions = to_positions(points) + reach_s * velocities[..., 0]
