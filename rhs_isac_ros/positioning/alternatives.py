@@ -155,9 +155,8 @@ class Outside:
         self._scale = (2 / ranges).astype(np.float32)
         self._node_energy = np.maximum(arrays['outer_energy'], np.finfo(np.float32).tiny)
         self._energy = (arrays['outer_energy'][self._index] / ranges**2).astype(np.float32)
-        self._possible = arrays['outer_weights'] > 0
-        log_prior = np.log(arrays['outer_weights'], where=self._possible,
-                           out=np.full(self._possible.shape, -np.inf))
+        with np.errstate(divide='ignore'):
+            log_prior = np.log(arrays['outer_weights'])
         self._offset = (log_prior - self._energy).astype(np.float32)
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
@@ -199,7 +198,7 @@ class Outside:
         amplitude = np.sum(self._filter(whitened), axis=0)[self._index] * self._scale
         residual = np.sum(np.abs(whitened)**2) - amplitude + self._energy
         tolerated = max_residual + _GRID_ERROR * self._energy
-        return bool((self._possible & (residual <= tolerated)).any())
+        return bool(((residual <= tolerated) & np.isfinite(self._offset)).any())
 
     def _filter(self, whitened: np.ndarray) -> np.ndarray:
         """Return filter output magnitudes by template and direction, [N_B, T, V] [m]."""
