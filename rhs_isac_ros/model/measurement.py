@@ -6,7 +6,6 @@ a covariance, which depends on the position; `impairments` adds unknown gains an
 """
 
 import functools
-from collections.abc import Callable
 
 import numpy as np
 
@@ -24,7 +23,6 @@ from rhs_isac_ros.model.los import (
     direct_gain,
     draw_blocked,
     has_pattern,
-    los_gain,
     los_waves,
 )
 from rhs_isac_ros.model.multipath import (
@@ -209,11 +207,9 @@ class MeasurementModel:
         return read_only(np.linalg.inv(self.root))
 
     @one_blas_thread
-    def prepare(self, jacobian: bool = False) -> 'MeasurementModel':
-        """Compute the whitener and, with `jacobian`, weights of the Jacobian; return the model."""
-        _ = self.whitener
-        if jacobian:
-            _ = self._weights
+    def prepare(self) -> 'MeasurementModel':
+        """Compute what later calls need, and return the model."""
+        _ = self.whitener, self._weights
         return self
 
     def whiten(self, signals: np.ndarray) -> np.ndarray:
@@ -223,33 +219,22 @@ class MeasurementModel:
 
     def mean(self, positions: np.ndarray) -> np.ndarray:
         """Compute the mean signals, complex128 [N, N_B, N_SB F]: Eq. (8) for the direct path."""
-        # A change of the arithmetic or the block size would change the results of all seeds.
-        def of_band(positions: np.ndarray, _: slice, band: int) -> np.ndarray:
-            los = los_gain(self.scenario, positions, band)
-            return received_signal(los, 0.0, self.radiation[band], 0.0)
-
-        return self._of_bands(positions, of_band)
-
-    def _of_bands(self, positions: np.ndarray,
-                  of_band: Callable[[np.ndarray, slice, int], np.ndarray]) -> np.ndarray:
-        """Call a function for every block of positions and every band, and join the results."""
-        positions = checked_positions(positions)
-        result = np.empty((len(positions), *self.shape), complex)
+        positions, weights = checked_positions(positions), self._weights
+        mean = np.empty((len(positions), *self.shape), complex)
 
         def fill(block: slice) -> None:
-            for band in range(len(self.radiation)):
-                result[block, band] = of_band(positions[block], block, band)
+            terms = weights.terms(positions[block], slopes=False)
+            mean[block] = np.swapaxes(terms[:, :, 0], 0, 1)
 
-        map_blocks(fill, position_blocks(self.scenario, len(positions)))
-        return result
+        map_blocks(fill, blocks(len(positions), weights.block))
+        return mean
 
     def mean_and_jacobian(
             self, positions: np.ndarray, by_coordinate: np.ndarray | None = None, *,
             whitened: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Compute the mean and its derivative, complex128 [N, 3, N_B, N_SB F] [1/m]: Eq. (13).
 
-        The mean equals the result of `mean` up to rounding, and is computed faster. With
-        `whitened`, both results are whitened. `by_coordinate`, float64 [N, 3, Q], contains
+        With `whitened`, both results are whitened. `by_coordinate`, float64 [N, 3, Q], contains
         derivatives of the positions with respect to Q other coordinates; the derivative of the
         mean, [N, Q, N_B, N_SB F], is then with respect to these coordinates.
         """
@@ -274,14 +259,6 @@ class MeasurementModel:
         map_blocks(fill, blocks(n, weights.block))
         return mean, jacobian
 
-    def fast_mean(self, positions: np.ndarray) -> np.ndarray:
-        """Compute only the mean of `mean_and_jacobian`, which takes a third of the time."""
-        positions, weights = checked_positions(positions), self._weights
-        mean = np.empty((len(positions), *self.shape), complex)
-        for block in blocks(len(positions), weights.block):
-            mean[block] = np.swapaxes(weights.terms(positions[block], slopes=False)[:, :, 0], 0, 1)
-        return mean
-
     @one_blas_thread
     def sample(self, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Draw signals of independent phases, one at each position, complex128 [N, N_B, N_SB F].
@@ -296,13 +273,15 @@ class MeasurementModel:
         model = self
         if surface is not None and self.surface is None:
             model = MeasurementModel(scenario, self.beams, surface)
-
-        def of_band(positions: np.ndarray, block: slice, band: int) -> np.ndarray:
-            los = direct_gain(scenario, positions, band, blocked[block])
-            return received_signal(los, 0.0, model.radiation[band], 0.0)
-
-        signals = model._of_bands(positions, of_band)
-        if not scenario.channel:
+        if scenario.channel:
+            signals = np.empty((len(positions), *self.shape), complex)
+            for block in position_blocks(scenario, len(positions)):
+                for band, radiation in enumerate(model.radiation):
+                    los = direct_gain(scenario, positions[block], band, blocked[block])
+                    signals[block, band] = received_signal(los, 0.0, radiation, 0.0)
+        else:
+            signals = model.mean(positions)
+            signals[blocked] = 0
             white = complex_normal(signals.shape, rng)
             # Factors act on the multipath, but not on the noise.
             roots = model.root if factors is None else map(

@@ -118,7 +118,7 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
     def fill(block: slice) -> None:
         part = points[block]
         carrier = np.exp(1j * carrier_wavenumbers(scenario) * part[:, :1]) * part[:, :1]
-        templates = model.whiten(model.fast_mean(to_positions(part)))
+        templates = model.whiten(model.mean(to_positions(part)))
         templates *= carrier[..., None]
         filters[:, block] = np.swapaxes(templates, 0, 1).conj()
         energy[block] = np.sum(np.abs(templates)**2, axis=(1, 2))

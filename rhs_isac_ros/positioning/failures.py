@@ -253,7 +253,7 @@ class FailureModel:
         self.likelihood, self.scenario = likelihood, scenario
         self.usual_residual = energy_limit(int(np.prod(likelihood.model.shape)), _UNUSUAL)
         intact = dataclasses.replace(scenario, failed_element_share=0.0)
-        self._model = MeasurementModel(intact, codebook).prepare(jacobian=True)
+        self._model = MeasurementModel(intact, codebook).prepare()
         # Weights of the elements' direct paths, [N_E, N_B, N_SB F]: change due to a failure, and
         # change per standard deviation of a failed element's amplitude.
         weights = np.matmul(codebook.digital, onboard_matrix(scenario))

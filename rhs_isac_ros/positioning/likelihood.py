@@ -217,7 +217,7 @@ class Likelihood:
         codebook.check(scenario)
         self.scenario, self.codebook, self.surface = scenario, codebook, surface
         # Estimators are built between cycles; the first estimate should be as fast as later ones.
-        self.model = MeasurementModel(scenario, codebook, surface).prepare(jacobian=True)
+        self.model = MeasurementModel(scenario, codebook, surface).prepare()
         self.nuisance = NuisancePrior(self.model)
         self.resolution, self._means = Resolution.of(scenario), Means(self.model)
         self.log_volume = float(log_determinant(self.model.root).sum())
@@ -324,7 +324,7 @@ class DispersedLikelihood:
         intact = dataclasses.replace(scenario, failed_element_share=0.0)
         self._average = MeasurementModel(
             dataclasses.replace(scenario, failed_element_share=share), likelihood.codebook,
-            likelihood.surface).prepare(jacobian=True)
+            likelihood.surface).prepare()
         self._intact = MeasurementModel(intact, likelihood.codebook, likelihood.surface)
         self._means = Means(self._average)
         self._scales, log_weights = _failure_counts(scenario.n_elements, share)

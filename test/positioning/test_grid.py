@@ -16,7 +16,7 @@ def test_arrays_of_the_table_match_their_definitions(random_beams):
     scenario = Scenario(center_frequencies_hz=(2.4e9, 3.1e9), n_subbands=2, n_frames=3,
                         elements_per_side=4, roi_center_m=(4, 0, 0), roi_size_m=(2, 2, 1))
     codebook = random_beams(scenario, np.random.default_rng(0))
-    model = MeasurementModel(scenario, codebook).prepare(jacobian=True)
+    model = MeasurementModel(scenario, codebook).prepare()
     table, grid = tabulate(model), lay_grid(scenario)
     wavenumbers = np.repeat(subband_wavenumbers(scenario), 3, axis=1)
 
