@@ -263,27 +263,17 @@ def time_correlation(
 
 
 @functools.lru_cache(maxsize=16)
-def correlation_matrices(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
-    """Implements Eq. (15). Correlation of the multipath over sub-bands and over frames.
+def measurement_correlation(scenario: Scenario) -> np.ndarray:
+    """Implements Eq. (15). Correlation of the multipath over all measurements of a band.
 
-    Returns K_f, complex128 [N_B, N_SB, N_SB], and K_t, float64 [N_B, F, F]; read-only.
+    Returns the Kronecker products of K_f and K_t, complex128 [N_B, N_SB F, N_SB F]. Rows and
+    columns are sub-band-major; the array is read-only.
     """
     subbands, frames = np.arange(scenario.n_subbands), np.arange(scenario.n_frames)
-    bands = range(scenario.n_bands)
-    over_frequency = np.stack(
-        [frequency_correlation(scenario, i, subbands[:, None], subbands) for i in bands])
-    over_time = np.stack([time_correlation(scenario, i, frames[:, None], frames) for i in bands])
-    return read_only(over_frequency), read_only(over_time)
-
-
-@functools.lru_cache(maxsize=16)
-def measurement_correlation(scenario: Scenario) -> np.ndarray:
-    """Compute the correlation K_ft over all measurements, complex128 [N_B, N_SB F, N_SB F].
-
-    Rows and columns are sub-band-major; the array is read-only.
-    """
-    pairs = zip(*correlation_matrices(scenario), strict=True)
-    return read_only(np.stack([np.kron(over_f, over_t) for over_f, over_t in pairs]))
+    return read_only(np.stack([
+        np.kron(frequency_correlation(scenario, band, subbands[:, None], subbands),
+                time_correlation(scenario, band, frames[:, None], frames))
+        for band in range(scenario.n_bands)]))
 
 
 def coupling(scenario: Scenario, radiation: np.ndarray, other: np.ndarray) -> np.ndarray:

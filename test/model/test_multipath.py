@@ -181,14 +181,6 @@ def test_correlations_match_the_definition_when_they_are_low(fading, plain):
     assert abs(p.rho_f(0, 0, 1)) < 0.8
 
 
-def test_correlation_matrices_match_the_vectors(case):
-    over_frequency, over_time = mp.correlation_matrices(case.scenario)
-    np.testing.assert_allclose(over_frequency, case.vectors['K_f'], rtol=1e-8)
-    np.testing.assert_allclose(over_time, case.vectors['K_t'], rtol=1e-8)
-    assert not over_frequency.flags.writeable
-    assert not over_time.flags.writeable
-
-
 def test_measurement_correlation_is_the_kronecker_product_of_the_vectors(case):
     correlation = mp.measurement_correlation(case.scenario)
     for band, (over_f, over_t) in enumerate(
