@@ -66,12 +66,7 @@ def quadratic_form(whitened: np.ndarray) -> np.ndarray:
     """
     # Re(a^H b) is the inner product of real and imaginary parts.
     parts = np.ascontiguousarray(whitened).view(whitened.real.dtype)
-    if parts.shape[1] == 1:
-        # Matrix products of single rows take many times as long as one sum over arrays.
-        form = np.einsum('nar,nar->na', parts, parts)[..., None]
-    else:
-        form = np.matmul(parts, np.swapaxes(parts, 1, 2))
-    return 2 * form
+    return 2 * np.matmul(parts, np.swapaxes(parts, 1, 2))
 
 
 def step_to_maximum(information: np.ndarray, gradient: np.ndarray) -> np.ndarray:
