@@ -131,34 +131,29 @@ class RandomWalk(StraightMobility):
             self, scenario: Scenario, speed_mps: float, rng: np.random.Generator,
             start: ArrayLike | None = None) -> None:
         self._scenario, self._speed_mps, self._rng = scenario, speed_mps, rng
-        self._origin = self._draw() if start is None else _checked_position(start)
-        self._target = self._draw()
-        self._departure_s: float | None = None
-        self._begin_leg()
+        self._target = self._draw() if start is None else _checked_position(start)
+        self._leg: Leg | None = None
 
     def leg(self, now_s: float) -> Leg:
         """Return the current leg; the next one begins when it ends."""
-        if self._departure_s is None:
-            self._departure_s = now_s
-        while now_s - self._departure_s >= self._duration_s:
-            self._departure_s += self._duration_s
-            self._origin, self._target = self._target, self._draw()
-            self._begin_leg()
-        return Leg(self._origin, self._velocity, self._departure_s,
-                   self._departure_s + self._duration_s)
+        if self._leg is None:
+            self._leg = self._next(now_s)
+        while now_s >= self._leg.end_s:
+            self._leg = self._next(self._leg.end_s)
+        return self._leg
 
     def _draw(self) -> np.ndarray:
         return self._scenario.sample_positions(1, self._rng)[0]
 
-    def _begin_leg(self) -> None:
-        """Compute the velocity and duration once per leg, because a node may have many users."""
-        leg = self._target - self._origin
-        length = float(np.linalg.norm(leg))
+    def _next(self, departure_s: float) -> Leg:
+        """Return the leg from the last target to a new one."""
+        origin, self._target = self._target, self._draw()
+        way = self._target - origin
+        length = float(np.linalg.norm(way))
         if length == 0:
-            self._velocity, self._duration_s = leg, _STAND_S
-            return
-        self._velocity = leg / length * self._speed_mps
-        self._duration_s = length / self._speed_mps if self._speed_mps else math.inf
+            return Leg(origin, way, departure_s, departure_s + _STAND_S)
+        duration_s = length / self._speed_mps if self._speed_mps else math.inf
+        return Leg(origin, way / length * self._speed_mps, departure_s, departure_s + duration_s)
 
 
 class Traced:
