@@ -3,16 +3,18 @@
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import blocks
 from rhs_isac_ros.model.gaussian import Marginal, marginalise, quadratic_form
 from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
-from rhs_isac_ros.model.measurement import position_blocks
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
 # A normalised matrix with a pivot below this is singular up to rounding.
 _MIN_PIVOT = 1e-14
+# Number of positions evaluated at a time. Arrays of many more positions do not fit in the cache.
+_BLOCK = 32
 
 
 @one_blas_thread
@@ -100,5 +102,5 @@ def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.n
         information[block] = np.sum([
             quadratic_form(whitened[:, band]) for band in range(len(model.whitener))], axis=0)
 
-    map_blocks(fill, position_blocks(model.scenario, len(positions)))
+    map_blocks(fill, blocks(len(positions), _BLOCK))
     return information

@@ -37,9 +37,8 @@ from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
 # Knowledge of the elements of one surface: known errors, or an estimate of the coefficients.
 Surface = ElementErrors | SurfaceEstimate
-# Largest number of positions in a block, and of gains over positions, elements and sub-bands. The
-# random numbers of `simulate_received` depend on the first of these limits.
-_BLOCK, _MAX_GAINS = 256, 1 << 21
+# Number of positions that `simulate_received` processes at a time; affects its random numbers.
+_BLOCK = 256
 # Target size of arrays over elements and sub-bands [bytes]. Larger arrays do not fit in the cache,
 # and every call obtains new memory pages for them.
 _ARRAY_BYTES = 3 << 18
@@ -129,12 +128,6 @@ def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
     """
     noise = scenario.noise_power_w * np.eye(radiation.shape[1])
     return scattered_covariance(scenario, radiation) + noise
-
-
-def position_blocks(scenario: Scenario, n: int) -> list[slice]:
-    """Split n positions into blocks, to limit the memory for their line-of-sight gains."""
-    return blocks(
-        n, max(min(_BLOCK, _MAX_GAINS // (scenario.n_subbands * scenario.n_elements)), 1))
 
 
 class MeasurementModel:
@@ -275,7 +268,7 @@ class MeasurementModel:
             model = MeasurementModel(scenario, self.beams, surface)
         if scenario.channel:
             signals = np.empty((len(positions), *self.shape), complex)
-            for block in position_blocks(scenario, len(positions)):
+            for block in blocks(len(positions), self._weights.block):
                 for band, radiation in enumerate(model.radiation):
                     los = direct_gain(scenario, positions[block], band, blocked[block])
                     signals[block, band] = received_signal(los, 0.0, radiation, 0.0)

@@ -12,7 +12,7 @@ from rhs_isac_ros.bounds import (
     fisher_information,
 )
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import MeasurementModel, Scenario, measurement
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.multipath import multipath_covariance
@@ -69,7 +69,7 @@ def test_a_model_serves_all_positions(case, monkeypatch):
 
 
 def test_bound_does_not_depend_on_the_blocks(case, monkeypatch):
-    monkeypatch.setattr(measurement, '_BLOCK', 4)
+    monkeypatch.setattr(fisher, '_BLOCK', 4)
     bound = crlb(case.scenario, case.codebook, case.vectors['positions'])
     np.testing.assert_allclose(bound, case.vectors['crlb'], rtol=1e-8)
 

@@ -92,8 +92,10 @@ def test_mean_matches_the_definition(small, plain):
 @pytest.mark.parametrize('method', POSITION_METHODS)
 def test_result_does_not_depend_on_the_blocks(case, model, monkeypatch, method):
     expected = getattr(model, method)(case.vectors['positions'])
-    monkeypatch.setattr(measurement, '_BLOCK', 4)
-    actual = getattr(model, method)(case.vectors['positions'])
+    monkeypatch.setattr(measurement, '_ARRAY_BYTES', 0)
+    monkeypatch.setattr(measurement, '_MIN_BLOCK', 4)
+    again = MeasurementModel(case.scenario, case.codebook)
+    actual = getattr(again, method)(case.vectors['positions'])
     for one, other in zip(actual, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12 * np.abs(other).max())
 
