@@ -14,7 +14,7 @@ import numpy as np
 
 from rhs_isac_ros.model.arrays import adjoint, blocks, gauss_legendre, read_only
 from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.geometry import element_interval_m, subband_frequencies_hz
+from rhs_isac_ros.model.geometry import element_interval_m
 from rhs_isac_ros.model.hall import MultipathEstimate
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
@@ -242,24 +242,25 @@ def mean_los_power(scenario: Scenario, band: int) -> float:
     return float((wavelength * gain / (4 * np.pi))**2 * mean_inverse)
 
 
-def frequency_correlation(
-        scenario: Scenario, band: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Implements Eq. (3). Correlation rho_f of two sub-bands, complex128; indices broadcast."""
-    frequencies = subband_frequencies_hz(scenario)[band]
-    difference = frequencies[first] - frequencies[second]
-    return 1 / (1 + 2j * np.pi * _fields(scenario).delay_spread_s * difference)
+def frequency_correlation(scenario: Scenario, difference_hz: np.ndarray) -> np.ndarray:
+    """Implements Eq. (3). Correlation rho_f of sub-bands of a band, complex128.
+
+    Takes differences between their frequencies [Hz], of any shape.
+    """
+    return 1 / (1 + 2j * np.pi * _fields(scenario).delay_spread_s * difference_hz)
 
 
-def time_correlation(
-        scenario: Scenario, band: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Implements Eq. (4). Correlation rho_t of two frames, float64; indices broadcast."""
-    center_hz = scenario.center_frequencies_hz[band]
-    doppler_hz = scenario.max_user_speed_mps * center_hz / SPEED_OF_LIGHT_MPS
-    lag_s = (np.asarray(first) - np.asarray(second)) * scenario.frame_duration_s
+def time_correlation(scenario: Scenario, lag_s: float | np.ndarray) -> np.ndarray:
+    """Implements Eq. (4). Correlation rho_t of frames that are `lag_s` [s] apart.
+
+    Returns float64 [N_B, ...] for lags of any shape.
+    """
+    centers_hz = np.array(scenario.center_frequencies_hz)
+    doppler_hz = scenario.max_user_speed_mps * centers_hz / SPEED_OF_LIGHT_MPS
     # Every node imports this module, and SciPy takes longer to load than ROS.
     from scipy.special import j0
 
-    return j0(2 * np.pi * doppler_hz * lag_s)
+    return j0(2 * np.pi * np.multiply.outer(doppler_hz, lag_s))
 
 
 @functools.lru_cache(maxsize=16)
@@ -270,10 +271,10 @@ def measurement_correlation(scenario: Scenario) -> np.ndarray:
     columns are sub-band-major; the array is read-only.
     """
     subbands, frames = np.arange(scenario.n_subbands), np.arange(scenario.n_frames)
-    return read_only(np.stack([
-        np.kron(frequency_correlation(scenario, band, subbands[:, None], subbands),
-                time_correlation(scenario, band, frames[:, None], frames))
-        for band in range(scenario.n_bands)]))
+    over_frequency = frequency_correlation(
+        scenario, (subbands[:, None] - subbands) * scenario.subband_width_hz)
+    over_time = time_correlation(scenario, (frames[:, None] - frames) * scenario.frame_duration_s)
+    return read_only(np.kron(over_frequency, over_time))
 
 
 def coupling(scenario: Scenario, radiation: np.ndarray, other: np.ndarray) -> np.ndarray:

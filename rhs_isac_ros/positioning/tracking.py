@@ -361,11 +361,8 @@ def independent_share(scenario: Scenario, elapsed_s: float) -> float:
     one place contain as much information as N (1 - rho) / (1 + rho) independent ones. A negative
     correlation, which would add information, is treated as 0.
     """
-    lag = np.array(elapsed_s / scenario.frame_duration_s)
-    rho = np.array([float(time_correlation(scenario, band, lag, np.array(0.0)))
-                    for band in range(scenario.n_bands)])
     # If the scatterers do not move, the phases are identical.
-    rho = np.clip(rho, 0.0, 1 - 1e-6)
+    rho = np.clip(time_correlation(scenario, elapsed_s), 0.0, 1 - 1e-6)
     mean = float(np.mean(rho))
     return (1 - mean) / (1 + mean)
 

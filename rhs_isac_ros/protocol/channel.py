@@ -64,9 +64,8 @@ class Fading:
             for band in range(scenario.n_bands)]
         if memory and user in self._latest:
             before_s, previous = self._latest[user]
-            lag = np.array((now_s - before_s) / scenario.frame_duration_s)
-            for band, earlier in enumerate(previous):
-                rho = float(time_correlation(scenario, band, lag, np.array(0.0)))
+            correlation = time_correlation(scenario, now_s - before_s)
+            for band, (earlier, rho) in enumerate(zip(previous, correlation, strict=True)):
                 gains[band] = rho * earlier + np.sqrt(1 - rho**2) * gains[band]
         self._latest.put(user, (now_s, gains))
         return gains

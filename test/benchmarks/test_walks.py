@@ -35,8 +35,7 @@ def test_signals_have_the_covariance_of_the_model_and_the_correlation_of_equatio
     mean = model.mean(walks.positions.reshape(-1, 3)).reshape(walks.signals.shape)
     white = model.whiten(walks.signals - mean)
     for band in range(scenario.n_bands):
-        rho = time_correlation(
-            scenario, band, np.array(PERIOD_S / scenario.frame_duration_s), np.array(0.0))
+        rho = time_correlation(scenario, PERIOD_S)[band]
         for lag, expected in ((0, 1.0), (1, rho), (2, rho**2)):
             product = np.mean(white[:, lag, band] * white[:, 0, band].conj(), axis=0)
             np.testing.assert_allclose(product, np.full(4, expected), atol=0.07)

@@ -8,7 +8,7 @@ from scipy.integrate import dblquad, tplquad
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model import multipath as mp
-from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
 
 
 def test_covariance_matches_the_vectors(case):
@@ -150,12 +150,13 @@ def test_the_multipath_from_a_side_is_coherent_with_a_wave_from_there(small):
 
 
 def test_correlations_match_the_vectors(case):
-    subbands, frames = np.arange(case.scenario.n_subbands), np.arange(case.scenario.n_frames)
-    for band in range(case.scenario.n_bands):
-        over_f = mp.frequency_correlation(case.scenario, band, subbands[:, None], subbands)
-        over_t = mp.time_correlation(case.scenario, band, frames[:, None], frames)
-        np.testing.assert_allclose(over_f, case.vectors['K_f'][band], rtol=1e-10)
-        np.testing.assert_allclose(over_t, case.vectors['K_t'][band], rtol=1e-10)
+    scenario, frames = case.scenario, np.arange(case.scenario.n_frames)
+    over_time = mp.time_correlation(
+        scenario, (frames[:, None] - frames) * scenario.frame_duration_s)
+    np.testing.assert_allclose(over_time, case.vectors['K_t'], rtol=1e-10)
+    for band, frequencies in enumerate(subband_frequencies_hz(scenario)):
+        over_frequency = mp.frequency_correlation(scenario, frequencies[:, None] - frequencies)
+        np.testing.assert_allclose(over_frequency, case.vectors['K_f'][band], rtol=1e-10)
 
 
 @pytest.fixture(scope='module')
@@ -171,12 +172,12 @@ def test_correlations_match_the_definition_when_they_are_low(fading, plain):
     for band in range(2):
         for a in range(3):
             for b in range(3):
-                assert mp.time_correlation(fading, band, a, b) == pytest.approx(
-                    p.rho_t(band, a, b), abs=1e-12)
+                found = mp.time_correlation(fading, (a - b) * fading.frame_duration_s)[band]
+                assert found == pytest.approx(p.rho_t(band, a, b), abs=1e-12)
         for a in range(2):
             for b in range(2):
-                assert mp.frequency_correlation(fading, band, a, b) == pytest.approx(
-                    p.rho_f(band, a, b), rel=1e-12)
+                found = mp.frequency_correlation(fading, (a - b) * fading.subband_width_hz)
+                assert found == pytest.approx(p.rho_f(band, a, b), rel=1e-12)
     assert abs(p.rho_t(1, 0, 2)) < 0.6
     assert abs(p.rho_f(0, 0, 1)) < 0.8
 

@@ -44,10 +44,9 @@ def simulate_walks(
         path[:] = [walk.state(time_s)[0] for time_s in times_s]
     signals = model.mean(positions.reshape(-1, 3)).reshape(n_walks, n_cycles, *model.shape)
     noise_w, n_rows = scenario.noise_power_w, model.shape[1]
-    lag = np.array(period_s / scenario.frame_duration_s)
-    for band, covariance in enumerate(model.covariance()):
+    correlation = time_correlation(scenario, period_s)
+    for band, (covariance, rho) in enumerate(zip(model.covariance(), correlation, strict=True)):
         root = square_root(covariance - noise_w * np.eye(n_rows))
-        rho = float(time_correlation(scenario, band, lag, np.array(0.0)))
         drawn = complex_normal((n_walks, n_cycles, root.shape[1]), rng)
         for cycle in range(1, n_cycles):
             drawn[:, cycle] = (
