@@ -139,7 +139,7 @@ def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
             product = np.conj(own.scatter(np.conj(vector.ravel())))
             return np.asarray(product.real if own.is_real else product)
 
-        start = np.random.default_rng(0).normal(size=spatial.n_elements)
+        start = np.random.default_rng(0).normal(size=spatial.power.shape[1:])
         start = start.astype(float if spatial.is_real else complex)
         operator = LinearOperator((len(start), len(start)), times, dtype=start.dtype)
         powers, directions = eigsh(operator, _MAX_MODES, v0=start, tol=_MODE_TOLERANCE)

@@ -60,11 +60,6 @@ class SpatialCovariance:
     # W F and F of the low-rank term that `plus` adds, if there is no matrix.
     excess: tuple[np.ndarray, np.ndarray] | None = None
 
-    @property
-    def n_elements(self) -> int:
-        """Number of elements N_E."""
-        return math.prod(self.shape)
-
     def __getitem__(self, bands: int | slice | list[int]) -> 'SpatialCovariance':
         """Return V_i of one or more of the bands."""
         return SpatialCovariance(
