@@ -15,6 +15,9 @@ from rhs_isac_ros.support import plugins
 KINDS = ('static', 'waypoints', 'random_walk')
 # Duration of a leg without length.
 _STAND_S = 1.0
+# After a longer time without a call, legs in between are skipped: a simulated clock may jump from 0
+# to the date of a recording.
+_MAX_GAP_S = 3600.0
 
 
 class Mobility(Protocol):
@@ -139,7 +142,7 @@ class RandomWalk(StraightMobility):
         if self._leg is None:
             self._leg = self._next(now_s)
         while now_s >= self._leg.end_s:
-            self._leg = self._next(self._leg.end_s)
+            self._leg = self._next(max(self._leg.end_s, now_s - _MAX_GAP_S))
         return self._leg
 
     def _draw(self) -> np.ndarray:

@@ -178,6 +178,15 @@ def test_a_walk_does_not_depend_on_the_times_of_the_calls():
     np.testing.assert_allclose(often_at, rarely_at, atol=1e-9)
 
 
+def test_a_walk_continues_after_a_jump_of_the_clock():
+    scenario = Scenario()
+    walk = mobility.RandomWalk(scenario, 1.0, np.random.default_rng(0))
+    positions, velocities = track(walk, [0.0, 1.8e9, 1.8e9 + 1])
+    low, high = scenario.roi_bounds_m
+    assert ((positions >= low) & (positions <= high)).all()
+    np.testing.assert_allclose(np.linalg.norm(velocities, axis=1), 1.0)
+
+
 def test_a_walk_changes_its_direction():
     walk = mobility.RandomWalk(Scenario(), 5.0, np.random.default_rng(0))
     _, velocities = track(walk, np.arange(0, 60, 0.2))
