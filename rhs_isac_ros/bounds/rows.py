@@ -70,13 +70,13 @@ class RowSource:
 class MeasurementRows:
     """Rows of all items and bands, as coefficients of basis vectors.
 
-    The sub-bands of a band form J groups of S sub-bands. The bases of a band are complex128
-    [J, S, N_E, R], or None if the coefficients are the rows themselves, with S = 1 and R = N_E.
+    The sub-bands of a band form J groups of S sub-bands: one group with a basis, complex128
+    [N_SB, N_E, R], or N_SB groups with None, as the coefficients are the rows, with R = N_E.
     """
 
     def __init__(self, source: RowSource, n_groups: int, width: int = 0) -> None:
         self.n_items, self.n_rows, self.patterns = source.n_items, source.n_rows, source.patterns
-        self.n_groups, self._n_in_group = n_groups, source.scenario.n_subbands // n_groups
+        self.n_groups, self._n_subbands = n_groups, source.scenario.n_subbands
         self._width = width
         self.bases: list[np.ndarray | None] = [None] * source.scenario.n_bands
 
@@ -90,7 +90,7 @@ class MeasurementRows:
 
     def means(self, band: int, radiation: np.ndarray) -> np.ndarray:
         """Return the means of the basis vectors of a band, complex128 [J, R, S F]."""
-        frames = radiation.reshape(self.n_groups, self._n_in_group, -1, radiation.shape[-1])
+        frames = radiation.reshape(self._n_subbands, -1, radiation.shape[-1])
         basis = self.bases[band]
         means = frames if basis is None else np.matmul(frames, np.conj(basis))
         return np.ascontiguousarray(
@@ -98,10 +98,9 @@ class MeasurementRows:
 
     def sums(self, band: int, weights: np.ndarray) -> np.ndarray:
         """Sum the basis vectors with weights [J, R, S F]; return complex128 [N_SB F, N_E]."""
-        frames = np.swapaxes(weights, 1, 2).reshape(
-            self.n_groups, self._n_in_group, -1, weights.shape[1])
+        frames = np.swapaxes(weights, 1, 2).reshape(self._n_subbands, -1, weights.shape[1])
         basis = self.bases[band]
-        sums = frames if basis is None else np.matmul(frames, np.swapaxes(basis, 2, 3))
+        sums = frames if basis is None else np.matmul(frames, np.swapaxes(basis, 1, 2))
         return sums.reshape(-1, sums.shape[-1])
 
 
@@ -267,7 +266,7 @@ class CompressedRows(MeasurementRows):
                 source.n_items * source.n_rows, tolerance,
                 max(_MIN_SKETCH, min(scenario.n_elements // 2, _MAX_RANK)))
             self.coefficients.append(coefficients)
-            self.bases[band] = basis.reshape(1, scenario.n_subbands, scenario.n_elements, -1)
+            self.bases[band] = basis.reshape(scenario.n_subbands, scenario.n_elements, -1)
 
     def chosen(self, items: np.ndarray) -> 'CompressedRows':
         """Return the rows of some items, int [n], with coefficients in single precision.
