@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial import chebyshev
 
 from rhs_isac_ros.bounds.fisher import fisher_information
 from rhs_isac_ros.model import MeasurementModel, Scenario
@@ -124,11 +125,13 @@ class _Lattice:
         span_hz = scenario.n_subbands * scenario.subband_width_hz
         turns = span_hz * np.ptp(limits) / SPEED_OF_LIGHT_MPS
         n_nodes = _N_NODES + int(np.ceil(2 * np.pi * turns))
-        angles = np.pi * (np.arange(n_nodes) + 0.5) / n_nodes
-        nodes = np.mean(limits) - np.ptp(limits) / 2 * np.cos(angles)
-        checks = np.linspace(limits[0], limits[1], _N_CHECKS)
-        at_ranges, self._at_checks = _weights(nodes, angles, ranges), _weights(
-            nodes, angles, checks)
+        middle, half = np.mean(limits), max(np.ptp(limits) / 2, np.finfo(float).tiny)
+        scaled = chebyshev.chebpts1(n_nodes)
+        nodes = middle + half * scaled
+        at_nodes, *wanted = (chebyshev.chebvander(points, n_nodes - 1).T for points in (
+            scaled, (ranges - middle) / half, np.linspace(-1, 1, _N_CHECKS)))
+        # Weights that interpolate from the nodes, [nodes, points].
+        at_ranges, self._at_checks = (np.linalg.solve(at_nodes, one) for one in wanted)
         wavenumbers = 2 * np.pi * np.array(scenario.center_frequencies_hz) / SPEED_OF_LIGHT_MPS
         signals = model.whiten(model.mean((sight[:, None] * nodes[:, None]).reshape(-1, 3)))
         signals = signals.reshape(len(sight), n_nodes, *model.shape)
@@ -187,14 +190,6 @@ class _Lattice:
         mean = weights @ offsets
         return np.array([
             *truth, weights @ np.sum((offsets - mean)**2, axis=1), mean @ mean])
-
-
-def _weights(nodes: np.ndarray, angles: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return weights that interpolate from Chebyshev nodes to `points`, [nodes, points]."""
-    gaps = points - nodes[:, None]
-    gaps[gaps == 0] = np.finfo(float).tiny
-    terms = ((-1.0)**np.arange(len(nodes)) * np.sin(angles))[:, None] / gaps
-    return terms / terms.sum(axis=0)
 
 
 def _steps(model: MeasurementModel, rng: np.random.Generator) -> tuple[np.ndarray, float]:
