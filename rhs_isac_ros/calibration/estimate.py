@@ -83,10 +83,10 @@ def estimate_surface(
         return _result(posterior, gains)
     for count in range(1, _MAX_ROUNDS + 1):
         information, shift = statistics.evaluate(
-            gains, posterior.complex_mean()[:n], posterior.complex_covariance()[:n, :n])
+            gains, posterior.mean[:n], posterior.covariance[:n, :n])
         before, posterior = posterior, surface_posterior(
             information, shift, prior, band_rms, posterior.failed)
-        gains = gains * (1 + posterior.complex_mean()[n:])
+        gains = gains * (1 + posterior.mean[n:])
         change = _change(before, posterior, n_bands)
         if progress:
             progress(count, change)
@@ -140,16 +140,15 @@ def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
 
 def _change(before: Posterior, after: Posterior, n_bands: int) -> float:
     """Return the largest change, in standard deviations; band parameters are already changes."""
-    moved = np.abs(after.complex_mean() - before.complex_mean())
-    moved[-n_bands:] = np.abs(after.complex_mean()[-n_bands:])
-    std = np.sqrt(np.maximum(np.diagonal(after.complex_covariance()).real, 1e-300))
+    moved = np.abs(after.mean - before.mean)
+    moved[-n_bands:] = np.abs(after.mean[-n_bands:])
+    std = np.sqrt(np.maximum(np.diagonal(after.covariance).real, 1e-300))
     return float(np.max(moved / np.maximum(std, 1e-9)))
 
 
 def _result(posterior: Posterior, band_gains: np.ndarray) -> SurfaceEstimate:
-    mean = posterior.complex_mean()
-    n = len(posterior.failed)
-    values, vectors = np.linalg.eigh(posterior.complex_covariance())
+    mean, n = posterior.mean, len(posterior.failed)
+    values, vectors = np.linalg.eigh(posterior.covariance)
     kept = values > _MIN_VARIANCE * max(values[-1], 0.0)
     return SurfaceEstimate(
         mean[:n], mean[n:2 * n], band_gains, vectors[:, kept] * np.sqrt(values[kept]),

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.gaussian import step_to_maximum
 
 # Smallest prior standard deviation of a coefficient; it keeps matrices invertible.
@@ -41,36 +42,26 @@ class SurfacePrior:
 
 
 class Posterior(NamedTuple):
-    """Gaussian approximation of a posterior, with all real parts before the imaginary parts."""
+    """Gaussian approximation of the posterior of P = 2 N_E + N_B complex parameters."""
 
-    # For the P = 2 N_E + N_B gains, offsets and band gains: float64 [2 P] and [2 P, 2 P].
+    # Mean of gains, offsets and errors of band gains, complex128 [P], and covariance E[z z^H] of
+    # their errors z, complex128 [P, P].
     mean: np.ndarray
     covariance: np.ndarray
     # Whether each element has probably failed, bool [N_E], and with what probability, [N_E].
     failed: np.ndarray
     failed_probability: np.ndarray
 
-    def complex_mean(self) -> np.ndarray:
-        """Return the mean, complex128 [P]."""
-        real, imag = np.split(self.mean, 2)
-        return real + 1j * imag
-
-    def complex_covariance(self) -> np.ndarray:
-        """Return the covariance E[z z^H] of the errors z, complex128 [P, P]."""
-        top, bottom = np.split(self.covariance, 2)
-        (rr, ri), (ir, ii) = np.split(top, 2, axis=1), np.split(bottom, 2, axis=1)
-        return rr + ii + 1j * (ir - ri)
-
 
 def without_data(prior: SurfacePrior, band_rms: np.ndarray, n_elements: int) -> Posterior:
     """Return the prior: the result of `surface_posterior` without information."""
     n, n_bands = n_elements, band_rms.shape[1]
-    size = 2 * (2 + n_bands)
-    one = surface_posterior(np.zeros((size, size)), np.zeros(size), prior, band_rms,
+    size = 2 + n_bands
+    one = surface_posterior(np.zeros((2 * size, 2 * size)), np.zeros(2 * size), prior, band_rms,
                             np.zeros(1, bool))
     # All elements have the distribution of this one, and they are independent.
-    like = np.repeat(np.arange(size), [n, n, *[1] * n_bands] * 2)
-    owner = np.tile([*range(n), *range(n), *[n] * n_bands], 2)
+    like = np.repeat(np.arange(size), [n, n, *[1] * n_bands])
+    owner = np.array([*range(n), *range(n), *[n] * n_bands])
     covariance = one.covariance[np.ix_(like, like)] * (owner[:, None] == owner)
     return Posterior(one.mean[like], covariance, np.repeat(one.failed, n),
                      np.repeat(one.failed_probability, n))
@@ -97,11 +88,12 @@ def surface_posterior(information: np.ndarray, shift: np.ndarray, prior: Surface
         difference, weight = other_mean - mean, other[element]
         total_mean += weight * difference
         total_covariance += weight * (
-            other_covariance - covariance + (1 - weight) * np.outer(difference, difference))
+            other_covariance - covariance
+            + (1 - weight) * np.outer(difference, np.conj(difference)))
     if other.sum() > 1:
         # The correction for each element assumes that the states of all others do not change.
         values, vectors = np.linalg.eigh(total_covariance)
-        total_covariance = vectors * np.maximum(values, 0.0) @ vectors.T
+        total_covariance = vectors * np.maximum(values, 0.0) @ adjoint(vectors)
     return Posterior(total_mean, total_covariance, state, np.where(state, 1 - other, other))
 
 
@@ -142,10 +134,14 @@ class _Search:
         return covariance @ self._shift[indices], (covariance + covariance.T) / 2
 
     def moments(self, failed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the posterior mean [2 P] and covariance [2 P, 2 P] given the states."""
+        """Return the posterior mean [P] and covariance [P, P] given the states, complex128."""
         indices = self._indices(failed)
-        mean, covariance = np.zeros(2 * self._size), np.zeros((2 * self._size, 2 * self._size))
-        mean[indices], covariance[np.ix_(indices, indices)] = self._solve(indices)
+        means, parts = self._solve(indices)
+        chosen, _ = np.split(indices, 2)
+        (rr, ri), (ir, ii) = parts.reshape(2, len(chosen), 2, -1).swapaxes(1, 2)
+        mean, covariance = np.zeros(self._size, complex), np.zeros([self._size] * 2, complex)
+        mean[chosen] = [1, 1j] @ means.reshape(2, -1)
+        covariance[np.ix_(chosen, chosen)] = rr + ii + 1j * (ir - ri)
         return mean, covariance
 
     def climb(self, failed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -34,7 +34,7 @@ def used(failed):
 
 
 def exact(design, data, share=0.1):
-    """Mean, covariance and probabilities by enumeration of all states."""
+    """Complex mean and covariance, and probabilities, by enumeration of all states."""
     weights, means, covariances, states = [], [], [], []
     for state in itertools.product((False, True), repeat=N_ELEMENTS):
         failed = np.array(state)
@@ -58,7 +58,10 @@ def exact(design, data, share=0.1):
     mean = shares @ means
     second = sum(share * (covariance + np.outer(one, one)) for share, one, covariance in zip(
         shares, means, covariances, strict=True))
-    return mean, second - np.outer(mean, mean), shares @ np.array(states, float)
+    # From real and imaginary parts to complex numbers.
+    parts = np.kron([1, 1j], np.eye(SIZE))
+    covariance = parts @ (second - np.outer(mean, mean)) @ parts.conj().T
+    return parts @ mean, covariance, shares @ np.array(states, float)
 
 
 @pytest.mark.parametrize('share', [0.1, 0.4])
