@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.gaussian import step_to_maximum
 
 # Smallest prior standard deviation of a coefficient; it keeps matrices invertible.
@@ -90,10 +89,6 @@ def surface_posterior(information: np.ndarray, shift: np.ndarray, prior: Surface
         total_covariance += weight * (
             other_covariance - covariance
             + (1 - weight) * np.outer(difference, np.conj(difference)))
-    if other.sum() > 1:
-        # The correction for each element assumes that the states of all others do not change.
-        values, vectors = np.linalg.eigh(total_covariance)
-        total_covariance = vectors * np.maximum(values, 0.0) @ adjoint(vectors)
     return Posterior(total_mean, total_covariance, state, np.where(state, 1 - other, other))
 
 
