@@ -7,11 +7,11 @@ from rhs_isac_ros.calibration.calibration import (
     load_surface,
     report,
 )
-from rhs_isac_ros.calibration.estimate import Pilots, estimate_surface, prior_of
+from rhs_isac_ros.calibration.estimate import Pilots, prior_of
 from rhs_isac_ros.calibration.mixture import SurfacePrior
 from rhs_isac_ros.calibration.survey import SurveyWarning, survey, survey_report
 
 __all__ = [
     'Calibration', 'CalibrationError', 'Pilots', 'SurfacePrior', 'SurveyWarning', 'calibrate',
-    'estimate_surface', 'load_surface', 'prior_of', 'report', 'survey', 'survey_report',
+    'load_surface', 'prior_of', 'report', 'survey', 'survey_report',
 ]

@@ -100,10 +100,12 @@ class Calibration:
 
 def calibrate(scenario: Scenario, pilots: Sequence[Pilots],
               prior: SurfacePrior | None = None) -> Calibration:
-    """Estimate a surface from pilots with `estimate_surface`; add the scenario and a record."""
+    """Estimate a surface from pilots of one or several codebooks; add the scenario and a record.
+
+    The default prior is the result of `prior_of`. Without pilots, the estimate is the prior.
+    """
     prior = prior or prior_of(scenario)
-    changes: list[float] = []
-    surface = estimate_surface(scenario, pilots, prior, lambda _, change: changes.append(change))
+    surface, changes = estimate_surface(scenario, pilots, prior)
     codebooks = sorted({str(getattr(group.beams, 'id', '')) for group in pilots} - {''})
     return Calibration(surface, _without_hall(scenario).id, {
         'pilots': sum(len(group.positions) for group in pilots), 'codebooks': codebooks,

@@ -66,33 +66,28 @@ def prior_of(scenario: Scenario) -> SurfacePrior:
 
 @one_blas_thread
 def estimate_surface(
-        scenario: Scenario, pilots: Sequence[Pilots], prior: SurfacePrior | None = None,
-        progress: Callable[[int, float], None] | None = None) -> SurfaceEstimate:
+        scenario: Scenario, pilots: Sequence[Pilots], prior: SurfacePrior
+) -> tuple[SurfaceEstimate, list[float]]:
     """Estimate a surface from pilots of one or several codebooks.
 
-    The default prior is the result of `prior_of`. Without pilots, the estimate is the prior.
-    `progress` is called after each round with the number of the round and the largest change of a
-    parameter, in standard deviations.
+    Also returns the largest change of a parameter in each round, in standard deviations. Without
+    pilots, there is no round, and the estimate is the prior.
     """
-    prior = prior or prior_of(scenario)
     statistics = PilotStatistics(scenario, pilots)
     n_bands, n = scenario.n_bands, 2 * scenario.n_elements
     band_rms = _band_rms(scenario, prior)
     gains, posterior = np.ones(n_bands, complex), without_data(prior, band_rms, n // 2)
-    if not any(len(group.positions) for group in pilots):
-        return _result(posterior, gains)
-    for count in range(1, _MAX_ROUNDS + 1):
+    changes: list[float] = []
+    for _ in range(_MAX_ROUNDS if any(len(group.positions) for group in pilots) else 0):
         information, shift = statistics.evaluate(
             gains, posterior.mean[:n], posterior.covariance[:n, :n])
         before, posterior = posterior, surface_posterior(
             information, shift, prior, band_rms, posterior.failed)
         gains = gains * (1 + posterior.mean[n:])
-        change = _change(before, posterior, n_bands)
-        if progress:
-            progress(count, change)
-        if change < TOLERANCE:
+        changes.append(_change(before, posterior, n_bands))
+        if changes[-1] < TOLERANCE:
             break
-    return _result(posterior, gains)
+    return _result(posterior, gains), changes
 
 
 def initial_values(nuisance: Nuisance, white: np.ndarray, white_mean: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rhs_isac_ros.calibration import Pilots, SurfacePrior, estimate_surface, prior_of
+from rhs_isac_ros.calibration import Pilots, SurfacePrior, calibrate, prior_of
 from rhs_isac_ros.calibration.estimate import initial_values
 from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario
 from rhs_isac_ros.model.elements import DeclaredElements, SurfaceEstimate
@@ -34,7 +34,7 @@ def excess_energy(scenario, beams, surface, known):
 def test_a_surface_is_recovered(scenario, beams, damaged, send, changes):
     scenario = dataclasses.replace(scenario, **changes)
     surface = damaged(3)
-    found = estimate_surface(scenario, [send(scenario, beams, surface)])
+    found = calibrate(scenario, [send(scenario, beams, surface)]).surface
     np.testing.assert_array_equal(found.failed, ~np.isnan(surface.stuck))
     plain = dataclasses.replace(scenario, element_error_rms=0.0, failed_element_share=0.0)
     assert excess_energy(scenario, beams, surface, found) < 2.0
@@ -47,7 +47,7 @@ def test_deviations_are_those_of_the_errors(scenario, beams, damaged, send, trut
     normalised = []
     for seed in range(8):
         surface = damaged(seed)
-        found = estimate_surface(scenario, [send(scenario, beams, surface, 30, seed)])
+        found = calibrate(scenario, [send(scenario, beams, surface, 30, seed)]).surface
         errors = np.concatenate([found.gains, found.offsets]) - truth(surface).ravel()
         std = found.std()[:len(errors)]
         # Offsets of elements that surely work are zero without any uncertainty.
@@ -57,8 +57,8 @@ def test_deviations_are_those_of_the_errors(scenario, beams, damaged, send, trut
 
 def test_without_pilots_the_estimate_is_the_prior(scenario, beams):
     """Mean and covariance of the signals are those that the scenario declares."""
-    found = estimate_surface(scenario, [], SurfacePrior(
-        scenario.element_error_rms, scenario.failed_element_share, band_gain_rms=0.0))
+    found = calibrate(scenario, [], SurfacePrior(
+        scenario.element_error_rms, scenario.failed_element_share, band_gain_rms=0.0)).surface
     elements = DeclaredElements(scenario)
     applied, expected = found.applied_beams(beams), elements.applied_beams(beams)
     np.testing.assert_allclose(applied.analog, expected.analog, atol=1e-9)
@@ -73,7 +73,7 @@ def test_gains_and_phases_of_bands_are_estimated(scenario, beams, damaged, send)
     surface, gains = damaged(4), np.array([1.3 * np.exp(0.5j), 0.8 * np.exp(-2.0j)])
     pilots = send(scenario, beams, surface)
     pilots = Pilots(beams, pilots.positions, gains[:, None] * pilots.received)
-    found = estimate_surface(scenario, [pilots])
+    found = calibrate(scenario, [pilots]).surface
     std = found.std()[-2:]
     assert (np.abs(found.band_gains / gains - 1) < 4 * std).all()
     assert (std < 0.1).all()
@@ -94,7 +94,7 @@ def test_several_codebooks_reveal_more_of_the_elements(scenario, damaged, send, 
     surface = damaged(5)
     codebooks = [random_beams(scenario, np.random.default_rng(seed)) for seed in range(3)]
     groups = [send(scenario, codebook, surface, 20) for codebook in codebooks]
-    alone, together = estimate_surface(scenario, groups[:1]), estimate_surface(scenario, groups)
+    alone, together = (calibrate(scenario, some).surface for some in (groups[:1], groups))
     assert together.std()[:25].mean() < 0.8 * alone.std()[:25].mean()
 
 
@@ -103,7 +103,7 @@ def test_an_intact_surface_stays_intact(beams, scenario, send):
     silent = Scenario(elements_per_side=5, n_feeds=2)
     assert prior_of(silent).element_error_rms > 0
     pilots = send(silent, beams, None)
-    found = estimate_surface(silent, [pilots])
+    found = calibrate(silent, [pilots]).surface
     assert not found.failed.any()
     assert excess_energy(silent, beams, None, found) < 2.0
 
@@ -114,7 +114,7 @@ def test_estimators_use_the_surface(scenario, beams, damaged, send):
     An estimator that assumes an ideal surface gives no position for most signals.
     """
     surface = damaged(6)
-    estimate = estimate_surface(scenario, [send(scenario, beams, surface)])
+    estimate = calibrate(scenario, [send(scenario, beams, surface)]).surface
     fresh = send(scenario, beams, surface, 60, seed=7)
     ideal = dataclasses.replace(scenario, element_error_rms=0.0, failed_element_share=0.0)
     assert make_estimator('bayes', ideal, beams).estimate(fresh.received).fix.mean() < 0.5
@@ -132,7 +132,7 @@ def test_estimators_use_the_surface(scenario, beams, damaged, send):
 def test_a_poor_estimate_has_consistent_errors(scenario, beams, damaged, send):
     """Few pilots leave errors whose covariance depends on the position."""
     surface = damaged(8)
-    estimate = estimate_surface(scenario, [send(scenario, beams, surface, 4)])
+    estimate = calibrate(scenario, [send(scenario, beams, surface, 4)]).surface
     fresh = send(scenario, beams, surface, 60, seed=8)
     model = MeasurementModel(scenario, beams, estimate)
     errors = fresh.received - model.mean(fresh.positions)
