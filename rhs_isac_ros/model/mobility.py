@@ -15,8 +15,8 @@ from rhs_isac_ros.support import plugins
 KINDS = ('static', 'waypoints', 'random_walk')
 # Duration of a leg without length.
 _STAND_S = 1.0
-# After a longer time without a call, legs in between are skipped: a simulated clock may jump from 0
-# to the date of a recording.
+# After a longer time without a call, legs in between are skipped: a simulated clock may jump from
+# 0 to the date of a recording.
 _MAX_GAP_S = 3600.0
 
 
