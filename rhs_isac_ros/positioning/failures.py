@@ -29,7 +29,6 @@ from rhs_isac_ros.model.multipath import measurement_correlation, multipath_cova
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.positioning.coordinates import concatenate, jacobian, select, to_positions
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
-from rhs_isac_ros.positioning.lattice import Means
 from rhs_isac_ros.positioning.likelihood import (
     Likelihood,
     Local,
@@ -218,15 +217,16 @@ class FailedSet:
         self._whitening = model.whitening(failed)
         stuck = np.full(model.scenario.n_elements, np.nan)
         stuck[self._failed] = 0.5
-        self._means = Means(MeasurementModel(
-            model.scenario, model.likelihood.codebook, ElementErrors(np.ones(len(stuck)), stuck)))
+        self._mean_model = MeasurementModel(
+            model.scenario, model.likelihood.codebook, ElementErrors(np.ones(len(stuck)), stuck))
         self._offset = model.log_prior(failed) + model.likelihood.log_volume
         self._amplitudes = model.amplitudes[self._failed]
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate the log-likelihood at points; see `Conditional.local`."""
         scenario, prior = self._model.scenario, self._model.likelihood.nuisance
-        positions, (mean, slopes) = to_positions(points), self._means(points)
+        positions = to_positions(points)
+        mean, slopes = self._mean_model.mean_and_jacobian(positions, jacobian(points))
         gains = np.stack([
             np.repeat(los_gain(scenario, positions, band)[:, :, self._failed],
                       scenario.n_frames, axis=1) for band in range(scenario.n_bands)])

@@ -1,7 +1,7 @@
 """The lengths over which signals from the region differ, and the grid that follows from them.
 
 The lengths follow from wavelength, aperture, bandwidth and region. The grid of the search is as
-coarse as they permit. Points in nearly the same direction share one expansion of the mean signals.
+coarse as they permit. The cells of a template share one expansion of the mean signals.
 """
 
 import functools
@@ -31,8 +31,6 @@ _STEP_RAD = 0.5
 # correct both errors to first order.
 PHASE_ERROR = 0.2
 _AMPLITUDE_ERROR = 0.05
-# Phase at the edge of the aperture within which points share an expansion [rad].
-_SHARED_RAD = 0.05
 # Radii of an ellipsoid around a mode that contains no other mode, in wavelengths and radians.
 _SEPARATION_WAVELENGTHS = 0.37
 _SEPARATION_RAD = 0.57
@@ -250,25 +248,3 @@ def whiten(model: MeasurementModel, mean: np.ndarray, slopes: np.ndarray) -> np.
     columns = np.moveaxis(np.concatenate([mean[:, None], slopes], axis=1), 2, 0)
     white = np.matmul(columns.reshape(n_bands, -1, n_rows), np.swapaxes(model.whitener, 1, 2))
     return np.moveaxis(white.reshape(n_bands, len(mean), 4, n_rows), 0, 2)
-
-
-class Means:
-    """Mean signals and their derivatives; points in nearly the same direction share an expansion.
-
-    This saves time, because many modes of the posterior differ little except in range.
-    """
-
-    def __init__(self, model: MeasurementModel) -> None:
-        self._model, resolution = model, Resolution.of(model.scenario)
-        self._per_cell = np.array(
-            [resolution.curvature_m, *1 / resolution.direction]) / _SHARED_RAD
-
-    def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Evaluate the mean signals at points (r [m], u, v), [M, 3]; see `Expansion.at`."""
-        cells = points * self._per_cell
-        cells[:, 0] = self._per_cell[0] / points[:, 0]
-        keys = np.rint(cells).astype(np.int64) @ np.array([1 << 42, 1 << 21, 1])
-        _, first, index = np.unique(keys, return_index=True, return_inverse=True)
-        if len(first) == len(points):
-            return self._model.mean_and_jacobian(to_positions(points), jacobian(points))
-        return Expansion.of(self._model, points[first]).at(index, points)

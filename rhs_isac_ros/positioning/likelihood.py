@@ -22,8 +22,8 @@ from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.gaussian import marginalise, quadratic_form, step_to_maximum
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, Exponents, nuisance_of
 from rhs_isac_ros.model.measurement import Surface
-from rhs_isac_ros.positioning.coordinates import to_positions
-from rhs_isac_ros.positioning.lattice import Means, Resolution, whiten
+from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
+from rhs_isac_ros.positioning.lattice import Resolution
 
 # Standard deviation of a Gaussian whose density at its centre equals that of a uniform phase.
 _UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
@@ -219,7 +219,7 @@ class Likelihood:
         # Estimators are built between cycles; the first estimate should be as fast as later ones.
         self.model = MeasurementModel(scenario, codebook, surface).prepare()
         self.nuisance = NuisancePrior(self.model)
-        self.resolution, self._means = Resolution.of(scenario), Means(self.model)
+        self.resolution = Resolution.of(scenario)
         self.log_volume = float(log_determinant(self.model.root).sum())
 
     def signals(self, received: np.ndarray) -> Signals:
@@ -234,9 +234,10 @@ class Likelihood:
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate the likelihood at points; see `Conditional.local`."""
-        n, white = len(points), whiten(self.model, *self._means(points))
-        mean, whitened = white[:, 0], self.whitened(values, signals)
-        columns = [(whitened - mean).reshape(n, 1, -1), white[:, 1:].reshape(n, 3, -1)]
+        n, whitened = len(points), self.whitened(values, signals)
+        mean, slopes = self.model.mean_and_jacobian(
+            to_positions(points), jacobian(points), whitened=True)
+        columns = [(whitened - mean).reshape(n, 1, -1), slopes.reshape(n, 3, -1)]
         if len(self.nuisance):
             observed = self.nuisance.slopes(whitened)
             moves = self.nuisance.moves_multipath[:, None]
@@ -326,7 +327,6 @@ class DispersedLikelihood:
             dataclasses.replace(scenario, failed_element_share=share), likelihood.codebook,
             likelihood.surface).prepare()
         self._intact = MeasurementModel(intact, likelihood.codebook, likelihood.surface)
-        self._means = Means(self._average)
         self._scales, log_weights = _failure_counts(scenario.n_elements, share)
         self._offsets = log_weights + likelihood.log_volume
         self._latest: tuple[np.ndarray, list[np.ndarray]] | None = None
@@ -352,7 +352,8 @@ class DispersedLikelihood:
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate the likelihood at points; see `Conditional.local`."""
         prior, states = self._base.nuisance, []
-        columns = prior.columns(values, signals.received, *self._means(points))
+        mean, slopes = self._average.mean_and_jacobian(to_positions(points), jacobian(points))
+        columns = prior.columns(values, signals.received, mean, slopes)
         for roots, offset, information in zip(
                 self._roots_at(points), self._offsets, self._information, strict=True):
             white, log_volume = whiten_each(roots, columns)

@@ -20,7 +20,7 @@ from rhs_isac_ros.model.multipath import (
 )
 from rhs_isac_ros.model.surface import AppliedBeams
 from rhs_isac_ros.positioning.grid import TemplateTable, tabulate
-from rhs_isac_ros.positioning.lattice import Means, Resolution
+from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood, NuisancePrior, Signals
 from rhs_isac_ros.positioning.posterior import WeightedSamples, draw_samples
 from rhs_isac_ros.positioning.search import find_modes
@@ -141,7 +141,7 @@ class ArrayLikelihood(Likelihood):
                       scenario.n_feeds)))
         # The prior of no parameters is the same for all beams.
         self.nuisance = NuisancePrior(MeasurementModel(scenario, dark))
-        self.resolution, self._means = Resolution.of(scenario), Means(receiver)
+        self.resolution = Resolution.of(scenario)
 
 
 def posterior_means(receiver: ArrayReceiver, received: np.ndarray) -> np.ndarray:
