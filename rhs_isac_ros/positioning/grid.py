@@ -21,11 +21,9 @@ from rhs_isac_ros.model.gaussian import quadratic_form
 from rhs_isac_ros.positioning.coordinates import (
     carrier_wavenumbers,
     concatenate,
-    is_inside,
     likelihood_loss,
     offset_to_roi,
     select,
-    to_positions,
 )
 from rhs_isac_ros.positioning.lattice import (
     PHASE_ERROR,
@@ -217,15 +215,17 @@ class TemplateTable:
             step, value = self._step(query, peaks, points, values)
             points = points + step
         error = _STEP_ERROR * self._loss[peaks.cell]
-        value = value - self._loss_outside(peaks.phases, points, peaks.cell, value, margin + error)
+        curvature = self._curvature[peaks.cell]
+        # Moves into the region lower the likelihood.
+        value = value - likelihood_loss(offset_to_roi(
+            points, curvature, self._bounds, self._resolution.tolerance_m), curvature)
         order = np.lexsort((-value, peaks.phases))
-        order = order[np.isfinite(value[order])]
         firsts = first_of_each(peaks.phases[order])
         slack = error[order] + np.repeat(error[order[firsts]], np.diff(firsts, append=len(order)))
         order = order[heaviest(peaks.phases[order], value[order], margin + slack)]
         phases, points, values = peaks.phases[order], points[order], values[order]
         chosen = separate(phases, points, self._resolution.separation(prior.is_coarse),
-                          self._curvature[peaks.cell[order]])
+                          curvature[order])
         return Starts(phases[chosen], points[chosen], values[chosen])
 
     def _peaks(self, query: 'Query', draw: Callable[['Query', int], bool] | None) -> '_Peaks':
@@ -400,21 +400,6 @@ class TemplateTable:
     def _cell_ranges(self, cells: np.ndarray) -> np.ndarray:
         """Return the central range [m] of the cell of each (template, cell) pair, float64 [K]."""
         return self.grid.ranges_m[self.grid.cell[cells]]
-
-    def _loss_outside(self, phases: np.ndarray, points: np.ndarray, cells: np.ndarray,
-                      value: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Return the log-likelihood lost by moves into the region, [P]; inf for unlikely moves."""
-        inside = is_inside(to_positions(points), self._bounds)
-        result = np.where(inside, 0.0, np.inf)
-        best = np.full(phases.max(initial=0) + 1, -np.inf)
-        np.maximum.at(best, phases[inside], value[inside])
-        outside = np.flatnonzero(~inside & (value >= best[phases] - margin))
-        if len(outside):
-            curvature = self._curvature[cells[outside]]
-            offset = offset_to_roi(
-                points[outside], curvature, self._bounds, self._resolution.tolerance_m)
-            result[outside] = likelihood_loss(offset, curvature)
-        return result
 
 
 class Starts(NamedTuple):
