@@ -152,7 +152,7 @@ def _step(conditional: Conditional, likelihood: Likelihood, starts: Starts, sign
     modes = Modes(
         starts.phases, points, marginal.information, evidence + rise, offset, values,
         local.residual - gain, np.full(len(points), state))
-    return modes, gain if moves else np.zeros(len(points))
+    return modes, gain
 
 
 def predict(local: Local, likelihood: Likelihood) -> np.ndarray:
