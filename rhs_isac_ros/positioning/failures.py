@@ -240,8 +240,7 @@ class FailedSet:
             roots = np.linalg.cholesky(self._covariance + self._model.excess_at(positions))
             white, log_volume = whiten_each(roots, columns)
         local = assemble(
-            prior, values, white, information_of_covariance=self._whitening.information,
-            n_linear=len(self._failed))
+            prior, values, white, self._whitening.information, len(self._failed))
         return local._replace(value=local.value + self._offset - log_volume)
 
 
@@ -350,8 +349,8 @@ class FailureModel:
         n = len(columns)
         white = np.matmul(np.moveaxis(columns, 2, 0), np.swapaxes(whitening.whitener, 2, 3))
         white = np.moveaxis(white, 0, 2).reshape(n, columns.shape[1], -1)
-        local = assemble(self.likelihood.nuisance, values, white, n_linear=n_failed,
-                         information_of_covariance=whitening.information)
+        local = assemble(
+            self.likelihood.nuisance, values, white, whitening.information, n_failed)
         return predict(local, self.likelihood)
 
     def _extensions_of(self, failed: Failed, remainder: float) -> Whitening:

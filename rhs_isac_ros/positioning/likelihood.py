@@ -242,7 +242,8 @@ class Likelihood:
             observed = self.nuisance.slopes(whitened)
             moves = self.nuisance.moves_multipath[:, None]
             columns += [np.where(moves, observed, self.nuisance.slopes(mean)), observed]
-        return assemble(self.nuisance, values, np.concatenate(columns, axis=1))
+        return assemble(
+            self.nuisance, values, np.concatenate(columns, axis=1), self.nuisance.information)
 
     def settle(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Replace uniform band phases in parameters [M, Q] by the most likely phases."""
@@ -259,15 +260,15 @@ class Likelihood:
         return np.sum(mean.conj() * self.whitened(values, signals), axis=2)
 
 
-def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
-             information_of_covariance: np.ndarray | None = None, n_linear: int = 0) -> Local:
+def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray,
+             information_of_covariance: np.ndarray, n_linear: int = 0) -> Local:
     """Combine whitened columns into the likelihood and its derivatives at parameters [M, Q].
 
     `white`, complex128 [M, C, n], contains the whitened `NuisancePrior.columns`. Without the last
     Q, gradient and information use the same derivatives, and never predict an energy below 0.
     `information_of_covariance`, float64 [Q, Q], is the information of the covariance about the
-    parameters, by default that of the average covariance. `n_linear` is the number of further
-    standard normal parameters, in which the mean is linear; they are integrated out.
+    parameters. `n_linear` is the number of further standard normal parameters, in which the mean
+    is linear; they are integrated out.
     """
     n, end = 3 + len(prior), 4 + len(prior) + n_linear
     expected, observed = np.ascontiguousarray(white[:, 1:end]), white[:, end:]
@@ -283,8 +284,7 @@ def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
     if len(prior):
         # Derivatives of parameters that move the multipath already include this information.
         still = ~prior.moves_multipath
-        information[:, 3:n, 3:n] += np.outer(still, still) * (
-            prior.information if information_of_covariance is None else information_of_covariance)
+        information[:, 3:n, 3:n] += np.outer(still, still) * information_of_covariance
         gradient[:, 3:n] -= prior.precision * values + prior.volume
         value = prior.log_prior(values) - energy
     if not n_linear:
@@ -357,7 +357,7 @@ class DispersedLikelihood:
         for roots, offset, information in zip(
                 self._roots_at(points), self._offsets, self._information, strict=True):
             white, log_volume = whiten_each(roots, columns)
-            local = assemble(prior, values, white, information_of_covariance=information)
+            local = assemble(prior, values, white, information)
             states.append(local._replace(value=local.value + offset - log_volume))
         return _average_of(states)
 
