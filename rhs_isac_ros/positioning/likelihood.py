@@ -424,8 +424,9 @@ class Alignment:
     """
 
     def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:
-        self._model, self._prior = likelihood.model, likelihood.nuisance
-        self._whitener = np.linalg.inv(np.linalg.cholesky(spread + np.eye(spread.shape[1])))
+        self._prior = likelihood.nuisance
+        roots = np.linalg.cholesky(spread + np.eye(spread.shape[1]))
+        self._whitener = np.linalg.solve(roots, likelihood.model.whitener)
 
     def values_of_each(self, received: np.ndarray) -> np.ndarray:
         """Estimate the parameters [N, Q] that move the multipath; all others are 0."""
@@ -469,4 +470,5 @@ class Alignment:
         return candidates[np.argmin(cost)]
 
     def _whitened(self, signals: np.ndarray) -> np.ndarray:
-        return np.einsum('irs,nis->nir', self._whitener, self._model.whiten(signals))
+        return np.moveaxis(
+            np.matmul(np.moveaxis(signals, 1, 0), np.swapaxes(self._whitener, 1, 2)), 0, 1)

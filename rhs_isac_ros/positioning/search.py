@@ -36,7 +36,8 @@ MAX_STEPS = 8
 class Modes(NamedTuple):
     """Local maxima of the posterior in or near the region of interest (ROI)."""
 
-    phases: np.ndarray  # Positioning phase of each mode, int [M], ascending.
+    # Positioning phase of each mode, int [M], ascending; the most likely mode of a phase is first.
+    phases: np.ndarray
     points: np.ndarray  # (r [m], u, v), float64 [M, 3].
     curvature: np.ndarray  # Curvature of the marginal log-likelihood there, float64 [M, 3, 3].
     # Marginal log-likelihood, up to a constant, float64 [M]. Without nuisance parameters and

@@ -188,3 +188,13 @@ def test_the_posterior_with_the_truth_requires_rare_failures(random_beams):
     intact = dataclasses.replace(FAILING, failed_element_share=0.0)
     with pytest.raises(ValueError, match='failed_element_share: 0, expected'):
         posterior_with_truth(intact, codebook, received, [surface], POSITION)
+
+
+def test_wide_phases_of_the_bands_add_little_to_uniform_ones(codebook):
+    scenario, received = draw(codebook, band_phase_std_rad=1.5)
+    wide, uniform = (
+        exhaustive_posterior(world, codebook, received, LOG2_POINTS)
+        for world in (scenario, dataclasses.replace(scenario, band_phase_std_rad=2 * np.pi)))
+    np.testing.assert_allclose(wide.mean, uniform.mean, atol=0.1)
+    # The declared phases still contain information.
+    assert (wide.mean != uniform.mean).all()

@@ -158,7 +158,7 @@ class _Posterior:
             signals = select(self._signals, [phase])
             outputs = likelihood.outputs(points, values, signals)
             turned = outputs * np.exp(1j * values @ prior.phases.T)
-            value += self._phases.factors(turned.T, averages=False)[0]
+            value += self._phases.factors(turned.T)[0]
         return value
 
     def _integrated(self, conditional: Conditional, points: np.ndarray, values: np.ndarray,
