@@ -28,10 +28,11 @@ def range_confusion_error(
         frequencies_hz: np.ndarray, energies: np.ndarray, max_lag_m: float) -> np.ndarray:
     """Estimate the squared error from confused ranges for P band plans, float64 [P] [m^2].
 
-    A minimum at a lag r of either sign has the weight w = (1 - |r| / r_max) Q(sqrt(q / 2)), with
-    q = 2 E sum_i (1 - cos(2 pi f_i r / v_0)) / N_B. The factor 1 - |r| / r_max is the share of
-    positions for which the lag stays inside the region. The estimate is sum w r^2 / (1/2 + sum w),
-    the mean of r^2 over the confused ranges and the true one, averaged over the energies E.
+    A minimum at a lag r of either sign has the weight ``w = (1 - |r| / r_max) Q(sqrt(q / 2))``,
+    with q = 2 E sum_i (1 - cos(2 pi f_i r / v_0)) / N_B. The factor ``1 - |r| / r_max`` is the
+    share of positions for which the lag stays inside the region. The estimate, averaged over the
+    energies E, is sum w r^2 / (1/2 + sum w): the mean of r^2 over the confused ranges and the true
+    one.
 
     Takes the centre frequencies of each plan, float64 [P, N_B] [Hz], the energies E of the
     whitened mean signals of all bands at some positions, float64 [N], and r_max [m].

@@ -61,7 +61,10 @@ ERRORS = (MissingLibraryError, ValueError, OSError, MemoryError)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, even if Ctrl-C ends the search, or 2 after one of `ERRORS`."""
+    """Run the command; return 0, even if Ctrl-C ends the search, or 2 after one of `ERRORS`.
+
+    The exit code is 130 if Ctrl-C ends the comparison of band plans, which writes no codebook.
+    """
     parser = ArgumentParser(
         prog='python3 -m rhs_isac_ros.codebook', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
@@ -70,6 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     check(parser, options)
     try:
         run(options)
+    except KeyboardInterrupt:
+        return 130
     except ERRORS as error:
         print_error(error, parser.prog)
         return 2

@@ -40,7 +40,8 @@ Surface = ElementErrors | SurfaceEstimate
 # Number of positions that `simulate_received` processes at a time; affects its random numbers.
 _BLOCK = 256
 # Target size of arrays over elements and sub-bands [bytes]. Larger arrays do not fit in the cache,
-# and every call obtains new memory pages for them.
+# and every call obtains new memory pages for them. Another size of blocks changes the last digits
+# of all results.
 _ARRAY_BYTES = 3 << 18
 _MIN_BLOCK = 8
 
@@ -134,7 +135,7 @@ class MeasurementModel:
     """Distribution of the received signals for one scenario and beamforming.
 
     Instances are immutable. The constructor computes only the radiation matrices; `prepare` or the
-    first use computes the factors of the covariance and the weights of `mean_and_jacobian`.
+    first use computes the factors of the covariance and the weights of the mean signals.
 
     Methods that take positions of the user, float64 [N, 3] [m], raise ValueError if the shape is
     wrong or a value is not finite. Measurements are sub-band-major. Only `sample` includes
@@ -260,7 +261,7 @@ class MeasurementModel:
         impairments and channel files. The multipath is drawn from the covariance of its signals,
         which is a hundred times as fast as drawing the gain of every element.
         """
-        scenario = self.scenario
+        positions, scenario = checked_positions(positions), self.scenario
         surface, factors = draw_impairments(scenario, len(positions), rng)
         blocked = draw_blocked(scenario, len(positions), rng)
         model = self
@@ -268,10 +269,13 @@ class MeasurementModel:
             model = MeasurementModel(scenario, self.beams, surface)
         if scenario.channel:
             signals = np.empty((len(positions), *self.shape), complex)
-            for block in blocks(len(positions), self._weights.block):
+
+            def fill(block: slice) -> None:
                 for band, radiation in enumerate(model.radiation):
                     los = direct_gain(scenario, positions[block], band, blocked[block])
                     signals[block, band] = received_signal(los, 0.0, radiation, 0.0)
+
+            map_blocks(fill, blocks(len(positions), self._weights.block))
         else:
             signals = model.mean(positions)
             signals[blocked] = 0

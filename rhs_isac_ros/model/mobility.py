@@ -127,7 +127,8 @@ class RandomWalk(StraightMobility):
     """A user that walks straight between random positions from `Scenario.sample_positions`.
 
     The first position is also random, unless it is given as `start`, float64 [3] [m]. If the same
-    position is drawn twice, the user stands there for `_STAND_S`.
+    position is drawn twice, the user stands there for `_STAND_S`. Legs that would have ended more
+    than `_MAX_GAP_S` before a call are skipped.
     """
 
     def __init__(

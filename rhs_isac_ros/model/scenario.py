@@ -288,8 +288,8 @@ class Scenario(Extensions, Table1):
         changes = {field.name: _plain(value) for field in dataclasses.fields(self)
                    if (value := getattr(self, field.name)) != field.default}
         if folder is not None:
-            changes |= {name: os.path.relpath(changes[name], folder)
-                        for name in _FILES if name in changes}
+            changes |= {name: os.path.relpath(os.path.realpath(path), os.path.realpath(folder))
+                        for name in _FILES if (path := changes.get(name))}
         return changes
 
     def fields(self) -> dict[str, Any]:

@@ -239,6 +239,8 @@ def main(args: Sequence[str] | None = None) -> int:
         if options.push_file:
             return _push(Codebook.load(options.push_file), args)
         codebook, reason = run_command(options)
+    except KeyboardInterrupt:
+        return 0
     except ERRORS as error:
         print_error(error, topics.OPTIMIZER_NODE)
         return 2

@@ -144,7 +144,7 @@ class Outside:
 
     name = 'outside'  # `Estimate` has the field ``<name>_probability``.
     reason = 'position outside of the region'  # Beginning of the reason why there is no fix.
-    limit = OUTSIDE_LIMIT  # Largest probability at which there is a fix.
+    limit = OUTSIDE_LIMIT  # Largest probability at which there is a fix, if alone.
     # Logarithm of the prior odds relative to a user inside and in sight: half of the users are
     # outside.
     log_odds = 0.0

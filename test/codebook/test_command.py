@@ -202,6 +202,14 @@ def test_the_bands_are_chosen_with_the_codebook(call, files, scenario, capsys, m
         f'{frequency / 1e9:g}' for frequency in Scenario.from_yaml(plan).center_frequencies_hz))
 
 
+def test_ctrl_c_while_plans_are_compared_writes_no_codebook(call, files, monkeypatch):
+    def interrupted(*arguments, **options):
+        raise KeyboardInterrupt
+    monkeypatch.setattr(__main__, 'choose_bands', interrupted)
+    assert call('--spectrum', '2.5e9:3e9', '--bands', 2, '--plan', files / 'plan.yaml') == 130
+    assert not (files / 'codebook.yaml').exists()
+
+
 @pytest.mark.parametrize(('arguments', 'words'), [
     (['--spectrum', '2.5e9:3e9'], ['--bands: expected together with --spectrum']),
     (['--bands', '2'], ['--bands: expected together with --spectrum']),

@@ -246,10 +246,12 @@ def test_paths_are_relative_to_the_folder_of_the_file(tmp_path, monkeypatch):
                 2.75e9).save(tmp_path / 'paths.npz')
     monkeypatch.chdir(tmp_path)
     scenario = Scenario(channel='paths.npz')
-    (tmp_path / 'plans').mkdir()
-    path = tmp_path / 'plans' / 'plan.yaml'
-    path.write_text(yaml.safe_dump(scenario.changes(path.parent)), encoding='utf-8')
-    assert Scenario.from_yaml(path).id == scenario.id
+    (tmp_path / 'all' / 'plans').mkdir(parents=True)
+    (tmp_path / 'link').symlink_to(tmp_path / 'all' / 'plans')
+    for folder in ('all/plans', 'link'):
+        path = tmp_path / folder / 'plan.yaml'
+        path.write_text(yaml.safe_dump(scenario.changes(path.parent)), encoding='utf-8')
+        assert Scenario.from_yaml(path).id == scenario.id
 
 
 def test_a_given_default_is_not_a_change(case):
