@@ -29,10 +29,11 @@ class PairwiseErrorCost(Average):
 
     A maximum-likelihood decision between two positions is wrong with probability Q(sqrt(q / 2)),
     where q = sum_i dmu_i^H Lambda_i^-1 dmu_i and dmu is the difference of the mean signals. The
-    cost is the average of ``w |p - p'|^2 Q(sqrt(q / 2))`` [m^2]. In its quadratic form, the
-    difference h(p) - h(p') replaces the derivative of Eq. (12). If the scenario declares unknown
-    phases, the form is minimised over them; other nuisance parameters are not included. Takes the
-    positions, float64 [N, 3] [m], and weights w, float64 [N], of N pairs; without weights, w = 1.
+    cost is the average of ``w |p - p'|^2 Q(sqrt(q / 2))`` [m^2]. Apart from the factor 2, q is the
+    quadratic form of Eq. (12), with h(p) - h(p') in place of the derivative. If the scenario
+    declares unknown phases, q is minimised over them; other nuisance parameters are not included.
+    Takes the positions, float64 [N, 3] [m], and weights w, float64 [N], of N pairs; without
+    weights, w = 1.
     `tolerance` and `tick` are the same as in `AverageCrlb`. Raises ValueError if a shape is wrong,
     a position is not finite, a weight is negative or NaN, or there are no pairs.
     """

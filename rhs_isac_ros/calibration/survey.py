@@ -257,9 +257,10 @@ def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
               in_sight: np.ndarray, total: np.ndarray, weight: float) -> np.ndarray:
     """Mark positions that probably have a direct path, bool [N]; if there are none, mark all.
 
-    Without a direct path, signals are multipath of an unknown level. With one, the level of the
-    multipath varies as among the positions that are `in_sight`. `total`, complex128 [N_B, R, R],
-    is the sum over these positions and the prior, and has the given `weight`.
+    Without a direct path, signals are multipath of an unknown level. With one, the level varies as
+    much as it does among the positions marked in `in_sight`. `total`, complex128 [N_B, R, R], is
+    the sum of e e^H over their residuals e, plus the prior covariance times its weight; `weight`
+    is that weight plus their number.
     """
     whitener = np.linalg.inv(np.linalg.cholesky(total))
     with_path = np.einsum('irs,nis->nir', whitener, residuals)

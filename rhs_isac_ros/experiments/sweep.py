@@ -152,7 +152,7 @@ def _estimator(name: str, scenario: str, codebook: str) -> Estimator:
 
 
 def _initialise_sobol() -> None:
-    """Create a Sobol sequence under a lock; at first use, SciPy loads a table without one."""
+    """Create a Sobol sequence under a lock: SciPy has none for the table that it then loads."""
     with _FIRST_SOBOL:
         qmc.Sobol(1)
 

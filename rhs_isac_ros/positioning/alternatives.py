@@ -2,8 +2,8 @@
 
 Each alternative has prior odds and an evidence, the likelihood averaged over its own unknowns. A
 comparison with the evidence for a user in the region gives the probability of the alternative. If
-the probability exceeds a limit, there is no fix. The limit for a user outside is high, because the
-prior odds are even although most users are inside, and these users should not lose their fixes.
+the probability exceeds a limit, there is no fix. The limit for a user outside is high: its prior
+odds are 1 to 1, but most users are inside and should not lose their fixes.
 """
 
 import math
@@ -64,8 +64,8 @@ class Blocked:
     """A user without a direct path, whose signals are multipath of an unknown level.
 
     The evidence for a user in sight is computed as if all users had the same level. An average
-    over their levels would multiply this evidence by a factor. Only the ratio of both evidences
-    counts, so the evidence for a blocked user is divided by this factor instead.
+    over their levels would multiply this evidence by a factor. Only its ratio to the evidence for
+    a blocked user counts, so the latter is divided by this factor instead.
 
     The attributes are those of `Outside`.
     """

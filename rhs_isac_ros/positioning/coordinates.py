@@ -35,8 +35,8 @@ def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,
                   tolerance_m: float) -> np.ndarray:
     """Compute the offsets, [M, 3], from modes into the region of interest; 0 for modes inside it.
 
-    The offset follows the sphere of the mode's range, because the signals determine the range
-    best. The range then changes with the direction to keep the likelihood as high as possible.
+    The direction is chosen first, at the range of the mode, which the signals determine best. The
+    range is then adjusted to the new direction so that the likelihood is as high as possible.
     Takes modes (r [m], u, v), float64 [M, 3], the curvature of the log-likelihood there, the
     bounds of the region, float64 [2, 3], and the largest distance from the sphere that counts as
     zero.
