@@ -144,7 +144,8 @@ class Outside:
 
     name = 'outside'  # `Estimate` has the field ``<name>_probability``.
     reason = 'position outside of the region'  # Beginning of the reason why there is no fix.
-    limit = OUTSIDE_LIMIT  # Largest probability at which there is a fix, if alone.
+    # Largest probability at which there is a fix, if no other alternative is considered.
+    limit = OUTSIDE_LIMIT
     # Logarithm of the prior odds relative to a user inside and in sight: half of the users are
     # outside.
     log_odds = 0.0
