@@ -50,13 +50,14 @@ setup(
         'neural': ['scikit-learn'],
         'genetic': ['pymoo'],
         'recording': ['mcap'],
+        'samples': ['sigmf'],
         'watch': ['rich'],
         # See requirements-view.txt.
         'view': ['rerun-sdk==0.22.1', 'pyarrow==25.0.0'],
         'all': [
             'matplotlib', 'joblib', 'dask', 'distributed', 'tqdm', 'scikit-learn',
-            'pymoo', 'mcap', 'rich', 'rerun-sdk==0.22.1', 'pyarrow==25.0.0'],
-        'docs': ['sphinx', 'furo', 'myst-parser'],
+            'pymoo', 'mcap', 'sigmf', 'rich', 'rerun-sdk==0.22.1', 'pyarrow==25.0.0'],
+        'docs': ['sphinx', 'furo', 'myst-nb'],
         'test': ['pytest', 'hypothesis', 'mcap-ros2-support', 'rosbags'],
     },
     zip_safe=False,

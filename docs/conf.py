@@ -1,9 +1,17 @@
 """Sphinx configuration; scripts/docs builds with it."""
 
+import logging
+import os
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent / 'extensions'))
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / 'docs' / 'extensions'))
+# Notebooks run with the kernel of this folder, whatever the user has installed and configured.
+os.environ['JUPYTER_PATH'] = str(ROOT / 'docs' / 'jupyter')
+os.environ['IPYTHONDIR'] = os.environ['JUPYTER_RUNTIME_DIR'] = str(ROOT / 'build' / 'jupyter')
+# Only warnings: the ROS libraries print all messages of other libraries.
+logging.getLogger('traitlets').setLevel(logging.WARNING)
 
 from rhs_isac_ros import __version__  # noqa: E402
 
@@ -11,8 +19,8 @@ project = 'rhs_isac_ros'
 author = 'rhs_isac_ros authors'
 copyright = author
 version = release = __version__
-extensions = ['sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'myst_parser', 'generated', 'mathml',
-              'notebook_pages', 'pictures']
+extensions = ['sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'myst_nb',
+              'matplotlib.sphinxext.plot_directive', 'generated', 'mathml']
 
 # The pages must display offline, so no fonts and no MathJax are loaded from other sites.
 html_theme = 'furo'
@@ -27,7 +35,14 @@ html_show_sourcelink = False
 html_copy_source = False
 
 default_role = 'py:obj'
-exclude_patterns = ['examples']
+exclude_patterns = ['examples', 'jupyter', 'pictures']
+# A build executes every notebook once. A cell that fails or prints a warning ends the build.
+nb_execution_mode = 'force'
+nb_execution_raise_on_error = True
+nb_execution_timeout = 240
+nb_output_stderr = 'error'
+plot_formats = [('png', 144)]
+plot_html_show_formats = plot_html_show_source_link = False
 autodoc_typehints_format = 'short'
 # The sources have none, and the search takes time.
 autodoc_use_type_comments = False

@@ -19,9 +19,10 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
+from rhs_isac_ros.positioning import Site
 from rhs_isac_ros.ros.parameters import NODES
 from rhs_isac_ros.ros.processes import MAX_USER_NODES
-from rhs_isac_ros.ros.roster import ROSTER
+from rhs_isac_ros.ros.roster import FOLLOWING, MEMBERS, ROSTER
 
 PACKAGE = 'rhs_isac_ros'
 # A launch that receives SIGTERM does not end its processes, so the kernel does.
@@ -30,6 +31,8 @@ ARGUMENTS = {
     'users': ('2', 'Number of users; more than 16 share one process.'),
     'config': ('', 'Scenario file; empty: Table I of the paper.'),
     'codebook': ('', 'Codebook file that fits the scenario; empty: the default codebook.'),
+    'site': ('', 'Site file, which takes the place of config and codebook: one network for each '
+             'surface, and their fusion; empty: a single surface.'),
     'seed': ('0', 'Seed of all random numbers.'),
     'estimator': ('bayes', 'Position estimator.'),
     'params_file': ('', 'ROS parameter file for all nodes, which takes precedence over the other '
@@ -68,13 +71,18 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     Raises
     ------
     ValueError
-        If the number of users or the seed is not an integer in its range, or if the parameter
-        file does not exist.
+        If the number of users or the seed is not an integer in its range, if the parameter file
+        does not exist, or if the site file is invalid or used with another file.
     """
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
     users = _integer('users', given, 1)
     values = {'seed': _integer('seed', given, 0), 'codebook_file': given['codebook'],
               'estimator': given['estimator']}
+    others = [name for name in ('config', 'codebook', 'record', 'composed')
+              if given[name] not in ('', 'false')]
+    if given['site'] and others:
+        raise ValueError(f'site: {given["site"]!r}, expected none with {others[0]}')
+    networks = _networks(given['site'])
     file = given['params_file']
     if file and not Path(file).is_file():
         raise ValueError(f'params_file: {file!r}, expected an existing file')
@@ -82,11 +90,26 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         # Without a name, the parameters apply to every node of the process.
         nodes = [_node(given, 'network', None, users=users, **values)]
     else:
-        nodes = [node for role in ROSTER for node in _nodes(given, role, users, values)]
+        nodes = [node for name, roles in networks for role in roles
+                 for node in _nodes(_below(given, name), role, users, values)]
     if 'true' in (given['visualizer'], given['rviz']):
-        nodes.append(_node(given, 'visualizer', 'visualizer'))
+        nodes += [_node(_below(given, name), 'visualizer', 'visualizer')
+                  for name, roles in networks if 'positioner' in roles]
     # The recorder comes first, because it misses earlier messages that are not latched.
     return [*_recorder(given), *nodes, *_rviz(given)]
+
+
+def _networks(site: str) -> list[tuple[str, tuple[str, ...]]]:
+    """Return the names of the networks and their roles; a network without a site has no name."""
+    if not site:
+        return [('', tuple(ROSTER))]
+    leader, *others = Site.from_yaml(site).surfaces
+    return [(leader, tuple(ROSTER)), *((name, FOLLOWING) for name in others), ('', ('fusion',))]
+
+
+def _below(given: dict[str, str], name: str) -> dict[str, str]:
+    """Return the arguments of a network with a name, whose namespace is in the given one."""
+    return {**given, 'namespace': f'{given["namespace"].rstrip("/")}/{name}'.rstrip('/')}
 
 
 def _nodes(
@@ -95,7 +118,7 @@ def _nodes(
     """Return the nodes of a role, with the `values` that are parameters of this role."""
     known = {parameter.name for parameter in NODES[role]}
     values = {name: value for name, value in values.items() if name in known}
-    if ROSTER[role].is_unique:
+    if MEMBERS[role].is_unique:
         return [_node(given, role, role, **values)]
     if users > MAX_USER_NODES:
         return [LogInfo(msg=f'the {users} users share the node users'),
@@ -117,6 +140,7 @@ def _node(given: dict[str, str], executable: str, name: str | None, **values: in
     # JSON quotes a string so that YAML does not read it as another type.
     pairs = [f'{key}:={json.dumps(value, ensure_ascii=False)}'
              for key, value in {**values, 'scenario_file': given['config'],
+                                'site_file': given['site'],
                                 'use_sim_time': given['use_sim_time'] == 'true'}.items()]
     return _process(
         given, name or executable, given['respawn'] == 'true',
@@ -154,7 +178,8 @@ def _rviz(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
         get_package_prefix('rviz2')
     except PackageNotFoundError:
         return [LogInfo(msg='rviz2 is not installed: apt install ros-jazzy-rviz2')]
-    file = f'{get_package_share_directory(PACKAGE)}/config/rviz/network.rviz'
+    name = 'site' if given['site'] else 'network'
+    file = f'{get_package_share_directory(PACKAGE)}/config/rviz/{name}.rviz'
     return [Node(
         package='rviz2', executable='rviz2', name='rviz', exec_name='rviz', output='screen',
         # The topic names in the file are relative.

@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib.util
+import signal
 import subprocess
 import sys
 import sysconfig
@@ -22,6 +23,8 @@ pytest_plugins = ['in_memory_network']
 if importlib.util.find_spec('rclpy'):
     pytest_plugins += ['node_processes', 'node_bench']
 HERE = Path(__file__).resolve().parent
+# A session without a terminal may ignore it, and the processes of the tests would inherit this.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 LIBRARIES = ('numpy', 'scipy', 'scikit-learn', 'matplotlib', 'pyyaml', 'joblib', 'dask', 'rich')
 
 # The profile quick uses the same examples in every run; thorough uses many more, which differ from
@@ -103,6 +106,16 @@ def built_scripts():
         pytest.skip(f'a test of the scripts: {done.stderr.strip()}')
 
 
+@pytest.fixture(autouse=True)
+def signal_handlers():
+    """Restore the signal handlers after the test, because an executable changes them."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in numbers}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.fixture(scope='session')
 def small() -> Case:
     return load_case('small')
@@ -145,7 +158,9 @@ class Plain:
         self.rows = [(j, q) for j in range(scenario.n_subbands) for q in range(scenario.n_frames)]
         wavelengths = [self.light / f for f in scenario.center_frequencies_hz]
         self.patterns = {}
-        self.interval = scenario.element_interval_wavelengths * sum(wavelengths) / len(wavelengths)
+        # Along y and z.
+        self.intervals = sum(wavelengths) / len(wavelengths) * np.array(
+            scenario.element_interval_wavelengths) * np.ones(2)
 
     def frequency(self, i, j):
         s = self.scenario
@@ -153,14 +168,14 @@ class Plain:
 
     def element(self, m):
         columns, rows = self.scenario.n_columns, self.scenario.n_rows
-        return np.array([0, m % columns - (columns - 1) / 2, m // columns - (rows - 1) / 2]) * (
-            self.interval)
+        y, z = m % columns - (columns - 1) / 2, m // columns - (rows - 1) / 2
+        return np.array([0, y * self.intervals[0], z * self.intervals[1]])
 
     def feed(self, k):
         s = self.scenario
         if s.feed_positions_m is not None:
             return np.array(s.feed_positions_m[k])
-        board = s.n_columns * self.interval
+        board = s.n_columns * self.intervals[0]
         return np.array([0, ((k + 0.5) / s.n_feeds - 0.5) * board, 0])
 
     def los(self, position, i, j, m):

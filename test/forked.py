@@ -1,17 +1,45 @@
 """Executables as copies of a process that has imported them and never used ROS."""
 
 import contextlib
+import ctypes
+import importlib
 import multiprocessing
 import os
 import signal
 import subprocess
+import sys
+from pathlib import Path
 
-from rhs_isac_ros.executables import EXECUTABLES, PARENT_ID
-from rhs_isac_ros.ros.processes import run_executable
+from rhs_isac_ros.executables import EXECUTABLES
+from rhs_isac_ros.support.exits import exit_code_of, on_end_signals
+
+# Option of prctl: the kernel ends a process with a signal when its parent dies.
+PR_SET_PDEATHSIG = 1
 
 FORKS = multiprocessing.get_context('forkserver')
 FORKS.set_forkserver_preload([
     f'rhs_isac_ros.nodes.{name}' for name, package in EXECUTABLES.items() if package == 'nodes'])
+
+
+def run_executable(command, log, environment):
+    """Run an executable in this process, a new fork, as its command would, and exit.
+
+    Output is appended to `log`. A signal results in the exit code 0, even before the executable
+    handles it.
+    """
+    on_end_signals(lambda number, _: sys.exit(0))
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    os.setsid()
+    os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666), 1)
+    os.dup2(1, 2)
+    os.environ.clear()
+    os.environ.update(environment)
+    name = Path(command[0]).name
+    # Set the name that `ps` and `top` show.
+    Path('/proc/self/comm').write_text(name, encoding='ascii')
+    sys.argv = list(command)
+    module = importlib.import_module(f'rhs_isac_ros.nodes.{name}')
+    sys.exit(exit_code_of(module.main, program=name))
 
 
 class Forked:
@@ -22,7 +50,7 @@ class Forked:
 
     def __init__(self, command, log, environment):
         self._command = command
-        self._process = FORKS.Process(target=run, args=(command, log, environment))
+        self._process = FORKS.Process(target=run_executable, args=(command, log, environment))
         self._process.start()
 
     @property
@@ -44,7 +72,3 @@ class Forked:
 
     def kill(self):
         self.send_signal(signal.SIGKILL)
-
-
-def run(command, log, environment):
-    run_executable(command, log, {**environment, PARENT_ID: str(os.getppid())})

@@ -5,13 +5,14 @@ import enum
 import heapq
 import itertools
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.codebook import Codebook, random_codebook
+from rhs_isac_ros.frontend import Air, EmulatedRadio, EmulatedSurface, FrontEnd, Surface
 from rhs_isac_ros.link import Beam, CapacityReport
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.model.los import los_gain
@@ -20,11 +21,11 @@ from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
 from rhs_isac_ros.model.surface import radiation_matrix
 from rhs_isac_ros.positioning import Estimate, ModelError
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol import transmission
 from rhs_isac_ros.protocol import user as user_role
 from rhs_isac_ros.protocol.base_station import BaseStation
-from rhs_isac_ros.protocol.channel import Channel
+from rhs_isac_ros.protocol.channel import Channel, apply_patterns
 from rhs_isac_ros.protocol.events import (
+    ApplyPatterns,
     BuildEstimator,
     CodebookOffered,
     LogMessage,
@@ -60,6 +61,33 @@ class Centre:
 
     def estimate(self, received: np.ndarray) -> Estimate:
         return Estimate(self._position, np.eye(3))
+
+
+FIXED_PLACE = np.array([8.0, -2.0, 0.5])
+# Means of the mixture in an example of a posterior [m].
+PLACES_OF_MODES = np.array([FIXED_PLACE, [8.0, -2.5, 0.5]])
+
+
+class Fixed:
+    """An estimator with a fixed result, whose name contains the id of its codebook."""
+
+    def __init__(self, codebook: Codebook) -> None:
+        self.name = f'fixed {codebook.id}'
+
+    def estimate(self, received: np.ndarray) -> Estimate:
+        return Estimate(FIXED_PLACE, 4 * np.eye(3))
+
+
+def plain_choice(scenario: Scenario, position: np.ndarray, covariance_m2: np.ndarray,
+                 bands: Sequence[int], surface: Any) -> Any:
+    """Take the place of `choose_beam`, with a beam that depends on the position alone."""
+    angles = np.arange(scenario.n_elements) * np.abs(position).sum()
+    digital = np.full((scenario.n_subbands, scenario.n_feeds), 0.1 + 0j)
+    return types.SimpleNamespace(
+        beam=Beam(0.5 + 0.5 * np.cos(angles), digital, bands[0]), expected_bps=1e6)
+
+
+PLAIN_BEAMS = {'choose': plain_choice, 'evaluate': lambda *_: CapacityReport(1e6, 1.1e6)}
 
 
 class Sent(NamedTuple):
@@ -103,10 +131,25 @@ class LosesFirst:
         return [(1e-3, message)]
 
 
+def emulated_front_end(scenario: Scenario, surface: Surface | None = None) -> FrontEnd:
+    air = Air(scenario, np.random.default_rng(0))
+    return FrontEnd(
+        surface or EmulatedSurface(scenario.n_elements), EmulatedRadio(scenario, air), air)
+
+
 def feed(role: Any, events: Iterable[Any]) -> list[list[m.Message]]:
-    """Return the messages that a role sends, one list for each event."""
-    return [[action.message for action in role.handle(event, float(n))
-             if isinstance(action, Send)] for n, event in enumerate(events)]
+    """Return the messages that a role sends, one list for each event.
+
+    The surface confirms all configurations, and the radio measures them without noise.
+    """
+    def sent(event, now_s):
+        for action in role.handle(event, now_s):
+            if isinstance(action, Send):
+                yield action.message
+            elif isinstance(action, ApplyPatterns):
+                yield from sent(apply_patterns(
+                    emulated_front_end(role._scenario), action), now_s)
+    return [[*sent(event, float(n))] for n, event in enumerate(events)]
 
 
 class Noisy:
@@ -133,7 +176,8 @@ class Network:
 
     `users` maps user numbers to positions or mobilities; `make` builds the estimator of a
     codebook, which takes `make_s`; `ordered` keeps the order of messages of a class from one role
-    to another.
+    to another. `plain_beams` replaces the optimisation of beams, which takes most of a cycle, by a
+    simple function.
     """
 
     def __init__(
@@ -142,10 +186,14 @@ class Network:
             rest_s: float = 0.1, transport: Transport = on_time, ordered: bool = True, make=None,
             make_s: float = 0.0, absent: Iterable[str] = (),
             begin_s: float = 0.0, retries: int = 0, beacon_timeout_s: float = 3.0,
-            allowed_users: str = '', ack_rate_hz: float = np.inf) -> None:
+            allowed_users: str = '', ack_rate_hz: float = np.inf,
+            plain_beams: bool = False, positioner=None) -> None:
+        self._positioner = positioner
         self.scenario, self.seed = scenario, seed
+        self._beams: dict[str, Any] = PLAIN_BEAMS if plain_beams else {}
         self.transport, self.ordered = transport, ordered
         self.now_s = begin_s
+        self.front_end = emulated_front_end(scenario)
         self.settings = BaseStationSettings(
             policy=policy, ack_timeout_s=ack_timeout_s, step_timeout_s=step_timeout_s,
             retries=retries, rest_s=rest_s, data_duration_s=DATA_DURATION_S,
@@ -238,6 +286,8 @@ class Network:
                 self.publish(action.message, name)
             elif isinstance(action, BuildEstimator):
                 self._make_estimator(name, action)
+            elif isinstance(action, ApplyPatterns):
+                self.dispatch(name, apply_patterns(self.front_end, action))
             elif isinstance(action, RevertSettings):
                 self.kept.append(action.settings)
             elif isinstance(action, Reply):
@@ -265,7 +315,7 @@ class Network:
 
     def publish(self, message: m.Message, sender: str = 'external') -> None:
         """Deliver a message to all roles that receive it."""
-        m.check(message, self.scenario.sizes)
+        m.check(message, self.scenario)
         if sender in self.instances:
             message = dataclasses.replace(message, sender=self.instances[sender])
         self.log.append(Sent(self.now_s, sender, message))
@@ -405,16 +455,16 @@ class Network:
             case 'user':
                 return user_role.User(
                     self._mobilities[name], step_s, self._beacon_timeout_s,
-                    self.instances[name])
+                    self.instances[name], pose=scenario.pose)
             case 'channel':
                 # Two channels differ in their multipath. Without memory, the expected signals
                 # depend on the seed alone.
                 return Channel(scenario, self.seed + name.endswith('_twin'),
                                Impairments(multipath_memory=False))
             case 'positioner':
-                return Positioner(scenario, lambda: self.now_s)
+                return Positioner(scenario, lambda: self.now_s, self._positioner)
             case 'transmission':
-                return Transmission(scenario)
+                return Transmission(scenario, **self._beams)
         return ROLES[kind]()
 
     def _receive(self, codebook, feeds, user: int, cycle_id: int, noise: bool) -> np.ndarray:
@@ -432,20 +482,9 @@ class Network:
                 self.dispatch(name, PeersChanged(missing))
 
 
-@pytest.fixture(scope='module')
-def plain_beams():
-    """Replace the optimisation of beams, which takes most of a cycle, by a simple function."""
-    def choose(scenario, position, covariance_m2, bands, surface):
-        angles = np.arange(scenario.n_elements) * np.abs(position).sum()
-        digital = np.full((scenario.n_subbands, scenario.n_feeds), 0.1 + 0j)
-        return types.SimpleNamespace(
-            beam=Beam(0.5 + 0.5 * np.cos(angles), digital, bands[0]), expected_bps=1e6)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(transmission, 'choose_beam', choose)
-        patch.setattr(
-            transmission, 'capacity_report', lambda *_: CapacityReport(1e6, 1.1e6))
-        yield
+@pytest.fixture
+def plain_beams() -> None:
+    """Request networks with plain beams."""
 
 
 @pytest.fixture(scope='session')
@@ -467,12 +506,14 @@ def places(scenario) -> np.ndarray:
 
 
 @pytest.fixture
-def network(scenario, codebooks, places):
+def network(request, scenario, codebooks, places):
     """Function that returns a network; `users` is a number of users or a mapping."""
+    plain_beams = 'plain_beams' in request.fixturenames
+
     def make(users=1, codebook=codebooks[0], **options) -> Network:
         if isinstance(users, int):
             users = {user: places[user - 1] for user in range(1, users + 1)}
-        return Network(scenario, codebook, users, **options)
+        return Network(scenario, codebook, users, plain_beams=plain_beams, **options)
     return make
 
 
@@ -499,11 +540,21 @@ def subscriptions() -> dict[str, tuple[type[m.Message], ...]]:
 
 @pytest.fixture(scope='session')
 def example(scenario):
-    """Function that returns a message of a class with zeros or random numbers, or given values."""
+    """Function that returns a message of a class with zeros or random numbers, or given values.
+
+    Positions are in front of the surface, and symbols have unit magnitude.
+    """
     def make(kind: type[m.Message], rng: np.random.Generator | None = None, **given) -> m.Message:
         sizes, values = scenario.sizes, {}
         if kind is m.GroundTruths:
             given = {'users': np.array([1, 2])} | given
+        if kind is m.Posterior:
+            given = {'log_weights': np.log([0.25, 0.75]), 'means': PLACES_OF_MODES.copy(),
+                     'covariances_m2': 0.01 * np.stack([np.eye(3), 4 * np.eye(3)]),
+                     'missing_probability': 1e-3, 'outside_probability': 0.25,
+                     'blocked_probability': 0.0,
+                     'surface_quaternion': np.array([0.6, 0.0, 0.0, 0.8]),
+                     'surface_uncertainty': 1e-4 * np.eye(6)} | given
         fields = dataclasses.fields(kind)
         for field in fields:
             meta = field.metadata
@@ -528,5 +579,9 @@ def example(scenario):
                 values[field.name] = np.zeros(shape, field.metadata['declared'].kind)
                 if rng is not None:
                     values[field.name] += rng.random(shape)
+                if field.metadata['in_front']:
+                    values[field.name][..., 0] += 1
+                if field.name == 'symbols':
+                    values[field.name] = np.exp(1j * values[field.name])
         return kind(**values)
     return make

@@ -26,12 +26,12 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.type_support import check_for_type_support
 
 import rhs_isac_msgs.msg as ros
-from rhs_isac_ros.executables import PARENT_ID
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE
-from rhs_isac_ros.ros.processes import claim_domain
+from rhs_isac_ros.ros.environment import claim_domain
+from rhs_isac_ros.ros.processes import with_parent
 
 # Set before rclpy reads them; the child processes inherit them.
 os.environ['ROS_DOMAIN_ID'] = claim_domain()
@@ -62,8 +62,8 @@ class Process:
             return
         with open(log, 'wb') as stream:
             self._popen = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream,
-                env={**environment, PARENT_ID: str(os.getpid())})
+                with_parent(command), stdin=subprocess.DEVNULL, stdout=stream, stderr=stream,
+                env=environment)
 
     @property
     def log(self):
@@ -270,7 +270,9 @@ def make_watch():
 def small_files(random_beams, tmp_path_factory):
     """Folder with the files of a small scenario and of two codebooks for it."""
     folder = tmp_path_factory.mktemp('small')
-    fields = {'n_subbands': 2, 'n_frames': 3, 'n_feeds': 2, 'elements_per_side': 4}
+    # Twelve measurements rarely show whether a user is inside: all users are taken to be.
+    fields = {'n_subbands': 2, 'n_frames': 3, 'n_feeds': 2, 'elements_per_side': 4,
+              'outside_probability': 0.0}
     scenario = Scenario(**fields)
     (folder / 'scenario.yaml').write_text(yaml.safe_dump(fields), encoding='utf-8')
     for seed, name in enumerate(('first', 'second')):

@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.ros.roster import UNIQUE
+from rhs_isac_ros.ros.roster import FOLLOWING, UNIQUE
 
 ROOT = Path(__file__).parents[1]
-FILES = ('network.launch.py', 'network.launch.xml')
+FILES = ('network.launch.py', 'network.launch.xml', 'site.launch.py')
 TIMEOUT_S = 60.0
 # mcap has no rosdep key.
 RECORDS = importlib.util.find_spec('mcap') is not None
@@ -97,7 +97,7 @@ def test_both_files_list_the_same_arguments():
     module = load_python_file()
     assert f'more than {module.MAX_USER_NODES} share' in module.ARGUMENTS['users'][1]
     python, xml = ({argument.name: argument.description for argument in load(
-        str(ROOT / 'launch' / file)).get_launch_arguments()} for file in FILES)
+        str(ROOT / 'launch' / file)).get_launch_arguments()} for file in FILES[:2])
     assert python == xml and python.keys() == module.ARGUMENTS.keys()
 
 
@@ -114,6 +114,38 @@ ONE_EACH = [name for name in UNIQUE if name != 'bs']
     ({'composed': 'true', 'visualizer': 'true'}, ['network', 'visualizer'])])
 def test_the_started_executables(values, expected):
     assert [name for name, _ in started(**values)] == expected
+
+
+@needs_launch
+def test_a_site_has_a_network_for_each_surface_and_their_fusion():
+    site = str(ROOT / 'config' / 'site.yaml')
+    nodes = started(site=site, namespace='lab', users='1', visualizer='true')
+    assert [(node._Node__node_namespace, name) for name, node in nodes] == [
+        *(('lab/front', name) for name in [*ONE_EACH, 'user', 'bs']),
+        *(('lab/side', name) for name in FOLLOWING), ('lab', 'fusion'),
+        ('lab/front', 'visualizer'), ('lab/side', 'visualizer')]
+
+
+@needs_launch
+@pytest.mark.parametrize(('values', 'file'), [
+    ({}, 'network.rviz'), ({'site': str(ROOT / 'config' / 'site.yaml')}, 'site.rviz')])
+def test_rviz_opens_the_layout_of_the_network_in_its_namespace(values, file, monkeypatch):
+    module = load_python_file()
+    # RViz need not be installed.
+    monkeypatch.setattr(module, 'get_package_prefix', lambda name: '')
+    given = {name: default for name, (default, _) in module.ARGUMENTS.items()}
+    (rviz,) = module._rviz(given | {'rviz': 'true', 'namespace': 'lab'} | values)
+    words = [''.join(part.text for part in word if hasattr(part, 'text')) for word in rviz.cmd]
+    (path,) = [Path(word) for word in words if word.endswith('.rviz')]
+    assert (path.name, rviz._Node__node_namespace) == (file, 'lab')
+    assert path.is_file()
+
+
+@needs_launch
+@pytest.mark.parametrize('other', ['config', 'codebook', 'record', 'composed'])
+def test_a_site_excludes_arguments_of_a_single_surface(other):
+    with pytest.raises(ValueError, match=f"^site: 'site.yaml', expected none with {other}"):
+        started(site='site.yaml', **{other: 'true'})
 
 
 @needs_launch
@@ -170,7 +202,7 @@ def test_a_failure_ends_the_launch_unless_the_process_is_restarted_or_optional(
     ('network.launch.xml', [f'config:={ROOT}/config/quick.yaml'],
      ['config/codebook.yaml', 'config/quick.yaml', 'codebook:=', 'network-1 ended'])])
 def test_an_error_ends_the_launch_and_is_named(file, arguments, expected, monkeypatch, tmp_path):
-    from rhs_isac_ros.ros.processes import claim_domain
+    from rhs_isac_ros.ros.environment import claim_domain
     monkeypatch.setenv('ROS_DOMAIN_ID', claim_domain())
     done = subprocess.run(
         [sys.executable, '-c', LAUNCH, ROOT / 'launch' / file, *arguments], check=False,
@@ -192,7 +224,7 @@ def exists(group):
 @pytest.fixture
 def observer(monkeypatch):
     """Return an observer of the cycles in the namespace /launched, and its executor."""
-    from rhs_isac_ros.ros.processes import claim_domain
+    from rhs_isac_ros.ros.environment import claim_domain
     monkeypatch.setenv('ROS_DOMAIN_ID', claim_domain())
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     import rclpy

@@ -10,39 +10,32 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+from test_installation import read_extras
 
 import rhs_isac_ros
 
 ROOT = Path(__file__).parents[1]
-TREE = ElementTree.parse(ROOT / 'package.xml').getroot()
-# Keys in rosdistro's rosdep/python.yaml by the name of the import; a ROS package is its own key.
-# threadpoolctl has no key: the system's scikit-learn depends on it.
-KEYS = {
-    'docutils': 'python3-sphinx', 'hypothesis': 'python3-hypothesis', 'joblib': 'python3-joblib',
-    'matplotlib': 'python3-matplotlib', 'numpy': 'python3-numpy',
-    'packaging': 'python3-packaging', 'psutil': 'python3-psutil',
-    'pytest': 'python3-pytest', 'rich': 'python3-rich', 'scipy': 'python3-scipy',
-    'sklearn': 'python3-sklearn', 'sphinx': 'python3-sphinx', 'threadpoolctl': 'python3-sklearn',
-    'tqdm': 'python3-tqdm', 'yaml': 'python3-yaml',
-}
+FOLDERS = ('rhs_isac_ros', 'launch', 'scripts', 'test', 'docs')
+# Keys in rosdistro's rosdep/python.yaml by the name of the import, if it is not python3-<name>; a
+# ROS package is its own key. threadpoolctl has no key: the system's scikit-learn depends on it.
+KEYS = {'docutils': 'python3-sphinx', 'threadpoolctl': 'python3-sklearn'} | {
+    name: f'python3-{name}' for name in (
+        'hypothesis', 'joblib', 'matplotlib', 'numpy', 'packaging', 'psutil', 'pytest', 'rich',
+        'scipy', 'sklearn', 'sphinx', 'tqdm', 'yaml')}
 # Libraries without a key, by the name of the import: their requirement in an extra of setup.py.
 # mcap requires lz4 and zstandard.
 PIP_ONLY = {
-    'distributed': 'distributed', 'jax': None, 'lz4': 'mcap', 'mcap': 'mcap',
+    'adi': None, 'distributed': 'distributed', 'jax': None, 'lz4': 'mcap', 'mcap': 'mcap',
     'mcap_ros2': 'mcap-ros2-support', 'pymoo': 'pymoo', 'rerun': 'rerun-sdk==0.22.1',
-    'rosbags': 'rosbags', 'sionna': None, 'stonesoup': None, 'zstandard': 'mcap',
+    'rosbags': 'rosbags', 'sigmf': 'sigmf', 'sionna': None, 'zstandard': 'mcap',
 }
-# Modules of the repository.
-OWN = {
-    'rhs_isac_ros', 'parts', 'peers', 'diagram', 'sequence', 'run_notebook', 'pictures',
-    'conftest', 'forked',
-    'headless_browser', 'impairment_checks', 'in_memory_network', 'node_processes', 'ros_messages',
-    'system', 'test_installation'}
 
 
 @functools.cache
 def imported(folder):
-    """Top-level packages that the modules of a folder import, each with one importing module."""
+    """Libraries that the modules of a folder import, each with one importing module."""
+    own = {path.stem if path.suffix else path.name for name in FOLDERS
+           for path in (ROOT / name, *(ROOT / name).rglob('*'))}
     found = {}
     for path in sorted((ROOT / folder).rglob('*.py')):
         for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
@@ -52,50 +45,30 @@ def imported(folder):
             elif isinstance(node, ast.ImportFrom) and node.level == 0:
                 names = [node.module]
             found |= {name.partition('.')[0]: path for name in names}
+    # The package `launch` of ROS has the name of a folder.
     return {name: path for name, path in found.items()
-            if name not in sys.stdlib_module_names and name not in OWN}
+            if name not in sys.stdlib_module_names and (name not in own or name == 'launch')}
 
 
 def keys(*kinds):
-    return {node.text for kind in kinds for node in TREE.iter(kind)}
-
-
-def extras():
-    tree = ast.parse((ROOT / 'setup.py').read_text(encoding='utf-8'))
-    (found,) = [ast.literal_eval(node.value) for node in ast.walk(tree)
-                if isinstance(node, ast.keyword) and node.arg == 'extras_require']
-    return {name for names in found.values() for name in names}
-
-
-RUN = ('depend', 'exec_depend')
+    tree = ElementTree.parse(ROOT / 'package.xml').getroot()
+    return {node.text for kind in ('depend', 'exec_depend', *kinds) for node in tree.iter(kind)}
 
 
 @pytest.mark.parametrize(('folder', 'kinds'), [
-    ('rhs_isac_ros', RUN), ('launch', RUN), ('scripts', RUN),
-    ('test', (*RUN, 'test_depend')), ('docs', (*RUN, 'doc_depend'))])
+    ('rhs_isac_ros', ()), ('launch', ()), ('scripts', ()), ('test', ('test_depend',)),
+    ('docs', ('doc_depend',))])
 def test_every_import_has_a_key_or_is_an_extra(folder, kinds):
-    there, missing = keys(*kinds), {}
-    for name, path in imported(folder).items():
-        if name in PIP_ONLY:
-            if PIP_ONLY[name] and PIP_ONLY[name] not in extras():
-                missing[name] = f'{path}: not in any extra of setup.py'
-        elif KEYS.get(name, name) not in there:
-            missing[name] = f'{path}: no {KEYS.get(name, name)} in package.xml'
-    assert not missing
+    extras = {None}.union(*read_extras().values())
+    assert not {name: path for name, path in imported(folder).items()
+                if (PIP_ONLY[name] not in extras if name in PIP_ONLY
+                    else KEYS.get(name, name) not in keys(*kinds))}
 
 
 def test_every_key_is_used():
-    folders = ('rhs_isac_ros', 'launch', 'scripts', 'test', 'docs')
-    used = {KEYS.get(name, name) for folder in folders
-            for name in imported(folder)}
+    used = {KEYS.get(name, name) for folder in FOLDERS for name in imported(folder)}
     # launch reads .xml files with a plug-in.
-    assert keys(*RUN, 'test_depend', 'doc_depend') <= used | {'launch_xml'}
-
-
-def test_libraries_have_keys_that_rosdep_knows():
-    libraries = {key for key in keys(*RUN, 'test_depend', 'doc_depend')
-                 if key.startswith('python3-')}
-    assert libraries <= set(KEYS.values())
+    assert keys('test_depend', 'doc_depend') <= used | {'launch_xml'}
 
 
 @pytest.mark.parametrize(('path', 'pattern'), [

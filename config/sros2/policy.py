@@ -9,13 +9,14 @@ from typing import NamedTuple
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.validate_namespace import validate_namespace
 
-from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.monitoring.cycle_log import ANSWERS
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.parameters import TF
 from rhs_isac_ros.ros.recording import recorded_topics
 from rhs_isac_ros.ros.roster import ROSTER
 from rhs_isac_ros.support.arguments import ArgumentParser, integer
+from rhs_isac_ros.support.exits import exit_code_of
 
 # Topics that every rclpy node publishes, and services that it offers.
 _RCLPY_TOPICS = ('/parameter_events', '/rosout')
@@ -90,9 +91,11 @@ def permissions(
                           *_of_users(numbers, topics.PATH, topics.TRUE_PATH))), *_RCLPY_TOPICS),
         subscribe=tuple(sorted(topics.NAMES[kind] for kind in SCENE_RECEIVES)))
     optimizer = topics.OPTIMIZER_NODE
-    # It provides the recorded codebook, as an optimizer or to the one that is present.
+    # It provides the recorded codebook, as an optimizer or to the one that is present, and awaits
+    # the answers to the signals.
     replay = _together({optimizer: nodes[optimizer], 'replay': Permissions(
         publish=tuple(recorded_topics()), reply=(),
+        subscribe=tuple(topics.NAMES[kind] for kind in ANSWERS),
         request=tuple(f'{optimizer}/{service}' for service in _PARAMETER_SERVICES))})
     nodes |= {'operator': _operator(nodes, numbers), 'replay': replay}
     if is_simulated:

@@ -19,7 +19,7 @@ class Radio(Role):
 
     `measure` takes a band, its configurations [F, N_E] and the `Pilot` message. In each frame, it
     configures the surface and lets the user transmit. It returns the noisy signals at the feeds,
-    complex [F, N_SB, K] [sqrt(W)].
+    complex [F, N_SB, K] [sqrt(W)], which `Radio` divides by the symbols of the pilots.
     `carry` transmits the data of a `Data` message and returns the number of received bits.
     """
 
@@ -58,7 +58,7 @@ class Radio(Role):
             feeds = self._measure(pilot.band, applied, pilot)
             answers.append(Send(m.FeedSignals(
                 cycle_id=pilot.cycle_id, user=pilot.user, user_instance=pilot.sender,
-                band=pilot.band, signals=feeds)))
+                band=pilot.band, signals=(feeds.T / pilot.symbols).T)))
         return answers
 
 

@@ -132,6 +132,10 @@ def main():
             rclpy.spin_once(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except RuntimeError:
+        # A callback that runs while a signal shuts the context down can no longer publish.
+        if rclpy.ok():
+            raise
     if options.picture and all(node.poses.values()):
         draw(node.poses, options.picture)
     node.destroy_node()

@@ -71,6 +71,10 @@ if __name__ == '__main__':
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except RuntimeError:
+        # A callback that runs while a signal shuts the context down can no longer publish.
+        if rclpy.ok():
+            raise
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

@@ -11,15 +11,15 @@ import pkgutil
 import re
 from pathlib import Path
 
-import diagram
 import sequence
+import states
 from docutils import nodes
 from docutils.statemachine import StringList
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import nested_parse_with_titles
 
 from rhs_isac_ros.experiments.sweep_settings import MEASURES
-from rhs_isac_ros.model.scenario import Extensions, Table1
+from rhs_isac_ros.model.scenario import Extensions, Scenario, Table1
 from rhs_isac_ros.protocol.events import Kind, Outcome
 from rhs_isac_ros.ros import parameters
 
@@ -59,10 +59,10 @@ def parameter_table():
 
 def scenario_table(kind):
     """Return a table of the scenario fields of `Table1` or `Extensions`."""
-    rows = []
+    rows, defaults = [], Scenario().fields()
     for field in dataclasses.fields({'table1': Table1, 'extensions': Extensions}[kind]):
         declared, source = field.metadata['declared'], field.metadata['source']
-        default = list(field.default) if isinstance(field.default, tuple) else field.default
+        default = defaults[field.name]
         source = f' Source: {source}.' if source else ''
         rows.append((code(field.name), declared.unit, 'null' if default is None else default,
                      f'{declared.low:g} to {declared.high:g}', declared.text + source))
@@ -89,24 +89,14 @@ def message_list():
     return '\n'.join(parts)
 
 
-def state_picture(role):
-    """Return the state diagram of a role."""
-    return diagram.svg(role)
-
-
 def state_table(role):
     """Return all rows of the table of a role."""
     def cell(number, text):
         plain = number == 0 or text == 'the same'
         return text if plain else code(text)
     rows = [tuple(cell(number, text) for number, text in enumerate(row))
-            for row in diagram.rows(role)]
-    return table(diagram.HEAD, rows, '14 17 17 14 24 14')
-
-
-def cycle_sequence():
-    """Return a sequence diagram of one cycle."""
-    return sequence.svg()
+            for row in states.rows(role)]
+    return table(states.HEAD, rows, '14 17 17 14 24 14')
 
 
 def outcome_table():
@@ -157,11 +147,6 @@ def module_list(package):
     return '\n'.join(parts)
 
 
-FUNCTIONS = {function.__name__: function for function in (
-    parameter_table, scenario_table, measure_table, message_list,
-    state_picture, state_table, cycle_sequence, outcome_table, module_list, dependency_table)}
-
-
 class Generated(SphinxDirective):
     """Directive that inserts the result of a function."""
 
@@ -178,6 +163,12 @@ class Generated(SphinxDirective):
         source = f'<{self.arguments[0]}>'
         nested_parse_with_titles(self.state, StringList(text.splitlines(), source), node)
         return node.children
+
+
+FUNCTIONS = {function.__name__: function for function in (
+    parameter_table, scenario_table, measure_table, message_list, state_table, outcome_table,
+    dependency_table, module_list)} | {
+        'state_picture': states.picture, 'cycle_sequence': sequence.picture}
 
 
 def setup(app):

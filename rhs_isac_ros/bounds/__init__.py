@@ -5,8 +5,10 @@ from rhs_isac_ros.bounds.fisher import crlb, crlb_of, fisher_information
 from rhs_isac_ros.bounds.global_bound import GlobalBound, global_bound
 from rhs_isac_ros.bounds.misspecified import Misspecified, misspecified
 from rhs_isac_ros.bounds.pairwise_error import PairwiseErrorCost
+from rhs_isac_ros.bounds.site import site_crlb, site_information
 
 __all__ = [
     'AverageCrlb', 'GlobalBound', 'Misspecified', 'PairwiseErrorCost', 'average_crlb', 'crlb',
-    'crlb_of', 'fisher_information', 'global_bound', 'misspecified',
+    'crlb_of', 'fisher_information', 'global_bound', 'misspecified', 'site_crlb',
+    'site_information',
 ]

@@ -21,7 +21,7 @@ from rhs_isac_ros.bounds.rows import (
     rows_within,
 )
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import adjoint
+from rhs_isac_ros.model.arrays import adjoint, checked_positions
 from rhs_isac_ros.model.elements import (
     SurfaceEstimate,
     element_correlation,
@@ -31,7 +31,7 @@ from rhs_isac_ros.model.elements import (
 from rhs_isac_ros.model.gaussian import quadratic_form
 from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.model.los import checked_positions, los_and_derivative
+from rhs_isac_ros.model.los import los_and_derivative
 from rhs_isac_ros.model.multipath import (
     coupling,
     declared_covariance,

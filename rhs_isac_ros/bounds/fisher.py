@@ -3,11 +3,10 @@
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import blocks
+from rhs_isac_ros.model.arrays import blocks, checked_positions
 from rhs_isac_ros.model.gaussian import Marginal, marginalise, quadratic_form
 from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 

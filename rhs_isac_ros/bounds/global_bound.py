@@ -24,8 +24,8 @@ from numpy.polynomial import chebyshev
 from rhs_isac_ros.bounds.fisher import fisher_information
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.geometry import jacobian, polar_bounds, to_polar
-from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import one_blas_thread
 

@@ -16,16 +16,17 @@ import numpy as np
 
 from rhs_isac_ros.bounds.fisher import inverse_information
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.model.arrays import adjoint
+from rhs_isac_ros.model.arrays import adjoint, checked_positions
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gaussian import energy_limit, quadratic_form, step_to_maximum
 from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.model.los import checked_positions
-from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.support.threads import one_blas_thread
 
 _MAX_STEPS, _HALVINGS = 60, 12
 # Step of finite differences, and step at which the search has converged [m].
 _DIFFERENCE_M, _TOLERANCE_M = 1e-4, 1e-7
+# Largest coordinate in the search, which diverges if the signals contain no information [m].
+_FARTHEST_M = 1e9
 # Number of ranges per shortest wavelength in the search for ambiguities.
 _PER_WAVELENGTH = 8
 # Scale of the distance between the maximum of an ambiguity and the ray [m].
@@ -112,7 +113,7 @@ def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndar
         step = step_to_maximum(information + ridge, gradient)
         for _ in range(_HALVINGS):
             # The mean is defined only in front of the surface.
-            trial = places + step
+            trial = np.clip(places + step, -_FARTHEST_M, _FARTHEST_M)
             trial[:, 0] = np.maximum(trial[:, 0], places[:, 0] / 2)
             other = cost(trial)
             worse = other > costs

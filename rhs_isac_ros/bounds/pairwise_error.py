@@ -12,8 +12,9 @@ import numpy as np
 
 from rhs_isac_ros.bounds.average import Average, Combination
 from rhs_isac_ros.bounds.rows import CompressedRows, RowSource, Tick, no_tick
+from rhs_isac_ros.model.arrays import checked_positions, numbers
 from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.model.los import checked_positions, los_gain
+from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming
 
@@ -49,7 +50,7 @@ class PairwiseErrorCost(Average):
             raise ValueError(
                 f'second_positions: {len(second_positions)} positions, expected as many as '
                 f'first_positions, {n}, and at least one')
-        weights = np.ones(n) if weights is None else np.asarray(weights, dtype=float)
+        weights = np.ones(n) if weights is None else numbers('weights', weights)
         if weights.shape != (n,) or not (weights >= 0).all():
             raise ValueError(
                 f'weights: shape {weights.shape}, expected {(n,)}, none negative or NaN')

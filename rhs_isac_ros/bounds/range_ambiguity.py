@@ -10,11 +10,10 @@ import numpy as np
 
 from rhs_isac_ros.bounds.pairwise_error import best_phases
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.model.arrays import blocks, mixture_weights
+from rhs_isac_ros.model.arrays import blocks, checked_positions, mixture_weights
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gaussian import step_to_maximum
 from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.model.los import checked_positions
-from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 
 # Number of grid points of the lag per shortest wavelength.
 _LAGS_PER_WAVELENGTH = 24

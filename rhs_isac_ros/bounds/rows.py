@@ -54,11 +54,16 @@ class RowSource:
     n_rows: int  #: Number G of rows of an item.
     patterns: Sequence[Pattern] = PLAIN
     tick: Tick = no_tick
+    block: int = _BLOCK  #: Items of three rows in a block.
 
     @property
     def width(self) -> int:
         """Number of complex numbers in a row."""
         return self.scenario.n_subbands * self.scenario.n_elements
+
+    def blocks(self) -> list[slice]:
+        """Split the items, in order, into blocks, smaller ones if rows are very wide."""
+        return _blocks(self.n_items, self.n_rows, self.width, self.block)
 
     def flat(self, block: slice, band: int) -> np.ndarray:
         """Return the rows of a block, complex128 [n G, N_SB N_E]."""
@@ -77,12 +82,12 @@ class MeasurementRows:
     def __init__(self, source: RowSource, n_groups: int, width: int = 0) -> None:
         self.n_items, self.n_rows, self.patterns = source.n_items, source.n_rows, source.patterns
         self.n_groups, self._n_subbands = n_groups, source.scenario.n_subbands
-        self._width = width
+        self._width, self._block = width, source.block
         self.bases: list[np.ndarray | None] = [None] * source.scenario.n_bands
 
     def blocks(self) -> list[slice]:
         """Split the items, in order, into blocks of a suitable size."""
-        return blocks(self.n_items, self.n_rows, self._width)
+        return _blocks(self.n_items, self.n_rows, self._width, self._block)
 
     def in_block(self, block: slice, band: int) -> np.ndarray:
         """Return the coefficients of a block of n items, complex [J, n, G, R]."""
@@ -213,7 +218,7 @@ def _rank_of_some(source: RowSource, tolerance: float, band: int) -> int:
     step = max(n_rows // size, 1)
     some = np.concatenate([
         source.flat(slice(block.start, block.stop, step), band)[:, columns]
-        for block in blocks(source.n_items, source.n_rows, source.width)])
+        for block in source.blocks()])
     norms = np.linalg.norm(some, axis=1)
     coefficients = some[norms > 0] / norms[norms > 0, None]
     values = np.linalg.eigvalsh(np.conj(coefficients.T) @ coefficients / max(len(some), 1))
@@ -221,14 +226,15 @@ def _rank_of_some(source: RowSource, tolerance: float, band: int) -> int:
 
 
 class ExactRows(MeasurementRows):
-    """Uncompressed rows, kept between evaluations unless they exceed `_CACHE_BYTES`."""
+    """Uncompressed rows, kept between evaluations unless they exceed `max_bytes`."""
 
     def __init__(
-            self, source: RowSource, kind: type[np.complexfloating] = np.complex128) -> None:
+            self, source: RowSource, kind: type[np.complexfloating] = np.complex128,
+            max_bytes: int = _CACHE_BYTES) -> None:
         super().__init__(source, source.scenario.n_subbands, source.width)
         self._source, self._kind = source, kind
         n_numbers = source.n_items * source.n_rows * source.scenario.n_bands * source.width
-        self._keeps_all = np.dtype(kind).itemsize * n_numbers <= _CACHE_BYTES
+        self._keeps_all = np.dtype(kind).itemsize * n_numbers <= max_bytes
         # Beyond the limit, only the current block is kept: an evaluation uses its rows twice.
         self._kept: dict[tuple[int, int], np.ndarray] = {}
 
@@ -251,20 +257,20 @@ class CompressedRows(MeasurementRows):
     To a given accuracy, the rows of all positions in a region span far fewer dimensions than a row
     has entries. A randomised range finder with a fixed seed finds a basis. `tolerance` limits the
     root mean square of the relative errors of the rows. Raises ValueError if it is less than
-    `MIN_TOLERANCE`, or not less than 1.
+    `MIN_TOLERANCE`, or not less than 1. The first sketch has `n_columns`, by default as many as
+    usually suffice.
     """
 
-    def __init__(self, source: RowSource, tolerance: float) -> None:
+    def __init__(self, source: RowSource, tolerance: float, n_columns: int = 0) -> None:
         super().__init__(source, n_groups=1)
         scenario = source.scenario
+        # Enough for Table I, and more for larger surfaces.
+        n_columns = n_columns or max(_MIN_SKETCH, min(scenario.n_elements // 2, _MAX_RANK))
         self.coefficients: list[np.ndarray] = []
         for band in range(scenario.n_bands):
-            # The first sketch has enough columns for Table I, and more for larger surfaces.
             coefficients, basis = _compress(
-                functools.partial(source.flat, band=band),
-                blocks(source.n_items, source.n_rows, source.width),
-                source.n_items * source.n_rows, tolerance,
-                max(_MIN_SKETCH, min(scenario.n_elements // 2, _MAX_RANK)))
+                functools.partial(source.flat, band=band), source.blocks(),
+                source.n_items * source.n_rows, tolerance, n_columns)
             self.coefficients.append(coefficients)
             self.bases[band] = basis.reshape(scenario.n_subbands, scenario.n_elements, -1)
 
@@ -291,9 +297,8 @@ class CompressedRows(MeasurementRows):
         return rows.reshape(1, -1, self.n_rows, rows.shape[1])
 
 
-def blocks(n_items: int, n_rows: int, width: int) -> list[slice]:
-    """Split items of `n_rows` rows into successive blocks, smaller ones if rows are very wide."""
-    size = max(3 // n_rows, 1) * _BLOCK
+def _blocks(n_items: int, n_rows: int, width: int, block: int) -> list[slice]:
+    size = max(3 // n_rows, 1) * block
     size = max(min(size, _BLOCK_NUMBERS // max(n_rows * width, 1)), 1)
     return [slice(start, min(start + size, n_items)) for start in range(0, n_items, size)]
 

@@ -3,7 +3,9 @@
 from rhs_isac_ros.calibration.calibration import (
     Calibration,
     CalibrationError,
+    CalibrationWarning,
     calibrate,
+    known_states,
     load_surface,
     report,
 )
@@ -12,6 +14,7 @@ from rhs_isac_ros.calibration.mixture import SurfacePrior
 from rhs_isac_ros.calibration.survey import SurveyWarning, survey, survey_report
 
 __all__ = [
-    'Calibration', 'CalibrationError', 'Pilots', 'SurfacePrior', 'SurveyWarning', 'calibrate',
-    'load_surface', 'prior_of', 'report', 'survey', 'survey_report',
+    'Calibration', 'CalibrationError', 'CalibrationWarning', 'Pilots', 'SurfacePrior',
+    'SurveyWarning', 'calibrate', 'known_states', 'load_surface', 'prior_of', 'report', 'survey',
+    'survey_report',
 ]

@@ -1,6 +1,7 @@
 """A calibration: the estimate of a surface, the scenario to which it applies, and its file."""
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,10 +9,20 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros import __version__
-from rhs_isac_ros.calibration.estimate import TOLERANCE, Pilots, estimate_surface, prior_of
+from rhs_isac_ros.calibration.estimate import (
+    MAX_UNEXPLAINED,
+    TOLERANCE,
+    Pilots,
+    check_pilots,
+    estimate_surface,
+    prior_of,
+    residuals_of,
+)
 from rhs_isac_ros.calibration.mixture import SurfacePrior
-from rhs_isac_ros.model import Scenario, SurfaceEstimate
-from rhs_isac_ros.model.arrays import check_arrays, read_only
+from rhs_isac_ros.model import MeasurementModel, Scenario, SurfaceEstimate
+from rhs_isac_ros.model.arrays import check_arrays, numbers, read_only
+from rhs_isac_ros.model.constants import NEPERS_PER_DB
+from rhs_isac_ros.model.gaussian import energy_limit
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
 
@@ -22,6 +33,12 @@ _ARRAYS = {'gains': complex, 'offsets': complex, 'band_gains': complex, 'factor'
 _DEVIATIONS = ('gains_std', 'offsets_std', 'band_gains_std')
 # Number of working elements that a report lists.
 _N_WORST = 5
+
+
+
+
+class CalibrationWarning(UserWarning):
+    """A calibration does not explain the signals of its pilots."""
 
 
 class CalibrationError(ValueError):
@@ -36,10 +53,11 @@ class Calibration:
     """
 
     surface: SurfaceEstimate  #: The estimate, as used by estimators, bounds and beams.
-    scenario_id: str  #: `Scenario.id` without channel and multipath files.
+    scenario_id: str  #: `Scenario.id` without pose, channel and multipath files.
     #: Record of the calibration: ``pilots``, their number; ``codebooks``, their ids; ``prior`` of
     #: the elements; ``scenario``, the fields that differ from Table I; ``rounds`` of the
-    #: estimation, and whether it ``converged``; ``version``.
+    #: estimation, and whether it ``converged``; ``warnings``; ``version``. The record of known
+    #: ``states`` has no estimation.
     about: dict[str, Any]
 
     def __post_init__(self) -> None:
@@ -94,7 +112,8 @@ class Calibration:
             arrays, about = read_archive(path, 'calibration', _FORMAT, {*_ARRAYS, *_DEVIATIONS})
         with translated((TypeError, ValueError), CalibrationError, path):
             surface = SurfaceEstimate(**{
-                name: arrays[name].astype(kind) for name, kind in _ARRAYS.items()})
+                name: numbers(name, arrays[name], kind, finite=False)
+                for name, kind in _ARRAYS.items()})
             return cls(surface, str(about.pop('scenario_id', '')), about)
 
 
@@ -103,20 +122,58 @@ def calibrate(scenario: Scenario, pilots: Sequence[Pilots],
     """Estimate a surface from pilots of one or several codebooks; add the scenario and a record.
 
     The default prior is the result of `prior_of`. Without pilots, the estimate is the prior.
+    Pilots at one place, within a quarter of a wavelength, together have the weight of one pilot.
+
+    Raises ValueError if positions are far from the region, or signals are zero. Warns with
+    CalibrationWarning if the result does not explain the signals of a third of the pilots.
     """
     prior = prior or prior_of(scenario)
+    check_pilots(scenario, pilots)
     surface, changes = estimate_surface(scenario, pilots, prior)
+    texts = _warnings(scenario, pilots, surface)
+    if texts:
+        warnings.warn('; '.join(texts), CalibrationWarning, stacklevel=2)
     codebooks = sorted({str(getattr(group.beams, 'id', '')) for group in pilots} - {''})
     return Calibration(surface, _without_hall(scenario).id, {
         'pilots': sum(len(group.positions) for group in pilots), 'codebooks': codebooks,
         'prior': dataclasses.asdict(prior), 'scenario': scenario.changes(),
         'rounds': len(changes), 'converged': not changes or changes[-1] < TOLERANCE,
+        'warnings': texts, 'version': __version__})
+
+
+def known_states(scenario: Scenario, off: complex, on: complex) -> Calibration:
+    """Return the calibration of a surface whose elements have the coefficients `off` and `on`.
+
+    These are the coefficients for 0 and 1 in a configuration, known exactly, in all bands.
+    Raises ValueError if one of them is not finite.
+    """
+    n, n_bands = scenario.n_elements, scenario.n_bands
+    surface = SurfaceEstimate(
+        np.full(n, on - off), np.full(n, off), np.ones(n_bands),
+        np.zeros((2 * n + n_bands, 0)), np.zeros(n))
+    return Calibration(surface, _without_hall(scenario).id, {
+        'pilots': 0, 'states': [str(off), str(on)], 'scenario': scenario.changes(),
         'version': __version__})
 
 
+def _warnings(
+        scenario: Scenario, pilots: Sequence[Pilots], surface: SurfaceEstimate) -> list[str]:
+    """Return reasons why an estimate of a surface may be wrong."""
+    n, n_unexplained = sum(len(group.positions) for group in pilots), 0
+    for group in pilots:
+        model = MeasurementModel(scenario, group.beams, surface)
+        white = model.whiten(residuals_of(model, group))
+        energies = np.sum(np.abs(white)**2, axis=(1, 2))
+        n_unexplained += int(np.sum(energies > energy_limit(int(np.prod(model.shape)))))
+    if n_unexplained <= MAX_UNEXPLAINED * n:
+        return []
+    return [f'positions: {n_unexplained} of {n} pilots do not fit the surface, as if they were '
+            f'shifted, expected at most {100 * MAX_UNEXPLAINED:.0f} %']
+
+
 def _without_hall(scenario: Scenario) -> Scenario:
-    """Return a scenario without channel and multipath files, which do not affect a surface."""
-    return dataclasses.replace(scenario, multipath=None, channel=None)
+    """Return a scenario without pose and files of the hall, which do not affect a surface."""
+    return dataclasses.replace(scenario.unplaced, multipath=None, channel=None)
 
 
 def load_surface(path: str, scenario: Scenario) -> SurfaceEstimate | None:
@@ -144,6 +201,7 @@ def report(calibration: Calibration, scenario: Scenario) -> str:
         f'failed elements: {len(failed)} of {n} (expected number {expected:.2f})']
     if not about.get('converged', True):
         lines.append(f'warning: the estimation did not converge in {about.get("rounds")} rounds')
+    lines += [f'warning: {text}' for text in about.get('warnings', ())]
     lines += [f'  {_place(scenario, m)}: stuck at {surface.offsets[m].real:.3f} '
               f'+- {std[n + m]:.3f}, probability {surface.failed_probability[m]:.3f}'
               for m in failed]
@@ -161,7 +219,7 @@ def report(calibration: Calibration, scenario: Scenario) -> str:
             zip(surface.band_gains, std[2 * n:], strict=True)):
         lines.append(
             f'band {band}: gain {20 * np.log10(abs(gain)):+.2f} dB +- '
-            f'{20 / np.log(10) * deviation:.2f} dB, phase {np.angle(gain):+.3f} rad +- '
+            f'{deviation / NEPERS_PER_DB:.2f} dB, phase {np.angle(gain):+.3f} rad +- '
             f'{deviation:.3f} rad')
     return '\n'.join(lines)
 

@@ -18,13 +18,12 @@ from rhs_isac_ros.calibration.mixture import (
     surface_posterior,
     without_data,
 )
-from rhs_isac_ros.model import Beamforming, Scenario, SurfaceEstimate
-from rhs_isac_ros.model.arrays import blocks, check_arrays
+from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Beamforming, Scenario, SurfaceEstimate
+from rhs_isac_ros.model.arrays import blocks, check_arrays, checked_positions, numbers
 from rhs_isac_ros.model.elements import direct_design, element_radiation, scattered_errors
-from rhs_isac_ros.model.gaussian import quadratic_form, step_to_maximum
+from rhs_isac_ros.model.gaussian import covariance_root, quadratic_form, step_to_maximum
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, Nuisance, nuisance_of
-from rhs_isac_ros.model.los import checked_positions
-from rhs_isac_ros.model.measurement import signal_covariance
+from rhs_isac_ros.model.measurement import MeasurementModel, signal_covariance
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Prior for scenarios that declare no errors or failures.
@@ -37,6 +36,15 @@ TOLERANCE = 0.02
 _MIN_VARIANCE = 1e-12
 # Number of pilots evaluated at a time.
 _BLOCK = 64
+# Number of steps in the alignment of signals with unknown impairments.
+_ALIGNMENT_STEPS = 6
+# Share of the pilots that should have a direct path above which misfits cause a warning.
+MAX_UNEXPLAINED = 1 / 3
+# Least power of signals and residuals, relative to thermal noise.
+_MIN_POWER = 1e-6
+# Distance of positions that count as one place [wavelengths of the lowest band]. Places then
+# extend over half a wavelength, beyond which the phases of paths differ.
+_WAVELENGTHS = 0.25
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -53,7 +61,8 @@ class Pilots:
 
     def __post_init__(self) -> None:
         """Check the arrays."""
-        checked_positions(self.positions)
+        object.__setattr__(self, 'positions', checked_positions(self.positions))
+        object.__setattr__(self, 'received', numbers('received', self.received, complex))
         n_bands, n_subbands, n_frames, _ = self.beams.digital.shape
         check_arrays(self, {'received': (len(self.positions), n_bands, n_subbands * n_frames)})
 
@@ -62,6 +71,66 @@ def prior_of(scenario: Scenario) -> SurfacePrior:
     """Return the prior that a scenario declares, with defaults for fields that are zero."""
     return SurfacePrior(scenario.element_error_rms or DEFAULT_ERROR_RMS,
                         scenario.failed_element_share or DEFAULT_FAILED_SHARE)
+
+
+def places_of(scenario: Scenario, positions: np.ndarray, wavelengths: float) -> list[np.ndarray]:
+    """Group positions, float64 [N, 3] [m], by place; return the indices of each place.
+
+    The first position that belongs to no place begins one, which contains all further positions
+    within a distance of so many wavelengths of the lowest band. A route is therefore divided into
+    places of about this length.
+    """
+    distance_m = wavelengths * SPEED_OF_LIGHT_MPS / min(scenario.center_frequencies_hz)
+    left, places = np.arange(len(positions)), []
+    while len(left):
+        is_close = np.linalg.norm(positions[left] - positions[left[0]], axis=1) <= distance_m
+        places.append(left[is_close])
+        left = left[~is_close]
+    return places
+
+
+def weights_of(places: Sequence[np.ndarray], counts: np.ndarray) -> np.ndarray:
+    """Return weights [N] of positions; those of a place share a weight of 1.
+
+    Positions that are False in `counts`, bool [N], have no weight.
+    """
+    weights = np.zeros(len(counts))
+    for rows in places:
+        weights[rows] = counts[rows] / max(counts[rows].sum(), 1)
+    return weights
+
+
+def check_pilots(scenario: Scenario, pilots: Sequence[Pilots]) -> None:
+    """Raise ValueError if positions are far from the region, or signals are weaker than noise."""
+    (low, high), limit_m = scenario.roi_bounds_m, max(scenario.roi_size_m)
+    for group in pilots:
+        outside_m = np.max([low - group.positions, group.positions - high], axis=(0, 2))
+        if outside_m.max(initial=0.0) > limit_m:
+            row = int(np.argmax(outside_m))
+            raise ValueError(
+                f'positions: {outside_m[row]:.3g} m outside of the region of interest in row '
+                f'{row}, expected at most its longest side, {limit_m:g} m, in metres and in the '
+                'frame of the surface')
+        check_power(scenario, group.received, 'signals')
+
+
+def check_power(scenario: Scenario, signals: np.ndarray, kind: str) -> None:
+    """Raise ValueError if signals or residuals, [N, N_B, R], are far weaker than the noise."""
+    power_w = np.mean(np.abs(signals)**2, axis=2)
+    if (power_w < _MIN_POWER * scenario.noise_power_w).any():
+        row, band = np.argwhere(power_w == power_w.min())[0].tolist()
+        raise ValueError(
+            f'received: {kind} of {power_w[row, band]:.3g} W in row {row}, band {band}, expected '
+            f'signals with noise, whose power is {scenario.noise_power_w:.3g} W')
+
+
+def residuals_of(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
+    """Remove the likeliest impairments and the mean from the pilots; return [N, N_B, R]."""
+    nuisance, mean = nuisance_of(model.scenario), model.mean(pilots.positions)
+    values = initial_values(nuisance, model.whiten(pilots.received), model.whiten(mean))
+    for _ in range(_ALIGNMENT_STEPS if len(nuisance) else 0):
+        values = refined_values(nuisance, values, pilots.received, mean, model.whiten)
+    return nuisance.divide(pilots.received, values) - mean
 
 
 @one_blas_thread
@@ -163,6 +232,8 @@ class PilotStatistics:
         self._radiation = [element_radiation(scenario, group.beams) for group in pilots]
         self._size = 2 * scenario.n_elements + scenario.n_bands
         self._nuisance = nuisance_of(scenario)
+        self._weights = [weights_of(places_of(scenario, group.positions, _WAVELENGTHS),
+                                    np.ones(len(group.positions), bool)) for group in pilots]
         # Nuisance values by number of the group and first pilot of the block.
         self._values: dict[tuple[int, int], np.ndarray] = {}
 
@@ -180,7 +251,8 @@ class PilotStatistics:
                 zip(self._pilots, self._radiation, strict=True)):
             whiteners = self._whiteners(radiation, gains, mean, covariance)
             for block in blocks(len(group.positions), _BLOCK):
-                part = _Block(self._scenario, radiation, whiteners, group.positions[block], mean)
+                part = _Block(self._scenario, radiation, whiteners, group.positions[block], mean,
+                              self._weights[number][block])
                 signals = group.received[block] / gains[:, None]
                 if len(self._nuisance):
                     signals, slopes = self._linearised(part, signals, (number, block.start))
@@ -204,7 +276,7 @@ class PilotStatistics:
         # The gain does not act on thermal noise.
         excess = scenario.noise_power_w * (1 / np.abs(gains)**2 - 1)
         total += excess[:, None, None] * np.eye(total.shape[1])
-        return np.linalg.inv(np.linalg.cholesky(total))
+        return np.linalg.inv(covariance_root(scenario, total))
 
     def _linearised(self, part: '_Block', signals: np.ndarray, key: tuple[int, int]
                     ) -> tuple[np.ndarray, np.ndarray]:
@@ -231,15 +303,15 @@ class PilotStatistics:
 
 
 class _Block:
-    """Linear model of several pilots.
+    """Linear model of several pilots, with weights, [N], of their information.
 
     `columns` are the whitened derivatives of the signals, complex128 [N_B, N, N_SB F, P], and
     `mean` the expected signals, complex128 [N, N_B, N_SB F].
     """
 
     def __init__(self, scenario: Scenario, radiation: np.ndarray, whiteners: np.ndarray,
-                 positions: np.ndarray, mean: np.ndarray) -> None:
-        self._whiteners = whiteners
+                 positions: np.ndarray, mean: np.ndarray, weights: np.ndarray) -> None:
+        self._whiteners, self._scales = whiteners, np.sqrt(weights)
         (n_bands, n_rows, n), n_pilots = radiation.shape, len(positions)
         self.mean = np.empty((n_pilots, n_bands, n_rows), complex)
         self.columns = np.zeros((n_bands, n_pilots, n_rows, n + n_bands), complex)
@@ -248,7 +320,8 @@ class _Block:
             self.mean[:, band] = design @ mean
             self.columns[band, ..., :n] = np.matmul(whitener, design)
             self.columns[band, ..., n + band] = self.mean[:, band] @ whitener.T
+        self.columns *= self._scales[:, None, None]
 
     def whiten(self, signals: np.ndarray) -> np.ndarray:
-        """Whiten signals [..., N_B, N_SB F]."""
-        return np.einsum('irs,...is->...ir', self._whiteners, signals)
+        """Whiten and weight signals [N, ..., N_B, N_SB F]."""
+        return np.einsum('irs,n...is,n->n...ir', self._whiteners, signals, self._scales)

@@ -13,6 +13,7 @@ import yaml
 
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.calibration import Calibration
+from rhs_isac_ros.codebook import library_command
 from rhs_isac_ros.codebook.band_plan import (
     DEFAULT_RASTER_HZ,
     BandPlan,
@@ -32,7 +33,6 @@ from rhs_isac_ros.codebook.optimize import (
 from rhs_isac_ros.codebook.plot import plot_optimization
 from rhs_isac_ros.codebook.problem import Progress
 from rhs_isac_ros.codebook.unoptimised import STARTS
-from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.arguments import (
@@ -47,6 +47,7 @@ from rhs_isac_ros.support.arguments import (
     positive_int,
     seed,
 )
+from rhs_isac_ros.support.exits import exit_code_of, print_error
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.pictures import write_picture
@@ -63,8 +64,12 @@ ERRORS = (MissingLibraryError, ValueError, OSError, MemoryError)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, even if Ctrl-C ends the search, or 2 after one of `ERRORS`.
 
-    The exit code is 130 if Ctrl-C ends the comparison of band plans, which writes no codebook.
+    The exit code is 130 if Ctrl-C ends the comparison of band plans, which writes no codebook. If
+    the first argument is ``library``, the others are those of `library_command`.
     """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments[:1] == ['library']:
+        return library_command.main(arguments[1:])
     parser = ArgumentParser(
         prog='python3 -m rhs_isac_ros.codebook', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)

@@ -10,6 +10,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -102,24 +103,36 @@ def first_fit(frequencies_hz: np.ndarray, n_bands: int, gap_hz: float) -> np.nda
 
 
 DEFAULT_RASTER_HZ = 10e6
-# Assumed signal energies with an optimised codebook, relative to a random one. The screening finds
-# plans for each, because wider plans are better with more energy. Plans for 8 and above would
-# confuse directions more often, which the screening does not consider.
-_ENERGY_LEVELS = (2.0, 3.0, 4.0)
-# Number of plans with a short optimisation, and numbers of positions and steps of each.
-_CANDIDATES = 6
-_SHORT_POSITIONS, _SHORT_STEPS = 64, 200
-# Largest number of full optimisations, and largest ratio of a candidate's error to the lowest.
-_FINALISTS, _MAX_RATIO = 3, 1.25
-# A later candidate replaces the best one if the ratio of their errors is below this number. Its
-# difference from 1 is two standard errors of the global bound.
-_BETTER = 0.95
-# Numbers of positioning phases in the global bound after short and after full optimisations.
-_SHORT_PHASES, _PHASES = 1024, 4096
+
+
+class Effort(NamedTuple):
+    """Numbers that determine the time and the accuracy of a comparison of band plans."""
+
+    # Assumed signal energies with an optimised codebook, relative to a random one. The screening
+    # finds plans for each, because wider plans are better with more energy. Plans for 8 and above
+    # would confuse directions more often, which the screening does not consider.
+    energy_levels: tuple[float, ...] = (2.0, 3.0, 4.0)
+    # Number of plans with a short optimisation; numbers of positions and steps of each, and of
+    # shots in the global bound after it.
+    candidates: int = 6
+    short_positions: int = 64
+    short_steps: int = 200
+    short_shots: int = 1024
+    # Candidates differ by at least this many steps of the raster in some frequency.
+    min_difference: int = 4
+    # Largest number of full optimisations, largest ratio of a candidate's error to the lowest, and
+    # number of shots in the global bound after it.
+    finalists: int = 3
+    max_ratio: float = 1.25
+    shots: int = 4096
+    # A later candidate replaces the best one if the ratio of their errors is below this number.
+    # Its difference from 1 is two standard errors of the global bound.
+    better: float = 0.95
+
+
+EFFORT = Effort()
 # Number of positions for energies and errors, and number of quantiles of the energies.
 _POSITIONS, _QUANTILES = 256, 16
-# Candidates differ by at least this many steps of the raster in some frequency.
-_MIN_DIFFERENCE = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,7 +161,7 @@ class BandPlan:
 def best_of(
         scenario: Scenario, candidates: Sequence[Candidate],
         search: Callable[[Scenario], OptimizeResult], seed: int = 0,
-        report: Callable[[Candidate], None] | None = None) -> BandPlan:
+        report: Callable[[Candidate], None] | None = None, effort: Effort = EFFORT) -> BandPlan:
     """Optimise codebooks for the first candidates, and return the best plan.
 
     The candidates are in ascending order of their errors. A later plan replaces an earlier one
@@ -157,17 +170,17 @@ def best_of(
     each complete optimisation, `report` is called with the candidate and its new error.
     """
     best: BandPlan | None = None
-    for candidate in candidates[:_FINALISTS]:
-        if candidate.error_m2 > _MAX_RATIO * candidates[0].error_m2:
+    for candidate in candidates[:effort.finalists]:
+        if candidate.error_m2 > effort.max_ratio * candidates[0].error_m2:
             break
         plan = with_bands(scenario, candidate.frequencies_hz)
         result = search(plan)
         if result.reason == INTERRUPTED:
             return best or BandPlan(plan, result, tuple(candidates), math.nan)
-        error = expected_error(plan, result.codebook, seed, _PHASES)
+        error = expected_error(plan, result.codebook, seed, effort.shots)
         if report:
             report(dataclasses.replace(candidate, error_m2=error))
-        if best is None or error < _BETTER * best.error_m2:
+        if best is None or error < effort.better * best.error_m2:
             best = BandPlan(plan, result, tuple(candidates), error)
     if best is None:
         raise ValueError('candidates: none, expected at least one')
@@ -177,7 +190,8 @@ def best_of(
 def choose_bands(
         scenario: Scenario, spectrum_hz: Sequence[tuple[float, float]], n_bands: int, *,
         raster_hz: float = DEFAULT_RASTER_HZ, min_gap_hz: float | None = None, seed: int = 0,
-        report: Callable[[Candidate], None] | None = None) -> tuple[Candidate, ...]:
+        report: Callable[[Candidate], None] | None = None,
+        effort: Effort = EFFORT) -> tuple[Candidate, ...]:
     """Propose centre frequencies with which users can be located accurately.
 
     `spectrum_hz` are intervals of centre frequencies, including their ends. `raster_hz` is the
@@ -199,14 +213,14 @@ def choose_bands(
             f'{len(frequencies_hz)} frequencies of the raster')
     candidates = []
     for plan, screening in _proposals(
-            scenario, frequencies_hz, n_bands, gap_hz, _MIN_DIFFERENCE * raster_hz,
-            streams.generator(seed, streams.PLANS)):
+            scenario, frequencies_hz, n_bands, gap_hz, effort.min_difference * raster_hz,
+            streams.generator(seed, streams.PLANS), effort):
         world = with_bands(scenario, plan)
-        short = optimize(world, objective='error', seed=seed, n_positions=_SHORT_POSITIONS,
-                         max_steps=_SHORT_STEPS)
+        short = optimize(world, objective='error', seed=seed, n_positions=effort.short_positions,
+                         max_steps=effort.short_steps)
         if short.reason == INTERRUPTED:
             raise KeyboardInterrupt
-        error_m2 = expected_error(world, short.codebook, seed, _SHORT_PHASES)
+        error_m2 = expected_error(world, short.codebook, seed, effort.short_shots)
         candidates.append(Candidate(plan, screening, error_m2))
         if report:
             report(candidates[-1])
@@ -222,7 +236,7 @@ def with_bands(scenario: Scenario, frequencies_hz: Sequence[float]) -> Scenario:
 
 def _proposals(
         scenario: Scenario, frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
-        difference_hz: float, rng: np.random.Generator
+        difference_hz: float, rng: np.random.Generator, effort: Effort
 ) -> list[tuple[tuple[float, ...], float]]:
     """Return plans and their screening errors, the best of each energy level in turn."""
     spread = np.linspace(frequencies_hz[0], frequencies_hz[-1], n_bands)
@@ -230,14 +244,14 @@ def _proposals(
     low, high = scenario.roi_bounds_m
     max_lag_m = float(np.linalg.norm(high - low))
     ranked = []
-    for level in _ENERGY_LEVELS:
+    for level in effort.energy_levels:
         def errors(plans: np.ndarray, level: float = level) -> np.ndarray:
             return range_confusion_error(plans, level * energies, max_lag_m)
         plans, values = screen(frequencies_hz, n_bands, gap_hz, errors, rng)
         order = np.argsort(values, kind='stable')
         ranked.append(iter(zip(plans[order], values[order], strict=True)))
     chosen: list[tuple[tuple[float, ...], float]] = []
-    while ranked and len(chosen) < _CANDIDATES:
+    while ranked and len(chosen) < effort.candidates:
         source = ranked.pop(0)
         for plan, value in source:
             if all(np.abs(plan - other).max() >= difference_hz for other, _ in chosen):
@@ -248,7 +262,7 @@ def _proposals(
 
 
 def expected_error(
-        scenario: Scenario, codebook: Codebook, seed: int = 0, n_phases: int = 2048) -> float:
+        scenario: Scenario, codebook: Codebook, seed: int = 0, n_shots: int = 2048) -> float:
     """Estimate the mean squared error with a codebook [m^2].
 
     Without nuisance parameters, the estimate is the global bound, slightly below the error.
@@ -257,7 +271,7 @@ def expected_error(
     """
     rng = streams.generator(seed, streams.PLANS, 1)
     if not len(nuisance_of(scenario)):
-        return global_bound(scenario, codebook, rng, n_phases).value
+        return global_bound(scenario, codebook, rng, n_shots).value
     model = MeasurementModel(scenario, codebook)
     positions = scenario.sample_positions(_POSITIONS, rng)
     return (float(crlb_of(model, positions, region_prior=True).mean())

@@ -18,10 +18,11 @@ import yaml
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.arrays import read_only
+from rhs_isac_ros.model.arrays import numbers, read_only
 from rhs_isac_ros.model.scenario import check_shape
 from rhs_isac_ros.model.surface import on_levels
 from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.fields import to_number
 from rhs_isac_ros.support.files import read_yaml, write_whole
 
 # Node that receives the parameters in a codebook file, in any namespace.
@@ -53,14 +54,11 @@ class Codebook:
         """Copy the arrays, check them, and make them read-only."""
         for name, kind, dims in (('analog', float, 'N_B, F, N_E'),
                                  ('digital', complex, 'N_B, N_SB, F, K')):
-            try:
-                array = np.array(getattr(self, name), dtype=kind, order='C')
-            except (TypeError, ValueError) as error:
-                raise CodebookError(f'{name}: {error}, expected numbers [{dims}]') from None
+            # A copy, which the caller cannot change.
+            array = np.array(numbers(
+                name, getattr(self, name), kind, CodebookError, shape=f'[{dims}]'), order='C')
             if array.ndim != len(dims.split(',')) or 0 in array.shape:
                 raise CodebookError(f'{name}: shape {array.shape}, expected [{dims}]')
-            if not np.isfinite(array).all():
-                raise CodebookError(f'{name}: not finite, expected finite numbers')
             object.__setattr__(self, name, read_only(array))
         if self.analog.min() < 0 or self.analog.max() > 1:
             raise CodebookError(
@@ -170,13 +168,11 @@ class Codebook:
 def _number(parameters: dict[str, Any], name: str) -> float:
     """Return a parameter, or NaN if it is missing; raise CodebookError if it is not a number."""
     value = parameters.get(f'codebook.{name}', math.nan)
-    try:
-        if not isinstance(value, bool):
-            # ``ros2 param load`` sends NaN as text.
-            return float(value)
-    except (TypeError, ValueError):
-        pass
-    raise CodebookError(f'codebook.{name}: {value!r}, expected a number')
+    # ``ros2 param load`` sends NaN as text.
+    value = math.nan if value in ('.nan', 'nan') else to_number(value, float)
+    if not isinstance(value, float):
+        raise CodebookError(f'codebook.{name}: {value!r}, expected a number')
+    return value
 
 
 def _array(parameters: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -184,11 +180,11 @@ def _array(parameters: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.
     values = parameters.get(f'codebook.{name}', ())
     if isinstance(values, str):
         # ``ros2 param load`` sends a list as text if it contains a number such as 1e-05.
-        values = values.strip('[]').split(',')
-    try:
-        values = np.asarray(values, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise CodebookError(f'codebook.{name}: {error}, expected numbers') from None
+        values = [value.strip() for value in values.strip('[]').split(',')]
+    if isinstance(values, Sequence):
+        # YAML 1.1 reads 1e-05 as text.
+        values = [to_number(value, float) for value in values]
+    values = numbers(f'codebook.{name}', values, error=CodebookError, finite=False)
     if values.size != math.prod(shape):
         raise CodebookError(
             f'codebook.{name}: {values.size} values, expected {math.prod(shape)} = '

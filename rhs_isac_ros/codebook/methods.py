@@ -60,7 +60,7 @@ def run_lbfgs(
 
 # Objectives with fewer pairs are evaluated with all pairs.
 FEWEST_PAIRS = 4096
-# Pairs and steps of each round; the last entry is repeated. The first steps change the codebook,
+# Pairs and steps of each round. The first steps change the codebook,
 # and with it the important pairs, the most. Later steps need a more accurate objective.
 _ROUNDS = (2048, 200), (4096, 600)
 # Number of corrections. With more corrections, their products would take longer than evaluations.
@@ -69,16 +69,17 @@ _SAMPLED_MEMORY = 100
 _DIGITAL_SCALE = 0.3
 
 
-def minimize_sampled(search: Search) -> str:
+def minimize_sampled(search: Search, rounds: Sequence[tuple[int, int]] = _ROUNDS) -> str:
     """Minimise with L-BFGS-B on samples of the pairs; return the reason for stopping.
 
     Each round draws a sample for the codebook of the previous round (`PairwiseErrorCost.sample`)
     and evaluates the result with all pairs. The search ends when no steps are left, or when a
-    round does not lower the objective.
+    round does not lower the objective. `rounds` are numbers of pairs and steps; the last entry is
+    repeated.
     """
     variables, left = search.start, search.max_steps
     value = search.value_m2
-    for n_pairs, steps in itertools.chain(_ROUNDS, itertools.repeat(_ROUNDS[-1])):
+    for n_pairs, steps in itertools.chain(rounds, itertools.repeat(rounds[-1])):
         done, variables = _round(search, variables, min(n_pairs, search.problem.n_pairs),
                                  min(steps, left))
         left -= done

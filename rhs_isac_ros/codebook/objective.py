@@ -1,9 +1,9 @@
 """Objectives of the codebook optimisation, and the samples of the region that they average over.
 
-Each function in `OBJECTIVES` takes a scenario, sampled positions, float64 [N_sam, 3] [m], a random
-generator and `tick`, and returns an `Average`. It raises ValueError unless the positions are a
-finite [N_sam, 3] array with at least one row. During computations that do not depend on the
-codebook, it calls `tick` repeatedly, which may end them with an exception.
+Each function in `OBJECTIVES` takes a scenario, positions sampled from a prior, float64 [N_sam, 3]
+[m], a random generator, `tick` and the prior, and returns an `Average`. It raises ValueError
+unless the positions are a finite [N_sam, 3] array with at least one row. During computations that
+do not depend on the codebook, it calls `tick` repeatedly, which may end them with an exception.
 """
 
 import dataclasses
@@ -14,10 +14,11 @@ import numpy as np
 from rhs_isac_ros.bounds import AverageCrlb, PairwiseErrorCost
 from rhs_isac_ros.bounds.average import Average
 from rhs_isac_ros.bounds.rows import Tick, no_tick
+from rhs_isac_ros.codebook.cell import REGION, Prior
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import element_interval_m
-from rhs_isac_ros.model.los import checked_positions
-from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
+from rhs_isac_ros.model.arrays import checked_positions
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
+from rhs_isac_ros.model.geometry import element_intervals_m
 
 # Relative error of the rows (see `bounds.rows`) of an objective. The error of the objective is
 # then below 0.1 %, far less than the sampling error. The gradient is exact for the value returned.
@@ -32,20 +33,20 @@ _VOLUME_POWER = 0.6
 
 def average_bound(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
-        tick: Tick = no_tick) -> Average:
-    """Implements Eq. (17). Objective of P1 [m^2] on sampled positions; `rng` is unused."""
+        tick: Tick = no_tick, prior: Prior = REGION) -> Average:
+    """Implements Eq. (17). Objective of P1 [m^2] on sampled positions; only these are used."""
     return AverageCrlb(scenario, positions, ROW_TOLERANCE, tick=tick)
 
 
 def nuisance(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
-        tick: Tick = no_tick) -> Average:
+        tick: Tick = no_tick, prior: Prior = REGION) -> Average:
     """Objective [m^2]: average bound with unknown band phases and with the region as prior.
 
     Even a known phase would determine the range only up to whole wavelengths, so phases are
     treated as unknown. With the region as prior, positions that the signals do not determine
-    cannot dominate the average. The scenario may declare further nuisance parameters. `rng` is
-    unused.
+    cannot dominate the average. The scenario may declare further nuisance parameters. `rng` and
+    `prior` are unused.
     """
     uniform = dataclasses.replace(
         scenario, band_phase_std_rad=max(scenario.band_phase_std_rad, 2 * np.pi))
@@ -54,17 +55,18 @@ def nuisance(
 
 def ambiguity(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
-        tick: Tick = no_tick) -> Average:
+        tick: Tick = no_tick, prior: Prior = REGION) -> Average:
     """Objective [m^2]: mean cost of mistaking sampled positions for ones with similar signals."""
     first_positions = np.repeat(checked_positions(positions), _PAIRS_PER_POSITION, axis=0)
-    second_positions = draw_confusable(scenario, first_positions, rng)
+    second_positions = draw_confusable(prior.box(scenario), first_positions, rng)
     return PairwiseErrorCost(
-        scenario, first_positions, second_positions, tolerance=ROW_TOLERANCE, tick=tick)
+        scenario, first_positions, second_positions,
+        prior.ratios(first_positions, second_positions), ROW_TOLERANCE, tick)
 
 
 def error(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
-        tick: Tick = no_tick) -> Average:
+        tick: Tick = no_tick, prior: Prior = REGION) -> Average:
     """Objective [m^2]: like `ambiguity`, but weighted almost as in the mean squared error.
 
     Across the line of sight, pairs extend farther than in `ambiguity`, beyond the first side
@@ -73,9 +75,11 @@ def error(
     squared error.
     """
     first_positions = np.repeat(checked_positions(positions), _PAIRS_PER_POSITION, axis=0)
-    second_positions = draw_confusable(scenario, first_positions, rng, WIDE)
+    box = prior.box(scenario)
+    second_positions = draw_confusable(box, first_positions, rng, WIDE)
     weights = confusable_volumes(
-        scenario, first_positions, second_positions, WIDE)**_VOLUME_POWER
+        box, first_positions, second_positions, WIDE)**_VOLUME_POWER
+    weights *= prior.ratios(first_positions, second_positions)
     if len(weights):
         weights /= weights.mean()
     return PairwiseErrorCost(
@@ -208,5 +212,5 @@ def _lag_density(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 def _beam_width(scenario: Scenario) -> float:
     """Return the width of the narrowest beam that the surface can form, at most 1 [rad]."""
     shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
-    side = max(scenario.n_columns, scenario.n_rows) * element_interval_m(scenario)
-    return float(min(shortest / side, 1.0))
+    sides = np.array([scenario.n_columns, scenario.n_rows]) * element_intervals_m(scenario)
+    return float(min(shortest / sides.max(), 1.0))

@@ -8,7 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.bounds import crlb_of
+from rhs_isac_ros.bounds.average import Average
 from rhs_isac_ros.calibration import Calibration
+from rhs_isac_ros.codebook.cell import REGION, Prior
 from rhs_isac_ros.codebook.codebook import Codebook, Provenance
 from rhs_isac_ros.codebook.methods import (
     FEWEST_PAIRS,
@@ -23,7 +25,8 @@ from rhs_isac_ros.codebook.objective import OBJECTIVES, SAMPLINGS
 from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Progress, Search
 from rhs_isac_ros.codebook.unoptimised import STARTS, random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.arrays import checked_positions
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.surface import on_levels
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -71,7 +74,8 @@ def optimize(
         seed: int = 0, start: Codebook | None = None, resume: Codebook | None = None,
         calibration: Calibration | None = None, max_steps: int | None = None,
         max_evaluations: int | None = None, progress: Callable[[Progress], None] | None = None,
-        keep: Callable[[OptimizeResult], None] | None = None) -> OptimizeResult:
+        keep: Callable[[OptimizeResult], None] | None = None, prior: Prior = REGION
+) -> OptimizeResult:
     """Find a codebook that minimises an objective.
 
     After a KeyboardInterrupt during the search, the best codebook so far is returned. Raises
@@ -114,73 +118,124 @@ def optimize(
         KeyboardInterrupt during the set-up, the result is the start.
     keep
         Called at most every ten seconds with the result so far.
+    prior
+        Where the user may be: the region, or a `Cell` of it.
     """
-    for name, value, known in (('method', method, METHODS), ('objective', objective, OBJECTIVES),
-                               ('sampling', sampling, SAMPLINGS)):
-        if value not in known:
-            raise ValueError(f'{name}: {value!r}, expected one of {sorted(known)}')
-    if max_steps is None:
-        max_steps = METHODS[method].steps
-    for name, number, low in (('n_positions', n_positions, 1), ('seed', seed, 0),
-                              ('max_evaluations', max_evaluations, 1),
-                              ('max_steps', max_steps, 1)):
-        if number is not None and number < low:
-            raise ValueError(f'{name}: {number}, expected at least {low}')
-    if positions is None:
-        positions = SAMPLINGS[sampling](
-            scenario, n_positions, streams.generator(seed, streams.SAMPLES))
-    else:
-        positions, sampling = checked_positions(positions), 'given'
-        if not len(positions):
-            raise ValueError('positions: none, expected at least one')
-    provenance = Provenance(
-        method=method, objective=objective, seed=int(seed), sampling=sampling,
-        positions=len(positions), scenario=scenario.changes(),
-        calibration=calibration.id if calibration else '')
-    done = provenance.resumed(resume.provenance) if resume else provenance
-    first = resume or start or STARTS.get(method, random_codebook)(
-        scenario, streams.generator(seed, streams.START))
-    check_start(first, scenario)
-    surface = None
-    if calibration:
-        calibration.check(scenario)
-        surface = calibration.surface
-
-    def result(best: Codebook, history: Sequence[Progress], reason: str) -> OptimizeResult:
-        bound = float(crlb_of(MeasurementModel(scenario, best, surface), positions).mean())
-        if not history:
-            # Only the bound is known, which is the objective only if that is 'crlb'.
-            value_m2 = _determined(bound) if objective == 'crlb' else np.nan
-            history = [Progress(done.steps, done.evaluations, value_m2, 0.0)]
-            report(history[0])
-        end = history[-1]
-        text = dataclasses.replace(
-            provenance, steps=end.step, evaluations=end.evaluations,
-            value_m2=float(end.value_m2), reason=reason).to_text()
-        return OptimizeResult(
-            dataclasses.replace(best, average_crlb_m2=bound, provenance=text),
-            tuple(history), reason)
-
-    report = _Report(progress, Progress(done.steps, done.evaluations, np.inf, 0.0))
-    unsearched = dataclasses.replace(first, analog=on_levels(scenario, first.analog))
+    design = _Design.of(
+        scenario, positions, method, objective, sampling, n_positions, seed, start, resume,
+        calibration, max_steps, max_evaluations, prior)
+    report = _Report(progress, Progress(
+        design.done.steps, design.done.evaluations, np.inf, 0.0))
     if METHODS[method].minimize is None:
-        return result(unsearched, (), 'nothing to optimise')
+        return _unsearched(design, report, 'nothing to optimise')
     try:
-        average = OBJECTIVES[objective](
-            scenario, positions, streams.generator(seed, streams.PAIRS), report.tick)
+        average = design.average(report.tick)
     except KeyboardInterrupt:
-        return result(unsearched, (), INTERRUPTED)
-    average.surface = surface
+        return _unsearched(design, report, INTERRUPTED)
     problem = Problem(scenario, average)
     minimize = _minimizer(problem, method)
-    search = Search(
-        problem, problem.pack(first), max_steps, max_evaluations,
-        streams.generator(seed, streams.METHOD), report, (done.steps, done.evaluations))
+    search = design.search(problem, report)
     if keep:
         report.keep = lambda: keep(
-            result(problem.unpack(search.best), search.history, 'not finished'))
+            design.result(problem.unpack(search.best), search.history, 'not finished'))
     reason = _run(search, minimize)
-    return result(problem.unpack(search.best), search.history, reason)
+    return design.result(problem.unpack(search.best), search.history, reason)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Design:
+    """Checked arguments of an optimisation: everything that determines its result."""
+
+    scenario: Scenario
+    positions: np.ndarray  # Samples of the user's position, float64 [N_sam, 3] [m].
+    first: Codebook  # Start of the search.
+    surface: SurfaceEstimate | None
+    provenance: Provenance  # Of a result before the first step.
+    done: Provenance  # Steps and evaluations of the resumed result.
+    max_steps: int
+    max_evaluations: int | None
+    prior: Prior
+
+    @classmethod
+    def of(cls, scenario: Scenario, positions: np.ndarray | None, method: str, objective: str,
+           sampling: str, n_positions: int, seed: int, start: Codebook | None,
+           resume: Codebook | None, calibration: Calibration | None, max_steps: int | None,
+           max_evaluations: int | None, prior: Prior) -> '_Design':
+        """Check the arguments of `optimize`, and replace None by the defaults."""
+        for name, value, known in (
+                ('method', method, METHODS), ('objective', objective, OBJECTIVES),
+                ('sampling', sampling, SAMPLINGS)):
+            if value not in known:
+                raise ValueError(f'{name}: {value!r}, expected one of {sorted(known)}')
+        for name, number, low in (('n_positions', n_positions, 1), ('seed', seed, 0),
+                                  ('max_evaluations', max_evaluations, 1),
+                                  ('max_steps', max_steps, 1)):
+            if number is not None and number < low:
+                raise ValueError(f'{name}: {number}, expected at least {low}')
+        if positions is None:
+            positions = prior.positions(scenario, SAMPLINGS[sampling](
+                scenario, n_positions, streams.generator(seed, streams.SAMPLES)))
+        else:
+            positions, sampling = checked_positions(positions), 'given'
+            if not len(positions):
+                raise ValueError('positions: none, expected at least one')
+        provenance = Provenance(
+            method=method, objective=objective, seed=int(seed), sampling=sampling,
+            positions=len(positions), scenario=scenario.changes(),
+            calibration=calibration.id if calibration else '')
+        done = provenance.resumed(resume.provenance) if resume else provenance
+        first = resume or start or STARTS.get(method, random_codebook)(
+            scenario, streams.generator(seed, streams.START))
+        check_start(first, scenario)
+        if calibration:
+            calibration.check(scenario)
+        return cls(scenario, positions, first, calibration.surface if calibration else None,
+                   provenance, done, max_steps or METHODS[method].steps, max_evaluations,
+                   prior)
+
+    def average(self, tick: Callable[[], None]) -> Average:
+        """Set up the objective."""
+        average = OBJECTIVES[self.provenance.objective](
+            self.scenario, self.positions, self._rng(streams.PAIRS), tick,
+            self.prior)
+        average.surface = self.surface
+        return average
+
+    def search(self, problem: Problem, report: Callable[[Progress], None]) -> Search:
+        """Return the search for the best variables of a problem."""
+        return Search(
+            problem, problem.pack(self.first), self.max_steps, self.max_evaluations,
+            self._rng(streams.METHOD), report, (self.done.steps, self.done.evaluations))
+
+    def bound_m2(self, codebook: Codebook) -> float:
+        """Compute the average Cramer-Rao bound of a codebook."""
+        model = MeasurementModel(self.scenario, codebook, self.surface)
+        return float(crlb_of(model, self.positions).mean())
+
+    def result(self, best: Codebook, history: Sequence[Progress], reason: str) -> OptimizeResult:
+        """Return a result with its provenance."""
+        end = history[-1]
+        provenance = dataclasses.replace(
+            self.provenance, steps=end.step, evaluations=end.evaluations,
+            value_m2=float(end.value_m2), reason=reason)
+        codebook = dataclasses.replace(
+            best, average_crlb_m2=self.bound_m2(best), provenance=provenance.to_text())
+        return OptimizeResult(codebook, tuple(history), reason)
+
+    def _rng(self, stream: int) -> np.random.Generator:
+        return streams.generator(self.provenance.seed, stream)
+
+
+def _unsearched(design: _Design, report: '_Report', reason: str) -> OptimizeResult:
+    """Return the start as the result."""
+    best = dataclasses.replace(
+        design.first, analog=on_levels(design.scenario, design.first.analog))
+    # Only the bound is known, which is the objective only if that is 'crlb'.
+    value_m2 = (_determined(design.bound_m2(best)) if design.provenance.objective == 'crlb'
+                else np.nan)
+    entry = Progress(design.done.steps, design.done.evaluations, value_m2, 0.0)
+    report(entry)
+    return design.result(best, [entry], reason)
 
 
 def check_start(codebook: Codebook, scenario: Scenario) -> None:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rhs_isac_ros.codebook import OBJECTIVES, CodebookError
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.experiments.jobs import add_run_options, markdown_table, run_command
 from rhs_isac_ros.experiments.sweep import KINDS, OPTIMIZE, Point, Sweep, run_sweep, table
 from rhs_isac_ros.experiments.sweep_picture import draw, shown
@@ -43,6 +42,7 @@ from rhs_isac_ros.support.arguments import (
     seed,
 )
 from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.pictures import write_picture
 

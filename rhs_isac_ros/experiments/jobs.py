@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rhs_isac_ros import __version__
-from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.support.arguments import integer, output_folder
+from rhs_isac_ros.support.exits import print_error
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
@@ -121,8 +121,8 @@ def run_locally(
 
 
 def run_on_cluster(
-        function: Callable[..., Mapping[str, Any]], jobs: Sequence[Job], address: str
-) -> Generator[JobResult, None, None]:
+        function: Callable[..., Mapping[str, Any]], jobs: Sequence[Job], address: str,
+        worker_timeout_s: float = _WORKER_TIMEOUT_S) -> Generator[JobResult, None, None]:
     """Run jobs on the Dask cluster of a scheduler; yield each result when it is ready.
 
     Closing the generator cancels pending jobs. This function uses `distributed` directly: joblib
@@ -136,7 +136,7 @@ def run_on_cluster(
         try:
             client = stack.enter_context(Client(  # type: ignore[no-untyped-call]
                 address, timeout=_SCHEDULER_TIMEOUT_S, set_as_default=False))
-            client.wait_for_workers(1, timeout=_WORKER_TIMEOUT_S)
+            client.wait_for_workers(1, timeout=worker_timeout_s)
         except (OSError, TimeoutError, ValueError) as error:
             raise ConnectionError(f'Dask cluster {address}: {error}') from error
         jobs_by_future = {
@@ -169,14 +169,16 @@ def _interrupts_ignored() -> Iterator[None]:
 
 def run_jobs(
         function: Callable[..., dict[str, Any]], jobs: Sequence[Job], folder: Path,
-        n_jobs: int = -1, dask: str | None = None, label: str = '') -> list[dict[str, Any]]:
+        n_jobs: int = -1, dask: str | None = None, label: str = '',
+        worker_timeout_s: float = _WORKER_TIMEOUT_S) -> list[dict[str, Any]]:
     """Run the jobs that have no stored result; return all results in order, decoded from JSON.
 
     `function` takes the arguments of a job and returns a dict that JSON can represent. Each result
     is stored as soon as it is available, in a file in `folder`. After an interruption or an error,
     the same call resumes the experiment. `n_jobs` jobs run in parallel on this machine, by default
-    one per core; `dask` is the address of the scheduler of a Dask cluster to use instead. If
-    stderr is a terminal, a progress bar with the label appears there.
+    one per core; `dask` is the address of the scheduler of a Dask cluster to use instead, whose
+    first worker may take `worker_timeout_s` to appear. If stderr is a terminal, a progress bar
+    with the label appears there.
 
     Raises JobError if a job fails, its process dies or its worker has another version of this
     package, ConnectionError if the cluster does not respond, OSError if a result cannot be read or
@@ -195,7 +197,7 @@ def run_jobs(
     with tqdm(total=len(jobs), initial=len(known), unit='job', disable=None,
               desc=label or None) as bar:
         if pending:
-            job_results = (run_on_cluster(function, pending, dask) if dask
+            job_results = (run_on_cluster(function, pending, dask, worker_timeout_s) if dask
                            else run_locally(function, pending, n_jobs))
             with contextlib.closing(job_results):
                 for job_result in job_results:

@@ -67,10 +67,11 @@ def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -
     resampled = _case_weights(n_cases)
     statistic = functools.partial(_quantiles, quantiles=quantiles) if quantiles else _mean
     with np.errstate(invalid='ignore'):
-        return [Replicates(values, by_member, n_members) for values, by_member in zip(
-            statistic(results, members, resampled),
-            statistic(results, members, np.broadcast_to(resampled[:1], resampled.shape)),
-            strict=True)]
+        values = statistic(results, members, resampled)
+        by_member = statistic(results, members, np.broadcast_to(resampled[:1], resampled.shape))
+    # Both begin with the statistic, but products of matrices of other strides round differently.
+    values[:, 0] = by_member[:, 0]
+    return [Replicates(*rows, n_members) for rows in zip(values, by_member, strict=True)]
 
 
 def share_percent(count: int, total: int) -> tuple[float, float, float]:

@@ -103,18 +103,20 @@ def design(scenario: Mapping[str, Any], kind: str, seed: int, objective: str = '
 
 
 def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, Any], seed: int,
-             first: int, n: int, estimator: str = '') -> dict[str, list[float]]:
+             first: int, n: int, estimator: str = '', max_coarseness: float = _MAX_COARSENESS
+             ) -> dict[str, list[float]]:
     """Run a job: compute a family of quantities at `n` positions, beginning with number `first`.
 
     The seed and the region determine the sequence of positions, except for the global bound, which
-    draws its own. Each list of the result has one value per position.
+    draws its own, and is NaN above a coarseness of its lattice. Each list of the result has one
+    value per position.
     """
     world, book = Scenario(**scenario), Codebook.from_parameters(dict(codebook))
     if family == BOUND:
         # The bound needs at least two phases.
         bound = global_bound(
             world, book, streams.generator(seed, streams.HELD_OUT, first), max(n, 2))
-        loose = bound.coarseness > _MAX_COARSENESS
+        loose = bound.coarseness > max_coarseness
         return {'bound_m2': [np.nan] * n if loose else bound.squared_errors[:n].tolist()}
     positions, received = simulate_pairs(world, book, n, seed, first)
     if family == CRLB:

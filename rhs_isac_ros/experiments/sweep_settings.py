@@ -8,12 +8,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 
 from rhs_isac_ros.experiments.resampling import replicate, share_percent
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.scenario import checked
+from rhs_isac_ros.support.files import parse_yaml
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Finite substitute for infinity, larger than any finite result.
@@ -174,8 +174,8 @@ def parse_axis(text: str) -> Axis:
         close = difflib.get_close_matches(name, NAMES) or NAMES
         raise ValueError(f'{name}: unknown field, expected one of {", ".join(close)}')
     try:
-        values = yaml.safe_load(f'[{listed}]')
-    except (ValueError, yaml.YAMLError):
+        values = parse_yaml(f'[{listed}]')
+    except ValueError:
         values = None
     if not equals or not isinstance(values, list) or not values:
         raise ValueError(f'{text!r}, expected FIELD=VALUE,... with values as in a scenario file')
@@ -208,4 +208,4 @@ def plain(value: Any) -> str:
     """Return the value of a field as text in the syntax of scenario files."""
     if isinstance(value, GainPattern | str):
         return str(value)
-    return json.dumps(value)
+    return json.dumps(value, default=dataclasses.asdict)

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.arrays import read_only
+from rhs_isac_ros.model.arrays import checked_position, read_only
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.geometry import element_positions, feed_positions
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
-from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import onboard_matrix
 
 # Gains above this limit have finite reciprocals.
@@ -77,7 +77,7 @@ class BandLink:
         ValueError if the position is not a finite [3] array.
         """
         onboard, fixed = arrays(scenario, surface)
-        listed, place = np.atleast_1d(bands).tolist(), np.asarray(position)[None]
+        listed, place = np.atleast_1d(bands).tolist(), checked_position(position)[None]
         los = np.concatenate([los_gain(scenario, place, band) for band in listed])
         if isinstance(bands, int):
             los = los[0]

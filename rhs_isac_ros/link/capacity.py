@@ -9,11 +9,12 @@ import numpy as np
 
 from rhs_isac_ros.link.band_link import band_index
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.arrays import read_only
+from rhs_isac_ros.model.arrays import checked_position, numbers, read_only
 from rhs_isac_ros.model.los import direct_gain, los_sums
 from rhs_isac_ros.model.multipath import spatial_covariance
 from rhs_isac_ros.model.scenario import check_shape
 from rhs_isac_ros.model.surface import onboard_matrix
+from rhs_isac_ros.support.fields import finite
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Quadrature nodes along each principal axis of the covariance.
@@ -102,9 +103,12 @@ def posterior_points(
     positions, float64 [n, 3] [m], and weights with the sum 1, float64 [n]. Raises ValueError if
     `mean` or `covariance` has a wrong shape or is not finite.
     """
+    mean, covariance = (numbers(name, value, finite=False) for name, value in (
+        ('mean', mean), ('covariance', covariance)))
     for name, value, shape in (('mean', mean, (3,)), ('covariance', covariance, (3, 3))):
-        if np.shape(value) != shape or not np.isfinite(value).all():
+        if value.shape != shape or not np.isfinite(value).all():
             raise ValueError(f'{name}: {value}, expected {list(shape)} finite numbers')
+    checked_position(mean, 'mean')
     # Halve before adding: the sum of two numbers near the largest float is infinite.
     variances, axes = np.linalg.eigh(np.divide(covariance, 2) + np.divide(covariance, 2).T)
     spreads = np.minimum(np.sqrt(np.maximum(variances, 0)), _MAX_SPREAD_M)
@@ -131,8 +135,9 @@ def _radiation(scenario: Scenario, beam: Beam) -> np.ndarray:
     check_shape('digital', beam.digital, 'N_SB K', scenario)
     if not 0 <= beam.band < scenario.n_bands:
         raise ValueError(f'band: {beam.band}, expected 0 to {scenario.n_bands - 1}')
-    feeds = np.einsum('jk,jkm->jm', beam.digital, onboard_matrix(scenario)[beam.band])
-    return feeds * beam.analog
+    digital, onboard = numbers('digital', beam.digital, complex), onboard_matrix(scenario)
+    feeds = np.einsum('jk,jkm->jm', digital, onboard[beam.band])
+    return feeds * numbers('analog', beam.analog, complex)
 
 
 def _rate(scenario: Scenario, power_w: np.ndarray) -> np.ndarray:
@@ -179,7 +184,7 @@ def beam_pattern(
     ValueError if the distance or the step is not positive, or the beam does not fit the scenario.
     """
     for name, value in (('distance_m', distance_m), ('step_deg', step_deg)):
-        if not value > 0:
+        if not finite(name, value) > 0:
             raise ValueError(f'{name}: {value}, expected a positive number')
     directions = _directions(step_deg)
     (sums,) = los_sums(scenario, distance_m * directions.reshape(-1, 3), [beam.band],

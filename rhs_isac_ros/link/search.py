@@ -116,11 +116,12 @@ def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
         peaks, _scattered_configurations(scaled, fixed, rng), fixed)
 
 
-def _modes(scenario: Scenario) -> np.ndarray:
+def _modes(scenario: Scenario, max_modes: int = _MAX_MODES) -> np.ndarray:
     """Return the strongest modes of the multipath, [N_B, N_E, L], padded with zeros."""
     spatial = spatial_covariance(scenario)
     powers, directions = (
-        _strongest(spatial) if spatial.matrix is None else np.linalg.eigh(spatial.matrix))
+        _strongest(spatial, max_modes) if spatial.matrix is None
+        else np.linalg.eigh(spatial.matrix))
     powers, directions = np.maximum(powers[:, ::-1], 0), directions[:, :, ::-1]
     omitted = 1 - np.cumsum(powers, axis=1) / np.sum(spatial.power, axis=1, keepdims=True)
     n_modes = 1 + np.sum(omitted > _MAX_OMITTED, axis=1)
@@ -128,7 +129,7 @@ def _modes(scenario: Scenario) -> np.ndarray:
     return (directions * np.sqrt(powers)[:, None])[:, :, :n_modes.max()]
 
 
-def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
+def _strongest(spatial: SpatialCovariance, n_modes: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest eigenvalues, in ascending order, and their eigenvectors."""
     from scipy.sparse.linalg import LinearOperator, eigsh
 
@@ -142,7 +143,7 @@ def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
         start = np.random.default_rng(0).normal(size=spatial.power.shape[1:])
         start = start.astype(float if spatial.is_real else complex)
         operator = LinearOperator((len(start), len(start)), times, dtype=start.dtype)
-        powers, directions = eigsh(operator, _MAX_MODES, v0=start, tol=_MODE_TOLERANCE)
+        powers, directions = eigsh(operator, n_modes, v0=start, tol=_MODE_TOLERANCE)
         # The eigenvalues of complex matrices are in no particular order.
         order = np.argsort(powers)
         pairs.append((powers[order], directions[:, order]))

@@ -6,6 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+# Largest coordinate of a position [m]; sums of squares of larger ones lose all digits of others.
+_MAX_COORDINATE_M = 1e12
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
@@ -28,6 +32,14 @@ def mixture_weights(log_weights: np.ndarray, axis: int | tuple[int, ...] = -1
     return weights / total, np.squeeze(highest + np.log(total), axis=axis)
 
 
+def log_sum(values: np.ndarray) -> float:
+    """Return the logarithm of the sum of exponentials."""
+    highest = float(values.max())
+    if np.isneginf(highest):
+        return highest
+    return highest + float(np.log(np.sum(np.exp(values - highest))))
+
+
 def blocks(n: int, size: int) -> list[slice]:
     """Return slices that split n items into blocks of the given size; the last may be smaller."""
     return [slice(start, start + size) for start in range(0, n, size)]
@@ -45,12 +57,81 @@ def digest(*arrays: np.ndarray) -> str:
     return hashlib.sha256(b''.join(array.tobytes() for array in arrays)).hexdigest()[:16]
 
 
+def all_finite(values: np.ndarray) -> bool:
+    """Return whether all numbers are finite."""
+    # The sum of the squares is, in one operation, unless a number is not finite or is enormous.
+    return values.dtype.kind in 'fc' and bool(np.isfinite(np.vdot(values, values))) or bool(
+        np.isfinite(values).all())
+
+
+def numbers(name: str, value: ArrayLike, kind: type = float,
+            error: type[ValueError] = ValueError, *, shape: str = '', finite: bool = True
+            ) -> np.ndarray:
+    """Convert numbers to an array of `kind`: float, complex or int; else raise `error`.
+
+    NumPy drops masks and some imaginary parts, and converts text and objects, without an error.
+    `shape` describes the expected shape in errors. If `finite` is set, all must be finite.
+    """
+    expected = f'expected numbers {shape}'.rstrip()
+    if _is_masked(value):
+        raise error(f'{name}: a masked array, {expected} without a mask')
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as problem:
+        raise error(f'{name}: {problem}, {expected}') from None
+    if array.dtype.kind == 'c' and kind is not complex:
+        raise error(f'{name}: complex numbers, expected real numbers {shape}'.rstrip())
+    if array.dtype.kind not in 'bifuc':
+        raise error(f'{name}: {array.ravel()[:1].tolist()} of type {array.dtype}, {expected}')
+    if (finite or kind is int) and not all_finite(array):
+        raise error(f'{name}: not finite, expected finite numbers')
+    if kind is int and (broken := array[array != np.round(array)]).size:
+        raise error(f'{name}: {broken[0]:g}, expected integers')
+    return array.astype(kind, copy=False)
+
+
+def _is_masked(value: object) -> bool:
+    return isinstance(value, np.ma.MaskedArray) or (
+        isinstance(value, list | tuple) and any(map(_is_masked, value)))
+
+
+def position_problem(positions: np.ndarray) -> str:
+    """Describe why finite positions [..., 3] [m] are not in front of the surface, or return ''."""
+    if positions.size and not positions[..., 0].min() > 0:
+        return (f'x = {positions[..., 0].min():g} m, expected x > 0, in front of the surface, '
+                'which lies in the plane x = 0')
+    # The norm, in one operation, is at least as large as each coordinate.
+    if np.vdot(positions, positions) > _MAX_COORDINATE_M**2 and (
+            np.abs(positions).max() > _MAX_COORDINATE_M):
+        return (f'{np.abs(positions).max():g} m, expected coordinates up to '
+                f'{_MAX_COORDINATE_M:g} m')
+    return ''
+
+
+def checked_positions(positions: ArrayLike, name: str = 'positions') -> np.ndarray:
+    """Return positions in front of the surface as float64 [N, 3] [m], or raise ValueError."""
+    array = numbers(name, positions)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f'{name}: shape {array.shape}, expected [N, 3]')
+    if problem := position_problem(array):
+        raise ValueError(f'{name}: {problem}')
+    return array
+
+
+def checked_position(position: ArrayLike, name: str = 'positions') -> np.ndarray:
+    """Return a position in front of the surface as float64 [3] [m], or raise ValueError."""
+    array = numbers(name, position)
+    if array.shape != (3,):
+        raise ValueError(f'{name}: shape {array.shape}, expected [3]')
+    if problem := position_problem(array):
+        raise ValueError(f'{name}: {problem}')
+    return array
+
+
 def check_arrays(owner: Any, shapes: Mapping[str, tuple[int, ...]],
                  error: type[ValueError] = ValueError) -> None:
     """Raise `error` unless `owner` has finite attributes with the names and shapes in `shapes`."""
     for name, shape in shapes.items():
-        array = getattr(owner, name)
-        if np.shape(array) != shape:
-            raise error(f'{name}: shape {np.shape(array)}, expected {shape}')
-        if not np.isfinite(array).all():
-            raise error(f'{name}: not finite, expected finite numbers')
+        array = numbers(name, getattr(owner, name), complex, error)
+        if array.shape != shape:
+            raise error(f'{name}: shape {array.shape}, expected {shape}')

@@ -24,7 +24,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import adjoint, blocks, digest, gauss_legendre, read_only
+from rhs_isac_ros.model.arrays import adjoint, blocks, digest, gauss_legendre, numbers, read_only
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import (
     complex_normal,
@@ -119,6 +119,11 @@ class ElementErrors(SurfaceModel):
     gains: np.ndarray  #: Factors of the coefficients, complex128 [N_E]; 1 without an error.
     stuck: np.ndarray  #: Amplitudes of failed elements, float64 [N_E]; NaN for working ones.
 
+    def __post_init__(self) -> None:
+        """Raise ValueError unless the arrays contain numbers."""
+        object.__setattr__(self, 'gains', numbers('gains', self.gains, complex))
+        object.__setattr__(self, 'stuck', numbers('stuck', self.stuck, finite=False))
+
     @property
     def id(self) -> str:
         """Hash of the errors, 16 hexadecimal digits."""
@@ -182,6 +187,13 @@ class SurfaceEstimate(SurfaceModel):
     #: complex128 [2 N_E + N_B, R].
     factor: np.ndarray
     failed_probability: np.ndarray  #: Probability that each element has failed, float64 [N_E].
+
+    def __post_init__(self) -> None:
+        """Raise ValueError unless the arrays contain finite numbers."""
+        for field in dataclasses.fields(self):
+            kind = float if field.name == 'failed_probability' else complex
+            object.__setattr__(
+                self, field.name, numbers(field.name, getattr(self, field.name), kind))
 
     @property
     def is_exact(self) -> bool:
@@ -265,13 +277,14 @@ def error_radiation(scenario: Scenario, beams: Beamforming) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=16)
-def element_correlation(scenario: Scenario, band: int) -> np.ndarray:
+def element_correlation(
+        scenario: Scenario, band: int, n_nodes: int = _ROI_NODES) -> np.ndarray:
     """Compute the correlation of each element's gain over the measurements of a band.
 
     It includes the direct path, averaged over the region of interest, and the multipath. Returns
     complex128 [N_SB F, N_SB F, N_E], read-only.
     """
-    nodes, weights = gauss_legendre(_ROI_NODES)
+    nodes, weights = gauss_legendre(n_nodes)
     low, high = scenario.roi_bounds_m
     axes = ((low + high) / 2 + nodes[:, None] * (high - low) / 2).T
     positions = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)

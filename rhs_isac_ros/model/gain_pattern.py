@@ -98,12 +98,15 @@ class GainPattern(External):
 def _evaluate(function: AngleFunction, angles: np.ndarray) -> np.ndarray:
     # A function that the user supplies may raise any exception.
     try:
-        result = np.asarray(function(angles))
+        given = function(angles)
+        result = np.asarray(given)
     except Exception as error:
         raise PatternError(
             f'{function!r}: {type(error).__name__}: {error}, expected a function of an array of '
             'angles [rad]') from error
-    if result.shape != np.shape(angles) or result.dtype.kind not in 'fiu':
-        raise PatternError(f'{function!r}: {result.dtype} {result.shape}, expected real numbers '
-                           f'of the shape of the angles, {np.shape(angles)}')
+    if (result.shape != np.shape(angles) or result.dtype.kind not in 'fiu'
+            or isinstance(given, np.ma.MaskedArray)):
+        raise PatternError(
+            f'{function!r}: {type(given).__name__} of {result.dtype} {result.shape}, expected '
+            f'real numbers of the shape of the angles, {np.shape(angles)}')
     return result.astype(float, copy=False)

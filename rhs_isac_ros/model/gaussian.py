@@ -1,15 +1,20 @@
-"""Energy and information of Gaussian signals, and elimination of nuisance parameters."""
+"""Energy, information and moments of Gaussians, and elimination of nuisance parameters."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from rhs_isac_ros.model.arrays import mixture_weights
+from rhs_isac_ros.model.constants import POWER_NEPERS_PER_DB
+from rhs_isac_ros.model.scenario import Scenario, ScenarioError
 
 # Standard deviation of the multipath level of a user without a direct path [dB].
 BLOCKED_STD_DB = 10.0
 # Share of valid signals that a test of the energy of a positioning phase may reject.
 FALSE_ALARM = 1e-9
+# Smallest square of a pivot relative to the largest variance, in units of the rounding error of n
+# variances. Below it, bounds have errors of more than about a per cent.
+_MIN_PIVOT = 4
 
 
 class Marginal(NamedTuple):
@@ -24,6 +29,31 @@ class Marginal(NamedTuple):
     offset: np.ndarray
     # Log of the integral over the Q unknowns relative to the maximum [N], without factors of 2 pi.
     log_volume: np.ndarray
+
+
+def covariance_root(scenario: Scenario, covariance: np.ndarray) -> np.ndarray:
+    """Compute Cholesky factors of covariances of received signals, [..., n, n].
+
+    Raises ScenarioError if the noise is so weak, compared with the multipath, that the factors
+    would be dominated by rounding errors.
+    """
+    largest = np.diagonal(covariance, axis1=-2, axis2=-1).real.max(axis=-1)
+    limit = _MIN_PIVOT * covariance.shape[-1] * np.finfo(float).eps * largest
+    try:
+        roots = np.linalg.cholesky(covariance)
+        smallest = np.diagonal(roots, axis1=-2, axis2=-1).real.min(axis=-1)**2
+    except np.linalg.LinAlgError:
+        smallest = -np.ones(1)
+    if not (smallest >= limit).all():
+        names = ('max_power_w', 'element_gain', 'user_gain', 'element_error_rms',
+                 'failed_element_share', *(('multipath',) if scenario.multipath else (
+                     'multipath_to_los_db', 'delay_spread_s', 'angular_spread_deg',
+                     'max_user_speed_mps')))
+        fields = ', '.join(f'{name} {getattr(scenario, name)}' for name in names)
+        raise ScenarioError(
+            f'noise_psd_dbm_hz: {scenario.noise_psd_dbm_hz:g} dBm/Hz, expected stronger noise: '
+            f'with {fields}, the covariance of the signals is singular up to rounding errors')
+    return roots
 
 
 def energy_limit(n: int, probability: float = FALSE_ALARM) -> float:
@@ -41,10 +71,10 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
     `energy`, float64 [N], is the energy of n complex numbers relative to their variance at 0 dB.
     Returns the logarithm of the average, float64 [N], relative to the likelihood of zeros at 0 dB.
     """
-    std = np.log(10) / 10 * std_db
+    std = POWER_NEPERS_PER_DB * std_db
     # As a function of the level, the likelihood has a width of n**-0.5, which the grid resolves.
     normal = np.linspace(-4, 4, 2 * int(np.ceil(4 * std * np.sqrt(n))) + 61)
-    level, prior = np.log(10) / 10 * median_db + std * normal, -normal**2 / 2
+    level, prior = POWER_NEPERS_PER_DB * median_db + std * normal, -normal**2 / 2
     exponents = -energy[:, None] * np.exp(-level) - n * level + prior
     return mixture_weights(exponents)[1] - mixture_weights(prior)[1]
 
@@ -55,7 +85,7 @@ def share_of_level(n: float, std_db: float) -> float:
     The energy is that of n complex Gaussian numbers, whose common level is a log-normal power. On
     average, the level also causes this share of the deviation of a log energy from its median.
     """
-    variance = float(np.log(10) / 10 * std_db)**2
+    variance = (POWER_NEPERS_PER_DB * std_db)**2
     return variance / (variance + 1 / n)
 
 
@@ -93,3 +123,20 @@ def marginalise(information: np.ndarray, gradient: np.ndarray, n: int = 3) -> Ma
         information[:, :n, :n] + (explained + np.swapaxes(explained, 1, 2)) / 2,
         gradient[:, :n] + np.einsum('mqp,mq->mp', regression, gradient[:, n:]),
         regression, offset, -np.linalg.slogdet(among)[1] / 2)
+
+
+def likelihood_loss(offset: np.ndarray, curvature: np.ndarray) -> np.ndarray:
+    """Compute the decrease of the log-likelihood over offsets [M, n] from modes, float64 [M]."""
+    return np.einsum('mp,mpq,mq->m', offset, curvature, offset) / 2
+
+
+def moments(weights: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean [..., n] and covariance [..., n, n] of points [..., S, n]; weights add to 1."""
+    mean = np.matmul(weights[..., None, :], points)
+    offsets = points - mean
+    return mean[..., 0, :], np.matmul(np.swapaxes(offsets * weights[..., None], -1, -2), offsets)
+
+
+def symmetric(covariances: np.ndarray) -> np.ndarray:
+    """Return matrices [..., n, n] without the asymmetry that rounding causes."""
+    return (covariances + np.swapaxes(covariances, -1, -2)) / 2

@@ -9,16 +9,22 @@ import functools
 import numpy as np
 
 from rhs_isac_ros.model.arrays import read_only
-from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
+from rhs_isac_ros.model.scenario import Scenario
 
+# Lower limit of x in conversions [m]; the model is not defined at x = 0.
+_MIN_X_M = 1e-15
 # Lower limit of a region's extent [wavelengths]; the information for an extent of 0 is infinite.
 _NO_EXTENT = 1e-5
 
 
-def element_interval_m(scenario: Scenario) -> float:
-    """Return the element spacing Delta_E [m], a multiple of the mean wavelength (Section V)."""
-    wavelengths_m = SPEED_OF_LIGHT_MPS / np.array(scenario.center_frequencies_hz)
-    return scenario.element_interval_wavelengths * float(np.mean(wavelengths_m))
+def element_intervals_m(scenario: Scenario) -> np.ndarray:
+    """Return the element spacing Delta_E along y and z, float64 [2] [m].
+
+    It is a multiple of the mean wavelength (Section V).
+    """
+    wavelength_m = np.mean(SPEED_OF_LIGHT_MPS / np.array(scenario.center_frequencies_hz))
+    return wavelength_m * np.broadcast_to(scenario.element_interval_wavelengths, 2)
 
 
 @functools.lru_cache(maxsize=16)
@@ -28,8 +34,8 @@ def element_positions(scenario: Scenario) -> np.ndarray:
     Returns float64 [N_E, 3] [m], read-only. The index of an element is row * n_columns + column;
     a row runs along y, a column along z.
     """
-    y, z = ((np.arange(n) - (n - 1) / 2) * element_interval_m(scenario)
-            for n in (scenario.n_columns, scenario.n_rows))
+    y, z = ((np.arange(n) - (n - 1) / 2) * interval_m for n, interval_m in zip(
+        (scenario.n_columns, scenario.n_rows), element_intervals_m(scenario), strict=True))
     lattice = np.zeros((scenario.n_rows, scenario.n_columns, 3))
     lattice[..., 1], lattice[..., 2] = y, z[:, None]
     return read_only(lattice.reshape(-1, 3))
@@ -43,7 +49,7 @@ def feed_positions(scenario: Scenario) -> np.ndarray:
     if scenario.feed_positions_m is not None:
         return np.array(scenario.feed_positions_m)
     n_feeds = scenario.n_feeds
-    length = scenario.n_columns * element_interval_m(scenario)
+    length = scenario.n_columns * element_intervals_m(scenario)[0]
     positions = np.zeros((n_feeds, 3))
     positions[:, 1] = ((np.arange(n_feeds) + 0.5) / n_feeds - 0.5) * length
     return positions
@@ -60,13 +66,14 @@ def subband_frequencies_hz(scenario: Scenario) -> np.ndarray:
 def to_positions(points: np.ndarray) -> np.ndarray:
     """Convert points (r [m], u, v), float64 [..., 3], to positions, float64 [..., 3] [m].
 
-    Points outside the unit circle, u^2 + v^2 > 1, are given x = 0.
+    Points outside the unit circle, u^2 + v^2 > 1, are given an x just above 0.
     """
     distance, u, v = points[..., 0], points[..., 1], points[..., 2]
     positions = np.empty_like(points, dtype=float)
     positions[..., 0] = np.sqrt(np.maximum(1 - u**2 - v**2, 0.0))
     positions[..., 1:] = points[..., 1:]
     positions *= distance[..., None]
+    np.maximum(positions[..., 0], _MIN_X_M, out=positions[..., 0])
     return positions
 
 
@@ -89,6 +96,21 @@ def jacobian(points: np.ndarray) -> np.ndarray:
     matrix[:, 0, 0], matrix[:, 1, 0], matrix[:, 2, 0] = w, u, v
     matrix[:, 0, 1], matrix[:, 0, 2] = -distance * u / w, -distance * v / w
     matrix[:, 1, 1] = matrix[:, 2, 2] = distance
+    return matrix
+
+
+def polar_derivative(points: np.ndarray) -> np.ndarray:
+    """Compute the derivative of (r [m], u, v) with respect to the position at points [N, 3].
+
+    Returns float64 [N, 3, 3]: rows r, u and v, columns x, y and z, the inverse of `jacobian`.
+    """
+    distance, u, v = points.T
+    matrix = np.zeros((len(points), 3, 3))
+    matrix[:, 0, 0], matrix[:, 0, 1:] = np.sqrt(np.maximum(1 - u**2 - v**2, 0.0)), points[:, 1:]
+    matrix[:, 1:] = -points[:, 1:, None] * matrix[:, :1]
+    matrix[:, 1, 1] += 1
+    matrix[:, 2, 2] += 1
+    matrix[:, 1:] /= distance[:, None, None]
     return matrix
 
 

@@ -25,9 +25,11 @@ from typing import Any
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import check_arrays, read_only
+from rhs_isac_ros.model.arrays import check_arrays, numbers, position_problem, read_only
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.external import ArrayFile
 from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.fields import Field
 from rhs_isac_ros.support.files import (
     ArchiveError,
     read_archive,
@@ -36,7 +38,6 @@ from rhs_isac_ros.support.files import (
     write_whole,
 )
 
-SPEED_OF_LIGHT_MPS = 299_792_458.0
 _FORMAT = 1
 # Fields of the scenario that a measured covariance replaces.
 FIELDS = ('multipath_to_los_db', 'delay_spread_s', 'angular_spread_deg')
@@ -44,11 +45,15 @@ FIELDS = ('multipath_to_los_db', 'delay_spread_s', 'angular_spread_deg')
 CONDITIONS = (
     'center_frequencies_hz', 'n_subbands', 'subband_width_hz', 'n_frames', 'elements_per_side',
     'element_interval_wavelengths', 'multipath_direction_deg', 'roi_center_m', 'roi_size_m')
+# Numbers in the record of a survey that estimators use.
+_ABOUT = {'inflation': Field(float, low=0.0, is_open=True), 'level_std_db': Field(float, low=0.0)}
 # Largest ratio between a centre frequency and the frequency of the paths, in either direction.
 _MAX_FREQUENCY_RATIO = 1.5
 # Largest amplitude relative to free space, and largest distance between a user and the source of
 # the user's direct path.
 _MAX_COEFFICIENT, _MAX_OFFSET_M = 2.0, 0.01
+# Largest number of reflections, as files store it in 8 bits.
+_MAX_REFLECTIONS = 127
 # Minimum share of the users in the region of interest.
 _MIN_SHARE = 0.5
 # Types of the arrays of paths in memory; in a file, some have less precision.
@@ -70,10 +75,11 @@ class MultipathEstimate(ArrayFile):
     radiation: np.ndarray  #: T_i of the survey, complex128 [N_B, N_SB F, N_E].
     excess: np.ndarray  #: M_i, complex128 [N_B, N_SB F, N_SB F] [1/W].
     conditions: dict[str, Any]  #: Fields of the survey's scenario that the covariance depends on.
-    #: Record of the survey: numbers of ``positions`` with a direct path and of ``blocked`` ones;
-    #: ``prior_weight`` in positions; ``inflation`` of the covariance; ``level_std_db``, the
-    #: standard deviation of the power among users [dB]; ``coverage``, the expected share of
-    #: positions in the 95 % region, and its interval; ``warnings``; ``codebook`` id; ``version``.
+    #: Record of the survey: numbers of ``positions`` with a direct path, of their ``places`` and
+    #: of ``blocked`` positions; ``prior_weight`` in places; ``inflation`` of the covariance;
+    #: ``level_std_db``, the standard deviation of the power among users [dB]; ``coverage``, the
+    #: expected share of users in the 95 % region, and its interval; ``warnings``; ``codebook`` id;
+    #: ``version``.
     about: dict[str, Any] = dataclasses.field(default_factory=dict)
     origin: str = ''
 
@@ -83,6 +89,9 @@ class MultipathEstimate(ArrayFile):
         check_arrays(self, {
             **dict.fromkeys(FIELDS, ()), 'radiation': (n_bands or 1, n_rows, n_elements),
             'excess': (n_bands, n_rows, n_rows)}, ArchiveError)
+        for name, declared in _ABOUT.items():
+            if problem := name in self.about and declared.problem(self.about[name]):
+                raise ArchiveError(f'{name}: {problem}')
         for array in self.content():
             read_only(array)
 
@@ -123,7 +132,8 @@ class MultipathEstimate(ArrayFile):
         arrays, about = read_archive(path, 'multipath', _FORMAT, {'radiation', 'excess'})
         with translated((KeyError, TypeError, ValueError), ArchiveError, path):
             content: dict[str, Any] = {name: float(about[name]) for name in FIELDS}
-            content |= {name: array.astype(complex) for name, array in arrays.items()}
+            content |= {name: numbers(name, array, complex, finite=False)
+                        for name, array in arrays.items()}
             content |= {name: dict(about[name]) for name in ('conditions', 'about')}
             return cls(**content, origin=str(path))
 
@@ -132,8 +142,9 @@ class MultipathEstimate(ArrayFile):
 class PathChannel(ArrayFile):
     """Propagation paths between users and the surface, as a value of `Scenario.channel`.
 
-    Users have at most P paths; the amplitude of missing ones is 0. Raises ArchiveError if sizes
-    disagree, or a number is not finite or physically impossible.
+    Users have at most P paths; the amplitude of missing ones is 0. `f0` may be an array of one
+    number. Raises ArchiveError if sizes disagree, or a number is not finite or physically
+    impossible.
     """
 
     users: np.ndarray  #: Positions, float64 [N, 3] [m], in the frame of the scenario.
@@ -150,6 +161,13 @@ class PathChannel(ArrayFile):
 
     def __post_init__(self) -> None:
         """Check sizes and numbers, and make the arrays read-only."""
+        with translated(ValueError, ArchiveError):
+            values = {name: numbers(name, getattr(self, name), kind, finite=False)
+                      for name, kind in _TYPES.items() if getattr(self, name) is not None}
+        # A single number has several dimensions in some files, such as those of MATLAB.
+        values['f0'] = values['f0'].reshape(()) if values['f0'].size == 1 else values['f0']
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
         shape = np.shape(self.a) if np.ndim(self.a) == 2 and np.size(self.a) else (1, 1)
         expected: dict[str, tuple[int, ...]] = {
             'a': shape, 'users': (shape[0], 3), 'src': (*shape, 3), 'n': shape, 'f0': ()}
@@ -158,6 +176,10 @@ class PathChannel(ArrayFile):
         check_arrays(self, expected, ArchiveError)
         for array in self.content():
             read_only(array)
+        object.__setattr__(self, 'f0', float(self.f0))
+        if self.n.min() < -1 or self.n.max() > _MAX_REFLECTIONS:
+            raise ArchiveError(f'n: {self.n.min()} to {self.n.max()}, expected -1 to '
+                               f'{_MAX_REFLECTIONS}')
         if self.f0 <= 0:
             raise ArchiveError(f'f0: {self.f0:g} Hz, expected a positive frequency')
         if (self.users[:, 0] <= 0).any():
@@ -172,6 +194,8 @@ class PathChannel(ArrayFile):
         if offset.size and offset.max() > _MAX_OFFSET_M:
             raise ArchiveError(f'src: {offset.max():.3g} m from the user for a direct path, '
                                f'expected at most {_MAX_OFFSET_M:g} m')
+        if problem := position_problem(self.sources):
+            raise ArchiveError(f'src: {problem}')
 
     @classmethod
     def from_sionna(cls, paths: Any, f0: float) -> 'PathChannel':
@@ -180,7 +204,8 @@ class PathChannel(ArrayFile):
         Users must be transmitters, and the only receiver must be at the surface's centre, with
         axes like the scenario's. Devices must have one isotropic antenna, and reflections must be
         specular. `f0` [Hz] is the scene's frequency. Paths from behind the surface are removed.
-        Raises ArchiveError if there are several receivers or antennas, or the result is invalid.
+        Raises ArchiveError if there are several receivers or antennas, angles are not in radians,
+        or the result is invalid.
         """
         a = np.array(paths.a[0]) + 1j * np.array(paths.a[1])
         if a.ndim != 5 or (*a.shape[:2], a.shape[3]) != (1, 1, 1):
@@ -190,10 +215,18 @@ class PathChannel(ArrayFile):
         users = np.array(paths.sources, float).T - centre
         elevation, azimuth, delay = (
             np.array(angles, float)[0] for angles in (paths.theta_r, paths.phi_r, paths.tau))
+        valid = np.array(paths.valid)[0]
+        for name, angles, low, high in (('theta_r', elevation, 0.0, np.pi),
+                                        ('phi_r', azimuth, -2 * np.pi, 2 * np.pi)):
+            # Angles of single precision may exceed the limits by rounding.
+            outside = valid & ~((low - 1e-3 <= angles) & (angles <= high + 1e-3))
+            if outside.any():
+                raise ArchiveError(f'{name}: {angles[outside][0]:g}, expected angles of {low:.3g} '
+                                   f'to {high:.3g} rad')
         direction = np.stack([np.sin(elevation) * np.cos(azimuth),
                               np.sin(elevation) * np.sin(azimuth), np.cos(elevation)], axis=-1)
         sources = SPEED_OF_LIGHT_MPS * delay[..., None] * direction
-        present = np.array(paths.valid)[0] & (sources[..., 0] > 0)
+        present = valid & (sources[..., 0] > 0)
         n = np.sum(np.array(paths.interactions)[:, 0] > 0, axis=0).astype(int)
         return cls(users, np.where(present, a[0, 0, :, 0], 0),
                    np.where(present[..., None], sources, 0.0), np.where(present, n, -1), f0)
@@ -274,6 +307,5 @@ class PathChannel(ArrayFile):
             for name in _TYPES:
                 if name not in arrays and name != 'gains':
                     raise ArchiveError(f'{name}: missing, expected an array of this name')
-            content: dict[str, Any] = {
-                name: arrays[name].astype(kind) for name, kind in _TYPES.items() if name in arrays}
-            return cls(**content | {'f0': float(arrays['f0'])}, origin=str(path))
+            content: dict[str, Any] = {name: arrays[name] for name in _TYPES if name in arrays}
+            return cls(**content, origin=str(path))

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model.arrays import read_only
+from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.elements import ElementErrors, draw_surface, has_errors
 from rhs_isac_ros.model.geometry import subband_frequencies_hz
 from rhs_isac_ros.model.scenario import Scenario
@@ -27,8 +28,6 @@ from rhs_isac_ros.support import plugins
 
 # Standard deviation above which a wrapped phase is treated as uniform [rad].
 UNIFORM_STD_RAD = 2.0
-# Nepers per decibel of an amplitude gain.
-_NEPERS_PER_DB = np.log(10) / 20
 
 
 class Scope(enum.Enum):
@@ -165,7 +164,7 @@ class Factor(Impairment):
 
 BUILT_IN: tuple[Factor, ...] = (
     Factor('user_gain_std_db', lambda scenario: np.ones((1, *_shape(scenario)), complex),
-           unit=_NEPERS_PER_DB, scope=Scope.USER),
+           unit=NEPERS_PER_DB, scope=Scope.USER),
     Factor('carrier_offset_std_hz', _carrier_offset, needs_search=True, scope=Scope.USER),
     Factor('phase_std_rad', lambda scenario: np.full((1, *_shape(scenario)), 1j)),
     Factor('timing_std_s', _timing_offset, needs_search=True),

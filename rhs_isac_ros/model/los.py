@@ -1,18 +1,19 @@
 """Line-of-sight gains of the elements and their derivatives with respect to the user's position.
 
 `positions`, float64 [N, 3] [m], are positions of users, and `band` is an index from 0. Public
-functions except `los_waves` raise ValueError if positions have a wrong shape or are not finite.
+functions except `los_waves` raise ValueError unless `checked_positions` accepts the positions.
 """
 
 from collections.abc import Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from rhs_isac_ros.model.arrays import checked_positions
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
-from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
+from rhs_isac_ros.model.scenario import Scenario
 
 # Minimum distance of the user from an element's boresight. On the boresight itself, the direction
 # in which the angle grows is undefined.
@@ -136,16 +137,6 @@ def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *
         boresight_term = over_subbands(phasors * (-by_angle * inverse / across))
         radial += boresight_term * (minus_square * offsets[..., 0])
         yield gain, radial, boresight_term
-
-
-def checked_positions(positions: ArrayLike) -> np.ndarray:
-    """Convert positions to float64 [N, 3] [m]; raise ValueError if they are not finite [N, 3]."""
-    array = np.asarray(positions, dtype=float)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f'positions: shape {array.shape}, expected [N, 3]')
-    if not np.isfinite(array).all():
-        raise ValueError('positions: not finite, expected finite coordinates in metres')
-    return array
 
 
 def has_pattern(scenario: Scenario) -> bool:

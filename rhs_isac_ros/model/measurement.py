@@ -9,17 +9,17 @@ import functools
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import blocks, read_only
+from rhs_isac_ros.model.arrays import blocks, checked_positions, read_only
 from rhs_isac_ros.model.elements import (
     DeclaredElements,
     ElementErrors,
     SurfaceEstimate,
     SurfaceModel,
 )
+from rhs_isac_ros.model.gaussian import covariance_root
 from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
 from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.model.los import (
-    checked_positions,
     direct_gain,
     draw_blocked,
     has_pattern,
@@ -193,7 +193,7 @@ class MeasurementModel:
     @functools.cached_property
     def root(self) -> np.ndarray:
         """Cholesky factor L_i of Lambda_i, complex128 [N_B, N_SB F, N_SB F], read-only."""
-        return read_only(np.linalg.cholesky(self.covariance()))
+        return read_only(covariance_root(self.scenario, self.covariance()))
 
     @functools.cached_property
     def whitener(self) -> np.ndarray:

@@ -7,10 +7,11 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rhs_isac_ros.model.arrays import checked_position, checked_positions
 from rhs_isac_ros.model.hall import PathChannel
-from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.fields import finite
 
 KINDS = ('static', 'waypoints', 'random_walk')
 # Duration of a leg without length.
@@ -26,7 +27,7 @@ class Mobility(Protocol):
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the position, float64 [3] [m], and velocity, float64 [3] [m/s].
 
-        The times of successive calls must not decrease.
+        The times of successive calls must not decrease. Raises ValueError if one is not finite.
         """
         ...
 
@@ -69,8 +70,9 @@ class Crowd:
     def states(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the positions, float64 [N, 3] [m], and velocities, float64 [N, 3] [m/s].
 
-        The times of successive calls must not decrease.
+        The times of successive calls must not decrease. Raises ValueError if one is not finite.
         """
+        now_s = finite('now_s', now_s)
         for user in np.flatnonzero(now_s >= self._end_s).tolist():
             mobility = self._mobilities[user]
             if isinstance(mobility, StraightMobility):
@@ -87,11 +89,11 @@ class Static(StraightMobility):
     """A user that stands still at a position, float64 [3] [m]."""
 
     def __init__(self, position: ArrayLike) -> None:
-        self._position = _checked_position(position)
+        self._position = checked_position(position)
 
     def leg(self, now_s: float) -> Leg:
         """Return a leg that never ends."""
-        return Leg(self._position, np.zeros(3), now_s, math.inf)
+        return Leg(self._position, np.zeros(3), finite('now_s', now_s), math.inf)
 
 
 class Waypoints:
@@ -102,7 +104,7 @@ class Waypoints:
 
     def __init__(self, waypoints: ArrayLike, speed_mps: float) -> None:
         self._points = checked_positions(waypoints)
-        self._speed_mps = speed_mps
+        self._speed_mps = finite('speed_mps', speed_mps, 0.0)
         legs = np.roll(self._points, -1, axis=0) - self._points
         self._lengths = np.linalg.norm(legs, axis=1)
         self._directions = legs / np.maximum(self._lengths, 1e-12)[:, None]
@@ -110,6 +112,7 @@ class Waypoints:
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the position [3] [m] and velocity [3] [m/s] on the polygon."""
+        now_s = finite('now_s', now_s)
         if self._start_s is None:
             self._start_s = now_s
         perimeter = self._lengths.sum()
@@ -134,12 +137,14 @@ class RandomWalk(StraightMobility):
     def __init__(
             self, scenario: Scenario, speed_mps: float, rng: np.random.Generator,
             start: ArrayLike | None = None) -> None:
-        self._scenario, self._speed_mps, self._rng = scenario, speed_mps, rng
-        self._target = self._draw() if start is None else _checked_position(start)
+        self._scenario, self._rng = scenario, rng
+        self._speed_mps = finite('speed_mps', speed_mps, 0.0)
+        self._target = self._draw() if start is None else checked_position(start)
         self._leg: Leg | None = None
 
     def leg(self, now_s: float) -> Leg:
         """Return the current leg; the next one begins when it ends."""
+        now_s = finite('now_s', now_s)
         if self._leg is None:
             self._leg = self._next(now_s)
         while now_s >= self._leg.end_s:
@@ -187,7 +192,3 @@ def make_plugin(
             f'{plugins.describe(plugins.MOBILITIES, name)}: returned {mobility!r}, expected '
             'a mobility with a method state')
     return mobility
-
-
-def _checked_position(position: ArrayLike) -> np.ndarray:
-    return checked_positions(np.asarray(position, dtype=float)[None])[0]

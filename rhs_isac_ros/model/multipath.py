@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model.arrays import adjoint, blocks, gauss_legendre, read_only
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.geometry import element_interval_m
+from rhs_isac_ros.model.geometry import element_intervals_m
 from rhs_isac_ros.model.hall import MultipathEstimate
-from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
+from rhs_isac_ros.model.scenario import Scenario
 
 # Gauss-Legendre nodes in each interval of angles, and the largest change of phase over the surface
 # that they resolve.
@@ -186,8 +187,8 @@ def _plane_waves(
 ) -> Iterator[_PlaneWaves]:
     """Yield plane waves in blocks of elevations, sized for `n_draws` amplitudes per wave."""
     wavenumber = 2 * np.pi * scenario.center_frequencies_hz[band] / SPEED_OF_LIGHT_MPS
-    columns, rows = (np.arange(n) * element_interval_m(scenario)
-                     for n in (scenario.n_columns, scenario.n_rows))
+    columns, rows = (np.arange(n) * interval_m for n, interval_m in zip(
+        (scenario.n_columns, scenario.n_rows), element_intervals_m(scenario), strict=True))
     # The elevation affects the phases along both axes.
     lengths = columns[-1], math.hypot(columns[-1], rows[-1])
     (azimuth, azimuth_weights), (elevations, elevation_weights) = (

@@ -1,12 +1,10 @@
 """The scenario: all parameters of the model, with their ranges and units."""
 
-import contextlib
 import dataclasses
 import functools
 import hashlib
 import itertools
 import json
-import operator
 import os
 from pathlib import Path
 from typing import Any
@@ -16,11 +14,11 @@ import numpy as np
 from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.external import ArrayFile, External
 from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.hall import SPEED_OF_LIGHT_MPS as SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.hall import MultipathEstimate, PathChannel
+from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.errors import translated
-from rhs_isac_ros.support.fields import Field
+from rhs_isac_ros.support.fields import Field, to_number
 from rhs_isac_ros.support.files import read_yaml
 from rhs_isac_ros.support.plugins import PluginError
 
@@ -64,8 +62,9 @@ class Table1:
         10, 1, 128, 'Elements along a side of the square surface, or two numbers for a rectangle: '
         'elements along y and along z.',
         label=r'elements along a side $\sqrt{N_\mathrm{E}}$')
-    element_interval_wavelengths: float = declare(
-        0.3, 1e-3, 10.0, 'Spacing of the elements, in mean wavelengths.',
+    element_interval_wavelengths: float | tuple[float, float] = declare(
+        0.3, 1e-3, 10.0, 'Spacing of the elements, in mean wavelengths, or two numbers: along y '
+        'and along z.',
         label=r'element spacing in $\lambda_\mathrm{avr}$')
     n_feeds: int = declare(3, 1, 256, 'Feeds K of the surface.', label='feeds $K$')
     feed_positions_m: tuple[tuple[float, float, float], ...] | None = declare(
@@ -187,6 +186,11 @@ class Extensions:
         'Bounds apply to users with a direct path.', '',
         'probability of the line of sight, 3GPP TR 38.901, section 7.4.2',
         label='share of blocked users')
+    outside_probability: float = declare(
+        0.5, 0.0, 1.0,
+        'Prior probability that a user is outside of the region of interest, for estimators that '
+        'reject such users. Bounds and simulated users are inside.', '',
+        label='share of users outside')
     multipath: MultipathEstimate | None = declare(
         None, 0.0, 0.0,
         'File of a measured covariance of the multipath, as a survey estimates it; it replaces '
@@ -198,8 +202,16 @@ class Extensions:
         'these paths instead of a direct path and random multipath. Estimators and bounds '
         'ignore the file.',
         '', label='channel')
+    pose: Pose = declare(
+        Pose(), -1e6, 1e6,
+        'Pose of the surface in the frame of the site: a mapping of position_m, quaternion '
+        '(x, y, z, w) and uncertainty, as in `Pose`. Messages are in the frame of the site; the '
+        'other fields and the model are in the frame of the surface.', 'm',
+        label='pose of the surface')
 
 
+# Fields with a number for both axes of the surface, or one each for y and z.
+_OF_AXES = ('elements_per_side', 'element_interval_wavelengths')
 # Fields whose values can come from plug-ins or files, and those of them that are files.
 _EXTERNAL: dict[str, type[External]] = {
     'element_gain': GainPattern, 'user_gain': GainPattern, 'multipath': MultipathEstimate,
@@ -214,7 +226,7 @@ class Scenario(Extensions, Table1):
     A scenario has the fields of `Table1` and those of `Extensions`.
 
     Lengths are in metres in the frame of the surface, which lies in the plane x = 0, centred on
-    the origin, with x pointing outward and z up.
+    the origin, with x pointing outward and z up. Only `pose` is in the frame of the site.
 
     A gain is a number, a `GainPattern`, a function of the angle from boresight, or the name of an
     installed plug-in; in a file, it is a number or a name. `multipath` and `channel` are objects
@@ -301,7 +313,8 @@ class Scenario(Extensions, Table1):
     def id(self) -> str:
         """Hash of the fields: ``sc`` and 16 hex digits, which YAML never parses as a number."""
         changes, fields = self.changes(), self.fields()
-        for name in ('impairments', 'multipath_direction_deg', 'blocked_probability', *_FILES):
+        for name in ('impairments', 'multipath_direction_deg', 'blocked_probability',
+                     'outside_probability', *_FILES, 'pose'):
             # Existing files contain identifiers from before these fields were introduced.
             if name not in changes:
                 del fields[name]
@@ -309,6 +322,11 @@ class Scenario(Extensions, Table1):
                 # The same file has the same identifier on every host.
                 fields[name] = fields[name].rpartition('@')[2]
         return f'sc{hashlib.sha256(json.dumps(fields).encode()).hexdigest()[:16]}'
+
+    @property
+    def unplaced(self) -> 'Scenario':
+        """The scenario with the default pose: all that the model and its files depend on."""
+        return dataclasses.replace(self, pose=Pose())
 
     @property
     def n_bands(self) -> int:
@@ -342,7 +360,7 @@ class Scenario(Extensions, Table1):
         """Noise power sigma_n^2 = P_N W of one sub-band [W]."""
         return 10 ** (self.noise_psd_dbm_hz / 10) * 1e-3 * self.subband_width_hz
 
-    @property
+    @functools.cached_property
     def sizes(self) -> dict[str, int]:
         """Array dimensions by their symbols in the paper."""
         return {'N_B': self.n_bands, 'N_SB': self.n_subbands, 'F': self.n_frames,
@@ -376,6 +394,8 @@ def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) 
 def _plain(value: Any) -> Any:
     if isinstance(value, External | str):
         return str(value)
+    if isinstance(value, Pose):
+        return {name: _plain(entry) for name, entry in dataclasses.asdict(value).items()}
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
 
 
@@ -387,30 +407,34 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
             _numbers(field, row, 3) for row in _entries(field, value, '[x, y, z]'))
     if name == 'impairments':
         return _strengths(field, value)
-    if name in _FILES or name in _EXTERNAL and not _is_number(value):
+    if name == 'pose':
+        return _pose(field, value)
+    if name in _FILES or name in _EXTERNAL and not isinstance(to_number(value, float), float):
         return _external(field, value, _EXTERNAL[name])
-    if name == 'elements_per_side' and isinstance(value, list | tuple | np.ndarray):
-        if len(value) != 2:
-            raise ScenarioError(f'{name}: {value!r}, expected an integer or two')
-        along_y, along_z = (_number(field, entry) for entry in value)
-        # A square is the same scenario in either notation.
-        return along_y if along_y == along_z else (along_y, along_z)
+    if name in _OF_AXES and isinstance(value, list | tuple | np.ndarray):
+        return _of_axes(field, value)
     if isinstance(field.default, tuple):
         length = None if name == 'center_frequencies_hz' else len(field.default)
         return _numbers(field, value, length)
     return _number(field, value)
 
 
+def _of_axes(field: dataclasses.Field[Any], value: Any) -> Any:
+    """Convert numbers along y and z; equal ones are the same scenario as a single number."""
+    kind = field.metadata['declared'].kind
+    one, many = ('an integer', 'integers') if kind is int else ('a number', 'numbers')
+    # MATLAB has no other scalars than arrays of one number.
+    if isinstance(number := to_number(value, kind), kind):
+        return _number(field, number)
+    if len(_entries(field, value, many)) != 2:
+        raise ScenarioError(f'{field.name}: {value!r}, expected {one} or two')
+    along_y, along_z = (_number(field, entry) for entry in value)
+    return along_y if along_y == along_z else (along_y, along_z)
+
+
 def _number(field: dataclasses.Field[Any], value: Any) -> Any:
-    declared = field.metadata['declared']
-    # YAML reads 28e9 as a string, so strings are accepted as real numbers.
-    convert = operator.index if declared.kind is int else float
-    if not isinstance(value, bool):
-        with contextlib.suppress(TypeError, ValueError, OverflowError):
-            value = convert(value)
-    if problem := declared.problem(value):
-        raise ScenarioError(f'{field.name}: {problem}')
-    return value
+    with translated(ValueError, ScenarioError):
+        return field.metadata['declared'].checked(field.name, value)
 
 
 def _external(field: dataclasses.Field[Any], value: Any, kind: type[External]) -> Any:
@@ -422,6 +446,18 @@ def _external(field: dataclasses.Field[Any], value: Any, kind: type[External]) -
         if kind is GainPattern and callable(value):
             return GainPattern(value)
     raise ScenarioError(f'{field.name}: {value!r}, expected {kind.WORDS[1]}')
+
+
+def _pose(field: dataclasses.Field[Any], value: Any) -> Any:
+    if not isinstance(value, Pose):
+        names = [part.name for part in dataclasses.fields(Pose)]
+        if not isinstance(value, dict) or not value.keys() <= set(names):
+            raise ScenarioError(f'{field.name}: {value!r}, expected a mapping of {names}')
+        with translated(ValueError, ScenarioError, field.name):
+            value = Pose(**value)
+    for coordinate in value.position_m:
+        _number(field, coordinate)
+    return value
 
 
 def _strengths(field: dataclasses.Field[Any], value: Any) -> tuple[tuple[str, float], ...]:
@@ -438,17 +474,12 @@ def _strengths(field: dataclasses.Field[Any], value: Any) -> tuple[tuple[str, fl
     return tuple(pair for pair in checked_pairs if pair[1])
 
 
-def _is_number(value: Any) -> bool:
-    try:
-        float(value)
-    except (TypeError, ValueError):
-        return False
-    return True
-
-
 def _entries(field: dataclasses.Field[Any], value: Any, expected: str) -> Any:
     """Return the value if it is a list with at least one entry, or raise ScenarioError."""
-    if not isinstance(value, list | tuple | np.ndarray) or len(value) == 0:
+    if isinstance(value, np.ma.MaskedArray):
+        raise ScenarioError(f'{field.name}: a masked array, expected a list of {expected}')
+    if (not isinstance(value, list | tuple | np.ndarray) or getattr(value, 'shape', None) == ()
+            or len(value) == 0):
         raise ScenarioError(f'{field.name}: {value!r}, expected a list of {expected}')
     return value
 

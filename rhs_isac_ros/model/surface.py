@@ -6,8 +6,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from rhs_isac_ros.model.arrays import read_only
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.geometry import element_positions, feed_positions, subband_frequencies_hz
-from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario, check_shape
+from rhs_isac_ros.model.scenario import Scenario, check_shape
 
 
 class Beamforming(Protocol):

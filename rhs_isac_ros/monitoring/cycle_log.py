@@ -7,12 +7,15 @@ import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome
+from rhs_isac_ros.support.fields import finite
 
 # Maximum number of incomplete cycles; the missing messages of older ones will not arrive.
 _MAX_OPEN_CYCLES = 16
 # Types of the messages that the log uses.
 RECEIVES = (m.Beacon, m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Capacity,
             m.ProtocolState)
+# Types of the messages that answer received signals.
+ANSWERS = (m.PositionEstimate, m.NoFix)
 
 
 @dataclasses.dataclass
@@ -118,6 +121,7 @@ class CycleLog:
 
     def add(self, message: m.Message, now_s: float) -> None:
         """Add a message of a type in `RECEIVES`, which arrived at `now_s` [s], to its cycle."""
+        now_s = finite('now_s', now_s)
         if not message.cycle_id:
             return
         if isinstance(message, m.Beacon):

@@ -12,6 +12,7 @@ from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
+from rhs_isac_ros.support.fields import finite
 
 RESTING = 'resting'
 # Time over which the rate of cycles is averaged [s].
@@ -49,7 +50,8 @@ class Overview:
     status of each node by name. Both are limited in size, because the keys come from messages.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, max_users: int = MAX_USERS, max_nodes: int = _MAX_NODES) -> None:
+        self._max_users, self._max_nodes = max_users, max_nodes
         self.phase = ''
         self.phase_began_s = math.nan
         self.cycle_id = self.user = self.served = self.given_up = 0
@@ -63,7 +65,7 @@ class Overview:
 
     def add(self, message: m.Message, now_s: float) -> None:
         """Add a message whose type is in `cycle_log.RECEIVES`; it arrived at `now_s` [s]."""
-        self.began_s = min(self.began_s, now_s)
+        self.began_s = min(self.began_s, finite('now_s', now_s))
         match message:
             case m.Beacon():
                 self._set_phase(m.Phase.BEACONING.name.lower(), message.cycle_id, 0, now_s)
@@ -73,7 +75,7 @@ class Overview:
                 if message.outcome:
                     self._end_cycle(message, now_s)
             case m.GroundTruth():
-                if len(self.users) < MAX_USERS:
+                if len(self.users) < self._max_users:
                     self.users.setdefault(message.user, None)
             case m.ReceivedSignals():
                 self.codebook_id = message.codebook_id
@@ -85,8 +87,8 @@ class Overview:
 
     def add_report(self, node: str, report: Report, now_s: float) -> None:
         """Add a report of a node; the report arrived at `now_s` [s]."""
-        if node in self.nodes or len(self.nodes) < _MAX_NODES:
-            self.nodes[node] = NodeStatus(report, now_s)
+        if node in self.nodes or len(self.nodes) < self._max_nodes:
+            self.nodes[node] = NodeStatus(report, finite('now_s', now_s))
 
     def rate_hz(self, now_s: float) -> float:
         """Return the rate of served cycles over the last 10 s, or since the first message [Hz]."""
@@ -167,11 +169,12 @@ class UserState:
 class SceneState:
     """The configuration of the surface, the latest beam, and the users by id.
 
-    There are at most `MAX_USERS` users, because their ids come from messages. Further users are
+    There are at most `max_users` users, because their ids come from messages. Further users are
     ignored until others are discarded.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, max_users: int = MAX_USERS) -> None:
+        self._max_users = max_users
         self.configuration: m.RhsConfiguration | None = None
         self.beam: m.Beam | None = None
         self.users: dict[int, UserState] = {}
@@ -179,6 +182,7 @@ class SceneState:
 
     def add(self, message: m.Message, now_s: float) -> None:
         """Add a message whose type is in `SCENE_RECEIVES`; it arrived at `now_s` [s]."""
+        now_s = finite('now_s', now_s)
         match message:
             case m.RhsConfiguration():
                 self.configuration = message
@@ -188,7 +192,7 @@ class SceneState:
                 for truth in message.each():
                     self.add(truth, now_s)
             case m.GroundTruth() | m.PositionEstimate():
-                if message.user in self.users or len(self.users) < MAX_USERS:
+                if message.user in self.users or len(self.users) < self._max_users:
                     self.users.setdefault(message.user, UserState(message.user, now_s)).add(
                         message, now_s)
 

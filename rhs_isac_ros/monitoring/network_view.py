@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.monitoring import cycle_log, shapes
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog
 from rhs_isac_ros.monitoring.network_state import NodeStatus, SceneState, new_path
@@ -23,15 +24,15 @@ from rhs_isac_ros.monitoring.shapes import (
     Text,
     user_colour,
 )
-from rhs_isac_ros.positioning import WeightedModes
 from rhs_isac_ros.positioning.alternatives import describe_doubts
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.role import NewestDict
 
 # Types of the messages that the view uses.
-RECEIVES = (*cycle_log.RECEIVES, m.RhsConfiguration, m.Beam, m.NoFix)
+RECEIVES = (*cycle_log.RECEIVES, m.Posterior, m.RhsConfiguration, m.Beam, m.NoFix)
 # Paths of the entities.
 WORLD = 'world'
+SURFACE = 'world/surface'
 MODES = 'modes'
 POSITIONING = 'surface/positioning'
 TRANSMISSION = 'surface/transmission'
@@ -72,11 +73,14 @@ Sample: TypeAlias = tuple[str, float, Series]
 
 
 class Charts:
-    """Computes the samples of the charts from the cycles and reports of a network."""
+    """Computes the samples of the charts from the cycles and reports of a network.
 
-    def __init__(self) -> None:
-        # Known global bounds on the root mean square error [m], by the id of the codebook.
-        self.bounds_m: dict[str, float] = {}
+    Only the first `max_series` users, and the first nodes that dropped a message, have series of
+    their own.
+    """
+
+    def __init__(self, max_series: int = _MAX_SERIES) -> None:
+        self._max_series = max_series
         self._drawn: set[str] = set()
         self._square_m2 = 0.0
         self._n_fixes = self._n_given_up = 0
@@ -95,14 +99,11 @@ class Charts:
                 yield Entry(cycle, path, Number(float(value)))
 
     def dropped(self, node: str, count: int) -> Iterator[Sample]:
-        """Yield the number of messages dropped by all nodes, and the `count` dropped by a node.
-
-        Only the first four nodes that dropped a message have their own series.
-        """
+        """Yield the number of messages dropped by all nodes, and the `count` dropped by a node."""
         self._n_dropped.put(node, count)
         yield 'drops/all', sum(self._n_dropped.values()), Series('all nodes', _WHITE)
         name = node.rpartition('/')[2]
-        if count and len(self._nodes) < _MAX_SERIES:
+        if count and len(self._nodes) < self._max_series:
             self._nodes.add(name)
         if name in self._nodes:
             # Python's hash of a string differs between processes.
@@ -114,11 +115,8 @@ class Charts:
         yield 'drops/given_up', self._n_given_up, Series('cycles given up', _RED)
 
     def of_cycle(self, cycle: CompleteCycle) -> Iterator[Sample]:
-        """Yield the samples of a complete cycle.
-
-        Only the first four users have their own series; the others share one.
-        """
-        if len(self._users) < _MAX_SERIES:
+        """Yield the samples of a complete cycle."""
+        if len(self._users) < self._max_series:
             self._users.add(cycle.user)
         if cycle.user in self._users:
             yield (f'error/user_{cycle.user}', cycle.error_m,
@@ -131,8 +129,6 @@ class Charts:
         yield ('error/root_mean_square', math.sqrt(self._square_m2 / self._n_fixes),
                Series('root mean square so far', _RED))
         yield 'error/crlb', math.sqrt(max(estimate.crlb_m2, 0.0)), Series('sqrt(CRLB)', _GREEN)
-        yield ('error/global_bound', self.bounds_m.get(estimate.codebook_id, math.nan),
-               Series('global bound', _WHITE))
         # If the loss is small, the lines would coincide, so the actual values are dots.
         for name, value, colour in (
                 ('perfect', capacity.perfect_bps, _WHITE),
@@ -159,17 +155,21 @@ def mode_axes() -> tuple[Lines, Points]:
                    np.full(len(labels), shapes.INVISIBLE_M), tuple(label[2] for label in labels)))
 
 
-def mode_bars(user: int, found: WeightedModes, origin: np.ndarray) -> Lines:
-    """Return modes as bars at their range minus the range of `origin`, in the colour of a user."""
-    errors = np.linalg.norm(found.positions, axis=1) - np.linalg.norm(origin)
+def mode_bars(message: m.Posterior, origin: np.ndarray, surface: np.ndarray) -> Lines:
+    """Return modes as bars at their range minus the range of `origin`, in the colour of the user.
+
+    Ranges are distances from the centre of the surface, float64 [3] [m].
+    """
+    errors = np.linalg.norm(message.means - surface, axis=1) - np.linalg.norm(origin - surface)
+    probabilities, _ = mixture_weights(message.log_weights)
     return Lines(tuple(_line(error, HEIGHT_M * probability) for error, probability in zip(
-        errors.tolist(), found.probabilities.tolist(), strict=True)),
-        user_colour(user), _BAR_WIDTH)
+        errors.tolist(), probabilities.tolist(), strict=True)),
+        user_colour(message.user), _BAR_WIDTH)
 
 
-def mode_estimate(position: np.ndarray, origin: np.ndarray) -> Lines:
-    """Return an estimate, float64 [3] [m], as a white line at its range minus that of `origin`."""
-    error = float(np.linalg.norm(position) - np.linalg.norm(origin))
+def mode_estimate(position: np.ndarray, origin: np.ndarray, surface: np.ndarray) -> Lines:
+    """Return an estimate, float64 [3] [m], as a white line; see `mode_bars`."""
+    error = float(np.linalg.norm(position - surface) - np.linalg.norm(origin - surface))
     return Lines((_line(error, HEIGHT_M),), (1.0, 1.0, 1.0), _LINE_WIDTH)
 
 
@@ -181,12 +181,13 @@ class NetworkView:
     """Converts the messages of a network to entries, in the order of arrival.
 
     `n_cycles` counts the observed cycles; `n_ended` counts the complete cycles and the cycles that
-    were given up.
+    were given up. The view contains at most `max_users` users.
     """
 
-    def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
-        self._scene, self._log, self._charts = SceneState(), CycleLog(), Charts()
+    def __init__(self, scenario: Scenario, charts: Charts | None = None,
+                 max_users: int = _MAX_USERS) -> None:
+        self._scenario, self._max_users = scenario, max_users
+        self._scene, self._log, self._charts = SceneState(), CycleLog(), charts or Charts()
         self._cycles: NewestDict[int, int] = NewestDict(_MAX_CYCLES)
         self.n_cycles = self.n_ended = 0
         self._users: list[int] = []
@@ -198,7 +199,9 @@ class NetworkView:
     def begin(self) -> list[Entry]:
         """Return the entries that are always shown."""
         grid, labels = mode_axes()
-        return [Entry(0, f'{WORLD}/region', shapes.region(self._scenario)),
+        pose = self._scenario.pose
+        return [Entry(0, SURFACE, shapes.Placement(pose.origin, pose.rotation)),
+                Entry(0, f'{SURFACE}/region', shapes.region(self._scenario)),
                 Entry(0, f'{MODES}/grid', grid), Entry(0, f'{MODES}/labels', labels)]
 
     def add(self, message: m.Message, now_s: float) -> list[Entry]:
@@ -218,38 +221,21 @@ class NetworkView:
         count = sum(NodeStatus(report, 0.0).counts('dropped').values())
         return [*self._charts.entries(self._count(0), self._charts.dropped(node, count))]
 
-    def add_modes(self, received: m.ReceivedSignals, found: WeightedModes | None) -> list[Entry]:
-        """Add the modes of the posterior of received signals; `found` is None without a fix."""
-        if not self._shows(received.user):
-            return []
-        cycle, path = self._count(received.cycle_id), f'{_path(received.user)}/modes'
-        if found is None:
-            return [Entry(cycle, name, Clear()) for name in (path, f'{MODES}/found')]
-        points, ellipsoids = shapes.modes(received.user, found)
-        origin = self._origins.get(received.cycle_id, found.probabilities @ found.positions)
-        return [Entry(cycle, path, points), Entry(cycle, f'{path}/ellipsoids', ellipsoids),
-                Entry(cycle, f'{MODES}/found', mode_bars(received.user, found, origin))]
-
-    def add_track(
-            self, cycle_id: int, user: int, position: np.ndarray, covariance_m2: np.ndarray,
-            velocity: np.ndarray) -> list[Entry]:
-        """Add a position [m] and a velocity [m/s] of a track; `cycle_id` is 0 if unknown."""
+    def add_track(self, user: int, position: np.ndarray, covariance_m2: np.ndarray,
+                  velocity: np.ndarray) -> list[Entry]:
+        """Add a position [m] and a velocity [m/s] of a track."""
         if not self._shows(user):
             return []
         positions = self._tracks.setdefault(user, new_path())
         positions.append(position)
         lines, ellipsoid = shapes.track(user, positions, velocity, covariance_m2)
-        cycle, path = self._count(cycle_id), f'{_path(user)}/track'
+        cycle, path = self._count(0), f'{_path(user)}/track'
         return [Entry(cycle, path, lines), Entry(cycle, f'{path}/ellipsoid', ellipsoid)]
-
-    def set_bound(self, codebook_id: str, mean_square_m2: float) -> None:
-        """Set the global bound on the mean squared error for a codebook [m^2]."""
-        self._charts.bounds_m[codebook_id] = math.sqrt(mean_square_m2)
 
     def _entities(self, message: m.Message) -> Iterator[tuple[str, Entity]]:
         match message:
             case m.RhsConfiguration():
-                yield f'{WORLD}/board', shapes.board(
+                yield f'{SURFACE}/board', shapes.board(
                     self._scenario, message.analog, enlarged=True)
                 if message.mode is m.Mode.TRANSMISSION:
                     yield TRANSMISSION, shapes.configurations(self._scenario, [message.analog])
@@ -258,7 +244,7 @@ class NetworkView:
                     yield POSITIONING, shapes.configurations(self._scenario, (
                         analog for _, analog in sorted(self._configurations.items())))
             case m.Beam():
-                yield f'{WORLD}/beam', shapes.lobe(
+                yield f'{SURFACE}/beam', shapes.lobe(
                     shapes.pattern(self._scenario, message), message.user)
             case m.GroundTruth():
                 path = _path(message.user)
@@ -271,14 +257,24 @@ class NetworkView:
                 yield f'{path}/true_path', shapes.path(
                     message.user, self._scene.users[message.user].true_path)
                 if self._scenario.channel:
-                    yield f'{path}/traced', shapes.traced(self._scenario, message)
+                    yield (f'{SURFACE}/user_{message.user}',
+                           shapes.traced(self._scenario, message))
             case m.PositionEstimate():
                 path = f'{_path(message.user)}/estimate'
                 point, ellipsoid = shapes.estimate(message)
                 yield path, point
                 yield f'{path}/ellipsoid', ellipsoid
                 yield f'{MODES}/estimate', mode_estimate(
-                    message.position, self._origins.get(message.cycle_id, message.position))
+                    message.position, self._origins.get(message.cycle_id, message.position),
+                    self._scenario.pose.origin)
+            case m.Posterior():
+                path = f'{_path(message.user)}/modes'
+                points, ellipsoids = shapes.modes(message)
+                yield path, points
+                yield f'{path}/ellipsoids', ellipsoids
+                yield f'{MODES}/found', mode_bars(
+                    message, self._origins.get(message.cycle_id, message.means[0]),
+                    self._scenario.pose.origin)
             case m.NoFix():
                 path = _path(message.user)
                 for part in (f'{path}/estimate', f'{MODES}/estimate', f'{path}/modes',
@@ -303,7 +299,7 @@ class NetworkView:
         self._log.clear()
 
     def _shows(self, user: int) -> bool:
-        if user not in self._users and len(self._users) < _MAX_USERS:
+        if user not in self._users and len(self._users) < self._max_users:
             self._users.append(user)
         return user in self._users
 

@@ -3,6 +3,9 @@
 Rerun, RViz and Matplotlib draw the same shapes, which `tools.rerun_stream`, `nodes.visualizer` and
 `tools.pictures` convert. Positions are float64 [N, 3] [m], or [N, 2] in a plane. Colours are red,
 green and blue from 0 to 1, float64 [N, 3] for N shapes.
+
+The region, the surface, traced paths and lobes are in the frame of the surface, all other shapes
+in the frame of the site.
 """
 
 import colorsys
@@ -14,8 +17,8 @@ import numpy as np
 
 from rhs_isac_ros.link import Beam, BeamPattern, beam_pattern
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import element_interval_m, element_positions
-from rhs_isac_ros.positioning import WeightedModes
+from rhs_isac_ros.model.arrays import mixture_weights
+from rhs_isac_ros.model.geometry import element_intervals_m, element_positions
 from rhs_isac_ros.protocol import messages as m
 
 Colour: TypeAlias = tuple[float, float, float]
@@ -97,8 +100,16 @@ class Clear:
     """Removes the entities of a path and of the paths below it."""
 
 
+class Placement(NamedTuple):
+    """The pose of the frame in which the entities of the paths below are."""
+
+    origin: np.ndarray
+    rotation: np.ndarray
+
+
 Entity: TypeAlias = (
-    Points | Ellipsoids | Boxes | Lines | Mesh | Picture | Series | Number | Text | Clear)
+    Placement | Points | Ellipsoids | Boxes | Lines | Mesh | Picture | Series | Number | Text
+    | Clear)
 
 
 class Entry(NamedTuple):
@@ -177,15 +188,15 @@ def board(scenario: Scenario, configuration: np.ndarray | None, enlarged: bool =
     The brightness is the mean over the frames of a configuration, float64 [F, N_E] in [0, 1], or
     0.5 for None. If `enlarged`, single elements are visible in a view of the whole region.
     """
-    positions, interval_m = element_positions(scenario), element_interval_m(scenario)
+    positions, intervals_m = element_positions(scenario), element_intervals_m(scenario)
     if enlarged:
-        true_interval_m, interval_m = interval_m, _BOARD_SIZE * math.hypot(
-            *scenario.roi_center_m) / max(scenario.n_columns, scenario.n_rows)
-        positions = interval_m / true_interval_m * positions
-    half_m = 0.45 * interval_m
+        sides_m = intervals_m * (scenario.n_columns, scenario.n_rows)
+        scale = _BOARD_SIZE * math.hypot(*scenario.roi_center_m) / sides_m.max()
+        positions, intervals_m = scale * positions, scale * intervals_m
+    half_y_m, half_z_m = 0.45 * intervals_m
     level = (np.full(len(positions), 0.5) if configuration is None
              else np.mean(configuration, axis=0))
-    return Boxes(positions, np.tile([_MIN_HALF_SIZE_M, half_m, half_m], (len(positions), 1)),
+    return Boxes(positions, np.tile([_MIN_HALF_SIZE_M, half_y_m, half_z_m], (len(positions), 1)),
                  np.stack([level, level, 0.3 + 0.2 * level], axis=1), solid=True)
 
 
@@ -218,17 +229,17 @@ def estimate(message: m.PositionEstimate) -> tuple[Points, Ellipsoids]:
                         np.array([user_colour(message.user)])))
 
 
-def modes(user: int, found: WeightedModes) -> tuple[Points, Ellipsoids]:
+def modes(message: m.Posterior) -> tuple[Points, Ellipsoids]:
     """Return the modes of a posterior as balls, and their 95 % ellipsoids.
 
     Less probable modes have smaller, greyer balls; modes below 0.5 % are left out.
     """
-    chosen = found.probabilities >= _MIN_PROBABILITY
-    probabilities, positions, covariances = (field[chosen] for field in found)
-    strength = np.cbrt(probabilities)[:, None]
-    colours = strength * user_colour(user) + (1 - strength) * np.array(_GREY)
-    return (Points(positions, colours, _MODE_RADIUS_M * strength[:, 0]),
-            _ellipsoids(positions, covariances, colours))
+    probabilities, _ = mixture_weights(message.log_weights)
+    chosen = probabilities >= _MIN_PROBABILITY
+    strength, means = np.cbrt(probabilities[chosen])[:, None], message.means[chosen]
+    colours = strength * user_colour(message.user) + (1 - strength) * np.array(_GREY)
+    return (Points(means, colours, _MODE_RADIUS_M * strength[:, 0]),
+            _ellipsoids(means, message.covariances_m2[chosen], colours))
 
 
 def path(user: int, positions: Iterable[np.ndarray]) -> Lines:
@@ -244,7 +255,8 @@ def traced(scenario: Scenario, message: m.GroundTruth) -> Lines:
     """
     strips: list[np.ndarray] = []
     if channel := scenario.channel:
-        (nearest,) = channel.nearest(message.position[None]).tolist()
+        position = scenario.pose.to_surface(message.position)
+        (nearest,) = channel.nearest(position[None]).tolist()
         user = channel.users[nearest]
         for source, n_reflections, amplitude in zip(
                 channel.sources[nearest], channel.n[nearest], channel.a[nearest], strict=True):

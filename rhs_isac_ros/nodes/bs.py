@@ -6,22 +6,21 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
+from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from rhs_isac_msgs.action import Locate
-from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BaseStation
+from rhs_isac_ros.protocol.receiver import combiner
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import create_or_refuse, steady_timer
-from rhs_isac_ros.ros.frames import Frame
+from rhs_isac_ros.ros.endpoints import SERVICES, create_or_refuse, steady_timer
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import streams
@@ -30,6 +29,40 @@ _DEFAULT_TIMEOUT_S = 10.0
 _MAX_TIMEOUT_S = 3600.0
 # Maximum number of goals in progress: each takes memory and a timer.
 _MAX_GOALS = 100
+
+
+# Minimum time between two answers of the action, in all and for each client [s]. By default, a
+# client of rclpy keeps the latest ten answers, including those to other clients, so it would lose
+# most of many answers at once. All clients may be in one process, which takes them in turn.
+_ANSWER_S, _ANSWER_PER_CLIENT_S = 0.01, 0.001
+
+
+class _Turns:
+    """Separates answers to many goals at once, so that each client can take them."""
+
+    def __init__(self, node: Node) -> None:
+        self._node, self._next_s = node, 0.0
+        self._feedback = f'{node.resolve_topic_name(topics.LOCATE)}/_action/feedback'
+
+    async def wait(self) -> None:
+        """Return at the next turn; at once if there is none before."""
+        now_s = time.monotonic()
+        delay_s = self._next_s - now_s
+        self._next_s = max(self._next_s, now_s) + max(
+            _ANSWER_S, _ANSWER_PER_CLIENT_S * self._node.count_subscribers(self._feedback))
+        if delay_s > 0:
+            future: Future = Future()
+            _later(self._node, delay_s, lambda: future.set_result(None))
+            await future
+
+
+def _later(node: Node, delay_s: float, callback: Callable[[], None]) -> Timer:
+    """Call a function once after a delay; return its timer."""
+    def once() -> None:
+        node.destroy_timer(timer)
+        callback()
+    timer = steady_timer(node, max(delay_s, 1e-3), once)
+    return timer
 
 
 @dataclasses.dataclass(eq=False)
@@ -50,13 +83,18 @@ class LocateServer:
     def __init__(
             self, node: Node, request: Callable[[int], None],
             pose: Callable[[m.PositionEstimate], PoseWithCovarianceStamped],
-            max_users: int) -> None:
+            max_users: int, max_goals: int = _MAX_GOALS) -> None:
         self._node, self._request, self._pose = node, request, pose
-        self._max_users = max_users
+        self._max_users, self._max_goals = max_users, max_goals
+        # Number of goals that were accepted and have not ended, and those that have begun.
+        self._n_accepted = 0
         self._goals: list[_Goal] = []
+        self._turns = _Turns(node)
         self._server = create_or_refuse(node, f'action {topics.LOCATE}', lambda: ActionServer(
             node, Locate, topics.LOCATE, self._execute, goal_callback=self._accept,
-            cancel_callback=self._cancel))
+            cancel_callback=self._cancel, goal_service_qos_profile=SERVICES,
+            result_service_qos_profile=SERVICES, cancel_service_qos_profile=SERVICES,
+            feedback_pub_qos_profile=SERVICES, callback_group=ReentrantCallbackGroup()))
 
     def observe(self, message: m.ProtocolState | m.PositionEstimate | m.NoFix) -> None:
         """Update the goals with a message that the base station has sent or received."""
@@ -85,16 +123,18 @@ class LocateServer:
             self._end(goal, 'the base station ends or stands by')
         server, self._server = self._server, None
         if server and delay_s:
-            self._later(delay_s, server.destroy)
+            _later(self._node, delay_s, server.destroy)
         elif server:
             server.destroy()
 
-    def _accept(self, request: Locate.Goal) -> GoalResponse:
+    async def _accept(self, request: Locate.Goal) -> GoalResponse:
+        await self._turns.wait()
         valid = 1 <= request.user <= self._max_users and 0 <= request.timeout_s <= _MAX_TIMEOUT_S
-        if valid and len(self._goals) < _MAX_GOALS:
+        if valid and self._n_accepted < self._max_goals:
+            self._n_accepted += 1
             return GoalResponse.ACCEPT
         self._node.get_logger().warning(
-            f'{topics.LOCATE}: {_MAX_GOALS} goals are in progress' if valid else
+            f'{topics.LOCATE}: {self._max_goals} goals are in progress' if valid else
             f'{topics.LOCATE}: user {request.user}, timeout_s {request.timeout_s:g}, expected a '
             f'user from 1 to {self._max_users} and a timeout from 0 to {_MAX_TIMEOUT_S:g} s',
             throttle_duration_sec=1.0)
@@ -104,27 +144,22 @@ class LocateServer:
         for goal in self._goals:
             if goal.handle.goal_id == handle.goal_id:
                 # Not at once: the handle enters the state CANCELING after this callback.
-                self._later(0.0, functools.partial(self._end, goal, 'canceled'))
+                _later(self._node, 0.0, functools.partial(self._end, goal, 'canceled'))
         return CancelResponse.ACCEPT
 
     async def _execute(self, handle: Any) -> Locate.Result:
         goal = _Goal(handle, Future())
         self._goals.append(goal)
         timeout_s = handle.request.timeout_s or _DEFAULT_TIMEOUT_S
-        timer = self._later(timeout_s, functools.partial(
+        timer = _later(self._node, timeout_s, functools.partial(
             self._end, goal, f'no position within {timeout_s:g} s'))
         self._feed_back(goal, m.Phase.BEACONING)
         self._request(handle.request.user)
         result = await goal.future
+        self._n_accepted -= 1
         self._node.destroy_timer(timer)
+        await self._turns.wait()
         return result
-
-    def _later(self, delay_s: float, callback: Callable[[], None]) -> Any:
-        def once() -> None:
-            self._node.destroy_timer(timer)
-            callback()
-        timer = steady_timer(self._node, max(delay_s, 1e-3), once)
-        return timer
 
     def _feed_back(self, goal: _Goal, phase: m.Phase) -> None:
         goal.handle.publish_feedback(Locate.Feedback(phase=int(phase), cycle_id=goal.cycle_id))
@@ -155,12 +190,11 @@ class BsNode(RoleNode[BaseStation]):
         values = self.values
         rng = streams.generator(values.seed, streams.BASE_STATION)
         self.start(BaseStation(
-            self.scenario, self.make_settings(values), rng, self._receive,
+            self.scenario, self.make_settings(values), rng, combiner(self.scenario, values.seed),
             values.first_cycle or _cycle_from_clock()))
-        frame = Frame.of(self, values)
         self._make_locate = functools.partial(
             LocateServer, self, lambda user: self.dispatch(events.LocateRequested(user)),
-            lambda found: convert.pose(found, convert.stamp_of(found, self), frame),
+            lambda found: convert.pose(found, convert.stamp_of(found, self), self.frame),
             values.max_users)
         self._locate: LocateServer | None = self._make_locate()
         self.endings.callback(self._end_locate)
@@ -169,7 +203,8 @@ class BsNode(RoleNode[BaseStation]):
                               (topics.RESUME, events.ResumeRequested()),
                               (topics.STEP, events.StepRequested())):
             create_or_refuse(self, f'service {name}', functools.partial(
-                self.create_service, Trigger, name, functools.partial(self._on_request, request)))
+                self.create_service, Trigger, name, functools.partial(self._on_request, request),
+                qos_profile=SERVICES))
 
     def stand_by(self) -> None:
         """Withdraw the action ``locate``, and abandon the cycle."""
@@ -212,14 +247,6 @@ class BsNode(RoleNode[BaseStation]):
         self.dispatch(event)
         response.success, response.message = self._reply.success, self._reply.text
         return response
-
-    def _receive(
-            self, codebook: Codebook, feeds: np.ndarray, user: int, cycle_id: int,
-            noise: bool) -> np.ndarray:
-        rng = None
-        if noise:
-            rng = streams.generator(self.values.seed, streams.RECEIVER, user, cycle_id)
-        return receive_feeds(self.scenario, codebook, feeds, rng)
 
 
 def _cycle_from_clock() -> int:

@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,10 @@ import rclpy
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from rclpy.exceptions import ParameterNotDeclaredException
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.parameter_service import ParameterService
-from rclpy.publisher import Publisher
 from rclpy.utilities import remove_ros_args, try_shutdown
 
 import rhs_isac_msgs.msg as ros
@@ -24,36 +21,43 @@ from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.codebook.__main__ import ERRORS, add_options, check
 from rhs_isac_ros.codebook.__main__ import run as run_command
 from rhs_isac_ros.codebook.optimize import INTERRUPTED
-from rhs_isac_ros.executables import print_error
-from rhs_isac_ros.monitoring.role_statistics import Report
+from rhs_isac_ros.protocol import events
+from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, parameters, topics
-from rhs_isac_ros.ros.diagnostics import publish_reports
 from rhs_isac_ros.ros.endpoints import LATCHED, create_publisher
-from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX, ParameterizedNode, same_value
-from rhs_isac_ros.ros.peers import Peers, new_instance
-from rhs_isac_ros.ros.run import check_parameters, parameter_help, parse, run
-from rhs_isac_ros.ros.startup import WITHOUT_SERVICES, SecurityError, one_line, prepare
+from rhs_isac_ros.ros.parameters import (
+    CODEBOOK,
+    CODEBOOK_PREFIX,
+    WITHOUT_SERVICES,
+    same_value,
+)
+from rhs_isac_ros.ros.role_node import RoleNode
+from rhs_isac_ros.ros.run import StartError, init, parse, run, starting
 from rhs_isac_ros.support.arguments import ArgumentParser, HelpFormatter, input_file
+from rhs_isac_ros.support.exits import print_error
 
 
-class GroupParameterService(ParameterService):
-    """Parameter services of a node with a group of parameters that can only be set together.
+class CodebookParameterService(ParameterService):
+    """Parameter services of a node that holds a codebook.
 
     The service ``set_parameters`` of rclpy, which ``ros2 param load`` uses, sets parameters one by
-    one. Here, it sets the parameters whose names begin with `prefix` together: all those in a
-    request, or none. Create the node with ``start_parameter_services=False``.
+    one. Here, it sets the parameters of the codebook together: all those in a request, or none.
+    Create the node with ``start_parameter_services=False``.
     """
 
-    def __init__(self, node: Node, prefix: str) -> None:
-        super().__init__(node)  # type: ignore[no-untyped-call]
-        self._prefix = prefix
+    def withdraw(self) -> None:
+        """Destroy the services."""
+        node = self._get_node()  # type: ignore[no-untyped-call]
+        for service in list(node.services):
+            if service.srv_type.__module__.startswith('rcl_interfaces.'):
+                node.destroy_service(service)
 
     # Overrides the callback of rclpy's service.
     def _set_parameters_callback(
             self, request: SetParameters.Request,
             response: SetParameters.Response) -> SetParameters.Response:
         parameters = [Parameter.from_parameter_msg(message) for message in request.parameters]
-        group = [p for p in parameters if p.name.startswith(self._prefix)]
+        group = [p for p in parameters if p.name.startswith(CODEBOOK_PREFIX)]
         group_result = self._set(group) if group else None
         response.results = [group_result if p in group else self._set([p]) for p in parameters]
         return response
@@ -79,27 +83,29 @@ def push(node: Node, codebook: Codebook, timeout_s: float = 10.0) -> None:
     """Send a codebook to the optimizer in the namespace of a node, by setting its parameters.
 
     This function spins the node, so it must not be called from a callback. It raises PushError if
-    no optimizer responds within `timeout_s`, or if the optimizer rejects the codebook.
+    no optimizer is found, or responds, within `timeout_s`, or if it rejects the codebook.
     """
     optimizer = f'{node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
     client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)
-    end_s, future = time.monotonic() + timeout_s, None
-    if client.wait_for_services(timeout_s):
-        future = client.set_parameters_atomically(
-            ros_parameters(codebook.to_parameters()))
-        executor = SingleThreadedExecutor(context=node.context)
-        rclpy.spin_until_future_complete(
-            node, future, executor, max(end_s - time.monotonic(), 0.0))
-        executor.shutdown()
-    if future is None or not future.done():
-        reason = 'no response' if future else 'not found'
-        raise PushError(f'{optimizer}: {reason} within {timeout_s:g} s')
+    if not client.wait_for_services(timeout_s):
+        raise PushError(f'{optimizer}: not found within {timeout_s:g} s')
+    future = client.set_parameters_atomically(ros_parameters(codebook.to_parameters()))
+    rclpy.spin_until_future_complete(node, future, timeout_sec=timeout_s)
+    if not future.done():
+        raise PushError(f'{optimizer}: no response within {timeout_s:g} s')
     result = future.result().result
     if not result.successful:
         raise PushError(f'{optimizer}: codebook rejected: {result.reason}')
 
 
-class OptimizerNode(ParameterizedNode):
+class Holder(Role):
+    """The role ``optimizer``, which exchanges no messages of the protocol."""
+
+    def react(self, event: events.Event) -> None:
+        """Do nothing; the node counts the event."""
+
+
+class OptimizerNode(RoleNode[Holder]):
     """Holds the codebook as parameters that can only be set together, and announces it.
 
     The first codebook comes from a parameter file on the command line or from ``codebook_file``.
@@ -109,35 +115,23 @@ class OptimizerNode(ParameterizedNode):
     def __init__(self, **node_options: Any) -> None:
         super().__init__(
             topics.OPTIMIZER_NODE, start_parameter_services=False, **node_options)
-        self._scenario = parameters.scenario_of(self.values)
-        self._instance = new_instance()
-        # None while the node stands by.
-        self._publisher: Publisher | None = None
         file = self.values.codebook_file or default_codebook_file()
-        defaults = Codebook.load(file).to_parameters()
+        defaults = (Codebook.load(file) if self.values.codebook_file or not self.place.codebook
+                    else self.place.codebook).to_parameters()
         for name, text in CODEBOOK.items():
             self.declare_parameter(name, defaults[name], ParameterDescriptor(description=text))
-        self._codebook_id, self._refused = '', 0
         # In a file of an earlier version, the provenance differs and the id may be missing.
-        self.set_parameters_atomically(
+        super().set_parameters_atomically(
             ros_parameters(self._first_codebook(file).to_parameters()))
-        self._announce(False)
-        self._peers = Peers(
-            self, topics.OPTIMIZER_NODE, self._instance, self._scenario, lambda missing: None,
-            self._announce)
-        self.endings.callback(self._peers.close)
-        publish_reports(self, self._report)
-        self.add_pre_set_parameters_callback(self._normalize)
-        self.add_on_set_parameters_callback(self._check_codebook)
-        self.add_post_set_parameters_callback(self._on_codebook_set)
+        self.start(Holder(), subscribe=False)
         # Last, so that no request arrives before the parameters are declared.
-        self._parameter_service = GroupParameterService(self, CODEBOOK_PREFIX)
-        self._peers.take_role()
+        self.resume()
+        self.subscribe()
 
     def _first_codebook(self, file: Path | str) -> Codebook:
         codebook = Codebook.from_parameters(self._codebook_values())
         try:
-            codebook.check(self._scenario)
+            codebook.check(self.scenario)
         except CodebookError as error:
             raise CodebookError(
                 f'codebook_file: {str(file)!r} does not fit scenario_file '
@@ -150,72 +144,54 @@ class OptimizerNode(ParameterizedNode):
 
     def _codebook_of(self, values: dict[str, Any]) -> Codebook:
         codebook = Codebook.from_parameters(values)
-        codebook.check(self._scenario)
+        codebook.check(self.scenario)
         return codebook
 
-    def _normalize(self, changes: list[Parameter]) -> list[Parameter]:
-        """Convert a valid codebook to the types of the parameters, and fill in its id."""
-        given = _given_codebook_values(changes)
-        if given.keys() != CODEBOOK.keys():
-            return changes
-        try:
-            normal = self._codebook_of(given).to_parameters()
-        except CodebookError:
-            # `_check_codebook` returns the reason.
-            return changes
-        return [Parameter(p.name, value=normal[p.name]) if p.name in normal else p
-                for p in changes]
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set all parameters or none; a new codebook must be complete and valid.
 
-    def _check_codebook(self, changes: list[Parameter]) -> SetParametersResult:
-        given = _given_codebook_values(changes)
-        if all(same_value(self.get_parameter(p.name), p) for p in changes if p.name in given):
-            return SetParametersResult(successful=True)
+        The codebook gets the types of the parameters, and its id if that is empty.
+        """
+        given = {p.name: p.value for p in parameter_list if p.name in CODEBOOK}
+        if all(same_value(self.get_parameter(p.name), p)
+               for p in parameter_list if p.name in given):
+            return super().set_parameters_atomically(parameter_list)
         try:
             if missing := [name for name in CODEBOOK if name not in given]:
                 raise CodebookError(
                     f'{", ".join(given)}: set without {", ".join(missing)}, expected the whole '
                     'codebook in one request')
-            self._codebook_of(given)
+            codebook = self._codebook_of(given)
         except CodebookError as error:
-            self._refused += 1
+            self.role.count(events.Outcome.WRONG_CODEBOOK)
             return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
+        result = super().set_parameters_atomically([
+            *(p for p in parameter_list if p.name not in given),
+            *ros_parameters(codebook.to_parameters())])
+        if result.successful:
+            self._publish(codebook)
+        return result
 
-    def _on_codebook_set(self, changes: list[Parameter]) -> None:
-        given = _given_codebook_values(changes)
-        # A request with only some of the values has changed nothing.
-        if given.keys() == CODEBOOK.keys():
-            self._publish(self._codebook_of(given))
+    def stand_by(self) -> None:
+        """Withdraw the codebook: only one optimizer may respond, as clients use one response."""
+        self.destroy_publisher(self._publisher)
+        self._codebook_services.withdraw()
 
-    def _report(self) -> Report:
-        conflicts = self._peers.conflicts()
-        values = {'codebook_id': self._codebook_id, 'dropped.wrong_codebook': str(self._refused),
-                  **conflicts}
-        return Report(bool(conflicts), '; '.join(conflicts.values()) or 'no fault', values)
-
-    def _announce(self, stands_by: bool) -> None:
-        """Announce the codebook, or withdraw the announcement if the node stands by."""
-        if self._publisher is not None and stands_by:
-            self.destroy_publisher(self._publisher)
-            self._publisher = None
-        if not stands_by:
-            self._publisher = self._publisher or create_publisher(
-                self, ros.Codebook, topics.CODEBOOK, LATCHED)
-            self._publish(self._codebook_of(self._codebook_values()))
+    def resume(self) -> None:
+        """Offer and announce the codebook."""
+        self._codebook_services = CodebookParameterService(self)  # type: ignore[no-untyped-call]
+        self._publisher = create_publisher(self, ros.Codebook, topics.CODEBOOK, LATCHED)
+        self._publish(self._codebook_of(self._codebook_values()))
 
     def _publish(self, codebook: Codebook) -> None:
-        self._codebook_id = codebook.id
-        if self._publisher is None:
+        self.dispatch(events.CodebookOffered(codebook))
+        if self.stands_by:
             return
         self._publisher.publish(convert.to_bytes(
-            convert.CodebookMessage.of(codebook, self._instance, self._scenario.id),
+            convert.CodebookMessage.of(codebook, self.instance, self.scenario.id),
             self.get_clock().now().nanoseconds))
         self.get_logger().info(  # type: ignore[no-untyped-call]
             f'codebook {codebook.id}: average CRLB {codebook.average_crlb_m2:.4f} m^2')
-
-
-def _given_codebook_values(changes: list[Parameter]) -> dict[str, Any]:
-    return {p.name: p.value for p in changes if p.name in CODEBOOK}
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -229,7 +205,7 @@ def main(args: Sequence[str] | None = None) -> int:
     args = sys.argv if args is None else [topics.OPTIMIZER_NODE, *args]
     parser = _parser()
     options = parse(parser, args[1:])
-    check_parameters(parser, topics.OPTIMIZER_NODE, args[1:])
+    parameters.check_arguments(parser, topics.OPTIMIZER_NODE, args[1:])
     if not remove_ros_args(args)[1:]:
         return run(lambda: [OptimizerNode()], args)
     if options.push_file and options.push:
@@ -256,7 +232,7 @@ def main(args: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog='optimizer', formatter_class=HelpFormatter,
-        epilog=parameter_help(topics.OPTIMIZER_NODE),
+        epilog=parameters.parameter_help(topics.OPTIMIZER_NODE),
         description='Without options, hold a codebook as parameters. With options, optimise one\n'
                     'offline, write it to a file and hold it.')
     add_options(parser)
@@ -271,13 +247,13 @@ def _parser() -> argparse.ArgumentParser:
 def _push(codebook: Codebook, args: Sequence[str]) -> int:
     node = None
     try:
-        rclpy.init(args=prepare(['', *args]))
-        with one_line():
+        init(['', *args])
+        with starting():
             node = Node('codebook_pusher', **WITHOUT_SERVICES)
         push(node, codebook)
-    except (PushError, SecurityError) as error:
+    except (PushError, StartError) as error:
         print_error(error, topics.OPTIMIZER_NODE)
-        return 1
+        return 1 if isinstance(error, PushError) else 2
     except KeyboardInterrupt:
         return 0
     finally:

@@ -4,27 +4,22 @@ import dataclasses
 import functools
 import time
 import types
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
 
 from rhs_isac_ros import positioning
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
 from rhs_isac_ros.monitoring.role_statistics import Report
-from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PositionerSettings
-from rhs_isac_ros.ros import convert, endpoints, topics
-from rhs_isac_ros.ros.frames import Frame
+from rhs_isac_ros.ros import endpoints
 from rhs_isac_ros.ros.parameters import calibrated_surface
-from rhs_isac_ros.ros.role_node import RoleNode
+from rhs_isac_ros.ros.poses import LocatingNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.errors import translated
@@ -34,7 +29,7 @@ from rhs_isac_ros.support.fields import ParameterError
 _LOG_PERIOD_S = 5.0
 
 
-class PositionerNode(RoleNode[Positioner]):
+class PositionerNode(LocatingNode[Positioner]):
     """The positioner, which serves once its first estimator is built."""
 
     def __init__(self, **node_options: Any) -> None:
@@ -42,14 +37,9 @@ class PositionerNode(RoleNode[Positioner]):
         settings = self.make_settings(self.values)
         self._worker, self._table = endpoints.BackgroundWorker(self), ''
         self.endings.callback(self._worker.close)
-        self._frame = Frame.of(self, self.values)
-        self._pose = endpoints.create_publisher(
-            self, PoseWithCovarianceStamped, topics.POSITION, endpoints.EXCHANGE, overridable=True)
-        limit = self.values.user_topics
-        self._user_poses = endpoints.UserTopics(
-            self, {topics.POSE: PoseWithCovarianceStamped}, limit)
-        self._user_odometry = endpoints.UserTopics(self, {topics.ODOMETRY: Odometry}, limit)
-        self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
+        self.start(
+            Positioner(self.scenario, time.perf_counter, settings,
+                       lambda: self.is_observed(m.Posterior)), subscribe=False)
 
     def make_settings(self, values: types.SimpleNamespace) -> PositionerSettings:
         """Return the settings; raise ParameterError if they, a file or a plug-in cannot be used.
@@ -79,9 +69,8 @@ class PositionerNode(RoleNode[Positioner]):
 
     def _make_estimator(
             self, settings: PositionerSettings, codebook: Codebook) -> positioning.Estimator:
-        folder = self.values.table_folder
         options = positioning.file_options(
-            settings.estimator, Path(folder) if folder else default_folder(),
+            settings.estimator, self.table_folder,
             settings.model_file)
         if settings.estimator in positioning.REGION_ESTIMATORS:
             options['reject_outside'] = settings.reject_outside
@@ -112,10 +101,8 @@ class PositionerNode(RoleNode[Positioner]):
             report, values={**report.values, 'table.progress': self._table})
 
     def execute(self, action: events.Action) -> None:
-        """Build an estimator in the background, or publish the odometry of a track."""
+        """Build an estimator in the background, or process another action."""
         match action:
-            case events.PublishTrack():
-                self._publish_track(action)
             case events.BuildEstimator(codebook, settings):
                 make = functools.partial(self._make_estimator, settings)
                 self._worker.run(
@@ -124,26 +111,10 @@ class PositionerNode(RoleNode[Positioner]):
             case _:
                 super().execute(action)
 
-    def _publish_track(self, track: events.PublishTrack) -> None:
-        if self.stands_by:
-            return
-        publishers = self._user_odometry.publishers(track.user)
-        endpoints.publish_if_subscribed(publishers, lambda: convert.odometry(
-            track.user, track.estimate, convert.stamp_of(track, self), self._frame))
-
     def _on_estimator(self, event: events.EstimatorBuilt) -> None:
         self.dispatch(event)
         if event.estimator is not None:
             self.subscribe()
-
-    def publish(self, message: m.Message) -> bool:
-        """Publish a message, and an estimate also as a pose; return whether it was published."""
-        is_published = super().publish(message)
-        if is_published and isinstance(message, m.PositionEstimate):
-            publishers = self._pose, *self._user_poses.publishers(message.user)
-            endpoints.publish_if_subscribed(publishers, lambda: convert.pose(
-                message, convert.stamp_of(message, self), self._frame))
-        return is_published
 
 
 main = entry('positioner', lambda: [PositionerNode()])

@@ -9,10 +9,13 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.time import Time
 
-from rhs_isac_ros.model import mobility
+from rhs_isac_ros.model import Pose, mobility
+from rhs_isac_ros.model.arrays import position_problem
+from rhs_isac_ros.model.pose import rotation_matrix
+from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros import convert, endpoints, topics
-from rhs_isac_ros.ros.frames import Frame, rotation_matrix, vector
+from rhs_isac_ros.ros.frames import vector
 from rhs_isac_ros.ros.parameters import ODOMETRY, ROBOTS
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
@@ -24,36 +27,53 @@ from rhs_isac_ros.support.fields import ParameterError
 _LOOKUP_S = 0.02
 # Maximum difference between a stamp and the clock of the node [s].
 _MAX_AGE_S = 5.0
+# Time in which positions in two frames, or with stamps of two clocks, come from two sources [s],
+# and maximum number of frames that are compared.
+_SOURCES_S, _MAX_ORIGINS = 1.0, 8
 
 
 class RobotMobility:
     """Mobility of a robot: the latest position, extrapolated with the velocity.
 
     `source` describes the origin of the positions. A position is valid for `timeout_s` [s].
+    `pose` is the pose of the surface.
     """
 
-    def __init__(self, node: Node, frame: Frame, source: str, timeout_s: float) -> None:
-        self._clock, self._frame = node.get_clock(), frame
+    def __init__(self, node: Node, pose: Pose, source: str, timeout_s: float) -> None:
+        self._clock, self._pose = node.get_clock(), pose
         self._source, self._timeout_s = source, timeout_s
         self._error = ''
+        # Time of the latest position [s] by its origin: its frame, and whether its stamp fits.
+        self._origins: dict[tuple[str, bool], float] = {}
         self._arrived_s, self._stamp_ns = -np.inf, 0
         self._position, self._velocity = np.full(3, np.nan), np.zeros(3)
 
     def put(self, stamp_ns: int, position: np.ndarray, velocity: np.ndarray) -> None:
-        """Store a position [3] [m] and a velocity [3] [m/s] in `frame`; a stamp of 0 means now."""
+        """Store a position [3] [m] and a velocity [3] [m/s]; a stamp of 0 means now."""
+        if not np.isfinite([position, velocity]).all():
+            self.reject(f'position {position.tolist()} m, velocity {velocity.tolist()} m/s, '
+                        'expected finite numbers')
+            return
         self._error = ''
         self._arrived_s = time.monotonic()
         self._stamp_ns = stamp_ns or self._clock.now().nanoseconds
-        self._position = self._frame.to_surface(position)
-        self._velocity = self._frame.rotation.T @ velocity
+        self._origins['', abs(self._age_s()) <= _MAX_AGE_S] = self._arrived_s
+        self._position = self._pose.to_surface(position)
+        self._velocity = self._pose.vectors_to_surface(velocity)
 
-    def reject(self, error: str) -> None:
-        """Store the reason why a position is unusable."""
+    def reject(self, error: str, frame: str = '') -> None:
+        """Store the reason why a position, in another frame if `frame` is given, is unusable."""
         self._error = error
+        if frame and len(self._origins) < _MAX_ORIGINS:
+            self._origins[frame, True] = time.monotonic()
 
     @property
     def lack(self) -> str:
         """Description of what is missing for a valid position; empty if the position is valid."""
+        begin_s = time.monotonic() - _SOURCES_S
+        self._origins = {one: last_s for one, last_s in self._origins.items() if last_s > begin_s}
+        if len(self._origins) > 1:
+            return f'{self._source}: from two sources, expected one'
         if self._error:
             return f'{self._source}: {self._error}'
         if time.monotonic() > self._arrived_s + self._timeout_s:
@@ -61,9 +81,12 @@ class RobotMobility:
         if abs(self._age_s()) > _MAX_AGE_S:
             return (f'{self._source}: its stamps differ from the clock of this node by '
                     f'{self._age_s():.0f} s; set use_sim_time alike')
-        if not self.state(0.0)[0][0] > 0:
-            return f'{self._source}: a position in front of the surface'
-        return ''
+        position, _ = self.state(0.0)
+        problem = position_problem(position)
+        if not problem and np.abs(position).max() > m.MAX_COORDINATE_M:
+            problem = (f'{np.abs(position).max():g} m from the surface, expected coordinates up '
+                       f'to {m.MAX_COORDINATE_M:g} m')
+        return f'{self._source}: {problem}' if problem else ''
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the current position [3] [m] and velocity [3] [m/s] in the surface's frame."""
@@ -74,15 +97,20 @@ class RobotMobility:
         return 1e-9 * (self._clock.now().nanoseconds - self._stamp_ns)
 
 
-def follow_odometry(node: Node, frame: Frame, topic: str, timeout_s: float) -> RobotMobility:
+def follow_odometry(
+        node: Node, frame: str, pose: Pose, topic: str, timeout_s: float) -> RobotMobility:
     """Return the mobility of a robot that publishes odometry in the frame `frame` on a topic."""
-    full_name = node.resolve_topic_name(topic)
-    mobility = RobotMobility(node, frame, f'odometry on {full_name}', timeout_s)
+    try:
+        full_name = node.resolve_topic_name(topic)
+    except RuntimeError as error:
+        reason = str(error).partition(', at ')[0].removeprefix('failed to resolve name: ')
+        raise ParameterError(f'odometry_topic: {topic!r}: {reason}') from None
+    mobility = RobotMobility(node, pose, f'odometry on {full_name}', timeout_s)
 
     def receive(message: Odometry) -> None:
-        if message.header.frame_id != frame.name:
+        if message.header.frame_id != frame:
             mobility.reject(f'in the frame {message.header.frame_id!r}, expected frame_id = '
-                            f'{frame.name!r}')
+                            f'{frame!r}', message.header.frame_id)
             return
         turn = message.pose.pose.orientation
         orientation = np.array([turn.x, turn.y, turn.z, turn.w])
@@ -98,7 +126,8 @@ def follow_odometry(node: Node, frame: Frame, topic: str, timeout_s: float) -> R
     return mobility
 
 
-def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> RobotMobility:
+def follow_frame(
+        node: Node, frame: str, pose: Pose, child: str, timeout_s: float) -> RobotMobility:
     """Return the mobility of the frame `child` in tf2; consecutive transforms give the velocity.
 
     Raises ParameterError if ``tf2_ros`` is not installed.
@@ -109,7 +138,7 @@ def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> Robo
         raise ParameterError(
             "mobility: 'tf', expected 'odometry' or a built-in mobility, because tf2_ros is not "
             'installed; it comes with a ROS 2 installation, but not as a wheel') from None
-    mobility = RobotMobility(node, frame, f'transform from {frame.name} to {child}', timeout_s)
+    mobility = RobotMobility(node, pose, f'transform from {frame} to {child}', timeout_s)
 
     def listen() -> tuple[Any, Any]:
         # The buffer also creates a service, which may be refused.
@@ -122,9 +151,9 @@ def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> Robo
         if not source:
             return
         buffer, _ = source  # The reference keeps the listener alive.
-        if not buffer.can_transform(frame.name, child, Time()):
+        if not buffer.can_transform(frame, child, Time()):
             return
-        found = buffer.lookup_transform(frame.name, child, Time())
+        found = buffer.lookup_transform(frame, child, Time())
         stamp_ns = Time.from_msg(found.header.stamp).nanoseconds
         position = vector(found.transform.translation)
         before_ns, before = last[0] if last else (stamp_ns, position)
@@ -147,15 +176,14 @@ class UserNode(RoleNode[User]):
     def __init__(self, name: str = '', **node_options: Any) -> None:
         super().__init__('user', name, **node_options)
         values = self.values
-        self._frame = Frame.of(self, values)
         mobilities = self._mobilities()
         self.start(User(
             mobilities, values.step_timeout_s, values.beacon_timeout_s, self.instance,
-            self.clocks.world_s))
+            self.clocks.world_s, self.scenario.pose))
         self._true_odometry = endpoints.UserTopics(
             self, {topics.TRUE_ODOMETRY: Odometry}, values.user_topics)
         # On the clock of ROS, like the mobilities.
-        endpoints.create_timer(self, values.ground_truth_period_s, self._publish_ground_truth)
+        self.create_timer(values.ground_truth_period_s, self._publish_ground_truth)
         if robot := self._robot:
             self._watch_robot(robot)
             endpoints.steady_timer(self, _LOOKUP_S, functools.partial(self._watch_robot, robot))
@@ -186,7 +214,8 @@ class UserNode(RoleNode[User]):
             follow, source = ((follow_odometry, values.odometry_topic)
                               if values.mobility == ODOMETRY else
                               (follow_frame, values.robot_frame))
-            self._robot = follow(self, self._frame, source, values.robot_timeout_s)
+            self._robot = follow(
+                self, self.frame.name, self.scenario.pose, source, values.robot_timeout_s)
             return self._robot
         is_moving = values.mobility != 'static'
         if is_moving and values.speed_mps > self.scenario.max_user_speed_mps:
@@ -212,19 +241,23 @@ class UserNode(RoleNode[User]):
                 None if position is None else position.tolist())
 
     def _points(self, name: str) -> np.ndarray:
-        """Return the points of a parameter, [N, 3], which must be in front of the surface."""
+        """Return the points of a parameter in the frame of the surface, [N, 3].
+
+        Raises ParameterError if a point is not in front of the surface.
+        """
         numbers = np.array(getattr(self.values, name))
         if numbers.size % 3:
             raise ParameterError(f'{name}: {numbers.size} numbers, expected three for each point')
-        points = numbers.reshape(-1, 3)
+        given = numbers.reshape(-1, 3)
+        points = self.scenario.pose.to_surface(given)
         if not (points[:, 0] > 0).all():
             raise ParameterError(
-                f'{name}: {points.tolist()}, expected points in front of the surface, x > 0')
+                f'{name}: {given.tolist()}, expected points in front of the surface, x > 0')
         low, high = self.scenario.roi_bounds_m
         if not ((points >= low) & (points <= high)).all():
             self.get_logger().warning(  # type: ignore[no-untyped-call]
-                f'{name}: {points.tolist()}: outside of the region of interest, {low.tolist()} to '
-                f'{high.tolist()}; a user there gets no position')
+                f'{name}: {given.tolist()}: outside of the region of interest, {low.tolist()} to '
+                f'{high.tolist()} in the frame of the surface; a user there gets no position')
         return points
 
     def _publish_ground_truth(self) -> None:
@@ -237,7 +270,7 @@ class UserNode(RoleNode[User]):
             endpoints.publish_if_subscribed(
                 self._true_odometry.publishers(truth.user), functools.partial(
                     convert.true_odometry, truth.user, truth.position, truth.velocity, stamp,
-                    self._frame))
+                    self.frame))
 
     def _watch_robot(self, robot: RobotMobility) -> None:
         self.set_lacking(robot.lack)

@@ -19,15 +19,18 @@ from geometry_msgs.msg import (
     Vector3,
 )
 from nav_msgs.msg import Path
+from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from rhs_isac_ros import model
 from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState, UserState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, endpoints, parameters, topics
 from rhs_isac_ros.ros.frames import Frame, to_ros
+from rhs_isac_ros.ros.place import Place
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.ros.topics import RHS_FRAME, TF, TF_STATIC
 
@@ -79,17 +82,17 @@ def marker(
     return found
 
 
-def deletion(namespace: str, number: int, stamp: Time) -> Marker:
-    """Return a message that deletes the marker with the given namespace and id."""
-    marker = _marker(namespace, number, Marker.SPHERE, stamp)
-    marker.action = Marker.DELETE
-    return marker
+# Namespaces of markers of shapes that are in the frame of the surface.
+_OF_SURFACE = ('region', 'board', 'traced', 'beam')
 
 
-def place(marker: Marker, frame: Frame) -> Marker:
-    """Convert the pose of a marker to a frame, in place; its points are relative to the pose."""
+def place(marker: Marker, frame: Frame, pose: model.Pose) -> Marker:
+    """Place a marker in the frame of the site, given the pose of the surface."""
     marker.header.frame_id = frame.name
-    marker.pose = frame.pose(marker.pose)
+    if marker.ns in _OF_SURFACE:
+        # The points of a marker are relative to its pose.
+        marker.pose = Pose(position=to_ros(Point, pose.origin),
+                           orientation=to_ros(Quaternion, pose.unit_quaternion))
     return marker
 
 
@@ -97,7 +100,7 @@ def path(positions: Iterable[np.ndarray], stamp: Time, frame: Frame) -> Path:
     """Convert positions, float64 [3] [m] each, to a path in a frame, without orientations."""
     header = Header(stamp=stamp, frame_id=frame.name)
     return Path(header=header, poses=[
-        PoseStamped(header=header, pose=Pose(position=to_ros(Point, frame.from_surface(position))))
+        PoseStamped(header=header, pose=Pose(position=to_ros(Point, position)))
         for position in positions])
 
 
@@ -143,7 +146,7 @@ class TransformPublisher:
     The constructor publishes the static transform of the surface.
     """
 
-    def __init__(self, node: Node, frame: Frame) -> None:
+    def __init__(self, node: Node, frame: Frame, pose: model.Pose) -> None:
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError:
@@ -154,8 +157,8 @@ class TransformPublisher:
         self._dynamic = endpoints.create_publisher(node, TFMessage, TF, endpoints.EXCHANGE)
         self._static = endpoints.create_publisher(node, TFMessage, TF_STATIC, endpoints.LATCHED)
         self._static.publish(TFMessage(transforms=[
-            transform(frame, frame.surface, frame.origin, node.get_clock().now().to_msg(),
-                      frame.orientation)]))
+            transform(frame, frame.surface, pose.origin, node.get_clock().now().to_msg(),
+                      pose.unit_quaternion)]))
 
     def publish(self, transform: TransformStamped) -> None:
         """Publish a transform that is not static, if transforms are `available`."""
@@ -169,20 +172,21 @@ class VisualizerNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('visualizer', **node_options)
         values = parameters.declare(self, 'visualizer')
-        self._scenario = parameters.scenario_of(values)
+        self._scenario = Place.of(values, self.get_namespace()).scenario
         self._frame = Frame.of(self, values)
         self._forget_s = values.forget_s
         self._scene = SceneState()
         # The latest beam and its marker, because a beam pattern is slow to compute.
         self._drawn: tuple[m.Beam, Marker] | None = None
-        self._shown: set[tuple[str, int]] = set()
+        # A marker that is no longer published disappears after three periods.
+        self._lifetime = Duration(seconds=3 * values.period_s).to_msg()
         self._publisher = endpoints.create_publisher(
             self, MarkerArray, topics.MARKERS, endpoints.EXCHANGE, overridable=True)
         self._paths = endpoints.UserTopics(
             self, {topics.PATH: Path, topics.TRUE_PATH: Path}, values.user_topics)
-        self._transforms = TransformPublisher(self, self._frame)
-        endpoints.subscribe_messages(self, SCENE_RECEIVES, self._scenario.sizes, self._on_message,
-                                     scenario_id=self._scenario.id)
+        self._transforms = TransformPublisher(self, self._frame, self._scenario.pose)
+        endpoints.subscribe_messages(self, SCENE_RECEIVES, self._scenario, self._on_message,
+                                     on_foreign=lambda message: None)
         endpoints.steady_timer(self, values.period_s, self._show)
         self.get_logger().info(  # type: ignore[no-untyped-call]
             'serving: markers, paths' + (
@@ -194,8 +198,8 @@ class VisualizerNode(Node):
         # The number of frames is limited like the number of topics, because tf2 keeps every frame.
         if isinstance(message, m.PositionEstimate) and self._paths.publishers(message.user):
             self._transforms.publish(transform(
-                self._frame, self._frame.user(message.user),
-                self._frame.from_surface(message.position), convert.stamp_of(message, self)))
+                self._frame, self._frame.user(message.user), message.position,
+                convert.stamp_of(message, self)))
 
     def _show(self) -> None:
         """Publish all markers and paths, so that late joiners receive them."""
@@ -231,10 +235,9 @@ class VisualizerNode(Node):
         array = [marker(*key, body, stamp) for key, body in bodies.items()]
         if state.beam:
             array.append(self._beam_marker(state.beam, stamp))
-        array = [place(marker, self._frame) for marker in array]
-        shown = {(marker.ns, marker.id) for marker in array}
-        array += [deletion(*key, stamp) for key in sorted(self._shown - shown)]
-        self._shown = shown
+        for found in array:
+            place(found, self._frame, self._scenario.pose)
+            found.lifetime = self._lifetime
         return MarkerArray(markers=array)
 
     def _beam_marker(self, message: m.Beam, stamp: Time) -> Marker:

@@ -4,17 +4,26 @@
 of `Estimator`, whose method ``estimate`` takes received signals and returns an `Estimate`. The
 classes of estimators are listed in `ESTIMATORS` below, and other packages may provide more as
 entry points of `plugins.ESTIMATORS`. `simulate_pairs` draws signals for trials, and a `Tracker`
-combines successive positioning phases of a moving user.
+combines successive positioning phases of a moving user. A shot is the signals of one positioning
+phase in a batch of them.
+
+Positions are ranges and direction cosines, (r, u, v), in which the modes of the likelihood are
+nearly Gaussian: the signals determine the range to a fraction of a wavelength, but the direction
+only to a fraction of a beam. In Cartesian coordinates, the modes are curved.
 
 The modules, in reading order:
 
 * `estimate`: the interface; `estimators`: `bayes` and `ml`, from signals to positions
-* `coordinates`: range and direction; `lattice`: lengths over which signals change, and the grid
+* `lattice`: lengths over which signals change, and the grid; `segments`: points of each shot
+* `region`: Gaussians restricted to the region of interest
 * `likelihood`: the likelihood of positions and nuisance parameters
-* `grid`: starts of the search; `search`: ascent from the starts to the modes; `failures`: modes if
-  elements have failed
+* `templates`, `peaks`, `grid`: starts of the search; `search`: ascent from the starts to the
+  modes; `failures`: modes if elements have failed
 * `posterior`: from modes to samples; `draws`: samples without modes; `alternatives`: users outside
   or blocked; `diagnosis`: tests of the fit between signals and model
+* `mixture`: posteriors in the frame of the site; `prior`: their update with signals; `fusion`:
+  several surfaces; `agreement`: surfaces whose pose is wrong; `alignment`: the pose of a surface
+  from common users; `site`: the surfaces of a site in a file
 * `tracking`: moving users; `neural`: the paper's network; `store`: tables in files
 """
 
@@ -32,8 +41,11 @@ from rhs_isac_ros.positioning.estimators import (
     WeightedModes,
     weighted_modes,
 )
+from rhs_isac_ros.positioning.fusion import Fused, Sighting, fuse
+from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.positioning.neural import ModelError, Network, NeuralEstimator, train
 from rhs_isac_ros.positioning.simulate import simulate_pairs
+from rhs_isac_ros.positioning.site import Site, SiteError, SiteEstimator, SiteSurface
 from rhs_isac_ros.positioning.tracking import Motion, Tracker, TrackEstimate
 from rhs_isac_ros.support import plugins
 
@@ -43,10 +55,11 @@ ESTIMATORS: Mapping[str, Callable[..., Estimator]] = {
 REGION_ESTIMATORS = (BayesEstimator.name, MlEstimator.name)
 
 __all__ = [
-    'ESTIMATORS', 'REGION_ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'MlEstimator',
-    'ModelError', 'Motion', 'Network', 'NeuralEstimator', 'SearchEstimator', 'SignalError',
-    'TrackEstimate', 'Tracker', 'WeightedModes', 'estimate_each', 'file_options',
-    'make_estimator', 'simulate_pairs', 'train', 'weighted_modes',
+    'ESTIMATORS', 'REGION_ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'Fused',
+    'Mixture', 'MlEstimator', 'ModelError', 'Motion', 'Network', 'NeuralEstimator',
+    'SearchEstimator', 'Sighting', 'SignalError', 'Site', 'SiteError', 'SiteEstimator',
+    'SiteSurface', 'TrackEstimate', 'Tracker', 'WeightedModes', 'estimate_each', 'file_options',
+    'fuse', 'make_estimator', 'simulate_pairs', 'train', 'weighted_modes',
 ]
 
 
@@ -77,10 +90,12 @@ def make_estimator(
     return estimator
 
 
-def file_options(name: str, table_folder: Path, model_file: str | Path) -> dict[str, Any]:
+def file_options(
+        name: str, table_folder: Path | None, model_file: str | Path) -> dict[str, Any]:
     """Return the options of `make_estimator` that specify the files of an estimator.
 
-    The estimators `bayes` and `ml` take the table folder. The model file goes to `neural` and,
+    The estimators `bayes` and `ml` take the table folder; without one, they keep tables only in
+    memory. The model file goes to `neural` and,
     unless it is empty, to plug-ins.
     """
     if name == NeuralEstimator.name or (name not in ESTIMATORS and model_file):

@@ -5,7 +5,6 @@ import sys
 from collections.abc import Sequence
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning.neural import (
     DEFAULT_EPOCHS,
@@ -23,6 +22,7 @@ from rhs_isac_ros.support.arguments import (
     positive_int,
     seed,
 )
+from rhs_isac_ros.support.exits import exit_code_of, print_error
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.progress import progress_bar
 

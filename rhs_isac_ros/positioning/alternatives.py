@@ -1,63 +1,72 @@
 """Alternatives to a user in the region with a direct path: a user outside, or a blocked one.
 
 Each alternative has prior odds and an evidence, the likelihood averaged over its own unknowns. A
-comparison with the evidence for a user in the region gives the probability of the alternative. If
-the probability exceeds a limit, there is no fix. The limit for a user outside is high: its prior
-odds are 1 to 1, but most users are inside and should not lose their fixes.
+comparison with the evidence for a user in the region gives the probability of the alternative.
+There is a fix only if a user in the region and in sight is at least as probable as all
+alternatives together, which is the decision with the least error, and if the probability of each
+alternative, compared with such a user alone, is within the limit of the alternative.
 """
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import blocks
+from rhs_isac_ros.model.arrays import blocks, log_sum
+from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
-from rhs_isac_ros.model.geometry import element_positions
-from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, log_sum, to_positions
-from rhs_isac_ros.positioning.lattice import Resolution, groups
+from rhs_isac_ros.model.geometry import element_positions, to_positions
+from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers, groups
 from rhs_isac_ros.positioning.likelihood import NuisancePrior
 from rhs_isac_ros.support.threads import map_blocks
 
-# Probabilities of a user outside, and of a blocked one, above which there is no fix.
-OUTSIDE_LIMIT = 0.99
+# Above this probability, a position is less probable than its alternatives.
+LIMIT = 0.5
 # Above this probability, a 95 % region that assumes a direct path cannot attain its coverage.
 BLOCKED_LIMIT = 0.05
 # Largest plausible level of the multipath of a blocked user, in standard deviations.
 _LEVEL_REACH = 3.0
-_DB_PER_NEPER = 20 / math.log(10)
 _MIN_PROBABILITY = 1e-12
 # Smallest probability of an alternative that is reported.
 _MIN_DOUBT = 0.01
-# In units of the nearest range of the region: width of the border around the region that does not
-# count as outside, and nearest range on the grid.
-_BORDER = 0.1
-_NEAREST = 0.3
-# The nearest range is at least this multiple of the radius of the aperture.
-_MIN_APERTURES = 4.0
-# Farthest range in units of the farthest range of the region, and ratio of successive ranges.
-_MAX_RANGE_FACTOR = 3.0
-_RANGE_RATIO = 1.15
-# Phase error of a template at the edge of the aperture at which the next direction takes over, and
-# largest number of templates. If this number would be exceeded, larger errors are accepted: large
-# apertures distinguish more directions than a comparison of two hypotheses needs.
-_DIRECTION_RAD = 0.25
-_MAX_TEMPLATES = 40_000
-# Quadrature over the gain: spacing [nepers], and reach in standard deviations.
-_GAIN_STEP = 0.04
-_GAIN_REACH = 4.0
-# Largest phase error of a template at the ends of the ranges that share it [rad].
-_MAX_PHASE_ERROR = 0.5
-# Error of a residual due to the grid, as a share of the template's energy.
-_GRID_ERROR = 0.25
-# Number of templates to compute at a time.
-_BLOCK = 512
-# Largest sine of the angle from boresight on the grid.
-_MAX_SINE = 0.998
-# Directions with a log-likelihood below the best by more than this at all ranges are ignored.
-_MARGIN = 30.0
+
+
+class OutsideGrid(NamedTuple):
+    """Extent and resolution of the grid of positions outside of the region."""
+
+    # In units of the nearest range of the region: width of the border around the region that does
+    # not count as outside, and nearest range, which is at least a multiple of the radius of the
+    # aperture.
+    border: float = 0.1
+    nearest: float = 0.3
+    apertures: float = 4.0
+    # Farthest range in units of the farthest range of the region, and ratio of successive ranges.
+    range_factor: float = 3.0
+    range_ratio: float = 1.15
+    # Phase error of a template at the edge of the aperture at which the next direction takes over,
+    # and largest number of templates. If this number would be exceeded, larger errors are
+    # accepted: large apertures distinguish more directions than a comparison of two hypotheses
+    # needs.
+    direction_rad: float = 0.25
+    templates: int = 40_000
+    # Largest phase error of a template at the ends of the ranges that share it [rad].
+    phase_error: float = 0.5
+    # Largest sine of the angle from boresight.
+    sine: float = 0.998
+    # Error of a residual due to the grid, as a share of the template's energy.
+    error: float = 0.25
+    # Directions with a log-likelihood below the best by more than this at all ranges are ignored.
+    margin: float = 30.0
+    # Quadrature over the gain: spacing [nepers], and reach in standard deviations.
+    gain_step: float = 0.04
+    gain_reach: float = 4.0
+    # Number of templates to compute at a time.
+    block: int = 512
+
+
+GRID = OutsideGrid()
 
 
 class Blocked:
@@ -73,8 +82,7 @@ class Blocked:
     name, reason, limit = 'blocked', 'blocked', BLOCKED_LIMIT
 
     def __init__(self, scenario: Scenario) -> None:
-        share = scenario.blocked_probability
-        self.log_odds = math.log(share / max(1 - share, _MIN_PROBABILITY))
+        self.log_odds = _log_odds(scenario.blocked_probability)
         self._median_db, self._std_db = scenario.multipath_level_db
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
@@ -82,7 +90,7 @@ class Blocked:
         """Compute the log evidence from the energies of the signals; see `Outside`."""
         energy = np.array([residual, np.sum(np.abs(whitened)**2)])
         # The gain of the user is part of the level.
-        std_db = math.hypot(BLOCKED_STD_DB, self._std_db, _DB_PER_NEPER * prior.gain_std)
+        std_db = math.hypot(BLOCKED_STD_DB, self._std_db, prior.gain_std / NEPERS_PER_DB)
         in_sight, blocked = (
             float(log_evidence_of_level(energy[[index]], whitened.size, std, self._median_db)[0])
             for index, std in enumerate((self._std_db, std_db)))
@@ -123,7 +131,7 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
         filters[:, block] = np.swapaxes(templates, 0, 1).conj()
         energy[block] = np.sum(np.abs(templates)**2, axis=(1, 2))
 
-    map_blocks(fill, blocks(len(points), _BLOCK), progress)
+    map_blocks(fill, blocks(len(points), GRID.block), progress)
     return {
         'outer_filters': filters,
         'outer_energy': energy.reshape(len(nodes), -1),
@@ -145,12 +153,11 @@ class Outside:
     name = 'outside'  # `Estimate` has the field ``<name>_probability``.
     reason = 'position outside of the region'  # Beginning of the reason why there is no fix.
     # Largest probability at which there is a fix, if no other alternative is considered.
-    limit = OUTSIDE_LIMIT
-    # Logarithm of the prior odds relative to a user inside and in sight: half of the users are
-    # outside.
-    log_odds = 0.0
+    limit = LIMIT
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
+        # Logarithm of the prior odds relative to a user inside and in sight.
+        self.log_odds = _log_odds(scenario.outside_probability)
         self._filters, self._index = arrays['outer_filters'], arrays['outer_index']
         ranges = _ranges(scenario)[:, None]
         self._scale = (2 / ranges).astype(np.float32)
@@ -165,13 +172,13 @@ class Outside:
         """Compute the logarithm of the evidence with the nuisance parameters integrated out.
 
         `aligned`, float64 [Q], contains the parameters that follow from the signals alone, and 0
-        for the others. `whitened`, complex128 [N_B, N_SB F], are the signals of one phase without
+        for the others. `whitened`, complex128 [N_B, N_SB F], are the signals of one shot without
         the factors of `aligned`. `residual` is the residual energy at the best position inside.
         """
         gain = np.zeros(1)
         if prior.gain_std:
-            n_points = 2 * int(np.ceil(_GAIN_REACH * prior.gain_std / _GAIN_STEP)) + 3
-            gain = prior.gain_std * np.linspace(-_GAIN_REACH, _GAIN_REACH, n_points)
+            n_points = 2 * int(np.ceil(GRID.gain_reach * prior.gain_std / GRID.gain_step)) + 3
+            gain = prior.gain_std * np.linspace(-GRID.gain_reach, GRID.gain_reach, n_points)
         evidence = self.log_evidence(whitened, np.exp(-gain)) - 2 * whitened.size * gain
         weights = -gain**2 / (2 * (prior.gain_std or 1.0)**2)
         return (log_sum(evidence + weights) - log_sum(weights)
@@ -188,7 +195,7 @@ class Outside:
         values = []
         for scale in scales:
             # Small scales make directions more alike.
-            chosen = np.flatnonzero(bound >= bound.max() - _MARGIN / scale**2)
+            chosen = np.flatnonzero(bound >= bound.max() - GRID.margin / scale**2)
             argument = filtered[:, :, chosen][:, self._index] * (np.float32(scale) * self._scale)
             log_likelihood = np.sum(_log_bessel(argument), axis=0) + self._offset[:, chosen]
             values.append(log_sum(log_likelihood) - scale**2 * energy)
@@ -198,7 +205,7 @@ class Outside:
         """Return whether some position explains the signals up to this residual energy."""
         amplitude = np.sum(self._filter(whitened), axis=0)[self._index] * self._scale
         residual = np.sum(np.abs(whitened)**2) - amplitude + self._energy
-        tolerated = max_residual + _GRID_ERROR * self._energy
+        tolerated = max_residual + GRID.error * self._energy
         return bool(((residual <= tolerated) & np.isfinite(self._offset)).any())
 
     def _filter(self, whitened: np.ndarray) -> np.ndarray:
@@ -225,12 +232,25 @@ def describe_doubts(estimate: object) -> str:
         estimate).items() if value >= _MIN_DOUBT)
 
 
-def rejection(alternative: Alternative, probability: float) -> str:
-    """Return why an alternative of this probability rules out a fix, or '' if it does not."""
-    if probability <= alternative.limit:
-        return ''
-    return (f'{alternative.reason}: probability {probability:.6g}, expected at most '
-            f'{alternative.limit:g}')
+def rejection(alternative: Alternative, probability: float, inside: float) -> str:
+    """Return why an alternative rules out a fix, or '' if it does not.
+
+    `probability` and `inside` are the probabilities of the alternative and of a user in the region
+    and in sight, among all hypotheses.
+    """
+    share = probability / max(probability + inside, _MIN_PROBABILITY)
+    if share > alternative.limit:
+        return (f'{alternative.reason}: probability {share:.6g}, expected at most '
+                f'{alternative.limit:g}')
+    if inside < 1 - LIMIT:
+        return (f'{alternative.reason}: probability {probability:.6g}, and {inside:.6g} of a user '
+                f'in the region and in sight, expected at least {1 - LIMIT:g}')
+    return ''
+
+
+def _log_odds(probability: float) -> float:
+    """Return the logarithm of the odds of a probability above 0; the odds are at most 1e12."""
+    return math.log(probability / max(1 - probability, _MIN_PROBABILITY))
 
 
 def _log_bessel(argument: np.ndarray) -> np.ndarray:
@@ -244,21 +264,21 @@ def _ranges(scenario: Scenario) -> np.ndarray:
     """Return the ranges of the grid in geometric progression, float64 [R] [m]."""
     resolution = Resolution.of(scenario)
     aperture_m = np.linalg.norm(element_positions(scenario), axis=1).max()
-    nearest_m = max(_NEAREST * resolution.nearest_m, _MIN_APERTURES * aperture_m)
-    ratio = _MAX_RANGE_FACTOR * resolution.farthest_m / nearest_m
-    n_ranges = 1 + max(1, int(np.ceil(np.log(ratio) / np.log(_RANGE_RATIO))))
-    return nearest_m * _RANGE_RATIO**np.arange(n_ranges)
+    nearest_m = max(GRID.nearest * resolution.nearest_m, GRID.apertures * aperture_m)
+    ratio = GRID.range_factor * resolution.farthest_m / nearest_m
+    n_ranges = 1 + max(1, int(np.ceil(np.log(ratio) / np.log(GRID.range_ratio))))
+    return nearest_m * GRID.range_ratio**np.arange(n_ranges)
 
 
 def _directions(scenario: Scenario) -> np.ndarray:
     """Return direction cosines (u, v) over the half space, float64 [V, 2]."""
     direction = Resolution.of(scenario).direction
     n_ranges = len(_template_ranges(scenario, _ranges(scenario))[0])
-    fewest = np.sqrt(np.pi / 4 * n_ranges / (np.prod(direction) * _MAX_TEMPLATES))
-    counts = np.ceil(0.5 / (max(_DIRECTION_RAD, fewest) * direction)).astype(int)
+    fewest = np.sqrt(np.pi / 4 * n_ranges / (np.prod(direction) * GRID.templates))
+    counts = np.ceil(0.5 / (max(GRID.direction_rad, fewest) * direction)).astype(int)
     lines = [(np.arange(2 * n) + 0.5) / n - 1 for n in counts.tolist()]
     grid = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 2)
-    return grid[np.hypot(*grid.T) < _MAX_SINE]
+    return grid[np.hypot(*grid.T) < GRID.sine]
 
 
 def _points(ranges: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -273,7 +293,7 @@ def _prior(scenario: Scenario, ranges: np.ndarray, directions: np.ndarray) -> np
     positions = to_positions(_points(ranges, directions))
     distance = np.linalg.norm(positions - np.clip(positions, *scenario.roi_bounds_m), axis=-1)
     solid_angle = 1 / np.sqrt(1 - np.sum(directions**2, axis=1))
-    border_m = _BORDER * Resolution.of(scenario).nearest_m
+    border_m = GRID.border * Resolution.of(scenario).nearest_m
     weights = np.where(distance > border_m, ranges[:, None] * solid_angle, 0.0)
     total = weights.sum()
     return weights / total if total > 0 else weights
@@ -295,7 +315,7 @@ def _template_ranges(scenario: Scenario, ranges: np.ndarray) -> tuple[np.ndarray
         ends_m, node_m = ranges[[first, end - 1]], node(first, end)
         errors = (resolution.curvature_m * np.abs(1 / ends_m - 1 / node_m)
                   + np.abs(ends_m - node_m) / resolution.delay_m)
-        return bool(errors.max() <= _MAX_PHASE_ERROR)
+        return bool(errors.max() <= GRID.phase_error)
 
     shared = groups(len(ranges), fits)
     index = np.repeat(np.arange(len(shared), dtype=np.int64),

@@ -48,7 +48,7 @@ _SPREAD_TOLERANCE = 0.15
 _MAX_DEVIATIONS = 6.0
 _MAX_SQUARE = 9.0
 # Subjects with which reasons begin.
-_ENERGY = 'energy of the whitened signals'
+_ENERGY = 'energy of the signals'
 _RESIDUAL = 'residual energy at the best position'
 # Likely causes of a missing position.
 LEVEL = 'level of the multipath or of the users'
@@ -59,7 +59,7 @@ _MAX_DISPERSION = 1.2
 
 
 class FitTest:
-    """Tests of the energy of N_B N_SB F whitened signals; each returns a reason to reject, or ''.
+    """Tests of the energies of N_B N_SB F signals; each returns a reason to reject, or ''.
 
     `level` is the median power of the multipath of users in sight, relative to the model.
     """
@@ -129,35 +129,22 @@ class InnovationTest:
 
     def clear(self) -> None:
         """Remove all residuals, for example after a change of the scenario or codebook."""
-        self._residuals: collections.deque[_Residual] = collections.deque(maxlen=self._window)
+        self._residuals: collections.deque[_Moments] = collections.deque(maxlen=self._window)
         self.drifts = False
 
     def add(self, energy: float, expected: float) -> None:
         """Add a residual's energy and its expectation, unless one is NaN, and update `drifts`."""
-        if np.isnan(energy) or np.isnan(expected):
+        if np.isnan(energy) or not np.isfinite(expected):
             return
-        scale = max(expected, 1.0)
-        share = share_of_level(scale, self._std_db)
-        shape = scale * (1 - share)
-        std = scale / shape**0.5
-        deviation = (energy / self._median - expected) / std
-        deviation = min(max(deviation, -_MAX_DEVIATIONS), _MAX_DEVIATIONS)
-        variance, square_variance = max(expected, 0.0), 2 + 6 / shape
-        self._residuals.append(_Residual(
-            1, expected + deviation * std, expected, min(deviation**2, _MAX_SQUARE),
-            variance, square_variance * (1 - share**2),
-            (variance * share / (1 - share))**0.5, square_variance**0.5 * share))
+        self._residuals.append(_Moments.of(energy / self._median, expected, self._std_db))
         if self.drifts:
             latest = list(self._residuals)[-MIN_RETURN:]
-            total = _Residual.total(latest)
-            if (len(latest) == MIN_RETURN and total.probability() >= RETURN
-                    and total.spread_probability() >= SPREAD_RETURN):
+            if len(latest) == MIN_RETURN and _Moments.total(latest).fit(RETURN, SPREAD_RETURN):
                 self.clear()
                 self._residuals.extend(latest)
         elif len(self._residuals) >= MIN_FIXES:
-            total = _Residual.total(self._residuals)
-            self.drifts = (total.probability() < FALSE_WARNING
-                           or total.spread_probability() < FALSE_SPREAD_WARNING)
+            self.drifts = not _Moments.total(self._residuals).fit(
+                FALSE_WARNING, FALSE_SPREAD_WARNING)
 
     @property
     def n_fixes(self) -> int:
@@ -167,18 +154,18 @@ class InnovationTest:
     @property
     def ratio(self) -> float:
         """Mean energy relative to the expectation; NaN without residuals."""
-        total = _Residual.total(self._residuals)
+        total = _Moments.total(self._residuals)
         return total.energy / max(total.expected, 0.5) if self._residuals else np.nan
 
     @property
     def spread(self) -> float:
         """Variance of the energy relative to its value in the model; NaN without residuals."""
-        total = _Residual.total(self._residuals)
+        total = _Moments.total(self._residuals)
         return total.square / len(self._residuals) if self._residuals else np.nan
 
 
-class _Residual(NamedTuple):
-    """A residual, or a sum of several."""
+class _Moments(NamedTuple):
+    """Energy and squared deviation of a residual, with their distribution; or sums of several."""
 
     n: int
     energy: float
@@ -192,8 +179,28 @@ class _Residual(NamedTuple):
     common_square_std: float
 
     @classmethod
-    def total(cls, residuals: Iterable['_Residual']) -> '_Residual':
+    def of(cls, energy: float, expected: float, level_std_db: float) -> '_Moments':
+        """Return the moments of an energy, relative to the median level of the multipath."""
+        scale = max(expected, 1.0)
+        share = share_of_level(scale, level_std_db)
+        shape = scale * (1 - share)
+        std = scale / shape**0.5
+        deviation = (energy - expected) / std
+        deviation = min(max(deviation, -_MAX_DEVIATIONS), _MAX_DEVIATIONS)
+        variance, square_variance = max(expected, 0.0), 2 + 6 / shape
+        return cls(
+            1, expected + deviation * std, expected, min(deviation**2, _MAX_SQUARE),
+            variance, square_variance * (1 - share**2),
+            (variance * share / (1 - share))**0.5, square_variance**0.5 * share)
+
+    @classmethod
+    def total(cls, residuals: Iterable['_Moments']) -> '_Moments':
         return cls(*map(sum, zip((0,) * len(cls._fields), *residuals, strict=True)))
+
+    def fit(self, probability: float, spread_probability: float) -> bool:
+        """Return whether both p-values are at least as high as these."""
+        return (self.probability() >= probability
+                and self.spread_probability() >= spread_probability)
 
     def probability(self) -> float:
         """Return the two-sided p-value of the sum of energies."""

@@ -18,32 +18,38 @@ import numpy as np
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import mixture_weights
-from rhs_isac_ros.positioning.coordinates import (
-    carrier_wavenumbers,
-    concatenate,
-    moments,
-    select,
-    symmetric,
-)
-from rhs_isac_ros.positioning.estimate import Fit
-from rhs_isac_ros.positioning.grid import Query, TemplateTable, Windows
-from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution
+from rhs_isac_ros.model.gaussian import moments
+from rhs_isac_ros.positioning.estimate import Fit, regular
+from rhs_isac_ros.positioning.grid import TemplateTable, Windows
+from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution, carrier_wavenumbers
+from rhs_isac_ros.positioning.segments import concatenate, select
+from rhs_isac_ros.positioning.templates import Query
 
-# Draws per round, largest number of rounds, and sufficient effective number of draws. The inverse
-# of this effective number is the relative increase of the mean squared error.
-_N_DRAWS = 500
-_MAX_ROUNDS = 12
-_N_EFFECTIVE = 150.0
-# Share of the draws in further rounds that follow the bounds instead of the weights.
-_SHARE_OF_BOUNDS = 0.7
-# Exponent of the bounds of the likelihood, below 1 so that cells with low bounds are drawn, too.
-_POWER = 0.8
-# Range windows are omitted if their bound is below the best window's average by more than this.
-_MARGIN = 12.0
-# Smallest number of range steps per wavelength. Narrow peaks get one per two standard deviations.
-_MIN_STEPS = 8
-# Number of range steps to evaluate at a time.
-_BLOCK = 1 << 20
+
+class Sampling(NamedTuple):
+    """Numbers that trade the speed of the draws for their accuracy."""
+
+    # Draws per round, largest number of rounds, and sufficient effective number of draws. The
+    # inverse of this number is the relative increase of the mean squared error.
+    draws: int = 500
+    rounds: int = 12
+    effective: float = 150.0
+    # Share of the draws in further rounds that follow the bounds instead of the weights.
+    share_of_bounds: float = 0.7
+    # Exponent of the bounds of the likelihood, below 1 so that cells with low bounds are drawn.
+    power: float = 0.8
+    # Range windows are omitted if their bound is below the average of the best window by more.
+    margin: float = 12.0
+    # Smallest number of range steps per wavelength. Narrow peaks get one per two standard
+    # deviations.
+    steps: int = 8
+    # Number of range steps to evaluate at a time.
+    block: int = 1 << 20
+
+
+SAMPLING = Sampling()
+# Smallest thickness of the region [wavelengths]. The likelihood hardly changes over it.
+_MIN_THICKNESS = 0.05
 # The multiples of this pair, modulo 1, cover the unit square evenly. Its numbers are powers of the
 # inverse of the real root of x^3 = x + 1.
 _SEQUENCE = 1.324717957244746**-np.array([1.0, 2.0])
@@ -66,33 +72,49 @@ class _Rays(NamedTuple):
 class DrawnPosterior:
     """The posterior of positions without nuisance parameters, computed from the table alone."""
 
-    def __init__(self, scenario: Scenario, table: TemplateTable) -> None:
-        self._table, resolution = table, Resolution.of(scenario)
-        self._wavelength_m, self._bounds = resolution.wavelength_m, resolution.bounds_m
+    def __init__(self, scenario: Scenario, table: TemplateTable,
+                 sampling: Sampling = SAMPLING) -> None:
+        self._table, self._sampling, resolution = table, sampling, Resolution.of(scenario)
+        self._wavelength_m = resolution.wavelength_m
+        # Rays have a length only in a region with a volume.
+        low, high = resolution.bounds_m
+        lacking_m = np.maximum(_MIN_THICKNESS * self._wavelength_m - (high - low), 0.0)
+        self._bounds = bounds = np.stack([low - lacking_m / 2, high + lacking_m / 2])
         self._wavenumbers = carrier_wavenumbers(scenario)
-        self._log_region = np.log(resolution.volume_m3)
+        self._log_region = float(np.log(bounds[1] - bounds[0]).sum())
         grid, points = table.grid, table.grid.points
-        # Directions of each cell: lowest (u, v) and extent, float64 [C, 2].
-        self._low, high = (np.clip(points[:, 1:] + sign * PHASE_ERROR * resolution.direction,
-                                   *resolution.directions.T) for sign in (-1, 1))
-        self._extent = high - self._low
+        # Directions of each cell that meet the region: lowest (u, v) and extent, float64 [C, 2].
+        half_m = grid.widths_m[grid.cell, None] / 2
+        sines = [bounds[:, None, 1:] / np.maximum(points[:, :1] + sign * half_m, half_m)
+                 for sign in (-1, 1)]
+        widest = np.minimum(*sines)[0], np.maximum(*sines)[1]
+        lowest, highest = (points[:, 1:] + sign * PHASE_ERROR * resolution.direction
+                           for sign in (-1, 1))
+        self._low = np.maximum(lowest, widest[0])
+        self._extent = np.maximum(np.minimum(highest, widest[1]) - self._low, 0.0)
         with np.errstate(divide='ignore'):
             self._log_area = np.log(self._extent).sum(axis=1)
         volume = points[:, 0]**2 * grid.widths_m[grid.cell] / _boresight(points[:, 1:])
         self._log_volume = np.log(volume) + self._log_area
 
-    def of(self, query: Query, phase: int) -> Fit | None:
-        """Compute the posterior of a phase, or None if too few draws are effective."""
-        probability = bounds = self._probabilities(query, phase)
+    def of(self, query: Query, shot: int) -> Fit | None:
+        """Compute the posterior of a shot.
+
+        Returns None if too few draws are effective, or the table limits signals.
+        """
+        if not self._table.filters.is_exact:
+            return None
+        sampling, n_draws = self._sampling, self._sampling.draws
+        probability = bounds = self._probabilities(query, shot)
         cells, log_weights, parts, total_share = np.empty(0, int), np.empty(0), [], 0.0
-        for n_rounds in range(1, _MAX_ROUNDS + 1):
+        for n_rounds in range(1, sampling.rounds + 1):
             share = np.sqrt(n_rounds)
             total_share += share
             drawn = np.searchsorted(
-                np.cumsum(probability), (np.arange(_N_DRAWS) + 0.5) / _N_DRAWS)
-            places = (len(cells) + np.arange(_N_DRAWS))[:, None] * _SEQUENCE
-            rays = self._rays(query, phase, drawn, places % 1)
-            log_scale = np.log(share / (_N_DRAWS * probability[drawn]))
+                np.cumsum(probability), (np.arange(n_draws) + 0.5) / n_draws)
+            places = (len(cells) + np.arange(n_draws))[:, None] * _SEQUENCE
+            rays = self._rays(query, shot, drawn, places % 1)
+            log_scale = np.log(share / (n_draws * probability[drawn]))
             log_weights = np.append(log_weights, rays.log_mass + log_scale[rays.draw])
             parts.append(rays._replace(draw=rays.draw + len(cells)))
             cells, rays = np.append(cells, drawn), concatenate(*parts)
@@ -101,10 +123,11 @@ class DrawnPosterior:
             weights, log_total = mixture_weights(log_weights)
             by_draw = np.bincount(rays.draw, weights, len(cells))
             variance = np.sum(by_draw**2)
-            if variance <= 1 / _N_EFFECTIVE:
+            if variance <= 1 / sampling.effective:
                 break
             found = np.bincount(cells, by_draw, len(bounds))
-            probability = (1 - _SHARE_OF_BOUNDS) * found + _SHARE_OF_BOUNDS * bounds
+            probability = ((1 - sampling.share_of_bounds) * found
+                           + sampling.share_of_bounds * bounds)
         else:
             return None
         places = rays.range_m[:, None] * rays.direction
@@ -112,37 +135,37 @@ class DrawnPosterior:
         along = weights * rays.variance_m2
         covariance += (along[:, None] * rays.direction).T @ rays.direction
         # The log-likelihoods of the rays omit the energy of the signals.
-        energy, best = float(query.energies[phase]), float(rays.highest[weights > 0].max())
+        energy, best = float(query.energies[shot]), float(rays.highest[weights > 0].max())
         return Fit(
-            mean, symmetric(covariance * (1 + variance)),
+            mean, regular(covariance * (1 + variance)),
             float(log_total) - np.log(total_share) - energy - self._log_region,
             energy - best, query.signals[0].size + float(weights @ rays.average) - best, 0.0)
 
-    def _probabilities(self, query: Query, phase: int) -> np.ndarray:
+    def _probabilities(self, query: Query, shot: int) -> np.ndarray:
         """Approximate each cell's share of the posterior, as if carrier phases were random."""
         # The average of exp(2 A cos(phase)) is nearly exp(2 A) / sqrt(1 + 4 pi A).
-        n_bands, bound = len(self._wavenumbers), query.bound[phase]
-        amplitude = (bound + self._table.energy) / (2 * n_bands)
-        value = _POWER * (bound - n_bands / 2 * np.log1p(4 * np.pi * amplitude))
+        n_bands, bound = len(self._wavenumbers), query.bound[shot]
+        amplitude = (bound + self._table.cells.energy) / (2 * n_bands)
+        value = self._sampling.power * (bound - n_bands / 2 * np.log1p(4 * np.pi * amplitude))
         value += self._log_volume
         shares: np.ndarray = np.exp(value - value.max(), dtype=float)
         return shares / shares.sum()
 
-    def _rays(self, query: Query, phase: int, cells: np.ndarray, places: np.ndarray) -> _Rays:
+    def _rays(self, query: Query, shot: int, cells: np.ndarray, places: np.ndarray) -> _Rays:
         """Integrate along K directions, given by cells [K] and positions within them [K, 2]."""
         directions = np.empty((len(cells), 3))
         directions[:, 1:] = self._low[cells] + places * self._extent[cells]
         directions[:, 0] = _boresight(directions[:, 1:])
-        windows = self._table.windows(query, phase, cells, directions[:, 1:])
+        windows = self._table.windows(query, shot, cells, directions[:, 1:])
         amplitude = np.abs(windows.outputs).sum(axis=1)
         bound = 2 * amplitude - windows.energy
         best = int(np.argmax(bound))
-        limit = bound[best] - np.log1p(4 * np.pi * amplitude[best]) / 2 - _MARGIN
+        limit = bound[best] - np.log1p(4 * np.pi * amplitude[best]) / 2 - self._sampling.margin
         windows = select(windows, np.flatnonzero(bound >= limit))
-        per_wavelength = max(_MIN_STEPS, np.pi * np.sqrt(2 * amplitude[best]))
+        per_wavelength = max(self._sampling.steps, np.pi * np.sqrt(2 * amplitude[best]))
         n_steps = int(np.ceil(self._table.window_m / self._wavelength_m * per_wavelength))
         low, high = self._inside(directions)
-        rows, n = windows.pair, max(_BLOCK // n_steps, 1)
+        rows, n = windows.pair, max(self._sampling.block // n_steps, 1)
         parts = [self._integrate(select(windows, slice(k, k + n)), low, high, n_steps)
                  for k in range(0, len(rows), n)]
         log_mass, *moments = (np.concatenate(fields) for fields in zip(*parts, strict=True))
@@ -154,8 +177,8 @@ class DrawnPosterior:
         """Integrate over windows from `low` to `high` [m]; return the last five `_Rays` fields."""
         step_m, range_m = self._table.window_m / n_steps, windows.range_m
         offsets_m = ((np.arange(n_steps) - (n_steps - 1) / 2) * step_m).astype(np.float32)
-        phase = np.exp(1j * self._wavenumbers[:, None] * offsets_m)
-        rotation = (2 * np.concatenate([phase.real, -phase.imag])).astype(np.float32)
+        turns = np.exp(1j * self._wavenumbers[:, None] * offsets_m)
+        rotation = (2 * np.concatenate([turns.real, -turns.imag])).astype(np.float32)
         outputs = windows.outputs
         value = np.hstack([outputs.real, outputs.imag]) @ rotation
         value -= windows.energy[:, None]
@@ -164,8 +187,10 @@ class DrawnPosterior:
         density = np.exp(value)
         nearest = np.maximum(low[windows.pair] - range_m, -windows.width_m / 2)
         farthest = np.minimum(high[windows.pair] - range_m, windows.width_m / 2)
-        density *= offsets_m >= nearest.astype(np.float32)[:, None]
-        density *= offsets_m <= farthest.astype(np.float32)[:, None]
+        # Part of each step that is inside.
+        ends_m = np.stack([nearest, farthest], axis=1)[..., None].astype(np.float32)
+        share = np.clip((ends_m - offsets_m) / np.float32(step_m), -0.5, 0.5)
+        density *= np.maximum(share[:, 1] - share[:, 0], 0)
         moments = (density @ np.stack([np.ones_like(offsets_m), offsets_m, offsets_m**2], axis=1)
                    ).astype(float)
         mass = np.maximum(moments[:, 0], np.finfo(np.float32).tiny)

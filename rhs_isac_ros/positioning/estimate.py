@@ -2,21 +2,26 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Pose, Scenario
+from rhs_isac_ros.model.arrays import numbers, position_problem
+from rhs_isac_ros.model.gaussian import symmetric
 
 # Limit far above any received amplitude [sqrt(W)]. The square of a whitened amplitude is still
 # finite in single precision.
 _MAX_MAGNITUDE = 1e3
-# The fields of an `Estimate` of one phase: mean [3], covariance [3, 3] and reason, optionally
+# Standard deviation that every coordinate of a position has, so that covariances have inverses.
+_MIN_STD_M = 1e-5
+# The fields of an `Estimate` of one shot: mean [3], covariance [3, 3] and reason, optionally
 # followed by the four other fields.
 Located: TypeAlias = (
     tuple[np.ndarray, np.ndarray, str]
     | tuple[np.ndarray, np.ndarray, str, float, float, float, float])
+_EstimateT = TypeVar('_EstimateT', bound='Estimate')
 
 
 class SignalError(ValueError):
@@ -51,9 +56,15 @@ class Estimate:
         """Whether there is a position, bool [] or [N]."""
         return np.isfinite(self.mean).all(axis=-1)
 
+    def to_site(self: _EstimateT, pose: Pose) -> _EstimateT:
+        """Convert from the frame of a surface with the given pose to that of the site."""
+        return dataclasses.replace(
+            self, mean=pose.to_site(self.mean),
+            covariance=pose.covariances_to_site(self.covariance))
+
 
 class Fit(NamedTuple):
-    """The posterior of one phase, for a user who is inside the region and in sight."""
+    """The posterior of one shot, for a user who is inside the region and in sight."""
 
     mean: np.ndarray  # Float64 [3] [m].
     covariance: np.ndarray  # Float64 [3, 3] [m^2].
@@ -73,18 +84,24 @@ class Estimator(Protocol):
 
         The signals are complex128 [N_B, N_SB F], or [N, N_B, N_SB F] for N positions,
         sub-band-major; the estimate has a leading dimension N if the signals have one. An
-        estimate in a batch may differ from the estimate of the same phase alone, but rarely by
+        estimate in a batch may differ from the estimate of the same shot alone, but rarely by
         more than a few hundredths of a standard deviation.
         """
         ...
 
 
+def regular(covariances: np.ndarray) -> np.ndarray:
+    """Return symmetric covariances of positions [..., 3, 3] [m^2] that have an inverse."""
+    # In a region without extent along an axis, the variance along it is 0.
+    return symmetric(covariances) + _MIN_STD_M**2 * np.eye(3)
+
+
 def estimate_each(
         scenario: Scenario, codebook: Codebook, received: np.ndarray,
         locate: Callable[[np.ndarray], Iterable[Located]]) -> Estimate:
-    """Check received signals, locate every phase, and return an estimate of matching shape.
+    """Check received signals, locate every shot, and return an estimate of matching shape.
 
-    `locate` takes checked signals, [N, N_B, N_SB F], and yields a `Located` for each phase. If
+    `locate` takes checked signals, [N, N_B, N_SB F], and yields a `Located` for each shot. If
     the reason is not empty, mean and covariance are ignored. Raises SignalError if the shape is
     wrong, a value is not a finite number, or a magnitude exceeds 1000.
     """
@@ -93,6 +110,9 @@ def estimate_each(
     reasons, residuals = [], np.full((4, len(batch)), np.nan)
     for row, (position, spread, reason, *energy) in enumerate(locate(batch)):
         residuals[:len(energy), row] = energy
+        # A network or a plug-in may return any position.
+        if not reason and (problem := position_problem(position)):
+            reason = f'position: {problem}'
         reasons.append(reason)
         if not reason:
             mean[row], covariance[row] = position, spread
@@ -103,10 +123,7 @@ def estimate_each(
 
 def checked_received(codebook: Codebook, received: np.ndarray) -> np.ndarray:
     """Return received signals as complex128 [N, N_B, N_SB F], or raise `SignalError`."""
-    try:
-        received = np.asarray(received, dtype=complex)
-    except (TypeError, ValueError) as error:
-        raise SignalError(f'received: {error}, expected complex numbers') from None
+    received = numbers('received', received, complex, SignalError, finite=False)
     n_bands, n_subbands, n_frames, _, _ = codebook.shape
     expected = (n_bands, n_subbands * n_frames)
     if received.ndim not in (2, 3) or received.shape[-2:] != expected:

@@ -1,8 +1,9 @@
 """Estimators that search for the modes of the posterior: `bayes` and `ml`."""
 
 import abc
+import functools
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +12,8 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
-from rhs_isac_ros.model.gaussian import share_of_level
+from rhs_isac_ros.model.gaussian import moments, share_of_level
+from rhs_isac_ros.model.geometry import to_positions
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.alternatives import (
     ALTERNATIVES,
@@ -19,14 +21,6 @@ from rhs_isac_ros.positioning.alternatives import (
     Blocked,
     Outside,
     rejection,
-)
-from rhs_isac_ros.positioning.coordinates import (
-    concatenate,
-    jacobian,
-    moments,
-    select,
-    symmetric,
-    to_positions,
 )
 from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.draws import DrawnPosterior
@@ -36,10 +30,11 @@ from rhs_isac_ros.positioning.estimate import (
     Located,
     checked_received,
     estimate_each,
+    regular,
 )
 from rhs_isac_ros.positioning.failures import FailedElements, can_enumerate
-from rhs_isac_ros.positioning.grid import Query, TemplateTable, standard_normal
-from rhs_isac_ros.positioning.lattice import Resolution
+from rhs_isac_ros.positioning.grid import TemplateTable
+from rhs_isac_ros.positioning.lattice import Grid, Resolution, lay_grid
 from rhs_isac_ros.positioning.likelihood import (
     Alignment,
     Conditional,
@@ -47,6 +42,7 @@ from rhs_isac_ros.positioning.likelihood import (
     Likelihood,
     Signals,
 )
+from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.positioning.posterior import (
     BandPhases,
     Posterior,
@@ -54,17 +50,66 @@ from rhs_isac_ros.positioning.posterior import (
     draw_broad_samples,
     draw_samples,
 )
-from rhs_isac_ros.positioning.search import Modes, ascend, find_modes
+from rhs_isac_ros.positioning.prior import (
+    MAX_COMPONENTS,
+    MIN_EXTENT_M,
+    PRIOR_MARGIN,
+    WRONG,
+    bend,
+    cells_of,
+    flatten,
+    inside,
+    is_doubtful,
+    multiply,
+    uniform,
+)
+from rhs_isac_ros.positioning.search import GRID_MARGIN, Modes, ascend, modes_from
+from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.positioning.store import load_table
+from rhs_isac_ros.positioning.templates import N_NORMAL, standard_normal, tabulate
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
-# Number of phases that are located together.
+# Number of shots that are located together.
 _BLOCK = 128
-# Samples per mode if the phases of the bands carry information. The density then has several peaks
-# within a mode, and a few of the samples carry most of the weight.
+# Samples per mode if the phases of the bands carry information, and if modes are narrow. In the
+# first case, the density has several peaks within a mode, and a few of the samples carry most of
+# the weight.
 _N_INFORMATIVE = 512
+_N_NARROW = 64
 # Total probability of the alternatives above which residuals are not compared with the scenario.
 _DOUBT_LIMIT = 0.05
+
+
+class Scope(NamedTuple):
+    """Where modes are searched for, and what depends on the templates there."""
+
+    table: TemplateTable
+    alignment: Alignment
+    failures: FailedElements | None
+    alternatives: Sequence[Alternative]
+    #: Cells in which less likely modes are found, too, bool [C] or [1].
+    favoured: np.ndarray
+    drawn: DrawnPosterior | None = None
+
+    @classmethod
+    def of(cls, likelihood: Likelihood, arrays: Mapping[str, np.ndarray], grid: Grid,
+           enumerates: bool) -> 'Scope':
+        """Take the templates of a grid, which may be part of the region's.
+
+        `enumerates` is whether sets of failed elements are compared.
+        """
+        scenario = likelihood.scenario
+        table = TemplateTable(scenario, arrays, grid=grid)
+        failures = FailedElements(likelihood, table) if enumerates else None
+        alternatives = [Blocked(scenario)] if scenario.blocked_probability else []
+        return cls(table, Alignment(likelihood, table.spread), failures, alternatives,
+                   np.zeros(1, bool))
+
+    @property
+    def margin(self) -> np.ndarray:
+        """Margin of modes in each cell, beyond the usual one."""
+        extra = self.failures.search_margin if self.failures else 0.0
+        return extra + PRIOR_MARGIN * self.favoured
 
 
 class SearchEstimator(abc.ABC):
@@ -77,13 +122,17 @@ class SearchEstimator(abc.ABC):
     Parameters
     ----------
     reject_outside
-        Whether the user may also be outside of the region. The estimate then contains the
-        probability of this; if it exceeds `alternatives.OUTSIDE_LIMIT`, there is no fix. Position
-        and covariance always apply to a user inside.
+        Whether the user may also be outside of the region, with the prior probability
+        `Scenario.outside_probability`. The estimate then contains the probability of this; if it
+        exceeds `alternatives.LIMIT`, there is no fix. Position and covariance always apply to a
+        user inside.
     surface
         Knowledge of the surface, such as a calibration; see `MeasurementModel`.
     progress
         Called with the completed share while a table is computed, from any thread.
+    lazy
+        Whether the table of the region is computed when it is first needed. With a mixture as
+        prior, it rarely is.
     """
 
     averages = True  # Whether positions are averages over the posterior.
@@ -93,43 +142,59 @@ class SearchEstimator(abc.ABC):
             self, scenario: Scenario, codebook: Codebook,
             table_folder: Path | None = None, *, reject_outside: bool = False,
             surface: Surface | None = None,
-            progress: Callable[[float], None] | None = None) -> None:
+            progress: Callable[[float], None] | None = None, lazy: bool = False) -> None:
         self.scenario, self.surface = scenario, surface
         self._likelihood = likelihood = Likelihood(scenario, codebook, surface)
-        arrays = load_table(likelihood.model, codebook.id, table_folder, progress)
-        self._grid = TemplateTable(scenario, arrays)
-        self._alternatives: list[Alternative] = []
-        if reject_outside:
-            self._alternatives.append(Outside(scenario, arrays))
-        if scenario.blocked_probability:
-            self._alternatives.append(Blocked(scenario))
+        self._rejects_outside = reject_outside and bool(scenario.outside_probability)
+        self._load = functools.partial(
+            load_table, likelihood.model, codebook.id, table_folder, progress)
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
         # Median multipath level of users in sight, and the share of a residual's deviation that
         # is due to the level.
         median_db, std_db = scenario.multipath_level_db
-        self._level = 10**(median_db / 10)
+        self._level, self._n_measurements = 10**(median_db / 10), n_measurements
         self._level_share = share_of_level(n_measurements, std_db)
         self._test = FitTest(n_measurements, self._level)
         self._bounds = likelihood.resolution.bounds_m
         self._prior_m2 = float(np.sum((self._bounds[1] - self._bounds[0])**2)) / 12
-        self._alignment = Alignment(likelihood, self._grid.spread)
         self._phases = BandPhases(likelihood)
-        self._failures = (FailedElements(likelihood, self._grid)
-                          if surface is None and can_enumerate(scenario) else None)
-        self._dispersed = None if self._failures else DispersedLikelihood.of(likelihood)
+        self._enumerates = surface is None and can_enumerate(scenario)
+        self._dispersed = None if self._enumerates else DispersedLikelihood.of(likelihood)
         # Twice an energy has two degrees of freedom for each complex measurement, less one for
         # each fitted coordinate or parameter.
         n_fitted = 3 + len(prior)
         self._mean_residual = max(n_measurements - n_fitted / 2, 0.5)
-        # Points that represent a standard Gaussian, float64 [128, 3].
-        self.normal = self._grid.normal
-        self._normal = (standard_normal(_N_INFORMATIVE) if self._phases.is_informative
-                        else self.normal)
         # The likelihood of positions; None if it also depends on other unknowns.
-        self.exact_likelihood = None if (
-            len(prior) or self._failures or self._dispersed) else likelihood
-        self._drawn = (DrawnPosterior(scenario, self._grid)
-                       if self.averages and self.exact_likelihood else None)
+        self._exact_likelihood = None if (
+            len(prior) or self._enumerates or self._dispersed) else likelihood
+        # Points that represent a standard Gaussian, float64 [128, 3].
+        self.normal = standard_normal(N_NORMAL) if lazy else self._region.table.normal
+        self._normal = (
+            standard_normal(_N_INFORMATIVE) if self._phases.is_informative
+            else self.normal if prior.is_coarse else self.normal[:_N_NARROW])
+
+    @functools.cached_property
+    def _region(self) -> Scope:
+        """The whole region."""
+        scenario, arrays = self.scenario, self._load()
+        scope = Scope.of(self._likelihood, arrays, lay_grid(scenario), self._enumerates)
+        if self._rejects_outside:
+            scope = scope._replace(
+                alternatives=[Outside(scenario, arrays), *scope.alternatives])
+        if self.averages and self._exact_likelihood:
+            scope = scope._replace(drawn=DrawnPosterior(scenario, scope.table))
+        return scope
+
+    def _scopes(self, bent: Mixture) -> Iterator[Scope]:
+        """Yield where a prior in (r [m], u, v) is, unless the table is there, and the region."""
+        likelihood, grid = self._likelihood, lay_grid(self.scenario)
+        chosen = cells_of(bent, grid, likelihood.resolution)
+        if '_region' not in vars(self) and chosen.any():
+            part = grid.within(chosen)
+            scope = Scope.of(
+                likelihood, tabulate(likelihood.model, grid=part), part, self._enumerates)
+            yield scope._replace(favoured=np.ones(1, bool))
+        yield self._region._replace(favoured=chosen)
 
     @one_blas_thread
     def estimate(self, received: np.ndarray) -> Estimate:
@@ -137,111 +202,169 @@ class SearchEstimator(abc.ABC):
         return estimate_each(self.scenario, self._likelihood.codebook, received, self._locate)
 
     @one_blas_thread
-    def posterior(self, received: np.ndarray) -> Posterior:
-        """Compute the posterior for the signals of one phase, complex128 [N_B, N_SB F]."""
+    def posterior(self, received: np.ndarray, prior: Mixture | None = None, *,
+                  wrong: float = WRONG, share: float = 1.0) -> Posterior:
+        """Compute the posterior for the signals of one shot, complex128 [N_B, N_SB F].
+
+        The probabilities of users outside or blocked, and the reason why there is no position, are
+        those without the prior. Users outside are considered once the region is searched. Raises
+        `SignalError` if the signals are unusable.
+
+        Parameters
+        ----------
+        prior
+            Mixture in the frame of the site; by default, a uniform density on the region. If the
+            table of the region does not exist yet, only the cells where the prior is are searched
+            at first, and the region if the prior does not explain the signals.
+        wrong
+            Probability that the prior does not hold, and the user is anywhere in the region.
+        share
+            Exponent of the likelihood with a mixture as prior; see `independent_share`.
+        """
         batch = checked_received(self._likelihood.codebook, received)
         signals = self._likelihood.signals(batch)
-        ((located, modes),) = self._locate_block(signals, draws=False)
-        return Posterior(Estimate(*located), modes, signals)
+        if prior is None:
+            ((located, modes),) = self._locate_block(self._region, signals, draws=False)
+            found = uniform(modes, self._bounds).normalised() if modes else None
+        else:
+            located, modes, found = self._update(signals, prior, wrong, share)
+        return Posterior(Estimate(*located), modes, signals,
+                         found and flatten(found, self.scenario.pose))
+
+    def _update(self, signals: Signals, prior: Mixture, wrong: float, share: float
+                ) -> tuple[Located, Modes | None, Mixture | None]:
+        """Return position, modes of the likelihood, and the mixture in (r [m], u, v)."""
+        pose, extent = self.scenario.pose, self._bounds[1] - self._bounds[0]
+        region = (pose.to_site(self._bounds.mean(axis=0)), pose.covariances_to_site(
+            np.diag(np.maximum(extent, MIN_EXTENT_M)**2)))
+        # The component for the whole region comes last.
+        before = bend(prior.or_within(*region, wrong), pose)
+        for scope in self._scopes(select(before, slice(-1))):
+            ((located, modes),) = self._locate_block(scope, signals, draws=False)
+            if modes is None:
+                continue
+            products = multiply(
+                before, modes, share, self._exact_likelihood, signals, self._bounds)
+            if not is_doubtful(products.energy / self._level, self._n_measurements):
+                break
+        if modes is None:
+            return located, None, None
+        found, estimate = products.bent, Estimate(*located)
+        blocked, outside = np.nan_to_num(
+            [float(estimate.blocked_probability), float(estimate.outside_probability)])
+        if blocked:
+            # Signals without a direct path contain no information. The odds are relative to a user
+            # anywhere in the region.
+            odds = share * np.log(blocked / max(1 - blocked - outside, 1e-12))
+            everywhere = uniform(modes, self._bounds, share).log_mass
+            found = concatenate(found, before.weighted(everywhere + odds))
+        found, mean, covariance = inside(
+            found.reduce(MAX_COMPONENTS), self._bounds, self.normal[:_N_NARROW])
+        return (mean, covariance, *located[2:]), modes, found
 
     @abc.abstractmethod
     def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions, [N, 3], and covariances, [N, 3, 3], of N phases."""
+        """Return positions, [N, 3], and covariances, [N, 3, 3], of N shots."""
 
     def _locate(self, batch: np.ndarray) -> Iterable[Located]:
         signals = self._likelihood.signals(batch)
         parts = map_blocks(
-            lambda block: self._locate_block(select(signals, block), draws=True),
+            lambda block: self._locate_block(self._region, select(signals, block), draws=True),
             blocks(len(batch), _BLOCK))
         return (located for located, _ in itertools.chain.from_iterable(parts))
 
-    def _locate_block(self, signals: Signals, draws: bool
+    def _locate_block(self, scope: Scope, signals: Signals, draws: bool
                       ) -> list[tuple[Located, Modes | None]]:
-        """Locate phases together; with `draws`, draw positions if there are too many modes."""
+        """Locate shots together; with `draws`, draw positions if the search is too long."""
         energies = np.sum(np.abs(signals.received)**2, axis=(1, 2)) / self.scenario.noise_power_w
         reasons = [self._test.min_energy_test(energy) for energy in energies.tolist()]
-        results: list[tuple[Located, Modes | None]] = [
-            ((*_no_fix(), reason), None) for reason in reasons]
         (usable,) = np.nonzero([not reason for reason in reasons])
-        if len(usable):
-            signals = select(signals, usable)
-            aligned = self._alignment.values_of_each(signals.received)
-            fits = self._search(signals, aligned, draws)
-            for row, (fit, modes), *phase in zip(usable.tolist(), fits, self._likelihood.whitened(
-                    aligned, signals), aligned, strict=True):
-                located = self._judge(fit, *phase)
-                results[row] = located, None if located[2] else modes
-        return results
+        found = self._locate_usable(scope, select(signals, usable), draws)
+        return [((*_no_fix(), reason), None) if reason else next(found) for reason in reasons]
 
-    def _search(self, signals: Signals, aligned: np.ndarray, draws: bool
-                ) -> list[tuple[Fit, Modes | None]]:
-        """Find the posterior and modes of each phase; the modes are None after draws."""
-        likelihood, fits = self._likelihood, dict[int, tuple[Fit, Modes | None]]()
-        extra = self._failures.search_margin if self._failures else 0.0
+    def _locate_usable(self, scope: Scope, signals: Signals, draws: bool
+                       ) -> Iterator[tuple[Located, Modes | None]]:
+        """Yield the position and the modes of each shot; modes are None without a position."""
+        aligned = scope.alignment.values_of_each(signals.received)
+        whitened = self._likelihood.whitened(aligned, signals)
+        for (fit, modes), *shot in zip(
+                self._fits(scope, signals, aligned, whitened, draws), whitened, aligned,
+                strict=True):
+            located = self._judge(scope.alternatives, fit, *shot)
+            yield located, None if located[2] else modes
 
-        def draw(query: Query, row: int) -> bool:
-            found = self._drawn.of(query, row) if self._drawn else None
-            if found is not None:
-                fits[query.first + row] = found, None
-            return found is not None
+    def _fits(self, scope: Scope, signals: Signals, aligned: np.ndarray, whitened: np.ndarray,
+              draws: bool) -> list[tuple[Fit, Modes | None]]:
+        """Find the posterior and the modes of each shot; the modes are None after draws."""
+        starts, drawn = scope.table.search(
+            whitened, self._likelihood.nuisance, GRID_MARGIN + scope.margin,
+            scope.drawn.of if scope.drawn and draws else None)
+        fits: dict[int, tuple[Fit, Modes | None]] = {
+            shot: (fit, None) for shot, fit in drawn.items()}
+        if len(starts.shots):
+            modes = modes_from(
+                starts, self._likelihood, signals, aligned, float(scope.margin.max()))
+            fits.update(self._fits_of(scope, modes, signals))
+        return [fits[shot] for shot in range(len(aligned))]
 
-        modes = find_modes(
-            likelihood, self._grid, signals, aligned, extra, draw if draws else None)
-        if modes:
-            rows = [phase for phase in range(len(aligned)) if phase not in fits]
-            fits.update(zip(rows, self._fit(modes, signals, rows), strict=True))
-        return [fits[phase] for phase in range(len(aligned))]
-
-    def _fit(self, modes: Modes, signals: Signals, rows: list[int]
-             ) -> Iterator[tuple[Fit, Modes]]:
-        """Yield posterior and modes of each phase in `rows`, in ascending order."""
+    def _fits_of(self, scope: Scope, modes: Modes, signals: Signals
+                 ) -> Iterator[tuple[int, tuple[Fit, Modes]]]:
+        """Yield each shot that has modes, with its posterior and its refined modes."""
         likelihood = self._likelihood
-        conditionals: dict[int, Sequence[Conditional]] = dict.fromkeys(
-            rows, [self._dispersed or likelihood])
-        if self._dispersed:
-            modes = ascend(self._dispersed, likelihood, modes.starts(), signals, 1, np.inf)
-        if self._failures:
-            parts = []
-            for phase in rows:
-                one, conditionals[phase] = self._failures.refine(
-                    modes.of_phase(phase), select(signals, [phase]))
-                # Each part counts its phases from 0.
-                parts.append(one._replace(phases=np.full(len(one.phases), phase)))
-            modes = concatenate(*parts)
+        modes, conditionals = self._refined(scope.failures, modes, signals)
         if likelihood.nuisance.is_coarse:
             drawn = concatenate(*(
-                draw_broad_samples(likelihood, conditionals[phase], self._phases,
-                                   select(signals, [phase]), modes.of_phase(phase), self._normal)
-                for phase in rows))
+                draw_broad_samples(likelihood, of_shot, self._phases, select(signals, [shot]),
+                                   modes.of_shot(shot), self._normal)
+                for shot, of_shot in conditionals.items()))
         else:
             drawn = draw_samples(modes, self._normal, self._bounds)
         samples = WeightedSamples.of(drawn, modes)
         means, covariances = self._moments(modes, samples)
-        log_evidence = samples.log_evidence(likelihood.resolution.volume_m3)
         # If the model holds, twice the residual energy, averaged over the posterior, has the mean
         # of a chi-square variable. At the best of several modes, it is smaller than the average.
         expected = self._mean_residual - samples.average(modes.residual)
-        # The best mode of each phase comes first.
-        for row, (phase, best) in enumerate(zip(rows, samples.starts.tolist(), strict=True)):
-            residual = float(modes.residual[best])
-            fit = Fit(means[row], covariances[row], float(log_evidence[row]), residual,
-                      expected[row] + residual, modes.values[best] @ likelihood.nuisance.gain)
-            yield fit, modes.of_phase(phase)
+        # The best mode of each shot comes first.
+        residuals = samples.of_shot.first(modes.residual)
+        gains = samples.of_shot.first(modes.values) @ likelihood.nuisance.gain
+        for shot, *fit in zip(
+                conditionals, means, covariances, samples.log_evidence.tolist(),
+                residuals.tolist(), (expected + residuals).tolist(), gains.tolist(), strict=True):
+            yield shot, (Fit(*fit), modes.of_shot(shot))
 
-    def _judge(self, fit: Fit, whitened: np.ndarray, aligned: np.ndarray) -> Located:
-        """Return the position of one phase, or the reason why there is none."""
+    def _refined(self, failures: FailedElements | None, modes: Modes, signals: Signals
+                 ) -> tuple[Modes, dict[int, Sequence[Conditional]]]:
+        """Return modes with regard to errors of elements, and the likelihoods for each shot."""
+        shots = np.unique(modes.shots).tolist()
+        if failures:
+            conditionals: dict[int, Sequence[Conditional]] = {}
+            parts = []
+            for shot in shots:
+                part, conditionals[shot] = failures.refine(
+                    modes.of_shot(shot), select(signals, [shot]))
+                # Each part counts its shots from 0.
+                parts.append(part._replace(shots=np.full(len(part.shots), shot)))
+            return concatenate(*parts), conditionals
+        if self._dispersed:
+            modes = ascend(self._dispersed, self._likelihood, modes.starts(), signals, 1, np.inf)
+        return modes, dict.fromkeys(shots, [self._dispersed or self._likelihood])
+
+    def _judge(self, alternatives: Sequence[Alternative], fit: Fit, whitened: np.ndarray,
+               aligned: np.ndarray) -> Located:
+        """Return the position of one shot, or the reason why there is none."""
         log_weights = np.array([fit.log_evidence, *(
             one.log_odds + one.log_evidence_of(
                 whitened, aligned, fit.residual, self._likelihood.nuisance)
-            for one in self._alternatives)])
+            for one in alternatives)])
         probabilities, _ = mixture_weights(log_weights)
-        reason = self._reason(whitened * np.exp(-fit.gain), fit.residual, log_weights)
+        reason = self._reason(
+            alternatives, whitened * np.exp(-fit.gain), fit.residual, probabilities)
         mean, covariance = _no_fix() if reason else (fit.mean, self._covariance(fit))
         # Without a fix, only a residual that nothing explains is evidence against the scenario.
         counts = (reason == self._test.residual_test(fit.residual) if reason
                   else probabilities[0] >= 1 - _DOUBT_LIMIT)
         by_name = {one.name: float(share) for one, share in zip(
-            self._alternatives, probabilities[1:], strict=True)}
+            alternatives, probabilities[1:], strict=True)}
         outside, blocked = (by_name.get(kind.name, np.nan) for kind in ALTERNATIVES)
         expected = fit.expected if counts else np.nan
         return mean, covariance, reason, fit.residual, expected, outside, blocked
@@ -253,16 +376,17 @@ class SearchEstimator(abc.ABC):
         largest = max(self._prior_m2 / float(fit.covariance.trace()), 1.0)
         return min(relative**self._level_share, largest) * fit.covariance
 
-    def _reason(self, whitened: np.ndarray, residual: float, log_weights: np.ndarray) -> str:
+    def _reason(self, alternatives: Sequence[Alternative], whitened: np.ndarray, residual: float,
+                probabilities: np.ndarray) -> str:
         """Return the reason why there is no fix, or '' if there is one."""
         # If no position in the region explains the signals, an alternative is the reason only if
         # it explains them.
         unexplained = self._test.residual_test(residual) or self._test.weak_test(
             float(np.sum(np.abs(whitened)**2)), residual)
-        for index in np.argsort(-log_weights[1:]).tolist():
-            one = self._alternatives[index]
-            (_, share), _ = mixture_weights(log_weights[[0, 1 + index]])
-            reason = rejection(one, float(share))
+        inside, *others = probabilities.tolist()
+        for probability, one in sorted(
+                zip(others, alternatives, strict=True), key=lambda pair: -pair[0]):
+            reason = rejection(one, probability, inside)
             if reason and (not unexplained or one.explain(whitened, self._test.max_residual)):
                 return reason
         return unexplained
@@ -275,28 +399,19 @@ class BayesEstimator(SearchEstimator):
 
     def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
         mean, covariance = samples.moments()
-        # The mean of few samples is itself uncertain; its covariance never exceeds the prior's.
-        prior = np.diag((self._bounds[1] - self._bounds[0])**2 / 12)
-        within = samples.average(np.matmul(samples.spread, np.swapaxes(samples.spread, 1, 2)))
-        within = within @ np.linalg.solve(within + prior, np.broadcast_to(prior, within.shape))
-        share = samples.sums(np.einsum('ms,ms->m', samples.weights, samples.weights))
-        covariance += within * share[:, None, None]
-        return mean, symmetric(covariance)
+        return mean, regular(covariance)
 
 
 class MlEstimator(SearchEstimator):
-    """The most likely position in the region; the covariance is the inverse of the curvature."""
+    """The most likely position in the region, and its squared deviation from the posterior."""
 
     name, averages = 'ml', False
 
     def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
-        best = select(modes, samples.starts)
-        points = best.roi_points
-        by_point = jacobian(points)
-        covariance = np.matmul(
-            by_point, np.linalg.solve(best.curvature, np.swapaxes(by_point, 1, 2)))
-        positions = np.clip(to_positions(points), *self._bounds)
-        return positions, symmetric(covariance)
+        mean, covariance = samples.moments()
+        best = to_positions(samples.of_shot.first(modes.points))
+        offsets = best - mean
+        return best, regular(covariance + offsets[:, :, None] * offsets[:, None])
 
 
 class WeightedModes(NamedTuple):
@@ -309,7 +424,7 @@ class WeightedModes(NamedTuple):
 
 @one_blas_thread
 def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> WeightedModes | None:
-    """Compute the mixture of modes for signals of one phase, [N_B, N_SB F] or [N_B, N_SB, F].
+    """Compute the mixture of modes for signals of one shot, [N_B, N_SB F] or [N_B, N_SB, F].
 
     The mixture has the mean and covariance that `BayesEstimator` estimates, up to sampling errors,
     unless the latter averages over draws, bands have unknown phases, or multipath levels vary.
@@ -319,7 +434,7 @@ def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> Weighted
     if modes is None:
         return None
     samples = WeightedSamples.of(draw_samples(
-        modes, estimator.normal, Resolution.of(estimator.scenario).bounds_m), modes)
+        modes, estimator._normal, Resolution.of(estimator.scenario).bounds_m), modes)
     shares = samples.weights.sum(axis=1)
     order = np.argsort(-shares)[:np.count_nonzero(shares)]
     weights = samples.weights[order] / shares[order, None]

@@ -21,15 +21,17 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
-from rhs_isac_ros.model.gaussian import energy_limit
+from rhs_isac_ros.model.gaussian import covariance_root, energy_limit
+from rhs_isac_ros.model.geometry import jacobian, to_positions
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import onboard_matrix
-from rhs_isac_ros.positioning.coordinates import concatenate, jacobian, select, to_positions
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.likelihood import (
+    Columns,
     Likelihood,
     Local,
     NuisancePrior,
@@ -39,36 +41,49 @@ from rhs_isac_ros.positioning.likelihood import (
     whiten_each,
 )
 from rhs_isac_ros.positioning.search import Modes, ascend, predict
+from rhs_isac_ros.positioning.segments import concatenate, select
 
 # Largest expected number of failures for which sets are searched.
 _MAX_EXPECTED = 2.0
-# Probability that the residual of an intact surface exceeds `usual_residual`, and number of modes
-# from which the search for sets starts if the observed residual does not exceed this limit.
-_UNUSUAL = 0.01
-_N_USUAL = 2
-# If it does: largest number of grid points besides the modes, their margin, and number of sites.
-_MAX_POINTS = 64
-_POINT_MARGIN = 30.0
-_N_SITES = 64
-# Factor of the share of further failures while sets are ranked; number of hypotheses to extend.
-_REMAINDER = 0.3
-_N_EXTENDED = 16
-# Number of sets to try at all sites.
-_N_SETS = 4
-# Hypotheses are dropped if their log-probability is below the best by more than these margins,
-# before and during the exact steps. Largest number of them to keep, and number of exact steps.
-_MARGIN = 9.0
-_FIRST_MARGIN = 27.0
-_MAX_HYPOTHESES = 48
-_N_STEPS = 2
-# Largest numbers of hypotheses to extend per set and per site, and to weigh exactly.
-_MAX_PER_SET = 3
-_MAX_PER_SITE = 4
-_N_EXACT = 16
-# Largest number of elements by which a set grows.
-_MAX_GROWTH = 6
 # Number of sets whose covariance is kept.
 _MAX_SURFACES = 256
+
+
+class FailureLimits(NamedTuple):
+    """Numbers that trade the speed of the search for sets for the completeness of its result."""
+
+    # Probability that the residual of an intact surface exceeds the usual residual, and number of
+    # modes from which sets grow if the observed residual does not exceed it.
+    unusual: float = 0.01
+    usual_modes: int = 2
+    # If it does: largest number of grid points besides the modes, their margin, and number of
+    # sites.
+    points: int = 64
+    point_margin: float = 30.0
+    sites: int = 64
+    # Factor of the share of further failures while sets are ranked.
+    remainder: float = 0.3
+    # Number of hypotheses to extend, in all, of the same set, and of the same site.
+    extended: int = 16
+    per_set: int = 3
+    per_site: int = 4
+    # Number of extended hypotheses to weigh exactly.
+    exact: int = 16
+    # Largest number of elements by which a set grows.
+    growth: int = 6
+    # Number of sets to try at all sites.
+    tried_everywhere: int = 4
+    # Hypotheses are dropped if their log-probability is below the best by more than these margins,
+    # before and during the exact steps.
+    margin: float = 9.0
+    first_margin: float = 27.0
+    # Largest number of hypotheses to keep.
+    hypotheses: int = 48
+    # Number of exact steps.
+    steps: int = 2
+
+
+LIMITS = FailureLimits()
 
 # A set of failed elements in ascending order, and a hypothesis: a set with the index of a site.
 Failed: TypeAlias = tuple[int, ...]
@@ -83,7 +98,7 @@ def can_enumerate(scenario: Scenario) -> bool:
 class FailedElements:
     """Refinement of modes if a few elements of the surface may have failed."""
 
-    # Extra margin of the search for modes, which averages over sets and thus misjudges each set.
+    # Extra margin, because the search for modes averages over sets and so misjudges each of them.
     search_margin = 10.0
 
     def __init__(self, likelihood: Likelihood, grid: TemplateTable) -> None:
@@ -92,47 +107,47 @@ class FailedElements:
 
     def _search(self, modes: Modes, signals: Signals) -> 'FailureSearch':
         """Search for probable sets of failed elements at the modes and, if needed, elsewhere."""
-        order = np.argsort(-modes.roi_log_likelihood)
+        order = np.argsort(-modes.log_likelihood)
         search = FailureSearch(self._model, signals)
-        keys = search.add(modes.roi_points[order], modes.values[order])
+        keys = search.add(modes.points[order], modes.values[order])
         if search.explains(keys):
-            search.grow(keys[:_N_USUAL])
+            search.grow(keys[:LIMITS.usual_modes])
         else:
             # The search on the grid needs the parameters that move the multipath.
             aligned = modes.values[order[0]] * self._likelihood.nuisance.moves_multipath
             found = self._grid.starts(
                 self._likelihood.whitened(aligned, signals), self._likelihood.nuisance,
-                _POINT_MARGIN)
-            search.add(found.points[:_MAX_POINTS], found.values[:_MAX_POINTS] + aligned)
+                LIMITS.point_margin)
+            search.add(found.points[:LIMITS.points], found.values[:LIMITS.points] + aligned)
             chosen = first_sites(
                 np.stack([site.point for site in search.sites]),
                 self._likelihood.resolution.separation(self._likelihood.nuisance.is_coarse))
-            search.grow([((), index) for index in chosen], _REMAINDER)
+            search.grow([((), index) for index in chosen], LIMITS.remainder)
         search.try_neighbours(search.best)
         return search
 
     def refine(self, modes: Modes, signals: Signals) -> tuple[Modes, list['FailedSet']]:
-        """Return modes of one phase for all probable sets, and the likelihoods of the sets.
+        """Return modes of one shot for all probable sets, and the likelihoods of the sets.
 
-        Takes the modes found without regard to sets, and the signals of the phase, N = 1.
+        Takes the modes found without regard to sets, and the signals of the shot, N = 1.
         """
         search = self._search(modes, signals)
         values, best = search.values, max(search.values.values())
-        keys = sorted((key for key in values if values[key] >= best - _MARGIN),
-                      key=lambda key: -values[key])[:_MAX_HYPOTHESES]
+        keys = sorted((key for key in values if values[key] >= best - LIMITS.margin),
+                      key=lambda key: -values[key])[:LIMITS.hypotheses]
         sets = list(dict.fromkeys(failed for failed, _ in keys))
         conditionals = [self._model.failed_set(failed) for failed in sets]
         parts = []
         for number, failed in enumerate(sets):
             # The most probable sets are tried at the other sites, too.
-            sites = search.sites if number < _N_SETS else [
+            sites = search.sites if number < LIMITS.tried_everywhere else [
                 search.sites[index] for one, index in keys if one == failed]
             starts = Starts(np.zeros(len(sites), int), np.stack([one.point for one in sites]),
                             np.stack([one.values for one in sites]))
-            parts.append(ascend(conditionals[number], self._likelihood, starts, signals, _N_STEPS,
-                                _FIRST_MARGIN, number))
+            parts.append(ascend(conditionals[number], self._likelihood, starts, signals,
+                                LIMITS.steps, LIMITS.first_margin, number))
         modes = concatenate(*parts)
-        order = np.argsort(-modes.roi_log_likelihood)[:_MAX_HYPOTHESES]
+        order = np.argsort(-modes.log_likelihood)[:LIMITS.hypotheses]
         return select(modes, order), conditionals
 
 
@@ -148,8 +163,8 @@ def first_sites(points: np.ndarray, radii: np.ndarray) -> list[int]:
     for index, cell in enumerate(map(tuple, np.floor(points[:, 1:] / radii[1:]).tolist())):
         turns[index] = seen[cell]
         seen[cell] += 1
-    turns[:_N_SITES // 2] = -1
-    return np.argsort(turns, kind='stable')[:_N_SITES].tolist()
+    turns[:LIMITS.sites // 2] = -1
+    return np.argsort(turns, kind='stable')[:LIMITS.sites].tolist()
 
 
 class Surface(NamedTuple):
@@ -158,6 +173,46 @@ class Surface(NamedTuple):
     scattered: np.ndarray  # Radiation times multipath covariance, complex128 [N_B, N_SB F, N_E].
     # Covariance of the signals, given the amplitudes in the direct path, [N_B, N_SB F, N_SB F].
     covariance: np.ndarray
+
+
+class FailureEffects(NamedTuple):
+    """Changes of the signals due to the failure of each element."""
+
+    # Change of the weight of the element's direct path, and change per standard deviation of its
+    # amplitude, complex128 [N_E, N_B, N_SB F].
+    shift: np.ndarray
+    amplitude: np.ndarray
+    spatial: np.ndarray  # Covariance of the multipath at the elements, [N_B, N_E, N_E].
+    correlation: np.ndarray  # Correlation between measurements, [N_B, N_SB F, N_SB F].
+
+    @classmethod
+    def of(cls, scenario: Scenario, codebook: Codebook) -> 'FailureEffects':
+        """Compute the effects on the signals of a codebook."""
+        weights = np.matmul(codebook.digital, onboard_matrix(scenario))
+        n_bands, n_subbands, n_frames, n_elements = weights.shape
+        shape = n_bands, n_subbands * n_frames, n_elements
+        shift, amplitude = (
+            np.ascontiguousarray(np.moveaxis(one.reshape(shape), 2, 0))
+            for one in ((0.5 - codebook.analog[:, None]) * weights, weights / np.sqrt(12)))
+        return cls(shift, amplitude, multipath_covariance(scenario),
+                   measurement_correlation(scenario))
+
+    def with_failure(self, surface: Surface, element: int) -> Surface:
+        """Return a surface with one more failed element."""
+        scattered = surface.scattered + (
+            self.shift[element, ..., None] * self.spatial[:, None, element])
+        growth = self.growth(surface, slice(element, element + 1))[0]
+        return Surface(scattered, surface.covariance + growth)
+
+    def growth(self, surface: Surface, elements: slice = slice(None)) -> np.ndarray:
+        """Return how each failure changes a surface's covariance, [N_E, N_B, N_SB F, N_SB F]."""
+        shift, spread = self.shift[elements], self.amplitude[elements]
+        power = np.diagonal(self.spatial, axis1=1, axis2=2).real.T[elements, :, None]
+        cross = np.moveaxis(surface.scattered[..., elements], 2, 0) + power / 2 * shift
+        # A product of two vectors plus its conjugate transpose, and a product of the amplitudes.
+        left = np.stack([shift, cross, power * spread], axis=-1)
+        right = np.stack([cross, shift, spread], axis=-1)
+        return self.correlation * np.matmul(left, np.conj(np.swapaxes(right, 2, 3)))
 
 
 class Whitening(NamedTuple):
@@ -171,15 +226,54 @@ class Whitening(NamedTuple):
     def of(cls, covariance: np.ndarray, prior: NuisancePrior, parent: 'Whitening | None' = None
            ) -> 'Whitening':
         """Factorise covariances [N_B, H, N_SB F, N_SB F]; a parent provides the information."""
-        roots = np.linalg.cholesky(covariance)
+        roots = covariance_root(prior.scenario, covariance)
         whitener = np.linalg.inv(roots)
         return cls(whitener, log_determinant(roots).sum(axis=0), parent.information if parent
                    else prior.information_of(roots[:, 0], whitener[:, 0]))
 
 
+class FailedSurfaces:
+    """Covariances of the signals for sets of failed elements, computed once for each set.
+
+    `surface` and `whitening` are functions of a set. `error` is the covariance of the errors that
+    all failures together cause on average, [N_B, N_SB F, N_SB F].
+    """
+
+    def __init__(self, effects: FailureEffects, intact: Surface, error: np.ndarray,
+                 prior: NuisancePrior) -> None:
+        self._effects, self._intact, self._error, self._prior = effects, intact, error, prior
+        self._extensions: dict[tuple[Failed, float], Whitening] = {}
+        # The same set is often probable in successive shots.
+        cache = functools.lru_cache(maxsize=_MAX_SURFACES)
+        self.surface = cache(self._surface)
+        self.whitening = cache(lambda failed: Whitening.of(
+            self.surface(failed).covariance[:, None], prior))
+
+    def _surface(self, failed: Failed) -> Surface:
+        if not failed:
+            return self._intact
+        return self._effects.with_failure(self.surface(failed[:-1]), failed[-1])
+
+    def extensions(self, failed: Failed, remainder: float) -> Whitening:
+        """Return the factors for a set with each element added in turn.
+
+        `remainder` times `error` is added to their covariances.
+        """
+        if (failed, remainder) not in self._extensions:
+            surface = self.surface(failed)
+            covariance = surface.covariance[:, None] + np.swapaxes(
+                self._effects.growth(surface), 0, 1)
+            covariance += remainder * self._error[:, None]
+            # Only extensions of the intact surface serve all shots; each takes a few megabytes.
+            self._extensions = {key: kept for key, kept in self._extensions.items() if not key[0]}
+            self._extensions[failed, remainder] = Whitening.of(
+                covariance, self._prior, self.whitening(failed))
+        return self._extensions[failed, remainder]
+
+
 @dataclasses.dataclass(eq=False)
 class Site:
-    """A point at which the signals of a phase are evaluated."""
+    """A point at which the signals of a shot are evaluated."""
 
     model: 'FailureModel'
     point: np.ndarray  # (r [m], u, v), float64 [3].
@@ -213,14 +307,14 @@ class FailedSet:
 
     def __init__(self, model: 'FailureModel', failed: Failed) -> None:
         self._model, self._failed = model, list(failed)
-        self._covariance = model.surface(failed).covariance
-        self._whitening = model.whitening(failed)
+        self._covariance = model.surfaces.surface(failed).covariance
+        self._whitening = model.surfaces.whitening(failed)
         stuck = np.full(model.scenario.n_elements, np.nan)
         stuck[self._failed] = 0.5
         self._mean_model = MeasurementModel(
             model.scenario, model.likelihood.codebook, ElementErrors(np.ones(len(stuck)), stuck))
         self._offset = model.log_prior(failed) + model.likelihood.log_volume
-        self._amplitudes = model.amplitudes[self._failed]
+        self._amplitudes = model.effects.amplitude[self._failed]
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate the log-likelihood at points; see `Conditional.local`."""
@@ -237,10 +331,11 @@ class FailedSet:
                 'irs,mcis->mcir', self._whitening.whitener[:, 0], columns, optimize=True)
             white, log_volume = white.reshape(*columns.shape[:2], -1), self._whitening.log_volume
         else:
-            roots = np.linalg.cholesky(self._covariance + self._model.excess_at(positions))
+            roots = covariance_root(
+                scenario, self._covariance + self._model.excess_at(positions))
             white, log_volume = whiten_each(roots, columns)
-        local = assemble(
-            prior, values, white, self._whitening.information, len(self._failed))
+        local = assemble(prior, values, Columns.of(white, len(prior), len(self._failed)),
+                         self._whitening.information)
         return local._replace(value=local.value + self._offset - log_volume)
 
 
@@ -250,54 +345,33 @@ class FailureModel:
     def __init__(self, likelihood: Likelihood) -> None:
         scenario, codebook = likelihood.scenario, likelihood.codebook
         self.likelihood, self.scenario = likelihood, scenario
-        self.usual_residual = energy_limit(int(np.prod(likelihood.model.shape)), _UNUSUAL)
+        self.usual_residual = energy_limit(int(np.prod(likelihood.model.shape)), LIMITS.unusual)
         intact = dataclasses.replace(scenario, failed_element_share=0.0)
-        self._model = MeasurementModel(intact, codebook).prepare()
-        # Weights of the elements' direct paths, [N_E, N_B, N_SB F]: change due to a failure, and
-        # change per standard deviation of a failed element's amplitude.
-        weights = np.matmul(codebook.digital, onboard_matrix(scenario))
-        self._shift, self.amplitudes = (
-            np.ascontiguousarray(np.moveaxis(one.reshape(self._model.radiation.shape), 2, 0))
-            for one in ((0.5 - codebook.analog[:, None]) * weights, weights / np.sqrt(12)))
-        self._spatial = multipath_covariance(scenario)
-        self._correlation = measurement_correlation(scenario)
-        self._intact = Surface(np.matmul(self._model.radiation, self._spatial),
-                               self._model.covariance())
+        self._intact = model = MeasurementModel(intact, codebook).prepare()
+        self.is_exact = model.elements.is_exact
+        self.effects = effects = FailureEffects.of(scenario, codebook)
         failing = dataclasses.replace(scenario, element_error_rms=0.0)
-        self._error = DeclaredElements(failing).error_covariance(failing, codebook)
-        self._extensions: dict[tuple[Failed, float], Whitening] = {}
+        self.surfaces = FailedSurfaces(
+            effects, Surface(np.matmul(model.radiation, effects.spatial), model.covariance()),
+            DeclaredElements(failing).error_covariance(failing, codebook), likelihood.nuisance)
         share = scenario.failed_element_share
         self._log_odds = float(np.log(share / (1 - share)))
-        self._log_intact = scenario.n_elements * float(np.log1p(-share))
-        self.is_exact = self._model.elements.is_exact
-        # The same set is often probable in successive phases.
-        cache = functools.lru_cache(maxsize=_MAX_SURFACES)
-        self.surface = cache(self._surface)
-        self.whitening = cache(lambda failed: Whitening.of(
-            self.surface(failed).covariance[:, None], likelihood.nuisance))
-        self.failed_set = cache(lambda failed: FailedSet(self, failed))
+        self.failed_set = functools.lru_cache(maxsize=_MAX_SURFACES)(
+            lambda failed: FailedSet(self, failed))
 
     def log_prior(self, failed: Failed) -> float:
         """Return the logarithm of the probability of a set of failed elements."""
-        return len(failed) * self._log_odds + self._log_intact
+        intact = self.scenario.n_elements * float(np.log1p(-self.scenario.failed_element_share))
+        return len(failed) * self._log_odds + intact
 
     def excess_at(self, positions: np.ndarray) -> np.ndarray:
         """Return the covariance of element errors at positions, less its average."""
-        return self._model.covariance_at(positions) - self._intact.covariance
-
-    def _surface(self, failed: Failed) -> Surface:
-        if not failed:
-            return self._intact
-        smaller, element = self.surface(failed[:-1]), failed[-1]
-        shift = self._shift[element]
-        scattered = smaller.scattered + shift[..., None] * self._spatial[:, None, element]
-        growth = self._growth(smaller, slice(element, element + 1))[0]
-        return Surface(scattered, smaller.covariance + growth)
+        return self._intact.covariance_at(positions) - self.surfaces.surface(()).covariance
 
     def sites(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> list[Site]:
-        """Return sites at points [P, 3] with parameters [P, Q], for the signals of one phase."""
+        """Return sites at points [P, 3] with parameters [P, Q], for the signals of one shot."""
         prior = self.likelihood.nuisance
-        mean, slopes = self._model.mean_and_jacobian(to_positions(points), jacobian(points))
+        mean, slopes = self._intact.mean_and_jacobian(to_positions(points), jacobian(points))
         columns = prior.columns(values, signals.received, mean, slopes)[:, :4 + len(prior)]
         return [Site(self, *each) for each in zip(points, values, columns, strict=True)]
 
@@ -310,10 +384,10 @@ class FailureModel:
             both = np.concatenate([gain, np.tensordot(by_point[0].T, slope[0], 1)])
             gains.append(np.repeat(both, self.scenario.n_frames, axis=1))
         elements = np.moveaxis(np.stack(gains), (0, 1, 2, 3), (2, 1, 3, 0))
-        changes = elements * self._shift[:, None]
+        changes = elements * self.effects.shift[:, None]
         fixed = prior.scaled_patterns * ~prior.moves_multipath[:, None, None]
         changes = np.concatenate([-changes[:, :1], changes[:, 1:], fixed * changes[:, :1]], axis=1)
-        return changes, elements[:, 0] * self.amplitudes
+        return changes, elements[:, 0] * self.effects.amplitude
 
     def weigh(self, failed: Failed, sites: Sequence[Site]) -> tuple[np.ndarray, np.ndarray]:
         """Return a set's log-probability and deviance, [P] each, after a step at each of P sites.
@@ -322,7 +396,7 @@ class FailureModel:
         energy of the residual plus the cost of the parameters, because an unknown gain can lower
         any energy.
         """
-        whitening = self.whitening(failed)
+        whitening = self.surfaces.whitening(failed)
         columns = np.stack([np.concatenate(site.columns_of(failed)) for site in sites])
         value = self._predicted(np.stack([site.values for site in sites]), columns, whitening,
                                 len(failed))
@@ -335,7 +409,8 @@ class FailureModel:
         share; these failures add to the covariance. With a `remainder`, an element that explains
         part of the signals has a higher value than one that imitates the sum of several failures.
         """
-        extended, (columns, own) = self._extensions_of(failed, remainder), site.columns_of(failed)
+        extended, (columns, own) = (
+            self.surfaces.extensions(failed, remainder), site.columns_of(failed))
         changes, amplitudes = site.elements
         own = np.broadcast_to(own, (len(changes), *own.shape))
         parts = np.concatenate([columns + changes, own, amplitudes[:, None]], axis=1)
@@ -349,45 +424,26 @@ class FailureModel:
         n = len(columns)
         white = np.matmul(np.moveaxis(columns, 2, 0), np.swapaxes(whitening.whitener, 2, 3))
         white = np.moveaxis(white, 0, 2).reshape(n, columns.shape[1], -1)
+        prior = self.likelihood.nuisance
         local = assemble(
-            self.likelihood.nuisance, values, white, whitening.information, n_failed)
+            prior, values, Columns.of(white, len(prior), n_failed), whitening.information)
         return predict(local, self.likelihood)
-
-    def _extensions_of(self, failed: Failed, remainder: float) -> Whitening:
-        if (failed, remainder) not in self._extensions:
-            surface = self.surface(failed)
-            covariance = surface.covariance[:, None] + np.swapaxes(self._growth(surface), 0, 1)
-            covariance += remainder * self._error[:, None]
-            # Only extensions of the intact surface serve all phases; each takes a few megabytes.
-            self._extensions = {key: kept for key, kept in self._extensions.items() if not key[0]}
-            self._extensions[failed, remainder] = Whitening.of(
-                covariance, self.likelihood.nuisance, self.whitening(failed))
-        return self._extensions[failed, remainder]
-
-    def _growth(self, surface: Surface, elements: slice = slice(None)) -> np.ndarray:
-        """Return how each failure changes a surface's covariance, [N_E, N_B, N_SB F, N_SB F]."""
-        shift, spread = self._shift[elements], self.amplitudes[elements]
-        power = np.diagonal(self._spatial, axis1=1, axis2=2).real.T[elements, :, None]
-        cross = np.moveaxis(surface.scattered[..., elements], 2, 0) + power / 2 * shift
-        # A product of two vectors plus its conjugate transpose, and a product of the amplitudes.
-        left = np.stack([shift, cross, power * spread], axis=-1)
-        right = np.stack([cross, shift, spread], axis=-1)
-        return self._correlation * np.matmul(left, np.conj(np.swapaxes(right, 2, 3)))
 
 
 class FailureSearch:
-    """Search for sets of failed elements at several sites, for the signals of one phase.
+    """Search for sets of failed elements at several sites, for the signals of one shot.
 
     Sets grow by one element at a time. Extended sets are ranked by a likelihood that admits a few
     more failures; see `FailureModel.weigh_extensions`. If it did not, and two elements had failed,
     the first element added would often be a third one that imitates the sum of both.
 
     Growth ends when all new sets are less probable than the best set by a margin, and the deviance
-    of some hypothesis is as low as usual, or else after `_MAX_GROWTH` elements.
+    of some hypothesis is as low as usual, or else after `FailureLimits.growth` elements.
     """
 
-    def __init__(self, model: FailureModel, signals: Signals) -> None:
-        self._model, self._signals = model, signals
+    def __init__(self, model: FailureModel, signals: Signals,
+                 limits: FailureLimits = LIMITS) -> None:
+        self._model, self._signals, self._limits = model, signals, limits
         self.sites: list[Site] = []
         # Logarithm of prior times likelihood of each hypothesis.
         self.values: dict[Key, float] = {}
@@ -415,17 +471,17 @@ class FailureSearch:
         """
         # Earlier growth does not count: it may have ended with a set that is less probable.
         found = self._weigh(parents)
-        for _ in range(_MAX_GROWTH):
+        for _ in range(self._limits.growth):
             ranked = self._weigh_children(parents, remainder)
             if not ranked:
                 # All elements have failed.
                 break
-            exact = self._weigh(ranked[:_N_EXACT])
-            limit = max(self.values[key] for key in found) - _MARGIN
+            exact = self._weigh(ranked[:self._limits.exact])
+            limit = max(self.values[key] for key in found) - self._limits.margin
             if self.values[exact[0]] < limit and self.explains(found):
                 break
             found += exact
-            parents = _diverse(ranked)
+            parents = _diverse(ranked, self._limits)
 
     def try_neighbours(self, key: Key) -> None:
         """Weigh the sets in which one element is added, removed or replaced."""
@@ -433,7 +489,7 @@ class FailureSearch:
         smaller = [tuple(sorted(set(failed) - {element})) for element in failed]
         self._weigh((one, index) for one in smaller)
         for parent in (failed, *smaller):
-            self._weigh(self._weigh_children([(parent, index)])[:_N_EXACT])
+            self._weigh(self._weigh_children([(parent, index)])[:self._limits.exact])
 
     def _weigh(self, keys: Iterable[Key]) -> list[Key]:
         """Weigh hypotheses, and return them, the most probable first."""
@@ -458,13 +514,13 @@ class FailureSearch:
         return sorted(children, key=lambda key: -children[key])
 
 
-def _diverse(ranked: list[Key]) -> list[Key]:
+def _diverse(ranked: list[Key], limits: FailureLimits) -> list[Key]:
     """Choose the best hypotheses to extend, but only a few per set and per site."""
     chosen: list[Key] = []
     for failed, index in ranked:
-        if (sum(other == failed for other, _ in chosen) < _MAX_PER_SET
-                and sum(other == index for _, other in chosen) < _MAX_PER_SITE):
+        if (sum(other == failed for other, _ in chosen) < limits.per_set
+                and sum(other == index for _, other in chosen) < limits.per_site):
             chosen.append((failed, index))
-        if len(chosen) == _N_EXTENDED:
+        if len(chosen) == limits.extended:
             break
     return chosen

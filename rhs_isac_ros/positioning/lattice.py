@@ -5,23 +5,25 @@ coarse as they permit. The cells of a template share one expansion of the mean s
 """
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.geometry import (
     element_positions,
+    jacobian,
     polar_bounds,
     subband_frequencies_hz,
+    to_positions,
 )
-from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
+from rhs_isac_ros.positioning.segments import Segments
 
 # Largest sine of the angle from boresight on the grid; at 1, derivatives are infinite.
 _MAX_SINE = 0.995
-# Distance in range up to which a point counts as inside the region, in wavelengths.
-_TOLERANCE_WAVELENGTHS = 0.2
 # Longest steps for which the linear model of the mean holds, in wavelengths and in radians at the
 # edge of the aperture.
 _STEP_WAVELENGTHS = 0.2
@@ -39,8 +41,6 @@ _COARSE_CELLS = 0.75
 # Largest value of `Resolution.direction`. It applies to apertures below one wavelength, where
 # the gains of elements and of the user also change with the direction.
 _MAX_DIRECTION = 0.4
-# Smallest thickness of the region, in wavelengths.
-_MIN_THICKNESS = 0.2
 # Smallest range relative to the farthest one, because directions lose their meaning at the
 # surface.
 _MIN_RANGE = 1e-3
@@ -60,9 +60,7 @@ class Resolution(NamedTuple):
     nearest_m: float
     farthest_m: float
     directions: np.ndarray  # Extent of the region in u and in v, float64 [2, 2].
-    # Lower and upper vertex of the region, float64 [2, 3]. A flat region is a fraction of a
-    # wavelength thick, so that samples of a posterior can be inside.
-    bounds_m: np.ndarray
+    bounds_m: np.ndarray  # Lower and upper vertex of the region, float64 [2, 3].
 
     @classmethod
     @functools.lru_cache(maxsize=16)
@@ -71,10 +69,7 @@ class Resolution(NamedTuple):
         elements = element_positions(scenario)
         wavenumber = subband_wavenumbers(scenario).max()
         wavelength_m = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
-        thickness_m, center = _MIN_THICKNESS * wavelength_m, np.array(scenario.roi_center_m)
-        thick = np.stack([center - thickness_m / 2, center + thickness_m / 2])
-        bounds = np.where(
-            np.array(scenario.roi_size_m) < thickness_m, thick, scenario.roi_bounds_m)
+        bounds = scenario.roi_bounds_m
         (nearest_m, *lowest), (farthest_m, *highest) = polar_bounds(bounds).tolist()
         return cls(
             wavelength_m,
@@ -83,11 +78,6 @@ class Resolution(NamedTuple):
             SPEED_OF_LIGHT_MPS / (np.pi * scenario.n_subbands * scenario.subband_width_hz),
             max(nearest_m, _MIN_RANGE * farthest_m), farthest_m,
             np.stack([lowest, highest], axis=1), bounds)
-
-    @property
-    def volume_m3(self) -> float:
-        """Volume of the region between the bounds."""
-        return float(np.prod(self.bounds_m[1] - self.bounds_m[0]))
 
     def cell_width_m(self, range_m: float) -> float:
         """Return the width of a range cell, in which delays and amplitudes hardly change [m]."""
@@ -114,10 +104,10 @@ class Resolution(NamedTuple):
         return 12 * _FLOOR / np.maximum(
             extent, _MIN_RANGE * np.array([self.farthest_m, 1.0, 1.0]))**2
 
-    @property
-    def tolerance_m(self) -> float:
-        """Distance in range up to which a point counts as inside the region."""
-        return _TOLERANCE_WAVELENGTHS * self.wavelength_m
+
+def carrier_wavenumbers(scenario: Scenario) -> np.ndarray:
+    """Return the wavenumbers k_i at the bands' centres, float64 [N_B] [1/m]."""
+    return 2 * np.pi * np.array(scenario.center_frequencies_hz) / SPEED_OF_LIGHT_MPS
 
 
 def subband_wavenumbers(scenario: Scenario) -> np.ndarray:
@@ -137,6 +127,18 @@ class Grid(NamedTuple):
     # pairs of a segment are a subset of all combinations of its templates and range cells.
     segments: list[tuple[slice, slice, slice]]
 
+    def within(self, chosen: np.ndarray) -> 'Grid':
+        """Return the grid of the chosen pairs, bool [C], and of the templates that they need."""
+        needed = np.zeros(len(self.nodes), bool)
+        needed[self.node[chosen]] = True
+        n_nodes, n_pairs = (np.append(0, np.cumsum(one)) for one in (needed, chosen))
+        segments = [(slice(n_nodes[nodes.start], n_nodes[nodes.stop]), cells,
+                     slice(n_pairs[pairs.start], n_pairs[pairs.stop]))
+                    for nodes, cells, pairs in self.segments]
+        return self._replace(
+            nodes=self.nodes[needed], node=n_nodes[self.node[chosen]], cell=self.cell[chosen],
+            segments=[one for one in segments if one[0].start < one[0].stop])
+
     @property
     def points(self) -> np.ndarray:
         """Centres of all pairs of template and range cell, (r [m], u, v), float64 [C, 3]."""
@@ -145,48 +147,72 @@ class Grid(NamedTuple):
         return points
 
 
+@functools.lru_cache(maxsize=16)
 def lay_grid(scenario: Scenario) -> Grid:
-    """Cover the region of interest with a grid."""
+    """Cover the region of interest with a grid; its arrays are read-only."""
     resolution = Resolution.of(scenario)
+    edges_m, directions = _range_edges(resolution), _directions(resolution)
+    is_used = _meets_region(resolution, edges_m, directions)
+    # Range cells [first, end) across which the curvature of the wavefront hardly changes share
+    # templates.
+    step = 2 * PHASE_ERROR / resolution.curvature_m
+    shells = groups(len(edges_m) - 1, lambda first, end: bool(
+        1 / edges_m[first] - 1 / edges_m[end] <= step))
+    first, end = np.array(shells).T
+    has_template = np.logical_or.reduceat(is_used, first)
+    shell, direction = np.nonzero(has_template)
+    range_m = 2 / (1 / edges_m[first] + 1 / edges_m[end])
+    nodes = np.column_stack([range_m[shell], directions[direction]])
+    number = np.cumsum(has_template).reshape(has_template.shape) - 1
+    cell, direction = np.nonzero(is_used)
+    shell_of_cell = np.repeat(np.arange(len(shells)), end - first)
+    of_shell = [Segments.of_counts(np.bincount(one, minlength=len(shells))).slices
+                for one in (shell, shell_of_cell, shell_of_cell[cell])]
+    return Grid(
+        read_only(nodes), read_only((edges_m[1:] + edges_m[:-1]) / 2), read_only(np.diff(edges_m)),
+        read_only(number[shell_of_cell[cell], direction]), read_only(cell),
+        list(zip(*of_shell, strict=True)))
+
+
+def _range_edges(resolution: Resolution) -> np.ndarray:
+    """Return the edges of the range cells, float64 [R + 1] [m]."""
     # Modes slightly outside of the region extend into it.
     beyond_m = resolution.wavelength_m / 2
     edges = [max(resolution.nearest_m - beyond_m, resolution.nearest_m / 2)]
     while edges[-1] < resolution.farthest_m + beyond_m:
         edges.append(edges[-1] + resolution.cell_width_m(edges[-1]))
-    edges_m = np.array(edges)
-    ranges_m, widths_m = (edges_m[1:] + edges_m[:-1]) / 2, np.diff(edges_m)
+    return np.array(edges)
+
+
+def _directions(resolution: Resolution) -> np.ndarray:
+    """Return the direction cosines (u, v) of all templates, float64 [V, 2]."""
     steps = 2 * PHASE_ERROR * resolution.direction
-    low, high = resolution.bounds_m
     lines = [np.arange(np.floor(first / step), np.ceil(last / step) + 1) * step
              for (first, last), step in zip(resolution.directions, steps, strict=True)]
     directions = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 2)
     # Directions slightly beyond the rim of the half space are moved onto it.
     excess = np.maximum(np.hypot(*directions.T) / _MAX_SINE, 1.0)
-    directions = (directions / excess[:, None])[excess < 1 + 2 * steps.max()]
-    halves = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing='ij'), axis=-1).reshape(-1, 3)
-    nodes, node, cell, segments, n_nodes, n_pairs = [], [], [], [], 0, 0
-    inverse_step = 2 * PHASE_ERROR / resolution.curvature_m
-    for first, last in groups(len(ranges_m), lambda first, end: bool(
-            1 / edges_m[first] - 1 / edges_m[end] <= inverse_step)):
-        inside = []
-        for index in range(first, last):
-            centres = np.insert(directions, 0, ranges_m[index], axis=1)
-            # A cell belongs to the grid if the bounding box of its vertices meets the region.
-            vertices = to_positions(
-                centres[:, None] + halves * np.array([widths_m[index], *steps]))
-            inside.append(((vertices.max(axis=1) >= low) & (vertices.min(axis=1) <= high)
-                           ).all(axis=1))
-        used = np.flatnonzero(np.any(inside, axis=0))
-        range_m = 2 / (1 / edges_m[first] + 1 / edges_m[last])
-        nodes.append(np.insert(directions[used], 0, range_m, axis=1))
-        which, direction = np.nonzero(np.array(inside)[:, used])
-        node.append(direction + n_nodes)
-        cell.append(which + first)
-        segments.append((slice(n_nodes, n_nodes + len(used)), slice(first, last),
-                         slice(n_pairs, n_pairs + len(which))))
-        n_nodes, n_pairs = n_nodes + len(used), n_pairs + len(which)
-    return Grid(np.concatenate(nodes), ranges_m, widths_m, np.concatenate(node),
-                np.concatenate(cell), segments)
+    return (directions / excess[:, None])[excess < 1 + 2 * steps.max()]
+
+
+def _meets_region(
+        resolution: Resolution, edges_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Mark range cells and directions that may meet the region, bool [R, V].
+
+    They do if the bounding box of the vertices of a cell meets the region.
+    """
+    low, high = resolution.bounds_m
+    sides = np.array([-1.0, 1.0])[:, None] * PHASE_ERROR * resolution.direction
+    vertices = np.empty((len(directions), 2, 2, 2, 3))
+    vertices[..., 1] = (directions[:, None, 0] + sides[:, 0])[:, None, :, None]
+    vertices[..., 2] = (directions[:, None, 1] + sides[:, 1])[:, None, None, :]
+    found = np.empty((len(edges_m) - 1, len(directions)), bool)
+    for index, ends_m in enumerate(itertools.pairwise(edges_m)):
+        vertices[..., 0] = np.reshape(ends_m, (2, 1, 1))
+        positions = to_positions(vertices).reshape(len(directions), -1, 3)
+        found[index] = ((positions.max(axis=1) >= low) & (positions.min(axis=1) <= high)
+                        ).all(axis=1)
+    return found
 
 
 def groups(n: int, fits: Callable[[int, int], bool]) -> list[tuple[int, int]]:
@@ -223,6 +249,13 @@ class Expansion(NamedTuple):
         slopes[:, 0] += (1j * wavenumbers + 1 / range_m) * mean
         return cls(points, wavenumbers, mean, slopes)
 
+    def template_at(self, index: np.ndarray, range_m: np.ndarray) -> np.ndarray:
+        """Return means without their slow changes, at ranges [M], complex128 [M, N_B, N_SB F]."""
+        range_m = range_m[:, None, None]
+        factor = np.exp(-1j * self.wavenumbers * range_m) / range_m
+        template: np.ndarray = self.mean[index] * factor
+        return template
+
     def at(self, index: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Evaluate the mean signals at points [M, 3]; `index`, int [M], selects expansions.
 
@@ -242,9 +275,12 @@ class Expansion(NamedTuple):
         return mean, slopes
 
 
-def whiten(model: MeasurementModel, mean: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Whiten both results of `Expansion.at`; return one array, complex128 [M, 4, N_B, N_SB F]."""
-    n_bands, n_rows = model.shape
-    columns = np.moveaxis(np.concatenate([mean[:, None], slopes], axis=1), 2, 0)
-    white = np.matmul(columns.reshape(n_bands, -1, n_rows), np.swapaxes(model.whitener, 1, 2))
-    return np.moveaxis(white.reshape(n_bands, len(mean), 4, n_rows), 0, 2)
+def whiten(whitener: np.ndarray, mean: np.ndarray, slopes: np.ndarray | None = None) -> np.ndarray:
+    """Whiten means [M, N_B, N_SB F], and slopes [M, 3, ...] after them, complex128 [M, C, ...]."""
+    columns = mean[:, None]
+    if slopes is not None:
+        columns = np.concatenate([columns, slopes], axis=1)
+    n_columns, n_bands, n_rows = columns.shape[1:]
+    columns = np.moveaxis(columns, 2, 0).reshape(n_bands, -1, n_rows)
+    white = np.matmul(columns, np.swapaxes(whitener, 1, 2))
+    return np.moveaxis(white.reshape(n_bands, len(mean), n_columns, n_rows), 0, 2)

@@ -19,10 +19,20 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import mixture_weights
-from rhs_isac_ros.model.gaussian import marginalise, quadratic_form, step_to_maximum
-from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, Exponents, nuisance_of
+from rhs_isac_ros.model.gaussian import (
+    covariance_root,
+    marginalise,
+    quadratic_form,
+    step_to_maximum,
+)
+from rhs_isac_ros.model.geometry import jacobian, to_positions
+from rhs_isac_ros.model.impairments import (
+    UNIFORM_STD_RAD,
+    Exponents,
+    Nuisance,
+    nuisance_of,
+)
 from rhs_isac_ros.model.measurement import Surface
-from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
 from rhs_isac_ros.positioning.lattice import Resolution
 
 # Standard deviation of a Gaussian whose density at its centre equals that of a uniform phase.
@@ -42,15 +52,18 @@ _N_AMPLITUDE = 256
 _GAIN_REACH = 4.5
 # Standard deviation of the gain below which the gain has no effect [nepers].
 _MIN_GAIN_STD = 1e-9
+# Smallest eigenvalue of a sum of signals, as a share of its trace.
+_MIN_SPREAD = 1e-12
 # Numbers of failures to average over: smallest probability of each, and how many at most.
 _MIN_PROBABILITY = 1e-5
 _MAX_COUNTS = 12
-# Up to this share of the whitened energy, an estimated surface needs no covariance per position.
+# Share of the whitened energy up to which errors of an estimated surface need no covariance for
+# each position.
 _MIN_ERROR_SHARE = 0.05
 
 
 class Signals(NamedTuple):
-    """Signals of N positioning phases, complex128 [N, N_B, N_SB F], as received and whitened."""
+    """Signals of N shots, complex128 [N, N_B, N_SB F], as received and whitened."""
 
     received: np.ndarray
     whitened: np.ndarray
@@ -73,8 +86,60 @@ class Conditional(Protocol):
     """The likelihood for one state of the surface, or averaged over several."""
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate the likelihood at points [M, 3] and parameters [M, Q] for one or M phases."""
+        """Evaluate the likelihood at points [M, 3] and parameters [M, Q] for one or M shots."""
         ...
+
+
+class Columns(NamedTuple):
+    """Whitened residuals and derivatives at M points, complex128, of n whitened measurements."""
+
+    residual: np.ndarray  # Signals without the factors of the parameters, less the mean, [M, n].
+    by_point: np.ndarray  # Derivatives of the mean with respect to the point, [M, 3, n].
+    by_values: np.ndarray  # Derivatives with respect to the parameters for information, [M, Q, n].
+    # Derivatives with respect to L further standard normal parameters, in which the mean is
+    # linear, [M, L, n].
+    linear: np.ndarray
+    # Negative derivatives of the signals with respect to the parameters, for the gradient,
+    # [M, Q, n].
+    observed: np.ndarray
+
+    @classmethod
+    def of(cls, stacked: np.ndarray, n_values: int, n_linear: int = 0) -> 'Columns':
+        """Divide columns in the order of the fields, [M, C, n].
+
+        If the last Q are omitted, `observed` is `by_values`. Gradient and information then use
+        the same derivatives, and never predict an energy below 0.
+        """
+        ends = np.cumsum([1, 3, n_values, n_linear])
+        residual, by_point, by_values, linear, observed = np.split(stacked, ends, axis=1)
+        return cls(residual[:, 0], by_point, by_values, linear,
+                   observed if observed.shape[1] else by_values)
+
+
+class _Parameters(NamedTuple):
+    """Effects of Q nuisance parameters; the fields are those of `Nuisance`."""
+
+    scaled_patterns: np.ndarray
+    phases: np.ndarray
+    needs_search: np.ndarray
+    moves_multipath: np.ndarray
+
+    @classmethod
+    def declared(cls, nuisance: Nuisance) -> '_Parameters':
+        """Return the parameters that a scenario declares."""
+        return cls(*(getattr(nuisance, name) for name in cls._fields))
+
+    @classmethod
+    def with_uniform_phases(cls, nuisance: Nuisance) -> '_Parameters':
+        """Return a phase of each band in place of all parameters that rotate whole bands."""
+        n_bands, keeps = len(nuisance.phases), ~nuisance.phases.any(axis=0)
+        turns, no_flags = _UNIFORM_EQUIVALENT * np.eye(n_bands), np.zeros(n_bands, bool)
+        patterns = 1j * turns[:, :, None] * np.ones(nuisance.scaled_patterns.shape[2])
+        return cls(
+            np.concatenate([nuisance.scaled_patterns[keeps], patterns]),
+            np.hstack([nuisance.phases[:, keeps], turns]),
+            np.append(nuisance.needs_search[keeps], no_flags),
+            np.append(nuisance.moves_multipath[keeps], no_flags))
 
 
 class NuisancePrior(Exponents):
@@ -86,25 +151,14 @@ class NuisancePrior(Exponents):
     """
 
     def __init__(self, model: MeasurementModel) -> None:
-        nuisance = nuisance_of(model.scenario)
-        n_bands, n_rows = model.shape
-        patterns, phases = nuisance.scaled_patterns, nuisance.phases
+        self.scenario, nuisance = model.scenario, nuisance_of(model.scenario)
         # Declared covariance of the phases of the bands, float64 [N_B, N_B].
-        self.phase_covariance = phases @ phases.T
-        centre = np.eye(n_bands) - (1 / n_bands if n_bands > 1 else 0.0)
-        relative = np.linalg.eigvalsh(centre @ self.phase_covariance @ centre)[-1]
-        # If all bands share one phase, only rounding errors remain.
-        is_shared = relative <= 1e-9 * np.trace(self.phase_covariance)
-        self.relative_phase_std_rad = 0.0 if is_shared else float(np.sqrt(relative))
+        self.phase_covariance = nuisance.phases @ nuisance.phases.T
+        self.relative_phase_std_rad = _relative_std(self.phase_covariance)
         # Whether every band is given a uniform phase.
         self.is_coarse = self.relative_phase_std_rad >= COARSE_STD_RAD
-        keeps = np.ones(len(nuisance), bool)
-        if self.is_coarse:
-            keeps = np.abs(phases).max(axis=0, initial=0.0) == 0
-            per_band = 1j * np.eye(n_bands)[:, :, None] * np.ones(n_rows)
-            patterns = np.concatenate([patterns[keeps], _UNIFORM_EQUIVALENT * per_band])
-            phases = np.hstack([phases[:, keeps], _UNIFORM_EQUIVALENT * np.eye(n_bands)])
-        n_added = len(patterns) - int(keeps.sum())
+        patterns, phases, self.needs_search, self.moves_multipath = (
+            _Parameters.with_uniform_phases if self.is_coarse else _Parameters.declared)(nuisance)
         largest = np.abs(phases).max(axis=0, initial=0.0)
         uniform = largest > UNIFORM_STD_RAD
         scale = np.where(uniform, _UNIFORM_EQUIVALENT / np.where(uniform, largest, 1.0), 1.0)
@@ -114,6 +168,7 @@ class NuisancePrior(Exponents):
         self.scaled_patterns, self.phases = patterns * scale[:, None, None], phases * scale
         self.precision = np.where(uniform, 0.0, 1.0)
         self.gain = self.scaled_patterns.real.mean(axis=(1, 2))
+        self.volume = 2 * self.scaled_patterns.real.sum(axis=(1, 2))
         # Standard deviations of the gain of all signals [nepers], 0 if it is negligible, and of
         # the phase of each band, infinite if it is uniform, float64 [N_B].
         gain_std = np.linalg.norm(self.gain)
@@ -121,9 +176,6 @@ class NuisancePrior(Exponents):
         self.gain_std = float(gain_std) if gain_std > _MIN_GAIN_STD else 0.0
         self.phase_std_rad = np.where(
             self.is_coarse | (phase_std > UNIFORM_STD_RAD), np.inf, phase_std)
-        self.volume = 2 * self.scaled_patterns.real.sum(axis=(1, 2))
-        self.needs_search = np.append(nuisance.needs_search[keeps], np.zeros(n_added, bool))
-        self.moves_multipath = np.append(nuisance.moves_multipath[keeps], np.zeros(n_added, bool))
         self._operators = self._multiplying(model.root, model.whitener)
         self.information = self.information_of(model.root, model.whitener)
         # Curvature in (r, u, v) that is added to every log-likelihood, float64 [3].
@@ -142,12 +194,9 @@ class NuisancePrior(Exponents):
 
     def columns(self, values: np.ndarray, received: np.ndarray, mean: np.ndarray,
                 slopes: np.ndarray, *linear: np.ndarray) -> np.ndarray:
-        """Return the residual and derivatives at M points, complex128 [M, C, N_B, N_SB F].
+        """Stack the fields of `Columns`, before whitening, complex128 [M, C, N_B, N_SB F].
 
-        Four groups follow the residual: `slopes`, derivatives of the mean with respect to the
-        point; derivatives of the signals with respect to the parameters, from `derivatives`;
-        `linear`, derivatives of the mean with respect to further parameters; and the divided
-        signals times the exponents of the parameters.
+        `slopes` are the derivatives of the mean with respect to the point.
         """
         divided = self.divide(received, values)
         return np.concatenate([
@@ -164,7 +213,7 @@ class NuisancePrior(Exponents):
         return -(values**2 @ self.precision / 2 + values @ self.volume)
 
     def log_evidence_of_aligned(self, aligned: np.ndarray) -> float:
-        """Return the log of Laplace's integral over the parameters that move the multipath."""
+        """Return the log of Laplace's integral over the parameters that `Alignment` estimates."""
         (moves,) = np.nonzero(self.moves_multipath)
         curvature = self.information[np.ix_(moves, moves)] + np.diag(self.precision[moves])
         return float(-self.precision @ aligned**2 - np.linalg.slogdet(curvature)[1]) / 2
@@ -182,7 +231,7 @@ class NuisancePrior(Exponents):
         """Maximise the log-likelihood, without the template's energy, over the gain.
 
         If signals y are multiplied by h, the log-likelihood at the amplitude A, of any shape, is
-        ``-h^2 |y|^2 + 2 h A + 2 n log h`` plus the prior of the gain, -log h; n is `n_rows`.
+        ``-h^2 |y|^2 + 2 h A + 2 n log h`` plus the log-prior of the gain -log h; n is `n_rows`.
         Returns its maximum and the gain [nepers]; if the gain is known, 2 A and a single 0.
         """
         if not self.gain_std:
@@ -237,13 +286,15 @@ class Likelihood:
         n, whitened = len(points), self.whitened(values, signals)
         mean, slopes = self.model.mean_and_jacobian(
             to_positions(points), jacobian(points), whitened=True)
-        columns = [(whitened - mean).reshape(n, 1, -1), slopes.reshape(n, 3, -1)]
+        residual, by_point = (whitened - mean).reshape(n, -1), slopes.reshape(n, 3, -1)
+        # Without parameters, both arrays have no columns.
+        observed = by_values = by_point[:, :0]
         if len(self.nuisance):
             observed = self.nuisance.slopes(whitened)
             moves = self.nuisance.moves_multipath[:, None]
-            columns += [np.where(moves, observed, self.nuisance.slopes(mean)), observed]
-        return assemble(
-            self.nuisance, values, np.concatenate(columns, axis=1), self.nuisance.information)
+            by_values = np.where(moves, observed, self.nuisance.slopes(mean))
+        columns = Columns(residual, by_point, by_values, by_point[:, :0], observed)
+        return assemble(self.nuisance, values, columns, self.nuisance.information)
 
     def settle(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Replace uniform band phases in parameters [M, Q] by the most likely phases."""
@@ -260,25 +311,24 @@ class Likelihood:
         return np.sum(mean.conj() * self.whitened(values, signals), axis=2)
 
 
-def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray,
-             information_of_covariance: np.ndarray, n_linear: int = 0) -> Local:
+def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
+             information_of_covariance: np.ndarray) -> Local:
     """Combine whitened columns into the likelihood and its derivatives at parameters [M, Q].
 
-    `white`, complex128 [M, C, n], contains the whitened `NuisancePrior.columns`. Without the last
-    Q, gradient and information use the same derivatives, and never predict an energy below 0.
     `information_of_covariance`, float64 [Q, Q], is the information of the covariance about the
-    parameters. `n_linear` is the number of further standard normal parameters, in which the mean
-    is linear; they are integrated out.
+    parameters. The further parameters of the columns are integrated out.
     """
-    n, end = 3 + len(prior), 4 + len(prior) + n_linear
-    expected, observed = np.ascontiguousarray(white[:, 1:end]), white[:, end:]
-    # Re(a^H b) is the inner product of real and imaginary parts.
-    parts = np.ascontiguousarray(white[:, 0]).view(float)
+    residual, by_point, by_values, linear, observed = columns
+    n, n_linear = 3 + len(prior), linear.shape[1]
+    expected = np.ascontiguousarray(np.concatenate([by_point, by_values, linear], axis=1))
     information = quadratic_form(expected)
     information += np.diag(np.concatenate([prior.floor, prior.precision, np.ones(n_linear)]))
-    if observed.shape[1]:
-        expected = np.concatenate([expected[:, :3], observed, expected[:, n:]], axis=1)
-    gradient = 2 * np.matmul(expected.view(float), parts[..., None])[..., 0]
+    slopes = expected
+    if observed is not by_values:
+        slopes = np.ascontiguousarray(np.concatenate([by_point, observed, linear], axis=1))
+    # Re(a^H b) is the inner product of real and imaginary parts.
+    parts = np.ascontiguousarray(residual).view(float)
+    gradient = 2 * np.matmul(slopes.view(float), parts[..., None])[..., 0]
     energy = np.sum(parts**2, axis=1)
     value = -energy
     if len(prior):
@@ -293,6 +343,16 @@ def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray,
     rise = np.sum(gradient[:, n:] * marginal.offset, axis=1) / 2
     return Local(value + rise + marginal.log_volume, marginal.gradient, marginal.information,
                  energy - rise)
+
+
+def _relative_std(phase_covariance: np.ndarray) -> float:
+    """Return the largest standard deviation of the bands' phases relative to their mean [rad]."""
+    n_bands = len(phase_covariance)
+    centre = np.eye(n_bands) - (1 / n_bands if n_bands > 1 else 0.0)
+    relative = np.linalg.eigvalsh(centre @ phase_covariance @ centre)[-1]
+    # If all bands share one phase, only rounding errors remain.
+    is_shared = relative <= 1e-9 * np.trace(phase_covariance)
+    return 0.0 if is_shared else float(np.sqrt(relative))
 
 
 def log_determinant(roots: np.ndarray) -> np.ndarray:
@@ -331,7 +391,8 @@ class DispersedLikelihood:
         self._offsets = log_weights + likelihood.log_volume
         self._latest: tuple[np.ndarray, list[np.ndarray]] | None = None
         average, least = self._average.covariance(), self._intact.covariance()
-        roots = np.linalg.cholesky(least + self._scales[:, None, None, None] * (average - least))
+        roots = covariance_root(
+            scenario, least + self._scales[:, None, None, None] * (average - least))
         self._information = [likelihood.nuisance.information_of(*both)
                              for both in zip(roots, np.linalg.inv(roots), strict=True)]
 
@@ -357,7 +418,7 @@ class DispersedLikelihood:
         for roots, offset, information in zip(
                 self._roots_at(points), self._offsets, self._information, strict=True):
             white, log_volume = whiten_each(roots, columns)
-            local = assemble(prior, values, white, information)
+            local = assemble(prior, values, Columns.of(white, len(prior)), information)
             states.append(local._replace(value=local.value + offset - log_volume))
         return _average_of(states)
 
@@ -372,7 +433,8 @@ class DispersedLikelihood:
             excess = (self._average.covariance_at(positions) - intact if any(self._scales)
                       else np.zeros(1))
             self._latest = latest = points, [
-                np.linalg.cholesky(intact + scale * excess) for scale in self._scales]
+                covariance_root(self._average.scenario, intact + scale * excess)
+                for scale in self._scales]
         return latest[1]
 
 
@@ -425,7 +487,9 @@ class Alignment:
 
     def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:
         self._prior = likelihood.nuisance
-        roots = np.linalg.cholesky(spread + np.eye(spread.shape[1]))
+        # Strong signals must not make the sum singular up to rounding errors.
+        least = np.maximum(_MIN_SPREAD * np.trace(spread, axis1=1, axis2=2).real, 1.0)
+        roots = np.linalg.cholesky(spread + least[:, None, None] * np.eye(spread.shape[1]))
         self._whitener = np.linalg.solve(roots, likelihood.model.whitener)
 
     def values_of_each(self, received: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ stops after the largest batches or the last epoch, and the weights of the best e
 
 import copy
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import numpy as np
 from rhs_isac_ros import __version__
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import check_arrays
+from rhs_isac_ros.model.arrays import check_arrays, numbers
 from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 from rhs_isac_ros.positioning.simulate import simulate_pairs
@@ -49,13 +50,18 @@ _KEYS = {name: 'loudest' if name == 'max_energy' else name for name in _SHAPES}
 
 def stack_parts(signals: np.ndarray) -> np.ndarray:
     """Flatten complex signals to float64 [N, 2 N_B N_SB F], all real parts first."""
-    flat = signals.reshape(len(signals), -1)
+    flat = _flat(signals)
     return np.hstack([flat.real, flat.imag])
+
+
+def _flat(signals: np.ndarray) -> np.ndarray:
+    # The second number cannot be left to NumPy, because there may be no signals.
+    return signals.reshape(len(signals), math.prod(signals.shape[1:]))
 
 
 # Inputs of a network as functions of the received signals. The paper does not specify them.
 INPUTS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
-    'parts': stack_parts, 'magnitudes': lambda signals: np.abs(signals.reshape(len(signals), -1))}
+    'parts': stack_parts, 'magnitudes': lambda signals: np.abs(_flat(signals))}
 
 
 class ModelError(ValueError):
@@ -113,7 +119,7 @@ class Network:
         inputs = str(about.pop('inputs', 'parts'))
         with translated(ValueError, ModelError, path):
             fields: dict[str, Any] = {
-                name: arrays[key].astype(float) for name, key in _KEYS.items()}
+                name: numbers(key, arrays[key], finite=False) for name, key in _KEYS.items()}
             return cls(**fields, about=about, inputs=inputs)
 
 
@@ -163,7 +169,7 @@ class NeuralEstimator:
 def _check_purpose(
         network: Network, scenario: Scenario, codebook: Codebook, source: str) -> None:
     for key, subject, expected in (('codebook', 'codebook', codebook.id),
-                                   ('scenario', 'the scenario', scenario.changes())):
+                                   ('scenario', 'the scenario', scenario.unplaced.changes())):
         found = network.about.get(key)
         if found != expected:
             raise ModelError(f'{source}: trained for {subject} {found}, expected {expected}')
@@ -227,7 +233,7 @@ def train(
         b_out=b_out * unit_m, center=center, inputs=inputs,
         covariance=errors.T @ errors / len(errors),
         max_energy=float(energies.max()), about={
-            'codebook': codebook.id, 'scenario': scenario.changes(), 'seed': seed,
+            'codebook': codebook.id, 'scenario': scenario.unplaced.changes(), 'seed': seed,
             'pairs': n_pairs, 'epochs': best_epoch, 'version': __version__,
             'validation_mse_m2': best_mse, 'test_mse_m2': _mean_square(residuals(test))})
 

@@ -1,10 +1,11 @@
 """The posterior of a position: weighted samples of its modes, in the region of interest.
 
-A mode is usually Gaussian. If it is inside the region, its samples there have equal weights. If
-every band has an unknown phase of its own, only delays, amplitudes and the curvature of the
-wavefront determine the range. A mode then extends over metres, across which the log-likelihood is
-not quadratic and the volume element changes. Samples are then drawn from wider Gaussians, and each
-is weighted by the posterior relative to the sum of their densities, so modes may overlap.
+A mode is usually Gaussian, and `region` draws samples of it inside the region. If every band has
+an unknown phase of its own, only delays, amplitudes and the curvature of the wavefront determine
+the range. A mode then extends over metres, across which the log-likelihood is not quadratic.
+Samples are then drawn from wider Gaussians, and their weights follow from the likelihood at each
+of them. Such modes may overlap; a sample counts for its own mode in proportion to the densities
+of all.
 """
 
 from collections.abc import Sequence
@@ -13,20 +14,15 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model.arrays import mixture_weights
+from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD
-from rhs_isac_ros.positioning.coordinates import (
-    carrier_wavenumbers,
-    is_inside,
-    jacobian,
-    likelihood_loss,
-    select,
-    to_polar,
-    to_positions,
-)
 from rhs_isac_ros.positioning.estimate import Estimate
-from rhs_isac_ros.positioning.grid import first_of_each
+from rhs_isac_ros.positioning.lattice import carrier_wavenumbers
 from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
+from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.region import Restricted
 from rhs_isac_ros.positioning.search import Modes, marginal_at
+from rhs_isac_ros.positioning.segments import Segments, select
 
 # Factor by which a proposal is wider than its Gaussian, because the tails of the posterior may be
 # heavier.
@@ -43,114 +39,93 @@ _MAX_STD_RAD = 3.0
 
 
 class Posterior(NamedTuple):
-    """The posterior of one positioning phase, for a uniform prior on the region of interest."""
+    """The posterior of one shot, for a uniform prior on the region of interest or a mixture."""
 
     estimate: Estimate
-    modes: Modes | None  # None without a position.
-    signals: Signals  # Signals of the phase, N = 1.
+    modes: Modes | None  # Of the likelihood; None without a position.
+    signals: Signals  # Signals of the shot, N = 1.
+    mixture: Mixture | None = None  # Normalised, in the frame of the site; None without one.
 
 
 class Samples(NamedTuple):
-    """Samples of the Gaussians of M modes, S samples per mode."""
+    """Samples of M modes inside the region, S samples per mode."""
 
     positions: np.ndarray  # Float64 [M, S, 3] [m].
-    log_weights: np.ndarray  # Not normalised, float64 [M, S]; -inf outside of the region.
-    spread: np.ndarray  # Factor of the covariance of each mode's position, float64 [M, 3, 3] [m].
+    log_weights: np.ndarray  # Posterior relative to the density of the samples, float64 [M, S].
 
 
 def draw_samples(modes: Modes, normal: np.ndarray, bounds: np.ndarray) -> Samples:
     """Represent the modes by samples, for a uniform prior between the bounds [2, 3] of the region.
 
-    `normal`, float64 [S, 3], contains points that represent a standard Gaussian. If no sample of a
-    phase is inside the region, all of them are moved onto its border.
+    `normal`, float64 [S, 3], contains points that represent a standard Gaussian.
     """
-    points, curvature, roi_offset = modes.points, modes.curvature, modes.roi_offset
-    starts = first_of_each(modes.phases)
-    jacobians = jacobian(points)
-    log_mass = (modes.log_likelihood + np.log(np.linalg.det(jacobians))
-                - np.log(np.linalg.det(curvature)) / 2)
-    factors = np.linalg.inv(np.swapaxes(np.linalg.cholesky(curvature), 1, 2))
-    # The Gaussian of a mode outside the region is sampled around its most likely point inside;
-    # the weights of the samples correct for the shift.
-    shift = np.linalg.solve(factors, roi_offset[..., None])[..., 0]
-    log_weights = (log_mass[:, None] - shift @ normal.T
-                   - likelihood_loss(roi_offset, curvature)[:, None])
-    # Contiguous coordinates make the following operations several times as fast.
-    spread = np.matmul(factors, normal.T)
-    positions = to_positions(np.swapaxes((points + roi_offset)[..., None] + spread, 1, 2))
-    inside = is_inside(positions, bounds)
-    possible = np.logical_or.reduceat(inside.any(axis=1), starts)
-    if not possible.all():
-        lost = np.repeat(~possible, np.diff(starts, append=len(points)))
-        positions[lost] = np.clip(positions[lost], *bounds)
-        inside[lost] = True
-    log_weights[~inside] = -np.inf
-    return Samples(positions, log_weights, np.matmul(jacobians, factors))
+    gaussians = Restricted.of(modes.points, modes.gradient, modes.curvature, bounds)
+    positions, log_ratio = gaussians.sample(normal)
+    log_weights = modes.log_likelihood[:, None] + gaussians.logarithm(positions) + log_ratio
+    return Samples(positions, log_weights)
 
 
 class WeightedSamples(NamedTuple):
-    """The samples of the posteriors of N phases, with weights whose sum is one for each phase."""
+    """The samples of the posteriors of N shots, with weights whose sum is one for each shot."""
 
     positions: np.ndarray  # Float64 [M, S, 3] [m].
     weights: np.ndarray  # Float64 [M, S].
-    spread: np.ndarray  # As in `Samples`.
-    starts: np.ndarray  # Index of each phase's first mode, int [N].
+    of_shot: Segments  # The modes of each shot.
     log_totals: np.ndarray  # Logarithms of the weights' sums before normalisation, float64 [N].
 
     @classmethod
     def of(cls, samples: Samples, modes: Modes) -> 'WeightedSamples':
-        """Normalise the weights of each phase."""
-        starts = first_of_each(modes.phases)
-        counts = np.diff(starts, append=len(modes.phases))
-        highest = np.maximum.reduceat(samples.log_weights.max(axis=1), starts)
-        weights = np.exp(samples.log_weights - np.repeat(highest, counts)[:, None])
-        totals = np.add.reduceat(weights.sum(axis=1), starts)
-        weights /= np.repeat(totals, counts)[:, None]
-        return cls(samples.positions, weights, samples.spread, starts, highest + np.log(totals))
+        """Normalise the weights of each shot."""
+        of_shot = Segments.of_keys(modes.shots)
+        highest = of_shot.max(samples.log_weights.max(axis=1))
+        weights = np.exp(samples.log_weights - of_shot.repeat(highest)[:, None])
+        totals = of_shot.sum(weights.sum(axis=1))
+        weights /= of_shot.repeat(totals)[:, None]
+        return cls(samples.positions, weights, of_shot, highest + np.log(totals))
 
-    def log_evidence(self, volume_m3: float) -> np.ndarray:
-        """Return the logarithm of the likelihood averaged over a region of this volume, [N]."""
-        return (self.log_totals - np.log(self.weights.shape[1])
-                + 1.5 * np.log(2 * np.pi) - np.log(volume_m3))
+    @property
+    def log_evidence(self) -> np.ndarray:
+        """Logarithms of the likelihood averaged over the region, float64 [N]."""
+        return self.log_totals - np.log(self.weights.shape[1])
 
     def average(self, values: np.ndarray) -> np.ndarray:
-        """Average values of the modes, float64 [M, ...], over each posterior, [N, ...]."""
-        shares = self.weights.sum(axis=1).reshape(-1, *[1] * (values.ndim - 1))
-        return self.sums(shares * values)
-
-    def sums(self, values: np.ndarray) -> np.ndarray:
-        """Add up values of the modes, float64 [M, ...], for each phase, [N, ...]."""
-        return np.add.reduceat(values, self.starts)
+        """Average values of the modes, float64 [M], over each posterior, [N]."""
+        return self.of_shot.sum(self.weights.sum(axis=1) * values)
 
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the mean, float64 [N, 3] [m], and the covariance, [N, 3, 3], of the samples."""
-        mean = self.sums(np.matmul(self.weights[:, None], self.positions)[:, 0])
-        counts = np.diff(self.starts, append=len(self.weights))
-        offsets = self.positions - np.repeat(mean, counts, axis=0)[:, None]
+        """Compute the mean, float64 [N, 3] [m], and the covariance, [N, 3, 3], of the posterior.
+
+        The covariance includes the uncertainty of a mean of few samples.
+        """
+        of_shot = self.of_shot
+        mean = of_shot.sum(np.matmul(self.weights[:, None], self.positions)[:, 0])
+        offsets = self.positions - of_shot.repeat(mean)[:, None]
         weighted = np.swapaxes(offsets * self.weights[..., None], 1, 2)
-        return mean, self.sums(np.matmul(weighted, offsets))
+        squares, shift = np.matmul(weighted, offsets), weighted.sum(axis=2)
+        shares = np.maximum(self.weights.sum(axis=1), np.finfo(float).tiny)
+        within = squares - shift[:, :, None] * shift[:, None] / shares[:, None, None]
+        n_effective = of_shot.sum(np.einsum('ms,ms->m', self.weights, self.weights))
+        return mean, of_shot.sum(squares) + n_effective[:, None, None] * of_shot.sum(within)
 
 
 def draw_broad_samples(
         likelihood: Likelihood, conditionals: Sequence[Conditional], phases: 'BandPhases',
         signals: Signals, modes: Modes, normal: np.ndarray) -> Samples:
-    """Represent the posterior of one phase by weighted samples of its widened modes.
+    """Represent the posterior of one shot by weighted samples of its widened modes.
 
     `conditionals` contains the likelihood for each state of the surface.
     """
     bounds = likelihood.resolution.bounds_m
-    samples = draw_samples(modes, _SPREAD * normal, bounds)
-    inside = np.isfinite(samples.log_weights)
-    log_weights, positions = np.full(inside.shape, -np.inf), samples.positions.copy()
+    positions, log_weights = Restricted.of(
+        modes.points, modes.gradient / _SPREAD**2, modes.curvature / _SPREAD**2, bounds
+    ).sample(normal)
     for state in np.unique(modes.state):
-        rows = modes.state == state
-        chosen = inside & rows[:, None]
-        points = to_polar(positions[chosen])
-        values = np.repeat(modes.values, inside.sum(axis=1) * rows, axis=0)
+        (rows,) = np.nonzero(modes.state == state)
+        points = to_polar(positions[rows]).reshape(-1, 3)
+        values = np.repeat(modes.values[rows], len(normal), axis=0)
         evidence, values = marginal_at(
             conditionals[state], likelihood, points, values, signals)
-        evidence += (np.log(np.linalg.det(jacobian(points))) - 1.5 * np.log(2 * np.pi)
-                     - _log_proposal(points, select(modes, rows)))
+        evidence += _log_share(points.reshape(len(rows), -1, 3), select(modes, rows)).ravel()
         if phases.is_informative:
             likely = evidence >= evidence.max() - _LIKELY_MARGIN
             outputs = likelihood.outputs(points[likely], values[likely], signals)
@@ -158,23 +133,28 @@ def draw_broad_samples(
             log_factors, offsets_m = phases.factors(outputs.T * turns)
             evidence[likely] += log_factors
             points[likely, 0] += offsets_m
-            positions[chosen] = to_positions(points)
-        log_weights[chosen] = evidence
-    return samples._replace(positions=positions, log_weights=log_weights)
+            positions[rows] = np.clip(
+                to_positions(points), *bounds).reshape(len(rows), -1, 3)
+        log_weights[rows] += evidence.reshape(len(rows), -1)
+    return Samples(positions, log_weights)
 
 
-def _log_proposal(points: np.ndarray, modes: Modes) -> np.ndarray:
-    """Return the logarithm of the summed densities from which samples are drawn, [P]."""
+def _log_share(points: np.ndarray, modes: Modes) -> np.ndarray:
+    """Return the logarithm of the share of points [M, S, 3] in their own mode, float64 [M, S].
+
+    Modes overlap. The shares of all modes in a point add up to 1, so that nothing counts twice.
+    """
     # Expanded about a common centre, squared distances are matrix products, which are faster.
-    centre = modes.roi_points.mean(axis=0)
-    points, means = points - centre, modes.roi_points - centre
+    n_modes, n_samples, _ = points.shape
+    centre = modes.points.mean(axis=0)
+    offsets, means = points.reshape(-1, 3) - centre, modes.centres - centre
     spread = np.einsum('mab,mb->ma', modes.curvature, means)
-    squares = (np.einsum('pa,pb->pab', points, points).reshape(-1, 9)
+    squares = (np.einsum('pa,pb->pab', offsets, offsets).reshape(-1, 9)
                @ modes.curvature.reshape(-1, 9).T)
-    squares += np.einsum('ma,ma->m', means, spread) - 2 * points @ spread.T
-    exponent = -squares / (2 * _SPREAD**2)
-    exponent += np.linalg.slogdet(modes.curvature)[1] / 2
-    return (np.logaddexp.reduce(exponent, axis=1) - 3 * np.log(_SPREAD) - 1.5 * np.log(2 * np.pi))
+    squares += np.einsum('ma,ma->m', means, spread) - 2 * offsets @ spread.T
+    exponent = -squares / (2 * _SPREAD**2) + np.linalg.slogdet(modes.curvature)[1] / 2
+    own = exponent.reshape(n_modes, n_samples, n_modes)[np.arange(n_modes), :, np.arange(n_modes)]
+    return own - np.logaddexp.reduce(exponent, axis=1).reshape(n_modes, n_samples)
 
 
 class BandPhases:

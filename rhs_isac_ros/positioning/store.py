@@ -12,20 +12,28 @@ import numpy as np
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.positioning import alternatives, grid
+from rhs_isac_ros.positioning import alternatives, templates
 from rhs_isac_ros.support.files import write_whole
 
 # Maximum number of tables in a folder. Beyond it, the least recently used tables are deleted.
 _MAX_TABLES = 16
 _PREFIX = 'table-'
 # Version of the contents; tables of other versions are ignored.
-_FORMAT = 5
+_FORMAT = 6
 
 
-def default_folder() -> Path:
-    """Return the folder ``rhs_isac_ros`` in the user's cache, according to the XDG convention."""
+def default_folder() -> Path | None:
+    """Return the folder ``rhs_isac_ros`` in the user's cache, according to the XDG convention.
+
+    For a user without a home directory, return None with a `RuntimeWarning`.
+    """
     base = os.environ.get('XDG_CACHE_HOME', '')
-    return (Path(base) if os.path.isabs(base) else Path.home() / '.cache') / 'rhs_isac_ros'
+    try:
+        return (Path(base) if os.path.isabs(base) else Path.home() / '.cache') / 'rhs_isac_ros'
+    except RuntimeError:
+        warnings.warn('the table is not stored: no home directory, and XDG_CACHE_HOME is not set',
+                      RuntimeWarning, stacklevel=2)
+        return None
 
 
 def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = None,
@@ -55,13 +63,13 @@ def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = 
 def _tabulate(model: MeasurementModel, progress: Callable[[float], None] | None
               ) -> dict[str, np.ndarray]:
     report = progress or (lambda _: None)
-    return (grid.tabulate(model, lambda share: report(share / 2))
+    return (templates.tabulate(model, lambda share: report(share / 2))
             | alternatives.tabulate_outside(model, lambda share: report((1 + share) / 2)))
 
 
 def table_key(model: MeasurementModel, codebook_id: str) -> str:
     """Return a hash of everything that determines the table of a model, 32 hexadecimal digits."""
-    parts = (model.scenario.id, codebook_id, __version__, _FORMAT,
+    parts = (model.scenario.unplaced.id, codebook_id, __version__, _FORMAT,
              *([model.surface.id] if model.surface else []))
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 

@@ -1,10 +1,9 @@
 """The base station, which invites users by beacons, and locates and serves one at a time."""
 
-import collections
 import dataclasses
 import enum
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,16 +12,11 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Event, Outcome, Timeout
+from rhs_isac_ros.protocol.events import Event, LogMessage, Outcome, Timeout
+from rhs_isac_ros.protocol.receiver import Reception
 from rhs_isac_ros.protocol.role import ANY, Drops, NewestDict, Row, StateMachine, on
 from rhs_isac_ros.protocol.settings import BaseStationSettings, PendingSettings
-from rhs_isac_ros.protocol.user_registry import (
-    LAST_NUMBER,
-    MAX_USERS,
-    UserRegistry,
-    join_users,
-    parse_users,
-)
+from rhs_isac_ros.protocol.user_registry import MAX_USERS, Admission, UserRegistry, join_users
 
 
 class State(enum.Enum):
@@ -41,28 +35,18 @@ class State(enum.Enum):
 
 # Steps of a granted cycle. Each waits for a reply, and may repeat its request.
 STEPS = (State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING, State.TRANSMITTING)
-NOT_BEACONING = tuple(state for state in State if state is not State.BEACONING)
 # Reasons for a lost cycle that concern one user. All others concern the whole network.
 _USER_REASONS = (Outcome.USER_GONE, Outcome.NO_FIX)
+NOT_BEACONING = tuple(state for state in State if state is not State.BEACONING)
 
 
 @dataclasses.dataclass
-class Cycle:
-    """The state of one cycle, as known to the base station."""
+class Cycle(Reception):
+    """The state of one cycle, as known to the base station; the user is 0 before the grant."""
 
-    cycle_id: int
-    codebook: Codebook | None = None  # latest codebook when the last beacon was sent
     attempt: int = 0  # number of earlier beacons in this cycle
-    user: int = 0     # user that was granted the cycle; 0 before the grant
-    # Instance of the user, from its acks or else from the first feed signals; 0 if unknown.
-    user_instance: int = 0
-    # Instance of the channel that sent the first signals; 0 if unknown.
-    channel: int = 0
     # Bands whose configurations the RHS has reported.
     configured: set[int] = dataclasses.field(default_factory=set)
-    # Feed signals by band, complex128 [F, N_SB, K].
-    signals: dict[int, np.ndarray] = dataclasses.field(default_factory=dict)
-    stamp_ns: int = 0  # time of the first feed signals [ns]; 0 if unknown
     # Signals that were sent to the positioner once all bands were complete.
     received: m.ReceivedSignals | None = None
     beam: m.Beam | None = None
@@ -71,10 +55,56 @@ class Cycle:
     began_s: np.ndarray = dataclasses.field(
         default_factory=lambda: np.full(len(m.Phase), math.nan))
 
-    @property
-    def codebook_id(self) -> str:
-        """Id of the codebook; empty if there is none."""
-        return self.codebook.id if self.codebook else ''
+
+class ServiceLog:
+    """Derives the messages of the log from what happens to cycles."""
+
+    def __init__(self) -> None:
+        # Outages that have been logged and have not ended, by reason, and number of the user, or 0
+        # for all users, with the name of the state, which contains the instance of the user.
+        self._outages: NewestDict[tuple[str, tuple[int, str]], None] = NewestDict(MAX_USERS)
+        # Missing roles and codebook as logged last; empty once a cycle has begun.
+        self._lacking: tuple[str, ...] = ()
+        # Whether a cycle has been served since the last time that something was missing.
+        self._serving = False
+
+    def waits(self, lacking: tuple[str, ...]) -> Iterator[LogMessage]:
+        """Log missing roles and codebook if they have changed."""
+        self._serving = False
+        if lacking != self._lacking:
+            self._lacking = lacking
+            yield LogMessage(f'waiting for {", ".join(lacking)}', True, 'service', True)
+
+    def begins(self) -> None:
+        """Note that a cycle has begun; a role that is missing later is then logged again."""
+        self._lacking = ()
+
+    def gives_up(self, cycle_id: int, user: int, instance: int, outcome: Outcome
+                 ) -> Iterator[LogMessage]:
+        """Log a lost cycle unless its outage has been logged."""
+        affected = ((user, f'outage of user {user} {instance}') if outcome in _USER_REASONS
+                    else (0, 'outage'))
+        if (outcome.value, affected) not in self._outages:
+            self._outages.put((outcome.value, affected), None)
+            yield LogMessage(f'cycle {cycle_id} of user {user} given up: {outcome.value}', True,
+                             affected[1], True)
+
+    def serves(self, cycle_id: int, user: int, use: str) -> Iterator[LogMessage]:
+        """Log the start of service, with what it uses, and the outages that ended."""
+        if not self._serving:
+            self._serving = True
+            yield LogMessage(f'serving: {use}', False, 'service', False)
+        ended = [outage for outage in self._outages if outage[1][0] in (0, user)]
+        for outage in ended:
+            del self._outages[outage]
+        for affected in dict.fromkeys(affected for _, affected in ended):
+            reasons = ', '.join(sorted(reason for reason, other in ended if other == affected))
+            yield LogMessage(f'cycle {cycle_id}: user {user} served again after: {reasons}', False,
+                             affected[1], False)
+
+
+def _admission(settings: BaseStationSettings) -> Admission:
+    return Admission(settings.allowed_users, settings.max_users, settings.ack_rate_hz)
 
 
 def reply(success: bool, text: str) -> Callable[['BaseStation', Event], None]:
@@ -117,26 +147,41 @@ class BaseStation(StateMachine):
         self._bands = frozenset(range(scenario.n_bands))
         self._users = UserRegistry(settings.policy, rng)
         self._settings = PendingSettings(settings)
-        # Number of acks by user in the current second; cleared each second, to bound the memory.
-        self._acks: collections.Counter[int] = collections.Counter()
-        self._second = 0
-        self._use(settings)
+        self._admission = _admission(settings)
         self._pause_requested = False  # whether a pause begins after the current cycle
         self._offered: Codebook | None = None  # codebook for the next beacon
         # Roles that are missing; None before the first report.
         self._missing: tuple[str, ...] | None = None
         self._cycle = Cycle(first_cycle_id - 1)
-        # Outages that have been logged and have not ended, by reason and user (0 for all users).
-        self._outages: NewestDict[tuple[str, int], None] = NewestDict(MAX_USERS)
-        # Missing roles and codebook as logged last; empty once a cycle has begun.
-        self._logged_lacking: tuple[str, ...] = ()
-        # Whether a cycle has been served since the last time that something was missing.
-        self._serving = False
+        self._service = ServiceLog()
 
-    def _use(self, settings: BaseStationSettings) -> None:
-        self._users.policy = settings.policy
-        self._allowed = parse_users(settings.allowed_users) or (range(LAST_NUMBER + 1),)
-        self._acks.clear()
+    def react(self, event: Event) -> None:
+        """Process an event, and log what its transitions mean for the service."""
+        before = self.state
+        super().react(event)
+        for message in self._observed(before):
+            self.act(message)
+
+    def _observed(self, before: enum.Enum) -> Iterable[LogMessage]:
+        """Return what to log about the transition from a state to the present one."""
+        cycle = self._cycle
+        if self.state is State.WAITING and self._missing is not None:
+            return self._service.waits(self._lacking())
+        if self.state is State.BEACONING:
+            self._service.begins()
+        elif self.state is State.RESTING and before in STEPS:
+            if self.outcome:
+                return self._service.gives_up(
+                    cycle.cycle_id, cycle.user, cycle.user_instance, self.outcome)
+            users = f'{len(self._users)} user{"s"[:len(self._users) != 1]}'
+            return self._service.serves(
+                cycle.cycle_id, cycle.user, f'codebook {cycle.codebook_id}, {users}')
+        elif self.state is State.PAUSED and before is not State.PAUSED:
+            reason = '' if before is State.WAITING else f' after cycle {cycle.cycle_id}'
+            if before is State.BEACONING:
+                reason = f': no user answered the beacon of cycle {cycle.cycle_id}'
+            return [LogMessage(f'paused{reason}')]
+        return ()
 
     def timeout_s(self, state: enum.Enum) -> float | None:
         """Return the timeout of a state [s], or None; the attempts at a step share it equally."""
@@ -154,14 +199,17 @@ class BaseStation(StateMachine):
 
     # Guards
 
+    def _ready(self, event: Event) -> bool:
+        return not self._lacking()
+
     def _not_ready(self, event: Event) -> bool:
-        """Return whether, after an event, roles are missing or unknown, or no codebook exists."""
-        missing = event.missing if isinstance(event, events.PeersChanged) else self._missing
-        has_codebook = self._offered or isinstance(event, events.CodebookOffered)
-        return missing != () or not has_codebook
+        return not self._ready(event)
 
     def _pausing(self, event: Event) -> bool:
         return self._pause_requested
+
+    def _pausing_or_not_ready(self, event: Event) -> bool:
+        return self._pausing(event) or self._not_ready(event)
 
     def _some_acks(self, event: Timeout) -> bool:
         return bool(self._users.answered)
@@ -189,15 +237,10 @@ class BaseStation(StateMachine):
         return event.stage is m.Stage.OFFERED or event.direction is m.Direction.DOWNLINK
 
     def _not_allowed(self, event: m.Ack) -> bool:
-        return not self._allows(event.user)
-
-    def _allows(self, user: int) -> bool:
-        return user <= self._settings.in_use.max_users and any(
-            user in users for users in self._allowed)
+        return not self._admission.allows(event.user)
 
     def _too_often(self, event: m.Ack) -> bool:
-        counted = self._acks[event.user] if math.floor(self.now_s) == self._second else 0
-        return counted + 1 > self._settings.in_use.ack_rate_hz
+        return self._admission.exceeds_rate(event.user, self.now_s)
 
     def _number_taken(self, event: m.Ack) -> bool:
         return self._users.is_taken(event.user, event.sender, self.now_s)
@@ -247,18 +290,10 @@ class BaseStation(StateMachine):
         if changes := self._settings.apply():
             self.log(changes)
             settings = self._settings.in_use
-            self._use(settings)
-            for user in self._users.remove_all_except(self._allows):
+            self._users.policy = settings.policy
+            self._admission = _admission(settings)
+            for user in self._users.remove_all_except(self._admission.allows):
                 self.log(f'user {user} removed: not in allowed_users {settings.allowed_users!r}')
-
-    def _log_not_ready(self, event: Event) -> None:
-        """Log missing roles and codebook if they have changed, unless the roles are unknown."""
-        lacking = self._lacking()
-        if self._missing is not None:
-            self._serving = False
-            if lacking != self._logged_lacking:
-                self._logged_lacking = lacking
-                self.log(f'waiting for {", ".join(lacking)}', warning=True)
 
     def fill(self, text: str) -> str:
         """Fill in the cycle id (``{cycle}``) and missing parts (``{lacking}``, ``{waiting}``)."""
@@ -280,14 +315,7 @@ class BaseStation(StateMachine):
         self._pause_requested = False
         self.log('resumed')
 
-    def _log_paused(self, event: events.PauseRequested | Timeout) -> None:
-        self.log(f'paused after cycle {self._cycle.cycle_id}')
-
-    def _log_unanswered(self, event: Timeout) -> None:
-        self.log(f'paused: no user answered the beacon of cycle {self._cycle.cycle_id}')
-
     def _begin_cycle(self, event: Event) -> None:
-        self._logged_lacking = ()
         self._cycle = Cycle(self._cycle.cycle_id + 1)
         self._beacon()
 
@@ -310,11 +338,7 @@ class BaseStation(StateMachine):
         self.send(m.derive(kind, self._cycle, **fields))
 
     def _count_ack(self, event: m.Ack) -> None:
-        second = math.floor(self.now_s)
-        if second != self._second:
-            self._second = second
-            self._acks.clear()
-        self._acks[event.user] += 1
+        self._admission.count(event.user, self.now_s)
 
     def _reject_number(self, event: m.Ack) -> None:
         self._users.reject(event.user)
@@ -336,11 +360,14 @@ class BaseStation(StateMachine):
 
     def _lose_absent(self) -> None:
         """Count missed invitations, and remove the users that no longer answer."""
+        instances = {user: self._users.owner(user) for user in self._users.awaited}
         lost = self._users.remove_absent()
         self.count(Outcome.USER_LOST, len(lost))
         if lost:
             plural, verb = ('s', 'answer') if len(lost) > 1 else ('', 'answers')
-            self.log(f'user{plural} {join_users(lost)} no longer {verb}', warning=True)
+            # A restarted user is another one; many users are one event.
+            self.log(f'user{plural} {join_users(lost)} no longer {verb}', warning=True,
+                     key=f'lost {lost[0]} {instances[lost[0]]}' if len(lost) == 1 else 'lost')
 
     def _command_bands(self, event: Event) -> None:
         for band in sorted(self._bands - self._cycle.configured):
@@ -359,22 +386,13 @@ class BaseStation(StateMachine):
                    n_frames=self._scenario.n_frames)
 
     def _store_signals(self, event: m.FeedSignals) -> None:
-        """Store the signals of a band, and the instances of user and channel if still unknown."""
-        cycle = self._cycle
-        cycle.user_instance = cycle.user_instance or event.user_instance
-        cycle.channel = cycle.channel or event.sender
-        cycle.stamp_ns = cycle.stamp_ns or event.stamp_ns
-        cycle.signals[event.band] = event.signals
+        self._cycle.store(event)
 
     def _send_signals(self, event: m.FeedSignals) -> None:
-        cycle = self._cycle
-        assert cycle.codebook
-        feeds = np.stack([cycle.signals[band] for band in sorted(self._bands)])
-        signals = self._receiver(cycle.codebook, feeds, cycle.user, cycle.cycle_id,
-                                 self._settings.in_use.receiver_noise)
-        cycle.received = m.derive(
-            m.ReceivedSignals, cycle, stamp_ns=cycle.stamp_ns, signals=signals)
-        self.send(cycle.received)
+        received = self._cycle.combined(
+            self._receiver, self._settings.in_use.receiver_noise)
+        self._cycle.received = received
+        self.send(received)
         self._announce(m.Phase.ESTIMATING)
 
     def _resend_signals(self, event: Timeout) -> None:
@@ -403,31 +421,13 @@ class BaseStation(StateMachine):
         self._users.remove(self._cycle.user)
 
     def _abandon(self, event: Timeout | m.NoFix) -> None:
-        """End the cycle without service; log the outage unless it has been logged."""
+        """End the cycle without service."""
         assert self.outcome
-        cycle, reason = self._cycle, self.outcome.value
-        self._end_cycle(reason)
-        outage = reason, cycle.user if self.outcome in _USER_REASONS else 0
-        if outage not in self._outages:
-            self._outages.put(outage, None)
-            self.log(f'cycle {cycle.cycle_id} of user {cycle.user} given up: {reason}',
-                     warning=True)
-        self._apply_settings(event)
+        self._end_cycle(self.outcome.value)
 
     def _finish(self, event: m.Data) -> None:
-        """End the cycle with service; log the start of service and the outages that ended."""
-        cycle, n_users = self._cycle, len(self._users)
+        """End the cycle with service."""
         self._end_cycle('served')
-        if not self._serving:
-            self._serving = True
-            self.log(f'serving: codebook {cycle.codebook_id}, {n_users} user{"s"[:n_users != 1]}')
-        ended = [outage for outage in self._outages if outage[1] in (0, cycle.user)]
-        for outage in ended:
-            del self._outages[outage]
-        if ended:
-            reasons = ', '.join(sorted({reason for reason, _ in ended}))
-            self.log(f'cycle {cycle.cycle_id}: user {cycle.user} served again after: {reasons}')
-        self._apply_settings(event)
 
     def _end_cycle(self, outcome: str) -> None:
         """Report the end of a cycle; a cycle without a fix counts as completed by its user."""
@@ -452,37 +452,31 @@ class BaseStation(StateMachine):
     _OF_CODEBOOK: Drops = {_wrong_codebook: Outcome.WRONG_CODEBOOK}
     _DELIVERED: Drops = {_not_delivered_uplink: None}
 
-    # For each event, the first matching row applies.
-    TABLE = (
-        *on(events.CodebookOffered, 'codebook')(
-            # A new codebook takes effect with the next beacon.
-            Row((State.WAITING,), (_store_codebook, _log_not_ready), guard=_not_ready),
-            Row((State.WAITING,), (_store_codebook, _begin_cycle), State.BEACONING),
-            Row(ANY, (_store_codebook,))),
-        *on(events.PeersChanged, 'peers')(
-            Row((State.WAITING,), (_store_peers, _log_not_ready), guard=_not_ready),
-            Row((State.WAITING,), (_store_peers, _begin_cycle), State.BEACONING),
-            Row(ANY, (_store_peers,))),
+    # In each table, the first matching row for an event applies. The operator and the other roles
+    # decide when cycles begin.
+    _OPERATION = (
+        *on(events.Immediately, 'immediately')(
+            Row((State.WAITING,), target=State.PAUSED, guard=_pausing),
+            Row((State.WAITING,), (_begin_cycle,), State.BEACONING, guard=_ready)),
+        # A new codebook takes effect with the next beacon.
+        *on(events.CodebookOffered, 'codebook')(Row(ANY, (_store_codebook,))),
+        *on(events.PeersChanged, 'peers')(Row(ANY, (_store_peers,))),
         *on(events.SettingsOffered, 'settings')(
             Row((State.WAITING, State.PAUSED), (_store_settings, _apply_settings)),
             Row((State.RESTING,), (_store_settings, _apply_settings), restart_timeout=True),
             Row(ANY, (_store_settings,))),
+        # A pause persists while another base station serves.
         *on(events.StoodBy, 'stood_by')(
-            # A pause persists while another base station serves.
-            Row(ANY, (_forget_peers, _apply_settings), State.PAUSED, guard=_pausing),
             Row(ANY, (_forget_peers, _apply_settings), State.WAITING)),
         *on(events.Resumed, 'resumed')(
             Row((State.WAITING, State.PAUSED), (_skip_cycles,))),
         *on(events.PauseRequested, 'pause')(
             # A pause begins between cycles or after an unanswered beacon; a step runs one cycle.
             Row((State.PAUSED,), (reply(True, 'already paused'),)),
-            Row((State.WAITING, State.RESTING), (_pause, _log_paused, reply(True, 'paused')),
-                State.PAUSED),
+            Row((State.WAITING, State.RESTING), (_pause, reply(True, 'paused')), State.PAUSED),
             Row(ANY, (_pause, reply(True, 'the pause begins after cycle {cycle}')))),
         *on(events.ResumeRequested, 'resume')(
-            Row((State.PAUSED,), (_resume, _log_not_ready, reply_resumed), State.WAITING,
-                guard=_not_ready),
-            Row((State.PAUSED,), (_resume, _begin_cycle, reply_resumed), State.BEACONING),
+            Row((State.PAUSED,), (_resume, reply_resumed), State.WAITING),
             Row(ANY, (_resume, reply_resumed), guard=_pausing),
             Row(ANY, (reply(True, 'not paused'),))),
         *on(events.StepRequested, 'step')(
@@ -493,38 +487,10 @@ class BaseStation(StateMachine):
             Row(ANY, (reply(False, 'not paused; a step requires a pause'),))),
         *on(events.LocateRequested, 'locate')(
             Row(ANY, (_prefer_user,))),
-        *on(Timeout, 'timeout')(
-            Row((State.RESTING,), (_log_paused,), State.PAUSED, guard=_pausing),
-            Row((State.RESTING,), (_log_not_ready,), State.WAITING, guard=_not_ready),
-            Row((State.RESTING,), (_begin_cycle,), State.BEACONING),
-            Row((State.BEACONING,), (_grant,), State.CONFIGURING, guard=_some_acks),
-            Row((State.BEACONING,), (_apply_settings, _log_unanswered), State.PAUSED,
-                guard=_pausing),
-            Row((State.BEACONING,), (_apply_settings, _log_not_ready), State.WAITING,
-                guard=_not_ready),
-            Row((State.BEACONING,), (_apply_settings, _beacon_again), outcome=Outcome.UNANSWERED,
-                restart_timeout=True),
-            Row((State.CONFIGURING,), (_command_bands,), guard=_may_retry,
-                outcome=Outcome.RETRY_RHS, restart_timeout=True),
-            Row((State.CONFIGURING,), (_abandon,), State.RESTING, outcome=Outcome.RHS_SILENT),
-            # Repeat the command too, because the channel may have missed the report of the RHS.
-            Row((State.SOUNDING,), (_command_silent_bands, _request_pilots), guard=_may_retry,
-                outcome=Outcome.RETRY_BAND, restart_timeout=True),
-            Row((State.SOUNDING,), (_remove_user, _abandon), State.RESTING,
-                outcome=Outcome.USER_GONE),
-            Row((State.ESTIMATING,), (_resend_signals,), guard=_may_retry,
-                outcome=Outcome.RETRY_POSITION, restart_timeout=True),
-            Row((State.ESTIMATING,), (_abandon,), State.RESTING,
-                outcome=Outcome.POSITIONER_SILENT),
-            # Roles answer a repeated message again, so repeated signals lead to the beam again.
-            Row((State.STEERING,), (_resend_signals,), guard=_may_retry,
-                outcome=Outcome.RETRY_BEAM, restart_timeout=True),
-            Row((State.STEERING,), (_abandon,), State.RESTING,
-                outcome=Outcome.TRANSMISSION_SILENT),
-            # The channel may have missed the beam or its configuration.
-            Row((State.TRANSMITTING,), (_resend_signals, _send_downlink), guard=_may_retry,
-                outcome=Outcome.RETRY_DATA, restart_timeout=True),
-            Row((State.TRANSMITTING,), (_abandon,), State.RESTING, outcome=Outcome.DATA_LOST)),
+    )
+
+    # Which acks count, and which of them ends the wait for acks.
+    _ADMISSION = (
         *on(m.Ack, 'ack', {_not_allowed: Outcome.NOT_ALLOWED, _too_often: Outcome.TOO_OFTEN})(
             # All acks that pass these two checks count towards the rate limit.
             Row(ANY, (_count_ack,), guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE),
@@ -537,6 +503,41 @@ class BaseStation(StateMachine):
             Row((State.BEACONING,), (_count_ack, _accept_ack, _grant), State.CONFIGURING,
                 guard=_last_ack),
             Row((State.BEACONING,), (_count_ack, _accept_ack))),
+    )
+
+    # The steps of a cycle, in order, and their timeouts.
+    _CYCLE = (
+        *on(Timeout, 'timeout')(
+            Row((State.RESTING,), target=State.WAITING, guard=_pausing_or_not_ready),
+            Row((State.RESTING,), (_begin_cycle,), State.BEACONING),
+            Row((State.BEACONING,), (_grant,), State.CONFIGURING, guard=_some_acks),
+            Row((State.BEACONING,), (_apply_settings,), State.WAITING,
+                guard=_pausing_or_not_ready),
+            Row((State.BEACONING,), (_apply_settings, _beacon_again), outcome=Outcome.UNANSWERED,
+                restart_timeout=True),
+            Row((State.CONFIGURING,), (_command_bands,), guard=_may_retry,
+                outcome=Outcome.RETRY_RHS, restart_timeout=True),
+            Row((State.CONFIGURING,), (_abandon, _apply_settings), State.RESTING,
+                outcome=Outcome.RHS_SILENT),
+            # Repeat the command too, because the channel may have missed the report of the RHS.
+            Row((State.SOUNDING,), (_command_silent_bands, _request_pilots), guard=_may_retry,
+                outcome=Outcome.RETRY_BAND, restart_timeout=True),
+            Row((State.SOUNDING,), (_remove_user, _abandon, _apply_settings), State.RESTING,
+                outcome=Outcome.USER_GONE),
+            Row((State.ESTIMATING,), (_resend_signals,), guard=_may_retry,
+                outcome=Outcome.RETRY_POSITION, restart_timeout=True),
+            Row((State.ESTIMATING,), (_abandon, _apply_settings), State.RESTING,
+                outcome=Outcome.POSITIONER_SILENT),
+            # Roles answer a repeated message again, so repeated signals lead to the beam again.
+            Row((State.STEERING,), (_resend_signals,), guard=_may_retry,
+                outcome=Outcome.RETRY_BEAM, restart_timeout=True),
+            Row((State.STEERING,), (_abandon, _apply_settings), State.RESTING,
+                outcome=Outcome.TRANSMISSION_SILENT),
+            # The channel may have missed the beam or its configuration.
+            Row((State.TRANSMITTING,), (_resend_signals, _send_downlink), guard=_may_retry,
+                outcome=Outcome.RETRY_DATA, restart_timeout=True),
+            Row((State.TRANSMITTING,), (_abandon, _apply_settings), State.RESTING,
+                outcome=Outcome.DATA_LOST)),
         *on(m.RhsConfiguration, 'configured', _OF_CYCLE | _OF_CODEBOOK)(
             # The report concerns the configurations of a band or the configuration of the beam.
             Row((State.CONFIGURING,), (_store_configured, _request_pilots), State.SOUNDING,
@@ -560,7 +561,8 @@ class BaseStation(StateMachine):
             Row((State.STEERING,)),
             Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
         *on(m.NoFix, 'no_fix', _OF_USER | _OF_CODEBOOK)(
-            Row((State.ESTIMATING,), (_abandon,), State.RESTING, outcome=Outcome.NO_FIX)),
+            Row((State.ESTIMATING,), (_abandon, _apply_settings), State.RESTING,
+                outcome=Outcome.NO_FIX)),
         *on(m.Beam, 'beam', _OF_USER | _OF_CODEBOOK)(
             Row((State.ESTIMATING,), (_store_beam,), State.STEERING),
             Row((State.STEERING,), (_store_beam, _begin_transmission), State.TRANSMITTING,
@@ -568,6 +570,8 @@ class BaseStation(StateMachine):
             Row((State.STEERING,), (_store_beam,)),
             Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
         *on(m.Data, 'delivered', _DELIVERED | _OF_USER)(
-            Row((State.TRANSMITTING,), (_finish,), State.RESTING),
+            Row((State.TRANSMITTING,), (_finish, _apply_settings), State.RESTING),
             Row((State.PAUSED, State.RESTING), outcome=Outcome.DUPLICATE)),
     )
+
+    TABLE = (*_OPERATION, *_CYCLE, *_ADMISSION)

@@ -1,4 +1,8 @@
-"""The emulated channel: line of sight, multipath, surface, and losses and delays of messages."""
+"""The front end: a surface and a radio, and the emulated channel in front of them.
+
+The channel has a line of sight, multipath, and losses and delays of messages. Surface and radio
+may be hardware; their faults are those of a measurement, and no signals are sent for it.
+"""
 
 import dataclasses
 import heapq
@@ -8,15 +12,23 @@ from typing import Any
 
 import numpy as np
 
+from rhs_isac_ros.frontend import FrontEnd, RadioFault, Sounding, SurfaceFault
 from rhs_isac_ros.link import Beam, actual_capacity
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.elements import DeclaredElements, draw_surface
+from rhs_isac_ros.model.elements import DeclaredElements, SurfaceEstimate, draw_surface
 from rhs_isac_ros.model.impairments import draw_factors
 from rhs_isac_ros.model.los import direct_gain, draw_blocked
 from rhs_isac_ros.model.multipath import draw_multipath, time_correlation
 from rhs_isac_ros.model.surface import element_signals, feed_signals
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Event, Outcome, SettingsOffered
+from rhs_isac_ros.protocol.events import (
+    ApplyPatterns,
+    Event,
+    FrontEndFailed,
+    Outcome,
+    PatternsApplied,
+    SettingsOffered,
+)
 from rhs_isac_ros.protocol.role import REMEMBERED_CYCLES, NewestDict, Role
 from rhs_isac_ros.protocol.settings import Impairments, PendingSettings
 from rhs_isac_ros.support import streams
@@ -104,6 +116,7 @@ class _Cycle:
     """The true position of the user in a cycle, and the resulting channel."""
 
     truth: m.GroundTruth
+    position: np.ndarray         # in the frame of the surface, float64 [1, 3]
     multipath: list[np.ndarray]  # of each band, complex128 [N_SB, F, N_E]
     # Whether the user has no direct path, bool [1].
     blocked: np.ndarray
@@ -115,22 +128,63 @@ class _Cycle:
     rate_bps: float | None = None
 
 
+@dataclasses.dataclass(frozen=True)
+class _Exchange:
+    """A message of a cycle, and the configurations that the surface shows for its answer."""
+
+    event: m.Pilot | m.Data
+    cycle: _Cycle
+    configurations: np.ndarray
+
+    def covers(self, event: m.Pilot | m.Data, cycle: _Cycle) -> bool:
+        """Return whether another message of the cycle asks for the same answer."""
+        own = self.event
+        return cycle is self.cycle and (
+            isinstance(own, m.Pilot) and isinstance(event, m.Pilot) and own.band == event.band
+            or isinstance(own, m.Data) and isinstance(event, m.Data)
+            and own.direction is event.direction)
+
+
+def apply_patterns(
+        front_end: FrontEnd, request: ApplyPatterns) -> PatternsApplied | FrontEndFailed:
+    """Show and measure configurations one after the other, until one fails."""
+    feeds = None
+    try:
+        if request.sounding:
+            feeds = front_end.sound(request.configurations, request.sounding)
+        else:
+            front_end.show(request.configurations)
+    except SurfaceFault as fault:
+        return FrontEndFailed(request.key, f'surface_{fault.kind}', f'surface: {fault}')
+    except RadioFault as fault:
+        return FrontEndFailed(request.key, 'radio', f'radio: {fault}')
+    # The surface cannot show such a configuration, or a driver of another package fails.
+    except Exception as error:
+        kind = type(error).__name__
+        return FrontEndFailed(request.key, f'surface_{kind}', f'surface: {kind}: {error}')
+    return PatternsApplied(request.key, feeds)
+
+
 class Channel(Role):
-    """The role that emulates the radio channel, the surface and the loss of messages.
+    """The role that steps the front end, and emulates the channel and the loss of messages.
 
     It answers pilots once it has received the true position of the user and the configurations
     for the band. It answers data once it has received the position, the beam and its
-    configuration. The position applies to the whole cycle, because the user hardly moves during
-    the emulated signals. Changed impairments take effect with the next cycle.
+    configuration. Before each answer, the surface shows the configurations of the frames, and the
+    radio measures pilots. If one of these fails, there is no answer: the base station asks again,
+    and finally gives the cycle up. The position applies to the whole cycle, because the user
+    hardly moves during the emulated signals. Changed impairments take effect with the next cycle.
+    If `states` are given, the elements have the coefficients that this estimate expects.
     """
 
     SENDS = (m.FeedSignals, m.Data)
     RECEIVES = (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data)
 
     def __init__(self, scenario: Scenario, seed: int,
-                 impairments: Impairments | None = None) -> None:
+                 impairments: Impairments | None = None,
+                 states: SurfaceEstimate | None = None) -> None:
         super().__init__()
-        self._scenario, self._seed = scenario, seed
+        self._scenario, self._seed, self._states = scenario, seed, states
         self._settings = PendingSettings(impairments or Impairments())
         self._use(self._settings.in_use)
         self._cycle: _Cycle | None = None
@@ -144,22 +198,27 @@ class Channel(Role):
         self._beams: NewestDict[tuple[int, int], m.Beam] = NewestDict(_MAX_PENDING)
         # Messages to answer, in order, by cycle and serial number.
         self._pending: NewestDict[tuple[int, int], m.Pilot | m.Data] = NewestDict(_MAX_PENDING)
+        self._applying: dict[tuple[int, int], _Exchange] = {}
+        # Description of the present fault of the front end, or empty.
+        self._fault = ''
         self._serial = itertools.count()
 
     def _use(self, impairments: Impairments) -> None:
         """Apply impairments; draw the surface from the seed, so the same elements fail again."""
         self._deviating = impairments.applied_to(self._scenario)
-        self._surface = (
+        self._elements = (
             None if DeclaredElements(self._deviating).is_exact
             else draw_surface(self._deviating, streams.generator(self._seed, streams.SURFACE)))
+        self._pose = impairments.pose_of(self._scenario)
 
     def next_deadline(self) -> float | None:
         """Return the time at which the next message arrives [s], or None if none is in flight."""
         return self._air.in_flight[0][0] if self._air.in_flight else None
 
     def status(self) -> Mapping[str, str]:
-        """Return the impairments in use and the pending ones, for the diagnostics."""
-        return self._settings.describe()
+        """Return the impairments in use, the pending ones and the fault of the front end."""
+        warning = {'warning.front_end': self._fault} if self._fault else {}
+        return self._settings.describe() | warning
 
     def react(self, event: Event) -> None:
         """Process an event, then send the signals and data whose delay has passed."""
@@ -176,6 +235,10 @@ class Channel(Role):
             case m.Pilot() | m.Data(stage=m.Stage.OFFERED):
                 self.count(Outcome.OVERFLOW, self._pending.put(
                     (event.cycle_id, next(self._serial)), event))
+            case PatternsApplied():
+                self._resume(event)
+            case FrontEndFailed():
+                self._fail(event)
         if self._cycle and isinstance(event, m.Message):
             if isinstance(event, m.Beam | m.RhsConfiguration):
                 # Compute the capacity, which is the same in both directions, before data arrive.
@@ -203,10 +266,15 @@ class Channel(Role):
         if changes := self._settings.apply():
             self.log(changes)
             self._use(self._settings.in_use)
+        position = self._pose.to_surface(truth.position[None])
+        if position[0, 0] <= 0:
+            # Another surface of the site may have the user in sight.
+            self.count(Outcome.BEHIND)
+            return
         multipath = self._fading.gains(
             truth.user, truth.cycle_id, truth.time_s(self.now_s),
             memory=self._settings.in_use.multipath_memory)
-        self._cycle = self._draw(truth, multipath)
+        self._cycle = self._draw(truth, position, multipath)
         self.count(Outcome.STALE, sum(key[0] != truth.cycle_id for key in self._pending))
         stores: tuple[NewestDict[Any, Any], ...] = (
             self._pending, self._configurations, self._beams)
@@ -215,7 +283,8 @@ class Channel(Role):
                 del store[stale]
         self._cycle.rate_bps = self._rate_bps(self._cycle)
 
-    def _draw(self, truth: m.GroundTruth, multipath: list[np.ndarray]) -> _Cycle:
+    def _draw(self, truth: m.GroundTruth, position: np.ndarray, multipath: list[np.ndarray]
+              ) -> _Cycle:
         """Draw the channel of a cycle in advance, so that answers to pilots are not delayed."""
         scenario, seed, user = self._scenario, self._seed, truth.user
         blocked = draw_blocked(
@@ -225,68 +294,102 @@ class Channel(Role):
             streams.generator(seed, streams.CYCLE_DEVIATION, user, truth.cycle_id))
         if factors is not None:
             factors = factors.reshape(scenario.n_bands, scenario.n_subbands, scenario.n_frames)
-        los = [direct_gain(scenario, truth.position[None], band, blocked)[0]
+        los = [direct_gain(scenario, position, band, blocked)[0]
                for band in range(scenario.n_bands)]
-        return _Cycle(truth, multipath, blocked, los, factors)
+        return _Cycle(truth, position, multipath, blocked, los, factors)
 
     def _answer_pending(self, cycle: _Cycle) -> None:
         for key, event in list(self._pending.items()):
-            answer = None
             if event.cycle_id != cycle.truth.cycle_id:
                 continue
             if event.user != cycle.truth.user:
                 self.count(Outcome.WRONG_USER)
             elif _is_from_other_instance(event, cycle.truth):
                 self.count(Outcome.WRONG_INSTANCE)
-            elif answer := self._answer(event, cycle):
-                if impaired := self._air.send(answer, self._settings.in_use, self.now_s):
-                    self.counters[impaired] += 1
+            elif any(exchange.covers(event, cycle) for exchange in self._applying.values()):
+                self.count(Outcome.DUPLICATE)
+            elif (configurations := self._configurations_for(event, cycle)) is not None:
+                self._applying[key] = _Exchange(event, cycle, configurations)
+                self.act(ApplyPatterns(
+                    key, configurations, self._sounding(event, cycle, configurations)))
             else:
                 continue
             del self._pending[key]
 
-    def _answer(self, event: m.Pilot | m.Data, cycle: _Cycle) -> m.Message | None:
+    def _configurations_for(
+            self, event: m.Pilot | m.Data, cycle: _Cycle) -> np.ndarray | None:
+        """Return what the surface is to show for a message, [F, N_E]; None if still unknown."""
         if isinstance(event, m.Pilot):
-            applied = self._applied(cycle, m.Mode.POSITIONING, event.band)
-            return None if applied is None else self._propagate(event, cycle, applied)
-        if cycle.rate_bps is None:
+            return self._configurations.get((event.cycle_id, m.Mode.POSITIONING, event.band))
+        beam = self._beams.get((event.cycle_id, event.user))
+        if beam is None or cycle.rate_bps is None:
             return None
+        return self._configurations[event.cycle_id, m.Mode.TRANSMISSION, beam.band]
+
+    def _resume(self, applied: PatternsApplied) -> None:
+        """Answer a message whose configurations were shown, unless its cycle is over."""
+        if self._fault:
+            self._fault = ''
+            self.log_state('front end', 'surface and radio work again', False)
+        exchange = self._applying.pop(applied.key)
+        if exchange.cycle is not self._cycle:
+            self.count(Outcome.STALE)
+        elif impaired := self._air.send(
+                self._answer(exchange, applied.feeds), self._settings.in_use, self.now_s):
+            self.counters[impaired] += 1
+
+    def _fail(self, failure: FrontEndFailed) -> None:
+        del self._applying[failure.key]
+        self._fault = failure.text
+        self.counters[failure.kind] += 1
+        self.log(failure.text, warning=True, key=failure.kind)
+
+    def _answer(self, exchange: _Exchange, feeds: np.ndarray | None) -> m.Message:
+        event, cycle = exchange.event, exchange.cycle
+        if isinstance(event, m.Pilot):
+            return m.derive(m.FeedSignals, event, stamp_ns=event.stamp_ns,
+                            user_instance=event.sender, signals=feeds)
         # Data in excess of the true capacity are lost.
+        assert cycle.rate_bps is not None
         bits = min(event.bits, cycle.rate_bps * event.duration_s // 1)
         return dataclasses.replace(event, stage=m.Stage.DELIVERED, bits=bits)
 
-    def _applied(self, cycle: _Cycle, mode: m.Mode, band: int) -> np.ndarray | None:
-        """Return the coefficients that the surface applies in each frame; None if unknown."""
-        reported = self._configurations.get((cycle.truth.cycle_id, mode, band))
-        if reported is None or self._surface is None:
-            return reported
-        return self._surface.applied(reported)
+    def _coefficients(self, configurations: np.ndarray, band: int) -> np.ndarray:
+        """Return the coefficients of the elements in each frame of a band, [F, N_E]."""
+        if self._states:
+            configurations = self._states.band_gains[band] * self._states.applied(configurations)
+        return configurations if self._elements is None else self._elements.applied(configurations)
 
-    def _propagate(self, pilot: m.Pilot, cycle: _Cycle, applied: np.ndarray) -> m.FeedSignals:
-        """Return the signals at the feeds for the coefficients applied in each frame."""
-        band = pilot.band
-        elements = element_signals(
-            cycle.los[band][:, None], cycle.multipath[band], pilot.symbols[:, None])
-        feeds = feed_signals(self._scenario, band, applied, elements.swapaxes(0, 1))
+    def _sounding(self, event: m.Pilot | m.Data, cycle: _Cycle,
+                  configurations: np.ndarray) -> Sounding | None:
+        """Return the emulated air in each frame of a pilot; None for data."""
+        if isinstance(event, m.Data):
+            return None
+        band = event.band
+        elements = element_signals(cycle.los[band][:, None], cycle.multipath[band], 1.0)
+        feeds = feed_signals(self._scenario, band, self._coefficients(configurations, band),
+                             elements.swapaxes(0, 1))
         if cycle.factors is not None:
             feeds = feeds * cycle.factors[band].T[:, :, None]
-        return m.derive(m.FeedSignals, pilot, stamp_ns=pilot.stamp_ns, user_instance=pilot.sender,
-                        signals=feeds)
+        return Sounding(event.cycle_id, band, event.symbols, feeds, event.user,
+                        cycle.truth.position, event.stamp_ns)
 
     def _rate_bps(self, cycle: _Cycle) -> float | None:
         """Return the true capacity [bit/s]; None until the beam and its configuration arrive."""
         beam = self._beams.get((cycle.truth.cycle_id, cycle.truth.user))
         if beam is None:
             return None
-        applied = self._applied(cycle, m.Mode.TRANSMISSION, beam.band)
-        if applied is None:
+        configurations = self._configurations.get(
+            (cycle.truth.cycle_id, m.Mode.TRANSMISSION, beam.band))
+        if configurations is None:
             return None
+        (applied,) = self._coefficients(configurations, beam.band)
         digital = beam.digital
         if cycle.factors is not None:
             # The phases of the factors do not change the capacity.
             digital = digital * np.abs(cycle.factors[beam.band, 0, 0])
         return float(actual_capacity(
-            self._scenario, Beam(applied[0], digital, beam.band), cycle.truth.position[None],
+            self._scenario, Beam(applied, digital, beam.band), cycle.position,
             cycle.blocked)[0])
 
 

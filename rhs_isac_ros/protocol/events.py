@@ -2,16 +2,26 @@
 
 import dataclasses
 import enum
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.frontend import Sounding
 from rhs_isac_ros.positioning import Estimator, TrackEstimate
+from rhs_isac_ros.positioning.agreement import Pair
 from rhs_isac_ros.protocol.messages import Message
 
 
 @dataclasses.dataclass(frozen=True)
 class Timeout:
     """The deadline of the role has passed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Immediately:
+    """Another event has led to the present state: the event of rows that wait for nothing."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -79,8 +89,37 @@ class EstimatorBuilt:
     failure: str = ''
 
 
-Event = (Message | Timeout | CodebookOffered | SettingsOffered | PeersChanged | StoodBy | Resumed
-         | PauseRequested | ResumeRequested | StepRequested | LocateRequested | EstimatorBuilt)
+@dataclasses.dataclass(frozen=True)
+class PatternsApplied:
+    """The surface has shown and confirmed all configurations of the `ApplyPatterns` with `key`.
+
+    `feeds` are the signals that were measured for unit symbols, complex128 [F, N_SB, K].
+    """
+
+    key: tuple[int, int]
+    feeds: np.ndarray | None = dataclasses.field(default=None, compare=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class FrontEndFailed:
+    """A configuration of the `ApplyPatterns` with `key` was not confirmed, or not measured."""
+
+    key: tuple[int, int]
+    kind: str  # identifies faults of the same kind, such as ``surface_silence``
+    text: str
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class AgreementsDrawn:
+    """Agreements of the surfaces of a site for right poses, as `PoseTest` takes them."""
+
+    references: Sequence[Mapping[Pair, float]]
+    places: np.ndarray
+
+
+Event = (Message | Timeout | Immediately | CodebookOffered | SettingsOffered | PeersChanged
+         | StoodBy | Resumed | PauseRequested | ResumeRequested | StepRequested | LocateRequested
+         | EstimatorBuilt | PatternsApplied | FrontEndFailed | AgreementsDrawn)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,10 +131,17 @@ class Send:
 
 @dataclasses.dataclass(frozen=True)
 class LogMessage:
-    """Log a text, as a warning if `warning` is set."""
+    """Log a text, as a warning if `warning` is set.
+
+    `holds` is True if the state named by `key` begins or has another text, False if it ends, and
+    None if the text is about an event. The log limits states and warnings that repeat; an event
+    without a `key` is identified by its text.
+    """
 
     text: str
     warning: bool = False
+    key: str = ''
+    holds: bool | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +158,19 @@ class BuildEstimator:
 
     codebook: Codebook
     settings: Any
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ApplyPatterns:
+    """Show configurations on the surface, one after the other, float64 [F, N_E].
+
+    If there is a `sounding`, measure each of them. Reply with `PatternsApplied` or, after the
+    first fault, `FrontEndFailed`.
+    """
+
+    key: tuple[int, int]
+    configurations: np.ndarray
+    sounding: Sounding | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +192,8 @@ class PublishTrack:
     stamp_ns: int = 0
 
 
-Action = Send | LogMessage | Reply | BuildEstimator | RevertSettings | PublishTrack
+Action = (Send | LogMessage | Reply | BuildEstimator | ApplyPatterns | RevertSettings
+          | PublishTrack)
 
 
 class Kind(enum.Enum):
@@ -175,6 +235,7 @@ class Outcome(enum.Enum):
     STALE_COMMAND = 'stale_command', Kind.DROPPED
     STALE = 'stale', Kind.DROPPED
     OVERFLOW = 'overflow', Kind.DROPPED
+    BEHIND = 'behind', Kind.DROPPED
 
     RETRY_RHS = 'retry_rhs', Kind.REPEATED
     RETRY_BAND = 'retry_band', Kind.REPEATED
@@ -190,6 +251,8 @@ class Outcome(enum.Enum):
     POSITIONER_SILENT = 'positioner_silent', Kind.LOST
     TRANSMISSION_SILENT = 'transmission_silent', Kind.LOST
     DATA_LOST = 'data_lost', Kind.LOST
+    # A cycle in which a surface that follows another one has not received the pilots of all bands.
+    INCOMPLETE = 'incomplete', Kind.LOST
     # A cycle that ended without service to a user that answered, as counted by that user.
     NOT_GRANTED = 'not_granted', Kind.LOST
     ABANDONED = 'abandoned', Kind.LOST

@@ -10,6 +10,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from rhs_isac_ros.model import Pose, Scenario
+from rhs_isac_ros.model.arrays import all_finite, position_problem
 from rhs_isac_ros.support.fields import Field
 
 
@@ -19,15 +21,16 @@ class MessageError(ValueError):
 
 def array(
         dims: str, kind: type = float, low: float = -math.inf, high: float = math.inf,
-        nan_allowed: bool = False) -> Any:
-    """Declare an array field; `low` and `high` are inclusive limits of real entries.
+        nan_allowed: bool = False, in_front: bool = False) -> Any:
+    """Declare an array field; `low` and `high` are inclusive limits of magnitudes if complex.
 
     `dims` lists the dimensions, separated by spaces: numbers, or symbols of `Scenario.sizes` or
-    `Message.own_sizes`. If `nan_allowed` is set, NaN stands for an unknown value.
+    `Message.own_sizes`. If `nan_allowed` is set, NaN stands for an unknown value. With `in_front`,
+    the entries are positions in front of the surface, in the frame of the site.
     """
     return dataclasses.field(
         metadata={'dims': tuple(dims.split()), 'declared': Field(kind, low=low, high=high),
-                  'nan_allowed': nan_allowed})
+                  'nan_allowed': nan_allowed, 'in_front': in_front})
 
 
 def index(symbol: str) -> Any:
@@ -51,24 +54,32 @@ def optional_float() -> Any:
     return dataclasses.field(metadata={'nan_allowed': True})
 
 
-def check(message: 'Message', sizes: Mapping[str, int]) -> None:
-    """Check the fields of a message against their declarations and the sizes of a scenario.
+def check(message: 'Message', scenario: Scenario) -> None:
+    """Check the fields of a message against their declarations and a scenario.
 
-    Raises MessageError if a shape or a size is wrong, an index or a number is out of range, or a
-    number is not finite, except where NaN is allowed.
+    Raises MessageError if a shape or a size is wrong, an index or a number is out of range, a
+    number is not finite, except where NaN is allowed, a position is behind the surface, or the
+    message has a problem of its own.
     """
+    sizes = scenario.sizes
     own = message.own_sizes(sizes)
     sizes = {**sizes, **own} if own else sizes
     kind: type = type(message)
-    for name, problem_of in _checks(kind):
-        if problem := problem_of(getattr(message, name), sizes):
+    for name, problem_of, in_front in _checks(kind):
+        value = getattr(message, name)
+        problem = problem_of(value, sizes) or (
+            position_problem(scenario.pose.to_surface(value)) if in_front else '')
+        if problem:
             raise MessageError(f'{kind.__name__}.{name}: {problem}')
+    if problem := message.own_problem():
+        raise MessageError(f'{kind.__name__}.{problem}')
 
 
 @functools.cache
-def _checks(kind: type) -> tuple[tuple[str, Callable[[Any, Mapping[str, int]], str]], ...]:
-    """Return the name of each field to check, and a function that describes a violation."""
-    return tuple((field.name, functools.partial(_check_of(field.metadata), field.metadata))
+def _checks(kind: type) -> tuple[tuple[str, Callable[[Any, Mapping[str, int]], str], bool], ...]:
+    """Return the name, a function that describes violations, and `in_front` of each field."""
+    return tuple((field.name, functools.partial(_check_of(field.metadata), field.metadata),
+                  field.metadata.get('in_front', False))
                  for field in dataclasses.fields(kind) if field.metadata or field.type is float)
 
 
@@ -108,17 +119,24 @@ def _array_problem(
         described = ', '.join(d if d.isdigit() else f'{d} = {e}'
                               for d, e in zip(dims, expected, strict=True))
         return f'shape {list(value.shape)}, expected [{described}]'
+    if isinstance(value, np.ma.MaskedArray) or (
+            value.dtype.kind == 'c' and declared.kind is not complex):
+        return f'{type(value).__name__} of {value.dtype}, expected real numbers without a mask'
     has_range = value.size and (declared.low > -math.inf or declared.high < math.inf)
+    if has_range and declared.kind is complex:
+        value = np.abs(value)
     # A comparison with NaN is false, so an array that passes this check contains no NaN.
     if has_range and declared.low <= value.min() and value.max() <= declared.high:
         return ''
-    finite = np.isfinite(value)
-    if not finite.all() and not (meta['nan_allowed'] and (finite | np.isnan(value)).all()):
+    if not all_finite(value) and not (
+            meta['nan_allowed'] and (np.isfinite(value) | np.isnan(value)).all()):
         return 'not finite, expected finite numbers'
     return (f'{value.min():g} to {value.max():g}, expected {declared.range}' if has_range else '')
 
 
 _LAST_USER = 2**32 - 1
+# Highest magnitude of the coordinates in a message [m].
+MAX_COORDINATE_M = 1e6
 _MAX_BITS = 1e15
 
 
@@ -176,6 +194,10 @@ class Message:
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
         """Return the sizes that depend on the message itself, by symbol as in `Scenario.sizes`."""
         return {}
+
+    def own_problem(self) -> str:
+        """Return the name of an invalid field and what is wrong with it; '' if there is none."""
+        return ''
 
 
 def same_instance(one: int, other: int) -> bool:
@@ -274,12 +296,15 @@ class Pilot(Message):
 
     user: int = number(1, _LAST_USER)
     band: int = index('N_B')
-    symbols: np.ndarray = array('F', complex)
+    symbols: np.ndarray = array('F', complex, low=0.99, high=1.01)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class FeedSignals(Message):
-    """Signals at the feeds of the surface, due to the pilots of a user in one band."""
+    """Signals at the feeds of the surface for the pilots of a user in one band, per unit symbol.
+
+    The sender divides the signals of each frame by the symbol of the pilots.
+    """
 
     user: int = number(1, _LAST_USER)
     user_instance: int = 0
@@ -299,18 +324,69 @@ class ReceivedSignals(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class PositionEstimate(Message):
-    """Estimate of the position of a user."""
+    """Estimate of the position of a user, in the frame of the site."""
 
     user: int = number(1, _LAST_USER)
     user_instance: int = 0
     codebook_id: str
-    position: np.ndarray = array('3', low=-1e6, high=1e6)
+    position: np.ndarray = array('3', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M,
+                                 in_front=True)
     covariance_m2: np.ndarray = array('3 3')
     crlb_m2: float = optional_float()
     estimator: str
     latency_s: float = number(0, 3600)
     outside_probability: float = number(0, 1, default=0.0)
     blocked_probability: float = number(0, 1, default=0.0)
+
+
+# Maximum number of components of a mixture in a message.
+_MAX_COMPONENTS = 256
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class Posterior(Message):
+    """What one or all surfaces know about the position of a user, in the frame of the site."""
+
+    user: int = number(1, _LAST_USER)
+    user_instance: int = 0
+    codebook_id: str
+    log_weights: np.ndarray = array('COMPONENTS')
+    means: np.ndarray = array('COMPONENTS 3', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M)
+    covariances_m2: np.ndarray = array(
+        'COMPONENTS 3 3', low=-MAX_COORDINATE_M**2, high=MAX_COORDINATE_M**2)
+    log_evidence: float
+    missing_probability: float = number(1e-9, 1 - 1e-9)
+    outside_probability: float = number(0, 1, default=0.0)
+    blocked_probability: float = number(0, 1, default=0.0)
+    surface_position_m: np.ndarray = array('3', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M)
+    surface_quaternion: np.ndarray = array('4', low=-1, high=1)
+    surface_uncertainty: np.ndarray = array('6 6', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M)
+
+    def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
+        """Return the number of Gaussians, COMPONENTS."""
+        return {'COMPONENTS': len(self.log_weights)}
+
+    def own_problem(self) -> str:
+        """Describe a mixture without a density, a pose that is none, or means behind it."""
+        if len(self.log_weights) > _MAX_COMPONENTS:
+            return (f'log_weights: {len(self.log_weights)} components, expected at most '
+                    f'{_MAX_COMPONENTS}')
+        smallest = np.linalg.eigvalsh(self.covariances_m2).min()
+        if not smallest > 0:
+            return f'covariances_m2: eigenvalue {smallest:g}, expected positive eigenvalues'
+        try:
+            pose = self.surface_pose
+        except ValueError as error:
+            return f'surface_{error}'
+        problem = position_problem(pose.to_surface(self.means))
+        return f'means: {problem}' if problem else ''
+
+    @property
+    def surface_pose(self) -> Pose:
+        """Pose of the surface in the frame of the site; raises ValueError if it is none."""
+        x, y, z = self.surface_position_m.tolist()
+        return Pose((x, y, z), tuple(self.surface_quaternion.tolist()),
+                    tuple(map(tuple, self.surface_uncertainty.tolist())))
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -374,19 +450,21 @@ class CapacityStatistics(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class GroundTruth(Message):
-    """True position and velocity of a user."""
+    """True position and velocity of a user, in the frame of the site."""
 
     user: int = number(1, _LAST_USER)
-    position: np.ndarray = array('3', low=-1e6, high=1e6)
+    position: np.ndarray = array('3', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M,
+                                 in_front=True)
     velocity: np.ndarray = array('3')
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class GroundTruths(Message):
-    """True positions and velocities of all users of one node."""
+    """True positions and velocities of all users of one node, in the frame of the site."""
 
     users: np.ndarray = array('USERS', int, low=1, high=_LAST_USER)
-    position: np.ndarray = array('USERS 3', low=-1e6, high=1e6)
+    position: np.ndarray = array('USERS 3', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M,
+                                 in_front=True)
     velocity: np.ndarray = array('USERS 3')
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
@@ -411,6 +489,12 @@ class ProtocolState(Message):
     outcome: str
     began_s: np.ndarray = array('4', nan_allowed=True)
     elapsed_s: float = number(0, 1e9)
+
+
+#: Messages of the base station and the users that concern every surface of a site.
+SHARED = (Grant, Pilot, GroundTruth)
+#: Messages that contain positions.
+POSITIONS = (PositionEstimate, Posterior, GroundTruth, GroundTruths)
 
 
 def started(instance: int) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import position_problem
 from rhs_isac_ros.positioning import (
     Estimate,
     Estimator,
@@ -22,10 +23,13 @@ from rhs_isac_ros.positioning import (
 )
 from rhs_isac_ros.positioning.alternatives import describe_doubts, probabilities_of
 from rhs_isac_ros.positioning.diagnosis import WINDOW, InnovationTest, diagnose
+from rhs_isac_ros.positioning.fusion import Sighting
+from rhs_isac_ros.positioning.posterior import Posterior
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import EstimatorBuilt, Event, Outcome
+from rhs_isac_ros.protocol.fusion import posterior_of
 from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.settings import TRACK, PendingSettings, PositionerSettings
 from rhs_isac_ros.protocol.user_registry import MAX_NAMED, MAX_USERS
@@ -59,6 +63,8 @@ class Tracks:
 
     def __init__(self) -> None:
         self._tracks: NewestDict[int, _Track] = NewestDict(MAX_USERS)
+        #: Posterior of the latest signals if they belong to a track.
+        self.posterior: Posterior | None = None
 
     def clear(self) -> None:
         """End all tracks."""
@@ -69,10 +75,11 @@ class Tracks:
             now_s: float) -> Estimate:
         """Estimate the position of a user from signals that were measured at `now_s` [s].
 
-        If the signals begin or continue a track, the result is a `TrackEstimate`. A new track
-        assumes the typical speed `speed_mps`. Raises SignalError if the signals are unusable.
+        If the signals begin or continue a track, the result is a `TrackEstimate`, and `posterior`
+        is that of these signals alone. A new track assumes the typical speed `speed_mps`. Raises
+        SignalError if the signals are unusable.
         """
-        signals = _stacked(received)
+        signals, self.posterior = _stacked(received), None
         # The oldest track comes first.
         while self._tracks and now_s > next(iter(self._tracks.values())).time_s + MAX_GAP_S:
             del self._tracks[next(iter(self._tracks))]
@@ -83,6 +90,7 @@ class Tracks:
             track = _Track(Tracker(estimator, Motion(speed_mps)), received, now_s)
         track.tracker.estimator = estimator
         estimate = track.tracker.update(now_s, signals)
+        self.posterior = track.tracker.latest
         if estimate.fix:
             track.latest, track.time_s = received, now_s
             self._tracks.put(received.user, track)
@@ -195,17 +203,20 @@ class Positioner(Role):
     time in the background. Meanwhile, existing estimators remain in use; the latest signals wait
     if their estimator is being built. New settings take effect once an estimator is built with
     them; if the build fails, the old settings and estimator remain in use. The tracks of the prior
-    ``track`` do not survive a restart. `stopwatch` returns a time [s], to measure latencies.
+    ``track`` do not survive a restart. `stopwatch` returns a time [s], to measure latencies, and
+    `is_observed` whether anyone receives posteriors, which take a moment to convert.
     """
 
-    SENDS = (m.PositionEstimate, m.NoFix)
+    SENDS = (m.PositionEstimate, m.Posterior, m.NoFix)
     RECEIVES = (m.ReceivedSignals,)
 
     def __init__(
             self, scenario: Scenario, stopwatch: Callable[[], float],
-            settings: PositionerSettings | None = None) -> None:
+            settings: PositionerSettings | None = None,
+            is_observed: Callable[[], bool] = lambda: False) -> None:
         super().__init__()
         self._scenario, self._stopwatch = scenario, stopwatch
+        self._is_observed = is_observed
         self._settings = PendingSettings(settings or PositionerSettings())
         # Reason why the latest change of settings was reverted; empty if it was not.
         self._failure = ''
@@ -314,28 +325,51 @@ class Positioner(Role):
         job, model, estimator = self._estimators.take(received.codebook_id)
         begin = self._stopwatch()
         try:
-            if job.settings.prior == TRACK:
-                estimate = self._tracks.locate(
-                    received, estimator, job.settings.track_speed_mps, received.time_s(now_s))
-            else:
-                self._tracks.clear()
-                estimate = estimator.estimate(_stacked(received))
+            estimate, posterior = self._estimate(received, job.settings, estimator, now_s)
         except SignalError as error:
             self._no_fix(received, str(error))
             return
         latency_s = self._stopwatch() - begin
-        if estimate.fix:
+        # A plug-in may return any position.
+        problem = position_problem(np.asarray(estimate.mean)) if estimate.fix else ''
+        if estimate.fix and not problem:
             probabilities = {f'{name}_probability': value
                              for name, value in probabilities_of(estimate).items()}
+            placed = estimate.to_site(self._scenario.pose)
             self.send(m.derive(
                 m.PositionEstimate, received, stamp_ns=received.stamp_ns,
-                position=np.array(estimate.mean), covariance_m2=np.array(estimate.covariance),
+                position=placed.mean, covariance_m2=placed.covariance,
                 crlb_m2=float(crlb_of(model, estimate.mean[None])[0]), estimator=estimator.name,
                 latency_s=latency_s, **probabilities))
-            self._publish_track(received, estimate)
+            self._publish_track(received, placed)
+            self._publish_posterior(received, posterior, probabilities)
         else:
-            self._no_fix(received, str(estimate.reason))
-        self.log(*self._residuals.add(received.user, received.codebook_id, estimate))
+            self._no_fix(received, f'position: {problem}' if problem else str(estimate.reason))
+        text, begins = self._residuals.add(received.user, received.codebook_id, estimate)
+        if text:
+            self.log_state('residuals', text, begins)
+
+    def _estimate(
+            self, received: m.ReceivedSignals, settings: PositionerSettings, estimator: Estimator,
+            now_s: float) -> tuple[Estimate, Posterior | None]:
+        """Estimate a position; return also its posterior if it is observed and has modes."""
+        if settings.prior == TRACK:
+            return self._tracks.locate(
+                received, estimator, settings.track_speed_mps, received.time_s(now_s)
+            ), self._tracks.posterior
+        self._tracks.clear()
+        signals = _stacked(received)
+        if not (self._is_observed() and isinstance(estimator, SearchEstimator)):
+            return estimator.estimate(signals), None
+        posterior = estimator.posterior(signals)
+        return posterior.estimate, posterior
+
+    def _publish_posterior(self, received: m.ReceivedSignals, posterior: Posterior | None,
+                           probabilities: Mapping[str, float]) -> None:
+        if posterior and self._is_observed() and (
+                sighting := Sighting.of(posterior, self._scenario.pose)):
+            self.send(posterior_of(
+                received, sighting, stamp_ns=received.stamp_ns, **probabilities))
 
     def _publish_track(self, received: m.ReceivedSignals, estimate: Estimate) -> None:
         user, loss = received.user, None
@@ -358,7 +392,9 @@ class Positioner(Role):
         elif before:
             text = f'user {received.user} {before.value}'
         if before is not loss:
-            self.log(f'cycle {received.cycle_id}: {text}', warning=loss is _Loss.NO_FIX)
+            self.log_state(
+                f'signals of user {received.user}', f'cycle {received.cycle_id}: {text}',
+                loss is not None, warning=loss is _Loss.NO_FIX)
 
 
 def build_estimator(

@@ -106,7 +106,7 @@ class RhsController(StateMachine):
             self._unknown_logged = True
             self.log(f'codebook {event.codebook_id!r} rejected; in use: '
                      f'{self._codebooks.in_use!r}, available: {list(self._codebooks)}',
-                     warning=True)
+                     warning=True, key='rejected codebook')
 
     TABLE = (
         *on(CodebookOffered, 'codebook')(

@@ -7,8 +7,16 @@ import itertools
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
 
-from rhs_isac_ros.protocol.events import Action, Event, LogMessage, Outcome, Send
+from rhs_isac_ros.protocol.events import (
+    Action,
+    Event,
+    Immediately,
+    LogMessage,
+    Outcome,
+    Send,
+)
 from rhs_isac_ros.protocol.messages import Message
+from rhs_isac_ros.support.fields import finite
 
 
 class Role:
@@ -35,8 +43,11 @@ class Role:
         self._actions: list[Action] = []
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Process an event at `now_s` [s] on a monotonic clock; return the actions in order."""
-        self.now_s, self._actions = now_s, []
+        """Process an event at `now_s` [s] on a monotonic clock; return the actions in order.
+
+        Raises ValueError if the time is not finite.
+        """
+        self.now_s, self._actions = finite('now_s', now_s), []
         self.react(event)
         return self._actions
 
@@ -52,10 +63,15 @@ class Role:
         """Append an action that publishes a message."""
         self.act(Send(message))
 
-    def log(self, text: str, warning: bool = False) -> None:
-        """Append an action that logs a text, unless it is empty."""
+    def log(self, text: str, warning: bool = False, key: str = '') -> None:
+        """Append an action that logs a text about an event, unless it is empty."""
         if text:
-            self.act(LogMessage(text, warning))
+            self.act(LogMessage(text, warning, key))
+
+    def log_state(
+            self, key: str, text: str, holds: bool, warning: bool | None = None) -> None:
+        """Append an action that logs the beginning of a state (`holds`), or its end."""
+        self.act(LogMessage(text, holds if warning is None else warning, key, holds))
 
     def count(self, outcome: Outcome, n: int = 1) -> None:
         """Add `n` occurrences of an outcome."""
@@ -149,6 +165,7 @@ class Row(Generic[RoleT, EventT]):
 
 
 AnyRow = Row[Any, Any]
+
 # Conditions under which a message is dropped in every state, with the outcome to count, or None.
 Drops = dict[Callable[..., bool], Outcome | None]
 
@@ -171,7 +188,8 @@ class StateMachine(Role):
     """A role whose reactions depend on its state and are defined by `TABLE`.
 
     `handle` applies the first row whose source, event class and guard match. If no row matches,
-    the event changes nothing, and is counted as ``unexpected_<name>``.
+    the event changes nothing, and is counted as ``unexpected_<name>``. After a row, those for
+    `Immediately` apply in the same way, until none matches.
     """
 
     STATES: ClassVar[type[enum.Enum]]
@@ -185,10 +203,11 @@ class StateMachine(Role):
         """If the subclass defines a table, derive its events, and group its rows."""
         super().__init_subclass__()
         if 'TABLE' in vars(cls):
-            cls.EVENT_NAMES = {row.event: row.event_name for row in cls.TABLE}
+            cls.EVENT_NAMES = {row.event: row.event_name for row in cls.TABLE
+                               if row.event is not Immediately}
             cls.RECEIVES = tuple(event for event in cls.EVENT_NAMES if issubclass(event, Message))
             cls._rows = {(state, event): tuple(rows_for(cls.TABLE, state, event))
-                         for state in cls.STATES for event in cls.EVENT_NAMES}
+                         for state in cls.STATES for event in (*cls.EVENT_NAMES, Immediately)}
 
     def __init__(self, initial: enum.Enum) -> None:
         super().__init__()
@@ -210,16 +229,21 @@ class StateMachine(Role):
     def react(self, event: Event) -> None:
         """Apply the first matching row, if any; raise TypeError if the table lacks the event."""
         kind = type(event)
-        try:
-            rows = self._rows[self.state, kind]
-        except KeyError:
-            raise TypeError(
-                f'{kind.__name__} is not an event of {type(self).__name__}') from None
+        if kind not in self.EVENT_NAMES:
+            raise TypeError(f'{kind.__name__} is not an event of {type(self).__name__}')
+        row = self._first(self._rows[self.state, kind], event)
+        if row is None:
+            self.counters[f'unexpected_{self.EVENT_NAMES[kind]}'] += 1
+        while row:
+            self._take(row, event)
+            event = Immediately()
+            row = self._first(self._rows[self.state, Immediately], event)
+
+    def _first(self, rows: Iterable[AnyRow], event: Event) -> AnyRow | None:
         for row in rows:
             if row.guard(self, event):
-                self._take(row, event)
-                return
-        self.counters[f'unexpected_{self.EVENT_NAMES[kind]}'] += 1
+                return row
+        return None
 
     def _take(self, row: AnyRow, event: Event) -> None:
         self.outcome = row.outcome

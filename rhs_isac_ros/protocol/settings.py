@@ -5,9 +5,12 @@ description from this declaration.
 """
 
 import dataclasses
+import math
 from typing import Any, Generic, TypeVar
 
-from rhs_isac_ros.model import Scenario
+import numpy as np
+
+from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.positioning import ESTIMATORS, BayesEstimator
 from rhs_isac_ros.protocol.user_registry import MAX_USERS, POLICIES, parse_users
 from rhs_isac_ros.support import plugins
@@ -30,13 +33,19 @@ def setting(
 
 
 @dataclasses.dataclass(frozen=True)
-class BaseStationSettings:
+class ReceiverSettings:
+    """Settings of a receiver."""
+
+    receiver_noise: bool = setting(
+        True, 'Whether to add thermal noise; false if the radio adds its own.')
+
+
+@dataclasses.dataclass(frozen=True)
+class BaseStationSettings(ReceiverSettings):
     """Settings of the base station; raises ValueError if ``allowed_users`` is invalid."""
 
     policy: str = setting(
         'round_robin', 'Policy that selects among the users that answer.', choices=POLICIES)
-    receiver_noise: bool = setting(
-        True, 'Whether to add thermal noise; false if the radio adds its own.')
     ack_timeout_s: float = setting(
         0.1, 'Time to wait for acks.', unit='s', low=0.001, high=60.0)
     # Not dynamic, because a change would not reach the users, which have the same timeout.
@@ -67,6 +76,11 @@ def _calibration_file() -> Any:
     return setting('', 'Calibration file; empty: the surface of the scenario.')
 
 
+def _track_speed_mps() -> Any:
+    return setting(
+        1.0, 'Typical speed of the users, for new tracks.', unit='m/s', low=0.01, high=1e3)
+
+
 @dataclasses.dataclass(frozen=True)
 class PositionerSettings:
     """Settings of the positioner; raises ValueError if the estimator cannot use the prior."""
@@ -75,14 +89,13 @@ class PositionerSettings:
         'bayes', 'Position estimator.', choices=tuple(ESTIMATORS), plugins=plugins.ESTIMATORS)
     model_file: str = setting('', 'Trained model; required by the estimator neural.')
     reject_outside: bool = setting(
-        True, 'Whether users who are almost certainly outside of the region get no fix. Only '
-        'bayes and ml use it.')
+        True, 'Whether users who are more probably outside of the region than inside get no fix; '
+        'the scenario declares the prior probability. Only bayes and ml use it.')
     calibration_file: str = _calibration_file()
     prior: str = setting(
         'region', 'Prior of the position: uniform in the region of interest, or the track of the '
         'user from earlier cycles, with the estimator bayes.', choices=PRIORS)
-    track_speed_mps: float = setting(
-        1.0, 'Typical speed of the users, for the prior track.', unit='m/s', low=0.01, high=1e3)
+    track_speed_mps: float = _track_speed_mps()
 
     def __post_init__(self) -> None:
         """Check that the estimator can use the prior."""
@@ -90,6 +103,16 @@ class PositionerSettings:
             raise ValueError(
                 f"prior: '{TRACK}', expected '{REGION}' with the estimator {self.estimator}; "
                 f'tracks need {BayesEstimator.name}')
+
+
+@dataclasses.dataclass(frozen=True)
+class FusionSettings:
+    """Settings of the fusion of a site."""
+
+    wait_s: float = setting(
+        0.2, 'Time to wait for the other surfaces after the first one has answered.', unit='s',
+        low=0.0, high=60.0)
+    track_speed_mps: float = _track_speed_mps()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,6 +166,12 @@ class Impairments:
     element_error_rms: float = _of_scenario('element_error_rms')
     blocked_probability: float = _of_scenario('blocked_probability')
     failed_element_share: float = _of_scenario('failed_element_share')
+    surface_shift_m: float = setting(
+        0.0, 'Distance of the surface from its pose in the scenario, to its left.', unit='m',
+        low=-10.0, high=10.0)
+    surface_turn_deg: float = setting(
+        0.0, 'Rotation of the surface against its pose in the scenario, about its vertical axis.',
+        unit='deg', low=-90.0, high=90.0)
 
     def applied_to(self, scenario: Scenario) -> Scenario:
         """Return the scenario, with fields overridden by the settings that are not negative."""
@@ -150,6 +179,13 @@ class Impairments:
         values = dataclasses.asdict(self)
         return dataclasses.replace(scenario, **{
             name: value for name, value in values.items() if name in known and value >= 0})
+
+    def pose_of(self, scenario: Scenario) -> Pose:
+        """Return the actual pose of the surface."""
+        shift_m = scenario.pose.vectors_to_site(np.array([0.0, self.surface_shift_m, 0.0]))
+        turn = scenario.pose.vectors_to_site(
+            np.array([0.0, 0.0, math.radians(self.surface_turn_deg)]))
+        return scenario.pose.displaced(np.concatenate([shift_m, turn]))
 
 
 SettingsT = TypeVar('SettingsT', bound=Any)

@@ -10,6 +10,7 @@ import numpy as np
 from rhs_isac_ros.link import (
     Beam,
     CapacityReport,
+    Choice,
     applied_beam,
     capacity,
     capacity_report,
@@ -58,7 +59,9 @@ class Transmission(Role):
 
     The true position affects only the reported capacities, never the beam. A report takes as long
     to compute as a beam, so reports are usually computed between cycles. `surface_of` takes the
-    name of a calibration file, and returns the surface in the file, or None for an empty name.
+    name of a calibration file, and returns the surface in the file, or None for an empty name. The
+    statistics are those of the newest `window` reports. `choose` and `evaluate` take the place of
+    `choose_beam` and `capacity_report`.
     """
 
     SENDS = (m.Beam, m.Capacity, m.CapacityStatistics)
@@ -66,9 +69,12 @@ class Transmission(Role):
 
     def __init__(
             self, scenario: Scenario, settings: TransmissionSettings | None = None,
-            surface_of: Callable[[str], SurfaceEstimate | None] = lambda file: None) -> None:
+            surface_of: Callable[[str], SurfaceEstimate | None] = lambda file: None,
+            window: int = _WINDOW, choose: Callable[..., Choice] = choose_beam,
+            evaluate: Callable[..., CapacityReport] = capacity_report) -> None:
         super().__init__()
         self._scenario, self._surface_of = scenario, surface_of
+        self._choose, self._evaluate = choose, evaluate
         self._settings = PendingSettings(settings or TransmissionSettings())
         self._codebooks: CodebookCache[None] = CodebookCache()
         # Beams, by cycle; true positions, by cycle, user and instance; cycles in the statistics.
@@ -79,7 +85,7 @@ class Transmission(Role):
         self._waiting: collections.deque[_Waiting] = collections.deque()
         self._active_s = -math.inf
         # Figures of the newest reports, in a ring buffer.
-        self._reported, self._n_reported = np.empty((_WINDOW, len(_FIGURES))), 0
+        self._reported, self._n_reported = np.empty((window, len(_FIGURES))), 0
 
     def react(self, event: Event) -> None:
         """Process an event: send the beam, or the capacity and its statistics."""
@@ -136,8 +142,10 @@ class Transmission(Role):
             settings = self._settings.in_use
             bands = range(self._scenario.n_bands) if settings.band < 0 else (settings.band,)
             surface = self._surface_of(settings.calibration_file)
-        choice = choose_beam(
-            self._scenario, estimate.position, estimate.covariance_m2, bands, surface)
+        pose = self._scenario.pose
+        choice = self._choose(
+            self._scenario, pose.to_surface(estimate.position),
+            pose.covariances_to_surface(estimate.covariance_m2), bands, surface)
         beam = choice.beam
         sent = m.derive(
             m.Beam, estimate, band=beam.band, analog=beam.analog, digital=beam.digital,
@@ -161,14 +169,16 @@ class Transmission(Role):
         waiting = next(filter(self._truth_of, self._waiting), self._waiting[0])
         self._waiting.remove(waiting)
         steered, applied, _ = waiting
+        pose = self._scenario.pose
         beam, result = steered.beam, CapacityReport(math.nan, math.nan)
         if truth := self._truth_of(waiting):
             used = Beam(applied.analog[0], beam.digital, beam.band)
-            result = capacity_report(
-                self._scenario, used, truth.position, steered.bands, steered.surface)
+            result = self._evaluate(
+                self._scenario, used, pose.to_surface(truth.position), steered.bands,
+                steered.surface)
         steering = applied_beam(Beam(beam.analog, beam.digital, beam.band), steered.surface)
         at_estimate_bps = float(capacity(
-            self._scenario, steering, steered.estimate.position[None])[0])
+            self._scenario, steering, pose.to_surface(steered.estimate.position)[None])[0])
         report = m.derive(
             m.Capacity, beam, expected_bps=beam.expected_bps, actual_bps=result.actual_bps,
             perfect_bps=result.perfect_bps, loss_bps=result.loss_bps,

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.mobility import Crowd, Mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome, PeersChanged, Timeout
@@ -35,13 +36,15 @@ class User(StateMachine):
     Parameters
     ----------
     mobilities
-        Mobility of each user, by id; ids start at 1.
+        Mobility of each user in the frame of the surface, by id; ids start at 1.
     step_s, beacon_s
         Time that the base station waits for each step, and time without a beacon after which the
         user logs a warning [s].
     world_s
         Callable that returns the time for the mobilities [s]; by default, they use the time passed
         to `handle`.
+    pose
+        Pose of the surface.
     """
 
     SENDS = (m.Ack, m.GroundTruth, m.GroundTruths, m.Pilot, m.Data)
@@ -51,13 +54,14 @@ class User(StateMachine):
 
     def __init__(
             self, mobilities: Mapping[int, Mobility], step_s: float, beacon_s: float,
-            instance: int = 0, world_s: Callable[[], float] | None = None) -> None:
+            instance: int = 0, world_s: Callable[[], float] | None = None,
+            pose: Pose | None = None) -> None:
         super().__init__(State.DISCONNECTED)
         self._step_s, self._beacon_s = step_s, beacon_s
         self.users, self._instance = tuple(sorted(mobilities)), instance
         # Description of another node that is served under the same number, by user.
         self._conflicts: dict[int, str] = {}
-        self._mobilities, self._world_s = mobilities, world_s
+        self._mobilities, self._world_s, self._pose = mobilities, world_s, pose or Pose()
         self._crowd = Crowd([mobilities[user] for user in self.users])
         self._cycle_id = 0
         # Cycle, first band and last band of the pilot request that was answered last.
@@ -68,9 +72,13 @@ class User(StateMachine):
 
     def ground_truths(self, now_s: float) -> m.GroundTruths:
         """Return the true positions and velocities of all users; `now_s` [s] is as in `handle`."""
-        position, velocity = self._crowd.states(self._time_s(now_s))
+        position, velocity = self._in_site(*self._crowd.states(self._time_s(now_s)))
         return m.GroundTruths(
             cycle_id=0, users=np.array(self.users), position=position, velocity=velocity)
+
+    def _in_site(
+            self, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._pose.to_site(position), self._pose.vectors_to_site(velocity)
 
     def _time_s(self, now_s: float) -> float:
         return self._world_s() if self._world_s else now_s
@@ -139,16 +147,16 @@ class User(StateMachine):
     # Steps
 
     def _log_connected(self, event: PeersChanged) -> None:
-        self.log('listening for beacons')
+        self.log_state('peers', 'listening for beacons', False)
 
     def _log_missing_peers(self, event: PeersChanged) -> None:
-        self.log(f'waiting for {", ".join(event.missing)}', warning=True)
+        self.log_state('peers', f'waiting for {", ".join(event.missing)}', True)
 
     def _log_no_beacon(self, event: Timeout) -> None:
-        self.log(f'no beacon for {self._beacon_s:g} s', warning=True)
+        self.log_state('beacons', f'no beacon for {self._beacon_s:g} s', True)
 
     def _log_resumed(self, event: m.Beacon | m.Grant) -> None:
-        self.log('beacons resumed')
+        self.log_state('beacons', 'beacons resumed', False)
 
     def _log_other_instance(self, event: m.Grant) -> None:
         text = m.describe_conflict(event.user, event.user_instance)
@@ -170,7 +178,8 @@ class User(StateMachine):
         key = event.cycle_id, event.user
         truth = self._truths.get(key)
         if truth is None:
-            position, velocity = self._mobilities[event.user].state(self._time_s(self.now_s))
+            position, velocity = self._in_site(
+                *self._mobilities[event.user].state(self._time_s(self.now_s)))
             truth = m.derive(m.GroundTruth, event, position=position, velocity=velocity)
         self._truths.put(key, truth)
         self.send(truth)

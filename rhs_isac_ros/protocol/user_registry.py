@@ -1,6 +1,7 @@
-"""The users known to a base station, their turns, and the nodes that own their numbers."""
+"""The users of a base station: whom it admits, their turns, and the owners of their numbers."""
 
 import bisect
+import collections
 import dataclasses
 import math
 import re
@@ -190,6 +191,11 @@ class UserRegistry:
             return True
         return self._awaited <= {user}
 
+    @property
+    def awaited(self) -> frozenset[int]:
+        """The registered users that were invited and have not answered yet."""
+        return frozenset(self._awaited)
+
     def remove_absent(self) -> list[int]:
         """Count missed invitations; remove and return the users that missed too many in a row."""
         lost = []
@@ -253,3 +259,31 @@ def join_users(users: Iterable[int]) -> str:
     n_others = len(names) - MAX_NAMED
     others = f' and {n_others} other{"s" * (n_others > 1)}' if n_others > 0 else ''
     return f'{", ".join(names[:MAX_NAMED])}{others}'
+
+
+class Admission:
+    """The limits on the numbers of users, as in `parse_users`, and on the rate of their acks."""
+
+    def __init__(self, allowed_users: str, max_users: int, rate_hz: float) -> None:
+        self._max_users, self._rate_hz = max_users, rate_hz
+        self._allowed = parse_users(allowed_users) or (range(LAST_NUMBER + 1),)
+        # Number of acks by user in the current second; cleared each second, to bound the memory.
+        self._acks: collections.Counter[int] = collections.Counter()
+        self._second = 0
+
+    def allows(self, user: int) -> bool:
+        """Return whether the number of a user is within the limits."""
+        return user <= self._max_users and any(user in users for users in self._allowed)
+
+    def exceeds_rate(self, user: int, now_s: float) -> bool:
+        """Return whether another ack of a user is one too many in the current second."""
+        counted = self._acks[user] if math.floor(now_s) == self._second else 0
+        return counted + 1 > self._rate_hz
+
+    def count(self, user: int, now_s: float) -> None:
+        """Count an ack."""
+        second = math.floor(now_s)
+        if second != self._second:
+            self._second = second
+            self._acks.clear()
+        self._acks[user] += 1

@@ -62,14 +62,17 @@ def _numbers(n: int) -> Type:
 
 
 # Types that are one item on the wire.
-SCALARS = {'uint8': 'B', 'uint32': 'I', 'uint64': 'Q', 'double': 'd', 'string': 's'}
+SCALARS = {'uint8': 'B', 'uint32': 'I', 'uint64': 'Q', 'double': 'd', 'string': 's',
+           'boolean': '?'}
 # The other supported types.
 TYPES = {
     'geometry_msgs/Point': _numbers(3),
     'geometry_msgs/Vector3': _numbers(3),
+    'geometry_msgs/Quaternion': _numbers(4),
     'double[3]': _numbers(3),
     'double[4]': _numbers(4),
     'double[9]': _numbers(9)._replace(decode=lambda items: np.array(items).reshape(3, 3)),
+    'double[36]': _numbers(36)._replace(decode=lambda items: np.array(items).reshape(6, 6)),
     'sequence<uint32>': Type(
         ('*I',), lambda values: (values.astype('<u4'),), lambda items: items[0].astype(int)),
     'rhs_isac_msgs/RealArray': Type(
@@ -83,7 +86,7 @@ TYPES = {
 HEADER = b'\0\1\0\0'
 _NANOSECONDS = 10**9
 _NONE = np.empty(0)
-_SIZES = {'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
+_SIZES = {'?': 1, 'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
 
 
 class _Run(NamedTuple):
@@ -192,11 +195,16 @@ class Codec:
                                f'{error.reason}') from None
 
     def decode(self, data: bytes) -> Any:
-        """Decode a message from bytes that begin with `HEADER`; its arrays are copies.
+        """Decode a message; its arrays are copies.
 
-        Raises MessageError if the bytes end too early, a string is not UTF-8, an array has the
-        wrong number of values, or the stamp or the value of an enumeration is invalid.
+        Raises MessageError if the bytes have another encoding or end too early, a string is not
+        UTF-8, an array has the wrong number of values, or the stamp or the value of an enumeration
+        is invalid.
         """
+        # The options do not affect the encoding.
+        if not data.startswith(HEADER[:2]):
+            raise MessageError(f'{self._kind.__name__}: CDR data with the representation '
+                               f'{data[:2].hex()}, expected {HEADER[:2].hex()}')
         try:
             items = self._items(data)
         except (struct.error, ValueError) as error:

@@ -8,14 +8,13 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped, Vector3
 from nav_msgs.msg import Odometry
-from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.positioning import TrackEstimate
 from rhs_isac_ros.protocol.events import PublishTrack
-from rhs_isac_ros.protocol.messages import Message, MessageError, PositionEstimate
+from rhs_isac_ros.protocol.messages import Message, PositionEstimate
 from rhs_isac_ros.protocol.presences import Presence
 from rhs_isac_ros.ros import cdr, frames
 from rhs_isac_ros.ros.frames import Frame
@@ -23,8 +22,6 @@ from rhs_isac_ros.ros.topics import NAMES, RHS_FRAME
 
 # Variance of an unknown angular velocity [rad^2/s^2], a value that ROS drivers often use.
 _UNKNOWN_ROTATION_VARIANCE = 1e6
-# The identifier of the encoding, without the option bytes, which do not affect the encoding.
-_ENCODING = cdr.HEADER[:2]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -79,23 +76,11 @@ def to_bytes(
 def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
     """Convert a serialized message (CDR) from a raw subscription.
 
-    Raises MessageError if the bytes are not a message of `ros_type`, an array has the wrong number
-    of values, or the stamp or the value of an enumeration is invalid. Subscriptions of rclpy that
-    are not raw silently drop bytes that they cannot deserialize.
+    Raises MessageError if the bytes are not a message of `ros_type` in little-endian byte order,
+    an array has the wrong number of values, or the stamp or the value of an enumeration is
+    invalid. Subscriptions of rclpy that are not raw silently drop bytes that they cannot
+    deserialize.
     """
-    if not serialized.startswith(_ENCODING):
-        # A machine with another byte order may have sent the message.
-        try:
-            serialized = serialize_message(deserialize_message(serialized, ros_type(kind)))
-        # rclpy raises a RuntimeError of a private class, or a ValueError for invalid UTF-8.
-        except (RuntimeError, ValueError) as error:
-            raise MessageError(
-                f'{kind.__name__}: invalid CDR data of {len(serialized)} bytes: '
-                f'{str(error).splitlines()[0]}') from None
-        if not serialized.startswith(_ENCODING):
-            raise RuntimeError(f'{kind.__name__}: serialized by rclpy with the representation '
-                               f'{serialized[:2].hex()}, expected {_ENCODING.hex()}: CDR '
-                               'version 1, little endian')
     return _CODECS[kind].decode(serialized)
 
 
@@ -107,14 +92,13 @@ def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
 
 
 def pose(estimate: PositionEstimate, stamp: Time, frame: Frame) -> PoseWithCovarianceStamped:
-    """Return a position estimate in a frame, as a pose of unknown orientation.
+    """Return a position estimate as a pose of unknown orientation.
 
     Each rotation angle has the variance of a uniform distribution from -pi to pi.
     """
     result = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=frame.name))
-    result.pose.pose.position = frames.to_ros(Point, frame.from_surface(estimate.position))
-    result.pose.covariance = _with_rotation(
-        frame.covariance(estimate.covariance_m2), math.pi**2 / 3)
+    result.pose.pose.position = frames.to_ros(Point, estimate.position)
+    result.pose.covariance = _with_rotation(estimate.covariance_m2, math.pi**2 / 3)
     return result
 
 
@@ -125,10 +109,9 @@ def odometry(
     The child frame, in which the velocity is given, has the same axes as `frame`.
     """
     result = true_odometry(user, estimate.mean, estimate.velocity, stamp, frame)
-    result.pose.covariance = _with_rotation(
-        frame.covariance(estimate.covariance), math.pi**2 / 3)
+    result.pose.covariance = _with_rotation(estimate.covariance, math.pi**2 / 3)
     result.twist.covariance = _with_rotation(
-        frame.covariance(estimate.velocity_covariance), _UNKNOWN_ROTATION_VARIANCE)
+        estimate.velocity_covariance, _UNKNOWN_ROTATION_VARIANCE)
     return result
 
 
@@ -138,8 +121,8 @@ def true_odometry(
     """Return a true position [3] [m] and velocity [3] [m/s] as odometry without covariances."""
     result = Odometry(header=Header(stamp=stamp, frame_id=frame.name),
                       child_frame_id=frame.user(user))
-    result.pose.pose.position = frames.to_ros(Point, frame.from_surface(position))
-    result.twist.twist.linear = frames.to_ros(Vector3, frame.rotation @ velocity)
+    result.pose.pose.position = frames.to_ros(Point, position)
+    result.twist.twist.linear = frames.to_ros(Vector3, velocity)
     return result
 
 

@@ -9,9 +9,13 @@ node then runs without it, logs the refusal, and reports it in its diagnostics.
 """
 
 import collections
+import copy
 import functools
+import itertools
+import threading
+import time
 import weakref
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -20,13 +24,22 @@ from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
 
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.support.state_log import Line, StateLog
 
 
 def _profile(
@@ -47,6 +60,8 @@ OBSERVATION = _profile(4096)
 LATCHED = _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
 # For the `LATCHED` values of many publishers.
 PRESENCES = _profile(128, DurabilityPolicy.TRANSIENT_LOCAL)
+# For services: all clients may call at once, and rclpy's default of 10 loses the other requests.
+SERVICES = _profile(1024)
 # For the positions of robots, whose drivers and simulators often publish best effort.
 SENSOR = _profile(10, reliability=ReliabilityPolicy.BEST_EFFORT)
 _LATCHED_MESSAGES = {m.CapacityStatistics}
@@ -58,21 +73,26 @@ def profile_for(kind: type[m.Message], exchange: QoSProfile = EXCHANGE) -> QoSPr
         return ACKS
     return LATCHED if kind in _LATCHED_MESSAGES else exchange
 
+
+# Period of logging what was not logged at once [s].
+_JOURNAL_S = 1.0
 _CreatedT = TypeVar('_CreatedT')
-# For each node: descriptions of refused endpoints, timers and threads, by kind and name.
+# For each node: descriptions of refused endpoints, by kind and name.
 _refusals: weakref.WeakKeyDictionary[Node, dict[str, str]] = weakref.WeakKeyDictionary()
 
 
 def refusals(node: Node) -> dict[str, str]:
-    """Return descriptions of refused endpoints, timers and threads, by kind and name."""
+    """Return descriptions of refused endpoints, by kind and name."""
     return _refusals.get(node, {})
 
 
 def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> _CreatedT | None:
     """Return the result of `create`, or None if it is refused; log a refusal once."""
     try:
-        return create()
-    # rclpy raises a ValueError for an action. RCLError and errors of threads are RuntimeErrors.
+        created = create()
+        _refusals.get(node, {}).pop(what, None)
+        return created
+    # rclpy raises a ValueError for an action. RCLError is a RuntimeError.
     except (RuntimeError, ValueError) as error:
         # The text ends with a position in the ROS sources, which does not help here.
         text = f'{what} was refused: {str(error).partition(", at ")[0].splitlines()[0]}'
@@ -83,33 +103,9 @@ def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> 
         return None
 
 
-class _NoTimer(Timer):
-    """Replacement for a timer that was refused; it never expires."""
-
-    timer_period_ns = 0
-
-    def __init__(self) -> None:
-        return
-
-    def cancel(self) -> None:
-        return
-
-    def reset(self) -> None:
-        return
-
-
-def create_timer(
-        node: Node, period_s: float, callback: Callable[[], None], clock: Clock | None = None
-) -> Timer:
-    """Create a running timer, by default on the clock of ROS; a refused timer never expires."""
-    timer = create_or_refuse(node, f'timer of {period_s:g} s', lambda: node.create_timer(
-        period_s, callback, clock=clock))
-    return timer or _NoTimer()
-
-
 def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:
     """Create a running timer on the steady clock."""
-    return create_timer(node, period_s, callback, Clock(clock_type=ClockType.STEADY_TIME))
+    return node.create_timer(period_s, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 class _NoPublisher(Publisher):
@@ -140,8 +136,10 @@ def create_publisher(
 
     Parameters ``qos_overrides.*`` change the quality of service of an `overridable` topic.
     """
+    # A copy: rclpy writes the overrides into the profile, which other endpoints share.
+    own = copy.copy(profile)
     publisher = create_or_refuse(node, f'publisher of {name}', lambda: node.create_publisher(
-        kind, name, profile, qos_overriding_options=_overriding(overridable),
+        kind, name, own, qos_overriding_options=_overriding(overridable),
         event_callbacks=PublisherEventCallbacks(use_default_callbacks=False)))
     return publisher or _NoPublisher(node.resolve_topic_name(name))
 
@@ -164,54 +162,110 @@ def subscribe(
 
     Parameters ``qos_overrides.*`` change the quality of service of an `overridable` topic.
     """
+    # A copy, as in `create_publisher`.
+    own = copy.copy(profile)
     create_or_refuse(node, f'subscription to {name}', lambda: node.create_subscription(
-        kind, name, callback, profile, raw=raw,
+        kind, name, callback, own, raw=raw,
         qos_overriding_options=_overriding(overridable),
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False)))
 
 
+class Journal:
+    """The log lines of a node about states and events, limited as `StateLog` describes."""
+
+    def __init__(self, node: Node) -> None:
+        self._logger, self._log = node.get_logger(), StateLog()
+        self._lock = threading.Lock()
+        steady_timer(node, _JOURNAL_S, lambda: self._write(StateLog.due))
+
+    def state(self, key: str, text: str, holds: bool, warning: bool | None = None) -> None:
+        """Log that a state begins or has another text (`holds`), or that it ends."""
+        line = Line(text, holds if warning is None else warning)
+        self._write(StateLog.state, key, line, holds=holds)
+
+    def event(self, key: str, text: str, error: bool = False) -> None:
+        """Log an event as a warning or an error."""
+        self._write(StateLog.event, key, Line(text, True, error))
+
+    def update(self, states: Mapping[str, str]) -> None:
+        """Log the changes of a group of states; `states` contains the texts of those that hold."""
+        self._write(StateLog.update, states)
+
+    def renew(self) -> None:
+        """Treat all states and events as new."""
+        self._log.renew()
+
+    def _write(self, method: Callable[..., list[Line]], *args: Any, **options: Any) -> None:
+        with self._lock:
+            lines = method(self._log, *args, now_s=time.monotonic(), **options)
+        # Three calls, because rclpy requires that a line of code always logs with one severity.
+        for text, warning, error in lines:
+            if error:
+                self._logger.error(text)
+            elif warning:
+                self._logger.warning(text)
+            else:
+                self._logger.info(text)
+
+
+_journals: weakref.WeakKeyDictionary[Node, Journal] = weakref.WeakKeyDictionary()
+
+
+def journal(node: Node) -> Journal:
+    """Return the journal of a node, which is created at the first call."""
+    if node not in _journals:
+        _journals[node] = Journal(node)
+    return _journals[node]
+
+
 def log_dropped(node: Node, error: m.MessageError) -> None:
-    """Log the reason why a node drops a message, at most once every ten seconds."""
-    node.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
+    """Log the reason why a node drops a message; the text starts with the name of the field."""
+    journal(node).event(
+        f'dropped {str(error).partition(":")[0]}', f'dropped: {error}', error=True)
 
 
 def subscribe_messages(
-        node: Node, kinds: Iterable[type[m.Message]], sizes: Mapping[str, int] | None,
+        node: Node, kinds: Iterable[type[m.Message]], scenario: Scenario | None,
         on_message: Callable[[m.Message], None],
-        on_error: Callable[[m.MessageError], None] | None = None, scenario_id: str = '', *,
-        on_foreign: Callable[[m.Message], None] = lambda message: None,
+        on_error: Callable[[m.MessageError], None] | None = None, *,
+        on_foreign: Callable[[m.Message], None] | None = None,
         on_arrival: Callable[[type[m.Message]], None] = lambda kind: None,
-        exchange: QoSProfile = EXCHANGE) -> None:
-    """Subscribe to messages of the protocol; drop malformed messages.
+        exchange: QoSProfile = EXCHANGE, prefix: str = '') -> None:
+    """Subscribe to messages of the protocol; drop messages that are malformed or foreign.
 
     Parameters
     ----------
-    sizes
-        Sizes that `check` expects, as in `Scenario.sizes`; None: no check.
+    scenario
+        Scenario of the messages, whose id and sizes are checked; None: no check.
     on_error
-        Called with the reason why a malformed message was dropped; by default, the node logs it.
-    scenario_id, on_foreign
-        If `scenario_id` is given, messages of other scenarios are passed only to `on_foreign`.
+        Called with the reason why a message was dropped; by default, the node logs it.
+    on_foreign
+        Called with messages of other scenarios; by default, they are errors.
     on_arrival
         Called with the class of each message before decoding.
     exchange
         Quality of service, as in `profile_for`.
+    prefix
+        Namespace of the topics with a final slash; empty: that of the node.
     """
     def receive(kind: type[m.Message], serialized: bytes) -> None:
         on_arrival(kind)
         try:
             message = convert.from_bytes(kind, serialized)
-            if scenario_id and message.scenario_id not in ('', scenario_id):
-                on_foreign(message)
-                return
-            if sizes is not None:
-                m.check(message, sizes)
+            if scenario and message.scenario_id not in ('', scenario.id):
+                if on_foreign:
+                    on_foreign(message)
+                    return
+                raise m.MessageError(f'{kind.__name__} of scenario {message.scenario_id}, '
+                                     f'expected {scenario.id}')
+            if scenario:
+                m.check(message, scenario)
         except m.MessageError as error:
             (on_error or functools.partial(log_dropped, node))(error)
             return
         on_message(message)
     for kind in kinds:
-        subscribe(node, convert.ros_type(kind), topics.NAMES[kind],
+        subscribe(node, convert.ros_type(kind), prefix + topics.NAMES[kind],
                   functools.partial(receive, kind), profile_for(kind, exchange), raw=True)
 
 
@@ -225,17 +279,13 @@ class UserTopics:
     def __init__(self, node: Node, kinds: Mapping[str, type], max_users: int) -> None:
         self._node, self._kinds, self._max_users = node, kinds, max_users
         self._publishers: dict[int, tuple[Publisher, ...]] = {}
-        self._is_limit_logged = False
 
     def publishers(self, user: int) -> tuple[Publisher, ...]:
         """Return the publishers for a user, in the order of `kinds`; empty above the limit."""
         if user > self._max_users:
-            # Not once=True: rclpy would examine the stack at each call, which takes 0.5 ms.
-            if not self._is_limit_logged:
-                self._is_limit_logged = True
-                self._node.get_logger().warning(
-                    f'no topics for user {user}, because the limit user_topics is '
-                    f'{self._max_users}')
+            journal(self._node).event(
+                'user_topics',
+                f'no topics for user {user}, because the limit user_topics is {self._max_users}')
             return ()
         if user not in self._publishers:
             self._publishers[user] = tuple(
@@ -248,6 +298,59 @@ class UserTopics:
         """Destroy the publishers for a user, if any."""
         for publisher in self._publishers.pop(user, ()):
             self._node.destroy_publisher(publisher)
+
+
+# Topics that ROS creates for every node, whose quality of service is not examined.
+_FOREIGN = ('/rosout', '/parameter_events')
+# Placeholders of the middleware for the name of a node, which may arrive after its endpoints.
+_UNNAMED = ('_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_')
+
+
+class Mismatches:
+    """Endpoints of other nodes that cannot exchange messages with those of a node."""
+
+    def __init__(self, node: Node) -> None:
+        self._node, self._texts = node, dict[str, str]()
+        # Numbers of endpoints by topic at the last update.
+        self._counts: list[tuple[str, int, int]] = []
+
+    def update(self) -> dict[str, str]:
+        """Return a description of each, by its key in the diagnostics.
+
+        The topics of the node in the ROS graph are examined if endpoints have appeared or gone.
+        """
+        node = self._node
+        ours = {*(one.topic_name for one in node.publishers),
+                *(one.topic_name for one in node.subscriptions)} - {*_FOREIGN}
+        counts = [(topic, node.count_publishers(topic), node.count_subscribers(topic))
+                  for topic in sorted(ours)]
+        if counts != self._counts:
+            self._counts = counts
+            self._texts = {key: text for topic in ours for key, text in self._find(topic)}
+        return self._texts
+
+    def _find(self, topic: str) -> Iterator[tuple[str, str]]:
+        own = self._node.get_fully_qualified_name()
+        for publisher, subscription in itertools.product(
+                self._node.get_publishers_info_by_topic(topic),
+                self._node.get_subscriptions_info_by_topic(topic)):
+            names = {full_name(publisher), full_name(subscription)}
+            if publisher.node_name in _UNNAMED or subscription.node_name in _UNNAMED:
+                # The name may arrive after the endpoint, which the next update examines again.
+                self._counts = []
+            elif own in names:
+                compatibility, reason = qos_check_compatible(
+                    publisher.qos_profile, subscription.qos_profile)
+                if compatibility == QoSCompatibility.ERROR:
+                    (name,) = names - {own} or {own}
+                    reason = reason.removeprefix('ERROR: ').rstrip(';. ')
+                    yield (f'conflict.qos.{topic.lstrip("/")}.{name.lstrip("/")}',
+                           f'{topic}: no messages between this node and {name}: {reason}')
+
+
+def full_name(info: Any) -> str:
+    """Return the fully qualified name of the node of an endpoint."""
+    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 
 _Result = TypeVar('_Result')
@@ -272,16 +375,14 @@ class BackgroundWorker:
     def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
         """Queue a job; the thread that spins the node passes the result to `on_result`.
 
-        That thread also raises exceptions of the job. The job is refused if no worker can start.
+        That thread also raises exceptions of the job.
         """
         def hand_over(future: Future[_Result]) -> None:
             self._done.append((future, on_result))
             executor = self._node.executor
             if self._is_open and executor is not None:
                 executor.create_task(self._wake)
-        if future := create_or_refuse(
-                self._node, 'thread of jobs', lambda: self._pool.submit(job)):
-            future.add_done_callback(hand_over)
+        self._pool.submit(job).add_done_callback(hand_over)
 
     def close(self) -> None:
         """Wait for the running job, cancel the others and discard all results."""

@@ -4,13 +4,16 @@ Descriptors, checks and documentation derive from the declarations. `protocol.se
 the parameters that are settings of a role.
 """
 
+import argparse
 import contextlib
 import copy
 import dataclasses
 import difflib
 import functools
+import itertools
+import re
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,14 +28,16 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from rhs_isac_ros.calibration import CalibrationError, load_surface
+from rhs_isac_ros.frontend import RADIOS, SURFACES
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import create_or_refuse, refusals
-from rhs_isac_ros.ros.roster import ROSTER
+from rhs_isac_ros.ros.roster import MEMBERS, ROSTER
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.arguments import ArgumentParser
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field, ParameterError
 
@@ -44,6 +49,7 @@ class Parameter(Field):
     name: str
     default: bool | int | float | str | list[float]
     dynamic: bool = False
+    is_frame: bool = False  #: Whether the value is the name of a frame.
 
     # ROS does not accept 1 in place of 1.0.
     WORDS = {**Field.WORDS, float: 'a number with a decimal point',
@@ -68,6 +74,10 @@ class Parameter(Field):
         # ROS checks neither lists nor the exact ends of a range.
         if problem := self.problem(value):
             raise ParameterError(f'{self.name}: {problem}')
+        # tf2 refuses such names when it is asked for a transform.
+        if self.is_frame and (not value or value.startswith('/')):
+            raise ParameterError(
+                f'{self.name}: {value!r}, expected the name of a frame, without a / in front')
 
 
 def _parameter(
@@ -87,27 +97,28 @@ def _declared_by(settings: type[Any] | None) -> dict[str, Parameter]:
 
 _SCENARIO = _parameter(
     'scenario_file', '', "YAML file of the scenario; empty: Table I of the paper.")
+_SITE = _parameter(
+    'site_file', '', 'Site file, which takes the place of scenario_file. The surface of a node is '
+    'named after the last part of its namespace; empty: no site.')
 _SEED = _parameter('seed', 0, 'Seed of all random numbers.', low=0, high=2**31 - 1)
 _USER_TOPICS = _parameter(
     'user_topics', 64, 'Highest user number for which separate topics are created.',
     low=0, high=MAX_USERS)
 
+_TABLES = _parameter(
+    'table_folder', '', 'Directory in which tables are cached; empty: the cache directory of the '
+    'user.')
+
 # Mobilities of robots. The library has further mobilities.
 ODOMETRY, TF = ROBOTS = ('odometry', 'tf')
-_FRAME = (
-    _parameter(
-        'frame_id', topics.MAP_FRAME, 'Frame of poses, odometry, paths and transforms; messages '
-        'of the protocol are in the frame of the surface.'),
-    _parameter(
-        'surface_pose', [0.0] * 6, 'Pose of the surface in frame_id: x, y, z in metres, roll, '
-        'pitch, yaw in radians.', low=-1e6, high=1e6),
-)
+_FRAME = _parameter(
+    'frame_id', topics.MAP_FRAME, 'Frame of the site, in which all positions are.', is_frame=True)
 
 # Parameters of the roles other than their settings.
 _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
     'bs': (
         _SEED,
-        *_FRAME,
+        _FRAME,
         _parameter(
             'first_cycle', 0, 'Id of the first cycle; 0: derived from the clock, so that no id '
             'is reused after a restart.', low=0, high=2**53),
@@ -122,16 +133,18 @@ _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
                    choices=(*mobility.KINDS, *ROBOTS), plugins=plugins.MOBILITIES),
         _parameter('odometry_topic', 'odom',
                    'Odometry of the robot in frame_id, for the mobility odometry.'),
-        _parameter('robot_frame', 'base_link', 'Frame of the robot, for the mobility tf.'),
+        _parameter('robot_frame', 'base_link', 'Frame of the robot, for the mobility tf.',
+                   is_frame=True),
         _parameter(
             'robot_timeout_s', 1.0, 'Time without a position of the robot after which the user '
             'stops answering beacons.', unit='s', low=0.05, high=3600.0),
-        *_FRAME,
+        _FRAME,
         _USER_TOPICS,
         _parameter(
-            'position_m', [], 'Initial position x, y, z of each user; empty: random points of '
-            'the region of interest.', unit='m', low=-1e6, high=1e6),
-        _parameter('waypoints_m', [], 'Coordinates x, y, z of each waypoint, in order.',
+            'position_m', [], 'Initial position x, y, z of each user in frame_id; empty: random '
+            'points of the region of interest.', unit='m', low=-1e6, high=1e6),
+        _parameter('waypoints_m', [],
+                   'Coordinates x, y, z of each waypoint in frame_id, in order.',
                    unit='m', low=-1e6, high=1e6),
         _parameter('speed_mps', 1.0, 'Speed, at most max_user_speed_mps of the scenario.',
                    unit='m/s', low=0.0, high=1e4),
@@ -142,11 +155,28 @@ _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
                    'Time without a beacon after which a warning is logged.',
                    unit='s', low=0.1, high=7200.0),
     ),
-    'channel': (_SEED,),
+    'channel': (
+        _SEED,
+        _parameter('surface', 'emulated', 'Surface that shows the configurations.',
+                   choices=tuple(SURFACES), plugins=plugins.SURFACES),
+        _parameter('surface_options', '', 'Options of the surface, as in port=/dev/ttyUSB0 '
+                   'timeout_s=0.2; empty: none.'),
+        _parameter('radio', 'emulated', 'Radio that measures the pilots. Those with noise of '
+                   'their own need receiver_noise: false of bs.',
+                   choices=tuple(RADIOS), plugins=plugins.RADIOS),
+        _parameter('radio_options', '', 'Options of the radio, as in noise_psd_dbm_hz=-150.0 '
+                   'of waveform, or path=samples of sigmf; '
+                   'empty: none.'),
+        _parameter('samples_folder', '', 'Folder in which the samples of the radio are recorded '
+                   'as SigMF collections; empty: no recording.'),
+        _parameter('states_file', '', 'Calibration file with the coefficients of the '
+                   'emulated elements; empty: those of the scenario.'),
+    ),
+    'receiver': (_SEED,),
+    'fusion': (_SEED, _TABLES, _FRAME, _USER_TOPICS),
     'positioner': (
-        _parameter('table_folder', '', 'Directory in which tables are cached; empty: the cache '
-                   'directory of the user.'),
-        *_FRAME,
+        _TABLES,
+        _FRAME,
         _USER_TOPICS,
     ),
     topics.OPTIMIZER_NODE: (
@@ -155,11 +185,12 @@ _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
 }
 
 NODES: Mapping[str, tuple[Parameter, ...]] = {
-    **{name: (_SCENARIO, *_declared_by(member.settings).values(), *_OTHERS.get(name, ()))
-       for name, member in sorted(ROSTER.items())},
+    **{name: (_SCENARIO, _SITE, *_declared_by(member.settings).values(), *_OTHERS.get(name, ()))
+       for name, member in sorted(MEMBERS.items())},
     'visualizer': (
         _SCENARIO,
-        *_FRAME,
+        _SITE,
+        _FRAME,
         _USER_TOPICS,
         _parameter('period_s', 0.2, 'Period at which the scene is published.',
                    unit='s', low=0.01, high=60.0),
@@ -169,6 +200,12 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     'network': (_parameter('users', 2, 'Number of users.', low=1, high=MAX_USERS),),
 }
 
+# Options for nodes that need no services; access control then need not permit any.
+WITHOUT_SERVICES: Mapping[str, Any] = {
+    'start_parameter_services': False,
+    'parameter_overrides': [RosParameter('start_type_description_service', value=False)]}
+# Parameters that rclpy declares for each node.
+_OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 CODEBOOK_PREFIX = 'codebook.'
 # The parameters of the optimizer that hold the codebook, with their descriptions.
 CODEBOOK: Mapping[str, str] = {
@@ -182,20 +219,69 @@ CODEBOOK: Mapping[str, str] = {
 }
 
 
+# Valid values of qos_overrides.<topic>.<publisher or subscription>.<policy>, by policy. A file may
+# contain overrides for other nodes, so policies that no node of this package uses are included.
+_DURATION_NS = Field(int, unit='ns', low=0, high=2**63 - 1)
+_QOS: Mapping[str, Field] = {
+    'history': Field(str, choices=('keep_last', 'keep_all', 'system_default')),
+    'depth': Field(int, low=0, high=2**31 - 1),
+    'reliability': Field(
+        str, choices=('reliable', 'best_effort', 'system_default', 'best_available')),
+    'durability': Field(
+        str, choices=('volatile', 'transient_local', 'system_default', 'best_available')),
+    'deadline': _DURATION_NS, 'lifespan': _DURATION_NS, 'liveliness_lease_duration': _DURATION_NS,
+    'liveliness': Field(
+        str, choices=('automatic', 'manual_by_topic', 'system_default', 'best_available')),
+    'avoid_ros_namespace_conventions': Field(bool)}
+_QOS_NAME = re.compile(r'qos_overrides\.(?:/\w+)+\.(?:publisher|subscription)(?:_\w+)?\.(\w+)')
+
+
+def check_qos_overrides(node: Node) -> None:
+    """Raise ParameterError if a parameter ``qos_overrides.*`` has an invalid name or value.
+
+    rclpy examines an override when the endpoint is created, which may be long after the start.
+    """
+    for name, parameter in node._parameter_overrides.items():
+        if not name.startswith('qos_overrides.'):
+            continue
+        match = _QOS_NAME.fullmatch(name)
+        if not match or match[1] not in _QOS:
+            raise ParameterError(
+                f'{name}: invalid name, expected qos_overrides./TOPIC.publisher.POLICY or '
+                f'qos_overrides./TOPIC.subscription.POLICY, with POLICY {", ".join(_QOS)}')
+        value = parameter.value
+        # rclpy accepts upper case, too.
+        if problem := _QOS[match[1]].problem(value.lower() if isinstance(value, str) else value):
+            raise ParameterError(f'{name}: {problem}')
+
+
 def declare(node: Node, executable: str) -> types.SimpleNamespace:
     """Declare the parameters of an executable in `NODES`, and return their values by name.
 
     Raises ParameterError if a value has the wrong type, is out of range, or is not allowed.
     """
+    check_qos_overrides(node)
     return types.SimpleNamespace(
         **{parameter.name: _declare_one(node, parameter) for parameter in NODES[executable]})
 
 
-def check_overrides(node: Node) -> None:
-    """Warn if a node was started with parameters that no executable has.
+def check_nodes(nodes: Sequence[Node]) -> None:
+    """Check the names of the nodes of a process, and the parameters with which they were started.
 
-    Parameters of other executables are accepted, because nodes may share a parameter file.
+    Raises ParameterError if two nodes have the same name. Logs a warning if there are parameters
+    that no executable has; those of other executables are accepted, because nodes may share a
+    parameter file.
     """
+    names = [node.get_fully_qualified_name() for node in nodes]
+    for name in names:
+        if (n := names.count(name)) > 1:
+            raise ParameterError(f'argument -r: {n} nodes are renamed to {name}, expected one: '
+                                 '-r NAME:__node:=NEW_NAME')
+    for node in nodes:
+        _check_overrides(node)
+
+
+def _check_overrides(node: Node) -> None:
     known = known_names()
     # rclpy gives no public access to all overrides. An endpoint declares its qos_overrides.*.
     foreign = [f'{name}{hint(name)}' for name in sorted(node._parameter_overrides)
@@ -215,6 +301,89 @@ def hint(name: str) -> str:
     """Return a text that suggests the closest known parameter; empty if none is close."""
     close = difflib.get_close_matches(name, known_names(), 1)
     return f' (the closest is {close[0]})' if close else ''
+
+
+def check_arguments(
+        parser: argparse.ArgumentParser, executable: str, arguments: Sequence[str]) -> None:
+    """Exit with a usage error if ``-p`` sets a parameter that the executable does not have.
+
+    A parameter file may set parameters of several executables; see `check_nodes`.
+    """
+    accepted = set(_names(executable)).union(*map(_names, _composed(executable)))
+    for name in _assigned(arguments):
+        if name not in known_names() and not name.startswith(_OF_RCLPY):
+            parser.error(f'argument -p: {name}: unknown parameter{hint(name)}')
+        owners = [owner for owner in NODES if name in _names(owner)]
+        if owners and name not in accepted:
+            parser.error(f'argument -p: {name} is a parameter of {", ".join(owners)}, '
+                         f'expected one of {executable}')
+
+
+def _names(executable: str) -> list[str]:
+    """Return the names of the parameters of an executable, not of the nodes that it composes."""
+    names = [parameter.name for parameter in NODES[executable]]
+    return [*names, *CODEBOOK] if executable == 'optimizer' else names
+
+
+def _assigned(arguments: Sequence[str]) -> Iterator[str]:
+    """Yield the parameters to which a command line assigns values for all nodes."""
+    in_ros_arguments = False
+    for word, following in itertools.pairwise(arguments):
+        if word in ('--ros-args', '--'):
+            in_ros_arguments = word == '--ros-args'
+        elif in_ros_arguments and word in ('-p', '--param'):
+            name, _, _ = following.partition(':=')
+            # A name with a colon is for a single node.
+            if ':' not in name:
+                yield name
+
+
+def _composed(executable: str) -> list[str]:
+    return [name for name in NODES if name in ROSTER] if executable == 'network' else []
+
+
+def make_parser(executable: str, text: str) -> ArgumentParser:
+    """Return a parser of the command line of an executable that has only ROS arguments.
+
+    `text` is the docstring of its module, whose first line contains a colon and a description.
+    """
+    description = text.partition('\n')[0].rpartition('``: ')[2]
+    return ArgumentParser(
+        prog=executable, usage=f'{executable} [--ros-args -p NAME:=VALUE ...]',
+        description=description[:1].upper() + description[1:], epilog=parameter_help(executable),
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+def parameter_help(executable: str) -> str:
+    """Return a description of the parameters of an executable, with an example."""
+    own = list(NODES[executable])
+    lines = ['ROS parameters:', *(_describe(parameter) for parameter in own)]
+    if executable == 'optimizer':
+        lines += [f'  {name}\n      {text}' for name, text in CODEBOOK.items()]
+    elif composed := _composed(executable):
+        # `network` sets these itself.
+        others = {parameter.name: parameter for name in composed for parameter in NODES[name]
+                  if parameter.name not in ('user_id', 'user_count')}
+        lines += ['', 'ROS parameters of the composed nodes:', *map(_describe, others.values())]
+    example = _example(own)
+    return '\n'.join([*lines, '', f'example: {executable} --ros-args -p {example}'])
+
+
+def _describe(parameter: Parameter) -> str:
+    details = [parameter.type, f'default {parameter.default_text}']
+    if parameter.range:
+        details.append(parameter.range)
+    if parameter.dynamic:
+        details.append('dynamic')
+    return f'  {parameter.name} ({"; ".join(details)})\n      {parameter.text}'
+
+
+def _example(declared: Sequence[Parameter]) -> str:
+    """Return an assignment to the first parameter, preferably not the scenario file or seed."""
+    chosen = next((parameter for parameter in declared
+                   if parameter.name not in ('scenario_file', 'seed')), declared[0])
+    value = 'my.yaml' if chosen.default == '' else chosen.default_text
+    return f'{chosen.name}:={value}'
 
 
 def _declare_one(node: Node, parameter: Parameter) -> Any:
@@ -239,7 +408,7 @@ def _declare_one(node: Node, parameter: Parameter) -> Any:
         # If one parameter has no value, the node returns no values at all to a request for several
         # parameters, such as a request of `ros2 param dump`.
         value = default
-        node.set_parameters([RosParameter(parameter.name, typed, default)])
+        Node.set_parameters(node, [RosParameter(parameter.name, typed, default)])
     if is_empty:
         # A copy: rclpy keeps the original, and rejects a new descriptor of a read-only parameter.
         final = copy.copy(descriptor)
@@ -258,16 +427,11 @@ def settings_of(kind: type[Any], values: types.SimpleNamespace) -> Any:
 
 
 def calibrated_surface(
-        values: types.SimpleNamespace, scenario: Scenario) -> SurfaceEstimate | None:
-    """Return the surface in the file ``calibration_file``; None if the parameter is empty."""
-    with translated(CalibrationError, ParameterError, 'calibration_file'):
-        return load_surface(values.calibration_file, scenario)
-
-
-def scenario_of(values: types.SimpleNamespace) -> Scenario:
-    """Return the scenario in the file ``scenario_file``; Table I if the parameter is empty."""
-    file = values.scenario_file
-    return Scenario.from_yaml(file) if file else Scenario()
+        values: types.SimpleNamespace, scenario: Scenario, name: str = 'calibration_file'
+) -> SurfaceEstimate | None:
+    """Return the surface in the calibration file of a parameter; None if this is empty."""
+    with translated(CalibrationError, ParameterError, name):
+        return load_surface(getattr(values, name), scenario)
 
 
 _FLOATING = (RosParameter.Type.DOUBLE, RosParameter.Type.DOUBLE_ARRAY)
@@ -295,11 +459,6 @@ class ParameterizedNode(Node):
         self._dynamic = {parameter.name: parameter for parameter in NODES[executable]
                          if parameter.dynamic}
         self._current_values = self.values
-        # Settings from the last check. ROS may still reject the change that was checked.
-        self._checked_settings: Any = None
-        self._is_reverting = False
-        self.add_on_set_parameters_callback(self._check)
-        self.add_post_set_parameters_callback(self._on_set)
 
     def destroy_node(self) -> None:
         """Run the callbacks in `endings`, then destroy the node."""
@@ -308,7 +467,7 @@ class ParameterizedNode(Node):
 
     def make_settings(self, values: types.SimpleNamespace) -> Any:
         """Return the role's settings, None if it has none; raise ParameterError if invalid."""
-        settings = ROSTER[self._executable].settings
+        settings = MEMBERS[self._executable].settings
         return settings and settings_of(settings, values)
 
     def on_settings_changed(self, settings: Any) -> None:
@@ -316,13 +475,11 @@ class ParameterizedNode(Node):
 
     def revert_parameters(self, settings: Any) -> None:
         """Reset dynamic parameters to earlier settings, without calling `on_settings_changed`."""
-        self._is_reverting = True
-        try:
-            self.set_parameters_atomically([
-                RosParameter(name, value=value)
-                for name, value in dataclasses.asdict(settings).items() if name in self._dynamic])
-        finally:
-            self._is_reverting = False
+        changes = [RosParameter(name, value=value)
+                   for name, value in dataclasses.asdict(settings).items()
+                   if name in self._dynamic]
+        super().set_parameters_atomically(changes)
+        self._current_values = self._with(changes)
 
     def set_parameters_atomically(
             self, parameter_list: list[RosParameter]) -> SetParametersResult:
@@ -331,50 +488,40 @@ class ParameterizedNode(Node):
         Unlike in rclpy, the reason for a rejection contains the value and the valid range, and
         read-only parameters are accepted if they keep their values, as in a dump of the node.
         """
-        parameter_list = [p for p in parameter_list if not self._is_kept(p)]
-        if not parameter_list:
+        changes = [p for p in parameter_list if not self._is_kept(p)]
+        if not changes:
             return SetParametersResult(successful=True)
-        try:
-            self._check_each(parameter_list)
-        except ParameterError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+        values, settings = self._with(changes), None
+        is_dynamic = any(p.name in self._dynamic for p in changes)
+        if is_dynamic:
+            try:
+                for name, parameter in self._dynamic.items():
+                    parameter.check(getattr(values, name))
+                settings = self.make_settings(values)
+            except ParameterError as error:
+                return SetParametersResult(successful=False, reason=str(error))
         # A change to use_sim_time makes rclpy subscribe to the simulated time.
         what = f'subscription to {topics.CLOCK}'
         result = create_or_refuse(self, what, functools.partial(
-            super().set_parameters_atomically, parameter_list))
-        if result:
-            return result
-        self._time_source.ros_time_is_active = False
-        return SetParametersResult(successful=False, reason=refusals(self)[what])
+            super().set_parameters_atomically, changes))
+        if result is None:
+            self._time_source.ros_time_is_active = False
+            return SetParametersResult(successful=False, reason=refusals(self)[what])
+        if result.successful and is_dynamic:
+            self._current_values = values
+            self.on_settings_changed(settings)
+        return result
+
+    def set_parameters(self, parameter_list: list[RosParameter]) -> list[SetParametersResult]:
+        """Set parameters one after the other; see `set_parameters_atomically`."""
+        return [self.set_parameters_atomically([one]) for one in parameter_list]
 
     def _is_kept(self, parameter: RosParameter) -> bool:
         name = parameter.name
         return (self.has_parameter(name) and self.describe_parameter(name).read_only
                 and same_value(self.get_parameter(name), parameter))
 
-    def _dynamic_values(self, changes: Iterable[RosParameter]) -> dict[str, Any]:
-        return {p.name: p.value for p in changes if p.name in self._dynamic}
-
-    def _check_each(self, changes: Iterable[RosParameter]) -> None:
-        for name, value in self._dynamic_values(changes).items():
-            self._dynamic[name].check(value)
-
     def _with(self, changes: Iterable[RosParameter]) -> types.SimpleNamespace:
-        return types.SimpleNamespace(
-            **{**vars(self._current_values), **self._dynamic_values(changes)})
-
-    def _check(self, changes: list[RosParameter]) -> SetParametersResult:
-        if self._dynamic_values(changes) and not self._is_reverting:
-            try:
-                self._check_each(changes)
-                self._checked_settings = self.make_settings(self._with(changes))
-            except ParameterError as error:
-                return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
-
-    def _on_set(self, changes: list[RosParameter]) -> None:
-        if not self._dynamic_values(changes):
-            return
-        self._current_values = self._with(changes)
-        if not self._is_reverting:
-            self.on_settings_changed(self._checked_settings)
+        return types.SimpleNamespace(**{
+            **vars(self._current_values),
+            **{p.name: p.value for p in changes if p.name in self._dynamic}})

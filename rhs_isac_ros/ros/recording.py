@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import re
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import yaml
 from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
@@ -25,6 +26,7 @@ from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.files import parse_yaml
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 # Separator between the message definitions of a schema, as in ROS 1 and 2.
@@ -32,6 +34,9 @@ _SEPARATOR = '=' * 80
 _SCENARIO = 'scenario'
 # Maximum size of a record, and of a decompressed chunk [bytes].
 _MAX_BYTES = 2**26
+# Period of completing a chunk, so that a killed process loses at most this time [s].
+_FLUSH_S = 0.5
+_COMPLETE_CHUNK = '_Writer__finalize_chunk'
 # Maximum number of characters of a scenario.
 _MAX_SCENARIO = 2**20
 _BUILT_IN = re.compile(r'(bool|byte|char|float\d+|u?int\d+|w?string)\b')
@@ -96,7 +101,8 @@ class Recorder:
     """Writes the messages and the scenario of a network to a file.
 
     Until `close` completes the file, its name is ``<name>.part``; an incomplete file keeps it.
-    Raises RecordingError if mcap is not installed or the file cannot be created.
+    The messages up to `_FLUSH_S` before the end of a process that is killed are readable. Raises
+    RecordingError if mcap is not installed or the file cannot be created.
     """
 
     def __init__(self, path: str | Path, scenario: Scenario) -> None:
@@ -112,8 +118,11 @@ class Recorder:
         self._writer = Writer(self._stream)
         self._writer.start(profile='ros2', library='rhs_isac_ros')
         self._writer.add_metadata(_SCENARIO, {'yaml': yaml.safe_dump(scenario.changes())})
+        # The library completes a chunk at a certain size, but has no public method for it.
+        self._complete_chunk: Callable[[], None] = getattr(self._writer, _COMPLETE_CHUNK)
         # Number of messages written, and the reason why writing failed, such as a full disk.
         self.count, self.failure = 0, ''
+        self._attempt(self._stream.flush)
 
     def record_topics(
             self, node: Node, on_message: Callable[[str, bytes], None] | None = None) -> None:
@@ -130,6 +139,12 @@ class Recorder:
                 metadata={'offered_qos_profiles': _offered_qos(profile)})
             endpoints.subscribe(
                 node, kind, name, self._writer_of(channel, name, on_message), profile, raw=True)
+        endpoints.steady_timer(node, _FLUSH_S, self._flush)
+
+    def _flush(self) -> None:
+        if not self._stream.closed:
+            self._attempt(self._complete_chunk)
+            self._attempt(self._stream.flush)
 
     def _writer_of(
             self, channel: int, name: str, on_message: Callable[[str, bytes], None] | None
@@ -222,36 +237,49 @@ def read_scenario(path: str | Path) -> Scenario | None:
                 # With references, a short text can describe an enormous value.
                 if '&' in text or len(text) > _MAX_SCENARIO:
                     raise TypeError('it contains references, or is too long')
-                return Scenario(**yaml.safe_load(text))
+                fields = parse_yaml(text)
             # The file may come from another version or another program.
-            except (KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
+            except (KeyError, TypeError, ValueError) as error:
                 raise RecordingError(f'{path}: invalid scenario: {error}') from None
+            with translated(TypeError, RecordingError, f'{path}: invalid scenario'):
+                return Scenario(**fields)
     return None
 
 
 def _records(path: str | Path) -> Iterator[Any]:
     """Yield the records of a file and of its chunks, in the order of the file.
 
-    Unlike the readers of mcap, this function limits the size of a decompressed chunk. Raises
-    RecordingError if the file cannot be read.
+    Unlike the readers of mcap, this function limits the size of a decompressed chunk. If the end
+    of the file is missing, because its writer was killed, it logs a warning. Raises RecordingError
+    if the file cannot be read.
     """
     with translated(MissingLibraryError, RecordingError), optional_import(
             'reading a recording', extra='recording'):
         from mcap.records import Chunk
         from mcap.stream_reader import StreamReader, breakup_chunk
+    is_begun = False
     try:
-        with Path(path).open('rb') as stream:
+        stream = Path(path).open('rb')
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+    with stream:
+        try:
             for record in StreamReader(stream, emit_chunks=True, validate_crcs=True,
                                        record_size_limit=_MAX_BYTES).records:
+                is_begun = True
                 if isinstance(record, Chunk):
                     yield from breakup_chunk(_decompressed(record), validate_crc=True)
                 else:
                     yield record
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
-    # For a damaged file, mcap and its libraries raise many kinds of exceptions.
-    except Exception as error:
-        raise RecordingError(f'{path}: not a complete recording: {error!r}') from None
+        except OSError as error:
+            raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+        # For a damaged file, mcap and its libraries raise many kinds of exceptions.
+        except Exception as error:
+            if not is_begun or stream.read(1):
+                raise RecordingError(f'{path}: not a complete recording: {error!r}') from None
+            get_logger('recording').warning(
+                f'{path}: incomplete, because its writer did not close it; read up to its end',
+                once=True)
 
 
 def _decompressed(chunk: Any) -> Any:
@@ -277,13 +305,13 @@ class CycleObserver(Node):
 
     With a `recorder`, which the caller closes, the observer also records the topics of the
     namespace, and collects the cycles from the recorded messages. Without a recorder, it passes
-    `receives`, `sizes` and `on_malformed` to `subscribe_messages`.
+    `receives`, `scenario` and `on_malformed` to `subscribe_messages`.
     """
 
     def __init__(
             self, recorder: Recorder | None = None,
             receives: Iterable[type[m.Message]] = cycle_log.RECEIVES,
-            sizes: Mapping[str, int] | None = None,
+            scenario: Scenario | None = None,
             on_malformed: Callable[[m.MessageError], None] | None = None,
             log: cycle_log.CycleLog | None = None, **node_options: Any) -> None:
         super().__init__('cycle_observer', **node_options)
@@ -295,8 +323,13 @@ class CycleObserver(Node):
             recorder.record_topics(self, lambda name, message: self._on_recorded(
                 kinds.get(name), message))
             return
-        endpoints.subscribe_messages(self, receives, sizes, self._on_message, on_malformed,
+        endpoints.subscribe_messages(self, receives, scenario, self._on_message, on_malformed,
                                      exchange=endpoints.OBSERVATION)
+
+    @property
+    def complete(self) -> Sequence[cycle_log.CompleteCycle]:
+        """Served cycles whose messages have all arrived."""
+        return self.log.complete
 
     def observe(self, message: m.Message, now_s: float) -> None:
         """Process a message that arrived at `now_s` [s]; subclasses may extend this method."""

@@ -1,7 +1,7 @@
 """The roles of a network.
 
-Parameters, the launch file, DDS permissions, the checks for missing roles, and tests derive from
-the declarations in `ROSTER`.
+Parameters, the launch files, DDS permissions, the checks for missing roles, and tests derive from
+the declarations in `MEMBERS`.
 """
 
 import dataclasses
@@ -10,12 +10,16 @@ from typing import Any
 
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.channel import Channel
+from rhs_isac_ros.protocol.fusion import Fusion
 from rhs_isac_ros.protocol.positioner import Positioner
+from rhs_isac_ros.protocol.receiver import Receiver
 from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
+    FusionSettings,
     Impairments,
     PositionerSettings,
+    ReceiverSettings,
     TransmissionSettings,
 )
 from rhs_isac_ros.protocol.transmission import Transmission
@@ -32,6 +36,7 @@ class Member:
     requires: tuple[str, ...] = ()  # roles that must be present before it serves
     is_unique: bool = True  # whether only one node serves in the role; others stand by
     has_codebook: bool = False  # whether it uses the codebook of the optimizer
+    of_site: bool = False  # whether it serves all surfaces of a site instead of one
     publishes: tuple[str, ...] = ()  # further topics; {user} stands for the number of a user
 
     @property
@@ -45,8 +50,7 @@ class Member:
     def received(self) -> tuple[str, ...]:
         """Topics of the network to which nodes of the role subscribe; protocol messages first."""
         return (*(topics.NAMES[kind] for kind in (self.role.RECEIVES if self.role else ())),
-                *((topics.CODEBOOK,) if self.has_codebook else ()),
-                *((topics.PRESENCE,) if self.is_unique else ()))
+                *((topics.CODEBOOK,) if self.has_codebook else ()), topics.PRESENCE)
 
     @property
     def needed(self) -> tuple[str, ...]:
@@ -54,7 +58,7 @@ class Member:
         return (*self.requires, *((topics.OPTIMIZER_NODE,) if self.has_codebook else ()))
 
 
-# The launch file and `demo` start the nodes in this order.
+# A network with one surface. The launch file and `demo` start the nodes in this order.
 ROSTER: Mapping[str, Member] = {
     'rhs_controller': Member(role=RhsController, has_codebook=True),
     'positioner': Member(
@@ -70,18 +74,15 @@ ROSTER: Mapping[str, Member] = {
         role=BaseStation, settings=BaseStationSettings, has_codebook=True,
         requires=('rhs_controller', 'channel', 'positioner', 'transmission')),
 }
+# The other roles of a site.
+_OF_SITES: Mapping[str, Member] = {
+    'receiver': Member(role=Receiver, settings=ReceiverSettings, has_codebook=True),
+    'fusion': Member(
+        role=Fusion, settings=FusionSettings, of_site=True,
+        publishes=(topics.POSITION, topics.POSE, topics.ODOMETRY)),
+}
+MEMBERS: Mapping[str, Member] = {**ROSTER, **_OF_SITES}
+# The roles of a surface that follows the base station of another one.
+FOLLOWING = ('rhs_controller', 'positioner', topics.OPTIMIZER_NODE, 'channel', 'receiver')
 # Roles in which only one node of a network serves.
 UNIQUE = tuple(name for name, member in ROSTER.items() if member.is_unique)
-
-
-def identifying_endpoints(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return two tuples of topics, published and subscribed, that show that a role is present.
-
-    Each contains the first topic that only this role publishes or subscribes to, if any. One
-    is enough, because a node creates its publishers together, and likewise its subscriptions.
-    """
-    others = [member for other, member in ROSTER.items() if other != name]
-    sent = {topic for member in others for topic in member.sent}
-    received = {topic for member in others for topic in member.received}
-    return (tuple(topic for topic in ROSTER[name].sent if topic not in sent)[:1],
-            tuple(topic for topic in ROSTER[name].received if topic not in received)[:1])

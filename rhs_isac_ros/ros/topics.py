@@ -15,6 +15,7 @@ NAMES: Mapping[type[m.Message], str] = {
     m.FeedSignals: 'feed_signals',
     m.ReceivedSignals: 'received_signals',
     m.PositionEstimate: 'position_estimate',
+    m.Posterior: 'posterior',
     m.NoFix: 'no_fix',
     m.Beam: 'beam',
     m.Data: 'data',
@@ -54,10 +55,10 @@ STEP = '~/step'
 
 # Node whose parameters hold the codebook.
 OPTIMIZER_NODE = 'optimizer'
-# Default of the parameter frame_id, the frame of standard messages.
+# Default of the parameter frame_id, the frame of the site, in which all positions are.
 MAP_FRAME = 'map'
-# Frame of the messages of the protocol: the origin is the centre of the surface, x points outward
-# and z points up. The namespace precedes this name and the next one.
+# Frame of the surface, and of messages without positions: the origin is the centre of the surface,
+# x points outward and z points up. The namespace precedes this name and the next one.
 RHS_FRAME = 'rhs_link'
 # Frame at the estimated position of a user, with the axes of the frame frame_id.
 USER_FRAME = 'user_{user}'

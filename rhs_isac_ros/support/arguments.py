@@ -3,7 +3,8 @@
 import argparse
 import math
 import os
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,6 +19,19 @@ class ArgumentParser(argparse.ArgumentParser):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **{'allow_abbrev': False, **options})
+
+    def parse_known_args(  # type: ignore[override]
+            self, args: Sequence[str] | None = None, namespace: Any = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse arguments, which must be UTF-8: they are printed, and passed to libraries."""
+        words = sys.argv[1:] if args is None else list(args)
+        for word in words:
+            try:
+                word.encode()
+            except UnicodeEncodeError:
+                self.error(f'argument {word!a}: expected UTF-8')
+        found: tuple[argparse.Namespace, list[str]] = super().parse_known_args(words, namespace)
+        return found
 
     def error(self, message: str) -> NoReturn:
         """Print an error as one line, and exit with code 2."""

@@ -6,10 +6,35 @@ declared in this way.
 
 import dataclasses
 import math
+import operator
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from rhs_isac_ros.support import plugins
+
+# Decimal notation, without the leading zeros, bases, underscores and sexagesimal numbers of YAML.
+DECIMAL = re.compile(
+    r'[-+]?(?:0|[1-9][0-9]*)(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?|[-+]?\.[0-9]+(?:[eE][-+]?[0-9]+)?')
+
+
+def to_number(value: Any, kind: type) -> Any:
+    """Convert a real number to int or float, and return any other value unchanged.
+
+    An array with a single number counts as this number, as MATLAB has no other scalars, and so
+    does a text in decimal notation for a float.
+    """
+    is_array = hasattr(value, 'dtype')
+    if is_array and (value.dtype.kind not in 'fiu' or value.size != 1 or hasattr(value, 'mask')):
+        return value
+    if isinstance(value, bool | bytes) or (
+            isinstance(value, str) and not (kind is float and DECIMAL.fullmatch(value))):
+        return value
+    try:
+        value = value.item() if is_array else value
+        return operator.index(value) if kind is int else float(value)
+    except (TypeError, ValueError, OverflowError):
+        return value
 
 
 class ParameterError(ValueError):
@@ -57,6 +82,13 @@ class Field:
         words = self.WORDS[self.kind]
         return f'{words}, {self.range}' if self.range else words
 
+    def checked(self, name: str, value: Any) -> Any:
+        """Return a number as the declared type; raise ValueError with `name` if it is invalid."""
+        value = to_number(value, self.kind)
+        if problem := self.problem(value):
+            raise ValueError(f'{name}: {problem}')
+        return value
+
     def problem(self, value: Any) -> str:
         """Describe an invalid value and what was expected; return '' for a valid value."""
         if not self._has_type(value):
@@ -82,3 +114,12 @@ class Field:
             return ''
         listed = f'; installed: {", ".join(installed) or "none"}' if self.plugins else ''
         return f'{value!r}, expected {self.expected}{listed}'
+
+
+def finite(name: str, value: Any, low: float = -math.inf) -> float:
+    """Return a finite number, at least `low`, as a float; raise ValueError with `name` if not."""
+    # At once, because roles check the time of every event.
+    if type(value) is float and low <= value and abs(value) < math.inf:
+        return value
+    number: float = Field(float, low=low).checked(name, value)
+    return number

@@ -3,23 +3,61 @@
 import contextlib
 import json
 import os
+import re
 import secrets
 import tempfile
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 import yaml
 
+from rhs_isac_ros.support.fields import DECIMAL
+
 # Maximum sizes [bytes] of the arrays of an archive, and of a YAML file. The memory needed to read
 # a YAML file is up to 240 times its size.
 _MAX_BYTES, _MAX_YAML_BYTES = 2**28, 2**24
 # Maximum depth of the lists and mappings of a YAML file.
 _MAX_YAML_DEPTH = 16
+_INT, _FLOAT = 'tag:yaml.org,2002:int', 'tag:yaml.org,2002:float'
+
+
 # The loader in C reads a codebook ten times as fast; some builds of PyYAML lack it.
-_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[misc]
+    """A loader that refuses repeated keys, and reads numbers only in decimal notation.
+
+    A number such as ``010``, ``0x1F``, ``1_000`` or ``-1:30`` is read as text.
+    """
+
+    # YAML 1.1 reads `010` as 8, and `-1:30` as -90.
+    yaml_implicit_resolvers = {
+        first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_INT, _FLOAT)]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()}
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Convert a mapping; raise ValueError if it contains a key twice."""
+        known = set()
+        for one, _ in node.value:
+            key = self.construct_object(one, deep=True)
+            if not isinstance(key, Hashable):
+                continue  # An error of the base class.
+            if key in known:
+                raise ValueError(
+                    f'{key}: repeated in line {one.start_mark.line + 1}, expected one value')
+            known.add(key)
+        content: dict[Any, Any] = super().construct_mapping(node, deep)
+        return content
+
+
+for _tag, _pattern, _first in (
+        (_INT, re.compile(r'(?:[-+]?(?:0|[1-9][0-9]*))$'), '-+0123456789'),
+        (_FLOAT, re.compile(
+            # As in YAML 1.1, a float contains a point.
+            rf'(?:(?=[^.]*\.)(?:{DECIMAL.pattern})|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$'),
+         '-+.0123456789')):
+    _Loader.add_implicit_resolver(_tag, _pattern, list(_first))
 
 
 class ArchiveError(ValueError):
@@ -66,30 +104,37 @@ def check_writable(path: Path) -> None:
         os.lstat(path.parent / f'.{path.name}.{"x" * 8}')
 
 
-def read_yaml(path: str | Path) -> Any:
-    """Read a YAML file.
-
-    Raises ValueError if the file cannot be read, is invalid, too large or nested too deeply, or
-    contains references, with which a short text can describe an enormous value.
-    """
+def read_yaml(path: str | Path, max_bytes: int = _MAX_YAML_BYTES) -> Any:
+    """Read a YAML file; raise ValueError if it cannot be read or `parse_yaml` fails."""
     try:
         with open(path, 'rb') as stream:
-            data = stream.read(_MAX_YAML_BYTES + 1)
-        if len(data) > _MAX_YAML_BYTES:
-            raise ValueError(f'more than {_MAX_YAML_BYTES} bytes')
-        text, depth = data.decode(), 0
+            return parse_yaml(stream.read(max_bytes + 1).decode(), max_bytes)
+    except (OSError, ValueError) as error:
+        raise ValueError(f'{path}: cannot be read: {error}') from error
+
+
+def parse_yaml(text: str, max_bytes: int = _MAX_YAML_BYTES) -> Any:
+    """Parse a text in YAML, with numbers in decimal notation.
+
+    Raises ValueError if the text is invalid, too long or nested too deeply, repeats a key, or
+    contains references, with which a short text can describe an enormous value.
+    """
+    if len(text) > max_bytes:
+        raise ValueError(f'more than {max_bytes} bytes')
+    depth = 0
+    try:
         # In the C loader, deep nesting would crash the process.
-        for event in yaml.parse(text, _LOADER):
+        for event in yaml.parse(text, _Loader):
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
             if depth > _MAX_YAML_DEPTH:
                 raise ValueError(f'nested more than {_MAX_YAML_DEPTH} times')
             if isinstance(event, yaml.AliasEvent):
                 raise ValueError(f'reference *{event.anchor}, expected none')
-        return yaml.load(text, _LOADER)
+        return yaml.load(text, _Loader)
     # PyYAML also raises ValueError, for impossible dates.
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ValueError(f'{path}: cannot be read: {" ".join(str(error).split())}') from error
+    except (ValueError, yaml.YAMLError) as error:
+        raise ValueError(' '.join(str(error).split())) from error
 
 
 def write_archive(path: str | Path, arrays: Mapping[str, np.ndarray | float],

@@ -8,6 +8,8 @@ IMPAIRMENTS = 'rhs_isac_ros.impairments'
 ESTIMATORS = 'rhs_isac_ros.estimators'
 MOBILITIES = 'rhs_isac_ros.mobilities'
 GAIN_PATTERNS = 'rhs_isac_ros.gain_patterns'
+SURFACES = 'rhs_isac_ros.surfaces'
+RADIOS = 'rhs_isac_ros.radios'
 
 
 class PluginError(ValueError):

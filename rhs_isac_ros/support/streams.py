@@ -4,7 +4,7 @@ import numpy as np
 
 (CHANNEL, RECEIVER, USER, BASE_STATION, SAMPLES, START, HELD_OUT, SKETCH, PAIRS,
  METHOD, PHASES, TRAINING, AIR, SURFACE, USER_DEVIATION, CYCLE_DEVIATION, PLANS,
- BLOCKAGE) = range(18)
+ BLOCKAGE, AGREEMENTS, RADIO) = range(20)
 
 
 def generator(seed: int, stream: int, *key: int) -> np.random.Generator:

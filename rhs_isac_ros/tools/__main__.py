@@ -3,7 +3,7 @@
 import importlib
 import sys
 
-from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.support.exits import exit_code_of
 
 if len(sys.argv) < 2:
     sys.exit('usage: python3 -m rhs_isac_ros.tools COMMAND [ARGUMENT ...]')

@@ -1,37 +1,49 @@
 """``scripts/calibrate``: estimates a surface, or the multipath, from pilots at known positions.
 
 The pilots come from a recording or a running network whose users publish their true positions, or
-from arrays in a file.
+from arrays in a file. Poses of the surfaces of a site are estimated from users at unknown
+positions.
 """
 
 import argparse
 import dataclasses
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from rclpy.node import Node
 
 from rhs_isac_ros.calibration import (
+    Calibration,
     CalibrationError,
+    CalibrationWarning,
     Pilots,
     SurveyWarning,
     calibrate,
+    known_states,
     load_surface,
     report,
     survey,
     survey_report,
 )
+from rhs_isac_ros.calibration.estimate import places_of
+from rhs_isac_ros.calibration.survey import PLACE_WAVELENGTHS
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import MultipathEstimate, Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
-from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning import Sighting, Site, make_estimator
+from rhs_isac_ros.positioning.alignment import PoseError, estimate_pose
+from rhs_isac_ros.positioning.site import SiteError, site_text
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros.endpoints import subscribe_messages
+from rhs_isac_ros.protocol.fusion import sighting_of
+from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.convert import from_bytes, ros_type
+from rhs_isac_ros.ros.endpoints import EXCHANGE, log_dropped, subscribe, subscribe_messages
+from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import RecordingError
-from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
@@ -40,15 +52,19 @@ from rhs_isac_ros.support.arguments import (
     positive_float,
     positive_int,
 )
-from rhs_isac_ros.support.files import ArchiveError, read_arrays
+from rhs_isac_ros.support.files import ArchiveError, read_arrays, write_whole
 from rhs_isac_ros.tools import command
 
 # Types of the messages that the log uses.
 RECEIVES = (m.GroundTruth, m.ReceivedSignals)
 _CYCLES = 200
+_OUTPUT, _SITE_OUTPUT = Path('calibration.npz'), Path('site_calibrated.yaml')
 _TIMEOUT_S = 600.0
-# Maximum number of pilots whose errors before and after the calibration are compared.
-_N_COMPARED = 200
+# Maximum number of pilots whose errors before and after the calibration are compared, and number
+# of groups of places that are left out in turn.
+_N_COMPARED, _N_FOLDS = 200, 5
+# Function that returns the scenario and the surface that an estimator assumes, from pilots.
+Assumption: TypeAlias = Callable[[list[Pilots]], tuple[Scenario, SurfaceEstimate | None]]
 
 
 class PilotLog:
@@ -57,8 +73,8 @@ class PilotLog:
     Unlike `CycleLog`, it keeps cycles without a fix, because a fix may require the calibration.
     """
 
-    def __init__(self, user: int = 0) -> None:
-        self._user = user
+    def __init__(self, scenario: Scenario, user: int = 0) -> None:
+        self._pose, self._user = scenario.pose, user
         self._truths: dict[tuple[int, int], list[m.GroundTruth]] = {}
         self._signals: dict[int, m.ReceivedSignals] = {}
         self.codebooks: dict[str, Codebook] = {}
@@ -96,7 +112,8 @@ class PilotLog:
             truth = self._truth_of(signals)
             if truth is not None and signals.codebook_id in self.codebooks:
                 groups.setdefault(signals.codebook_id, []).append(
-                    (truth.position, signals.signals.reshape(len(signals.signals), -1)))
+                    (self._pose.to_surface(truth.position),
+                     signals.signals.reshape(len(signals.signals), -1)))
         return [Pilots(self.codebooks[codebook_id], *map(np.array, zip(*group, strict=True)))
                 for codebook_id, group in groups.items()]
 
@@ -111,27 +128,115 @@ class CalibratorNode(Node):
 
     def __init__(self, log: PilotLog, scenario: Scenario) -> None:
         super().__init__('calibrator', **WITHOUT_SERVICES)
-        subscribe_messages(self, RECEIVES, scenario.sizes, log.add, scenario_id=scenario.id)
+        subscribe_messages(self, RECEIVES, scenario, log.add, on_foreign=lambda message: None)
         command.subscribe_codebooks(self, scenario, log.add)
 
 
+class PosteriorLog:
+    """Collects the posteriors of the surfaces of a site, by cycle and user."""
+
+    def __init__(self, site: Site) -> None:
+        self._names = {one.scenario.id: name for name, one in site.surfaces.items()}
+        self._site = site
+        self._found: dict[tuple[int, int], dict[str, Sighting]] = {}
+
+    def add(self, message: m.Posterior) -> None:
+        """Add a posterior; drop those of other scenarios."""
+        if name := self._names.get(message.scenario_id):
+            m.check(message, self._site.surfaces[name].scenario)
+            self._found.setdefault((message.cycle_id, message.user), {})[name] = sighting_of(
+                message)
+
+    def pairs(self, one: str, other: str) -> tuple[list[Sighting], list[Sighting]]:
+        """Return the sightings by both surfaces of users that they located in one cycle."""
+        both = [found for found in self._found.values() if {one, other} <= found.keys()]
+        return [found[one] for found in both], [found[other] for found in both]
+
+    @property
+    def n_pairs(self) -> int:
+        """Smallest number of users that the first surface and another one located together."""
+        first, *others = self._site.surfaces
+        return min(len(self.pairs(first, other)[0]) for other in others)
+
+
+class AlignerNode(Node):
+    """Collects the posteriors in the namespaces of the surfaces of a running site."""
+
+    def __init__(self, log: PosteriorLog, site: Site) -> None:
+        super().__init__('calibrator', **WITHOUT_SERVICES)
+        self._log = log
+        for name in site.surfaces:
+            subscribe(self, ros_type(m.Posterior), f'{name}/{topics.NAMES[m.Posterior]}',
+                      self._receive, EXCHANGE, raw=True)
+
+    def _receive(self, content: bytes) -> None:
+        try:
+            self._log.add(from_bytes(m.Posterior, content))
+        except m.MessageError as error:
+            log_dropped(self, error)
+
+
+def _align(options: argparse.Namespace, arguments: list[str]) -> int:
+    """Estimate the poses of all surfaces of a site but the first, and write a site file."""
+    site = Site.from_yaml(options.site)
+    if len(site.surfaces) < 2:
+        raise SiteError(f'{options.site}: surfaces: one, expected at least two')
+    log = PosteriorLog(site)
+    end_s = time.monotonic() + options.timeout
+    command.observe(lambda: AlignerNode(log, site), arguments,
+                    lambda _: log.n_pairs >= options.cycles or time.monotonic() > end_s)
+    if log.n_pairs < options.cycles:
+        raise command.none_within(
+            f'{log.n_pairs} of {options.cycles} users located by two surfaces', options.timeout)
+    first, *others = site.surfaces
+    poses = {}
+    for name in others:
+        try:
+            pose = estimate_pose(*log.pairs(first, name), site.bounds_m)
+        except PoseError as error:
+            raise SiteError(f'{name}: {error}') from None
+        change = site.surfaces[name].pose.error_of(pose)
+        std = np.sqrt(np.diagonal(pose.covariance))
+        print(f'{name}: moved by {change[:3].round(3)} m, turned by '
+              f'{np.degrees(change[3:]).round(2)} deg; standard deviations {std[:3].round(3)} m, '
+              f'{np.degrees(std[3:]).round(2)} deg', flush=True)
+        poses[name] = pose
+    write_whole(options.output, site_text(options.site, poses, options.output.parent))
+    print(options.output)
+    return 0
+
+
 def _calibrate(options: argparse.Namespace, arguments: list[str]) -> int:
+    if options.site:
+        return _align(options, arguments)
     has_arrays = options.file and options.file.suffix == '.npz'
     try:
         scenario = command.choose_scenario(options.config, None if has_arrays else options.file)
+        if options.states:
+            if options.file:
+                raise CalibrationError(f'{options.file}: expected no file with --states')
+            return _save(known_states(scenario, *options.states), options.output)
         pilots = ([_arrays(options)] if has_arrays
                   else _collected(options, scenario, arguments))
-        if options.multipath:
-            _survey(scenario, pilots, options)
-            return 0
-        calibration = calibrate(scenario, pilots)
-        print(report(calibration, scenario), flush=True)
-        for text, surface in (('before', None), ('after', calibration.surface)):
-            print(f'position error of the pilots {text}: {_error(scenario, pilots, surface)}')
-        calibration.save(options.output)
+        with warnings.catch_warnings():
+            # The reports contain these warnings.
+            warnings.simplefilter('ignore', CalibrationWarning)
+            warnings.simplefilter('ignore', SurveyWarning)
+            if options.multipath:
+                _survey(scenario, pilots, options)
+                return 0
+            calibration = calibrate(scenario, pilots)
+            print(report(calibration, scenario), flush=True)
+            _print_errors(scenario, pilots, lambda _: (scenario, None),
+                          lambda some: (scenario, calibrate(scenario, some).surface))
+        return _save(calibration, options.output)
     except ValueError as error:
         raise CalibrationError(str(error)) from None
-    print(f'{options.output}: calibration {calibration.id}')
+
+
+def _save(calibration: Calibration, output: Path) -> int:
+    calibration.save(output)
+    print(f'{output}: calibration {calibration.id}')
     return 0
 
 
@@ -147,7 +252,7 @@ def _arrays(options: argparse.Namespace) -> Pilots:
 
 def _collected(
         options: argparse.Namespace, scenario: Scenario, arguments: list[str]) -> list[Pilots]:
-    log = PilotLog(options.user)
+    log = PilotLog(scenario, options.user)
     if options.file:
         for found, _ in command.recorded(
                 options.file, options.namespace, scenario, [*RECEIVES, Codebook]):
@@ -176,37 +281,86 @@ def _collected(
 
 
 def _survey(scenario: Scenario, pilots: Sequence[Pilots], options: argparse.Namespace) -> None:
-    """Estimate the multipath from the largest group of pilots with the same codebook."""
-    group = max(pilots, key=lambda group: len(group.positions))
+    """Estimate the multipath from pilots with the codebook that was used at the most places."""
+    group = max(pilots, key=lambda group: len(
+        places_of(scenario, group.positions, PLACE_WAVELENGTHS)))
     n_other = sum(len(one.positions) for one in pilots) - len(group.positions)
     if n_other:
         print(f'{n_other} pilots with other codebooks have no effect')
     surface = load_surface(str(options.calibration or ''), scenario)
-    with warnings.catch_warnings():
-        # The report contains these warnings.
-        warnings.simplefilter('ignore', SurveyWarning)
-        estimate = survey(scenario, group.beams, group.positions, group.received, surface)
+
+    def surveyed(group: Pilots) -> MultipathEstimate:
+        return survey(scenario, group.beams, group.positions, group.received, surface)
+
+    estimate = surveyed(group)
     print(survey_report(estimate), flush=True)
-    measured = dataclasses.replace(scenario, multipath=estimate)
-    for text, known in (('before', scenario), ('after', measured)):
-        print(f'position error of the pilots {text}: {_error(known, [group], surface)}')
+    _print_errors(scenario, [group], lambda _: (scenario, surface), lambda some: (
+        dataclasses.replace(scenario, multipath=surveyed(*some)), surface))
     estimate.save(options.output)
     print(f'{options.output}: multipath {estimate.digest}; use it with the line '
           f'"multipath: {options.output.name}" in a scenario file beside it')
 
 
-def _error(scenario: Scenario, pilots: Sequence[Pilots], surface: SurfaceEstimate | None) -> str:
-    """Return the rms error and the number of missing fixes, over the first pilots, as text."""
-    distances = np.empty(0)
-    for group in pilots:
-        left = _N_COMPARED - len(distances)
-        if isinstance(group.beams, Codebook) and left:
-            estimator = make_estimator('bayes', scenario, group.beams, surface=surface)
-            errors = estimator.estimate(group.received[:left]).mean - group.positions[:left]
-            distances = np.append(distances, np.linalg.norm(errors, axis=1))
-    fixes = distances[np.isfinite(distances)]
-    rms = f'{np.sqrt(np.mean(fixes**2)):.3f} m rms' if len(fixes) else 'none'
-    return f'{rms}, {len(distances) - len(fixes)} of {len(distances)} without a fix'
+def _print_errors(scenario: Scenario, pilots: Sequence[Pilots], *assumptions: Assumption) -> None:
+    """Print position errors at places that were left out, before and after a calibration."""
+    for text, assumption in zip(('before', 'after'), assumptions, strict=True):
+        distances = [np.empty(0)]
+        for others, left_out in _folds(scenario, pilots):
+            assumed, surface = assumption(others)
+            for group in left_out:
+                assert isinstance(group.beams, Codebook)
+                estimator = make_estimator('bayes', assumed, group.beams, surface=surface)
+                errors = estimator.estimate(group.received).mean - group.positions
+                distances.append(np.linalg.norm(errors, axis=1))
+        every = np.concatenate(distances)
+        fixes = every[np.isfinite(every)]
+        rms = f'{np.sqrt(np.mean(fixes**2)):.3f} m rms' if len(fixes) else 'none'
+        print(f'position error of left-out pilots {text}: {rms}, {len(every) - len(fixes)} of '
+              f'{len(every)} without a fix', flush=True)
+
+
+def _folds(scenario: Scenario, pilots: Sequence[Pilots]
+           ) -> Iterator[tuple[list[Pilots], list[Pilots]]]:
+    """Leave groups of places out in turn; yield the pilots at other places, and those left out.
+
+    At most about `_N_COMPARED` pilots are left out in total.
+    """
+    positions = np.concatenate([group.positions for group in pilots])
+    fold_of = np.empty(len(positions), int)
+    for number, place in enumerate(places_of(scenario, positions, PLACE_WAVELENGTHS)):
+        fold_of[place] = number % _N_FOLDS
+    step = -(-len(positions) // _N_COMPARED)
+    parts = np.split(fold_of, np.cumsum([len(group.positions) for group in pilots])[:-1])
+
+    def chosen(rows: list[np.ndarray]) -> list[Pilots]:
+        return [Pilots(group.beams, group.positions[some], group.received[some])
+                for group, some in zip(pilots, rows, strict=True) if len(some)]
+
+    for fold in range(_N_FOLDS):
+        others = chosen([np.flatnonzero(part != fold) for part in parts])
+        left_out = chosen([np.flatnonzero(part == fold)[::step] for part in parts])
+        if others and left_out:
+            yield others, left_out
+
+
+def _states(text: str) -> tuple[complex, ...]:
+    try:
+        states = tuple(complex(word) for word in text.split(','))
+    except ValueError:
+        states = ()
+    if len(states) != 2 or not np.isfinite(states).all():
+        raise argparse.ArgumentTypeError(f'{text!r}, expected two numbers such as 1,-1')
+    return states
+
+
+def _conflict(options: argparse.Namespace) -> str:
+    options.output = options.output or (_SITE_OUTPUT if options.site else _OUTPUT)
+    others = [name for name in (
+        'file', 'multipath', 'states', 'config', 'codebook', 'calibration', 'user', 'namespace')
+        if getattr(options, name) not in (None, False, 0, '/')]
+    if options.site and others:
+        return f'argument --site: not allowed with {", ".join(others)}'
+    return ''
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -219,20 +373,28 @@ def _parser() -> argparse.ArgumentParser:
     add('file', type=input_file, nargs='?',
         help='recording made with record, or .npz file with the arrays positions [N, 3] (m) and '
         'received [N, N_B, N_SB F], by default received with the default codebook')
-    add('--multipath', action='store_true',
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument('--multipath', action='store_true',
         help='estimate the multipath of the hall instead of the surface, which --calibration '
         'describes')
-    add('--output', type=output_file, default=Path('calibration.npz'), metavar='FILE',
-        help='calibration or multipath to write (default: calibration.npz)')
+    what.add_argument('--states', type=_states, metavar='OFF,ON',
+        help='write a surface whose elements have these coefficients for 0 and 1, such as 1,-1 or '
+        '0.5+0.1j,-0.6, without an estimation')
+    add('--site', type=input_file, metavar='FILE',
+        help='estimate the poses of the surfaces of a running site, except for the first one, '
+        'from users that two surfaces locate; write a site file')
+    add('--output', type=output_file, metavar='FILE',
+        help=f'file to write (default: {_OUTPUT}, or {_SITE_OUTPUT} with --site)')
     command.add_files(parser, 'config', 'codebook', 'calibration')
     add('--user', type=integer(0), default=0, metavar='ID',
         help='use only the signals of this user (default: of all users)')
     add('--namespace', default='/', help='namespace of the recorded network (default: /)')
     add('--cycles', type=positive_int, default=_CYCLES, metavar='N',
-        help=f'pilots to collect from a running network (default: {_CYCLES})')
+        help='pilots, or users that two surfaces locate, to collect from a running network '
+        f'(default: {_CYCLES})')
     add('--timeout', type=positive_float, default=_TIMEOUT_S, metavar='S',
         help=f'maximum time to collect the pilots (default: {_TIMEOUT_S:g} s)')
     return parser
 
 
-main = command.entry(_calibrate, _parser)
+main = command.entry(_calibrate, _parser, _conflict)

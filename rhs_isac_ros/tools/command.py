@@ -11,41 +11,41 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
-from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import try_shutdown
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.calibration import CalibrationError
 from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.executables import discard_stdout, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning import ModelError
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, diagnostics, endpoints, startup, topics
+from rhs_isac_ros.ros import convert, diagnostics, endpoints, topics
 from rhs_isac_ros.ros.endpoints import subscribe
+from rhs_isac_ros.ros.environment import is_secure
+from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
-from rhs_isac_ros.ros.run import parse, run
+from rhs_isac_ros.ros.run import StartError, init, parse, run, starting
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import check_distinct, input_file
 from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.exits import discard_stdout, on_end_signals, print_error
 from rhs_isac_ros.support.optional import MissingLibraryError
 
 # Period of polling the graph [s], because changes to the graph do not wake the executor.
 _POLL_PERIOD_S = 0.02
 # Discovery is complete when the graph has not changed for this time [s]. With DDS security,
 # discovery pauses while keys are exchanged.
-_SETTLE_S = 1.0 if startup.is_enabled() else 0.4
+_SETTLE_S = 1.0 if is_secure() else 0.4
 # Errors in arguments and files.
-INVALID = (RecordingError, ScenarioError, CodebookError, CalibrationError, ModelError,
+INVALID = (StartError, RecordingError, ScenarioError, CodebookError, CalibrationError, ModelError,
            plugins.PluginError, OSError)
 # Advice after an error about messages that do not match the scenario.
 OTHER_SCENARIO = '; if the network uses another scenario, pass it with --config FILE'
@@ -194,7 +194,7 @@ def recorded(
                 yield codebook, time_s
             else:
                 message: m.Message = convert.from_bytes(kind, content)
-                m.check(message, scenario.sizes)
+                m.check(message, scenario)
                 yield message, time_s
 
 
@@ -202,14 +202,10 @@ class Session(contextlib.AbstractContextManager['Session']):
     """A context manager with a node, which `spin_until` and `discover` spin."""
 
     def __init__(self, arguments: Sequence[str] = ('',)) -> None:
-        startup.use_discovery_profile()
-        # The handlers of rclpy would invalidate the context while the executor uses it.
-        rclpy.init(args=startup.prepare(arguments),
-                   signal_handler_options=SignalHandlerOptions.NO)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.default_int_handler)
-        with startup.one_line():
-            self.node = Node(f'_rhs_isac_cli_{os.getpid()}', **startup.WITHOUT_SERVICES)
+        init(arguments)
+        on_end_signals(signal.default_int_handler)
+        with starting():
+            self.node = Node(f'_rhs_isac_cli_{os.getpid()}', **WITHOUT_SERVICES)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
 
@@ -262,9 +258,9 @@ def run_verb(options: argparse.Namespace, arguments: list[str]) -> int:
     As in ``ros2``, errors do not start with the name of the program.
     """
     try:
-        with Session(arguments) as session, startup.one_line():
+        with Session(arguments) as session, starting():
             options.verb(session, options)
-    except (ToolError, startup.SecurityError) as error:
+    except ToolError as error:
         print(error, file=sys.stderr)
         return 1
     return 0

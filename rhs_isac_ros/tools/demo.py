@@ -4,6 +4,8 @@ import argparse
 import contextlib
 import math
 import os
+import shlex
+import signal
 import sys
 import tempfile
 import time
@@ -13,21 +15,24 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.utilities import try_shutdown
 
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
-from rhs_isac_ros.executables import print_error
+from rhs_isac_ros.frontend import RADIOS, SURFACES
+from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog, CycleRecord
+from rhs_isac_ros.positioning.site import Site, SiteError
 from rhs_isac_ros.protocol.messages import Phase
 from rhs_isac_ros.protocol.settings import PRIORS, REGION
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
-from rhs_isac_ros.ros import parameters, startup
-from rhs_isac_ros.ros.processes import MAX_USER_NODES, Processes, max_processes, private_domain
+from rhs_isac_ros.ros import parameters
+from rhs_isac_ros.ros.environment import check_environment, private_domain
+from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
+from rhs_isac_ros.ros.processes import MAX_USER_NODES, Processes
 from rhs_isac_ros.ros.recording import CycleObserver, Recorder, RecordingError
-from rhs_isac_ros.ros.roster import ROSTER, UNIQUE
-from rhs_isac_ros.ros.run import check_domain
+from rhs_isac_ros.ros.roster import ROSTER
+from rhs_isac_ros.ros.run import StartError, init, starting
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
@@ -38,9 +43,11 @@ from rhs_isac_ros.support.arguments import (
     positive_int,
     seed,
 )
+from rhs_isac_ros.support.exits import on_end_signals, print_error
 from rhs_isac_ros.support.pictures import write_picture
 from rhs_isac_ros.tools.command import choose_scenario, text_table
 from rhs_isac_ros.tools.pictures import compose_cycles, prepare_drawing
+from rhs_isac_ros.tools.site_demo import SiteObserver, report, start_others
 
 # Maximum time between two complete cycles [s].
 _CYCLE_TIMEOUT_S = 60.0
@@ -61,11 +68,6 @@ def add_network_options(parser: argparse.ArgumentParser) -> None:
                         help='codebook file; by default the codebook of the package')
 
 
-def max_user_processes() -> int:
-    """Return the number of users that this machine can run as processes beside other nodes."""
-    return max_processes() - len(UNIQUE)
-
-
 def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Path]:
     """Return a scenario, and the absolute path of a codebook file that fits it.
 
@@ -79,7 +81,7 @@ def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Pa
 
 def start_network(
         processes: Processes, users: int, scenario: Scenario, *, together: bool = False,
-        **given: Any) -> None:
+        namespace: str = '', **given: Any) -> None:
     """Start each node of a network in a separate process; if `together`, the users share a node.
 
     Users walk at random at the scenario's maximum speed. Each parameter in `given` applies to all
@@ -91,27 +93,28 @@ def start_network(
         values = {name: value for name, value in given.items()
                   if name in known and value is not None}
         if member.is_unique:
-            processes.start(role, **values)
+            processes.start(role, namespace=namespace, **values)
             continue
         for name, first, count in [('users', 1, users)] if together else [
                 (f'user_{user}', user, 1) for user in range(1, users + 1)]:
             processes.start(
-                role, name, **values, user_id=first, user_count=count, mobility='random_walk',
-                speed_mps=scenario.max_user_speed_mps)
+                role, name, namespace=namespace, **values, user_id=first, user_count=count,
+                mobility='random_walk', speed_mps=scenario.max_user_speed_mps)
 
 
 def watch(
         observer: CycleObserver, processes: Processes, cycles: int,
-        on_progress: Callable[[int, int], None]) -> str:
-    """Spin an observer until it has received `cycles` complete cycles.
+        on_progress: Callable[[int, int], None],
+        stopped: Callable[[], bool] = lambda: False) -> str:
+    """Spin an observer until it has received `cycles` complete cycles, or `stopped` is True.
 
     At first and whenever their number changes, `on_progress` is called with this number and with
     `cycles`. Returns the error that ended the wait, or ''.
     """
     seen, changed_s = -1, time.monotonic()
-    while seen < cycles:
+    while seen < cycles and not stopped():
         rclpy.spin_once(observer, timeout_sec=_PERIOD_S)
-        complete = len(observer.log.complete)
+        complete = len(observer.complete)
         if complete != seen:
             seen, changed_s = complete, time.monotonic()
             on_progress(complete, cycles)
@@ -161,69 +164,141 @@ def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) ->
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demonstration, and return its exit code.
 
-    The code is 0 if every cycle was served or had no fix, even after Ctrl-C; 2 if an argument or a
-    file is invalid; otherwise 1.
+    The code is 0 if every cycle was served or had no fix, even after a signal; 2 if an argument or
+    a file is invalid; otherwise 1.
     """
     parser = _parser()
     options = parser.parse_args(arguments)
-    check_domain(parser)
+    check_environment(parser)
     check_distinct(parser, options)
     try:
-        scenario, codebook_file = load_files(options.config, options.codebook)
-        recorder = Recorder(options.record, scenario) if options.record else None
+        if options.site:
+            demonstration: _Demonstration = _SiteDemonstration(parser, options)
+        else:
+            demonstration = _Demonstration(options)
         os.environ.update(private_domain())
-        startup.use_discovery_profile()
-        return _run(scenario, codebook_file, recorder, options)
+        return _run(demonstration, options)
     except CodebookError as error:
         print_error(f'{error}; to create a codebook for a scenario: python3 -m '
                     'rhs_isac_ros.codebook --scenario FILE --output FILE', parser.prog)
-    except (ScenarioError, RecordingError, startup.SecurityError) as error:
+    except (ScenarioError, SiteError, RecordingError, StartError) as error:
         print_error(error, parser.prog)
     return 2
 
 
-def _run(
-        scenario: Scenario, codebook_file: Path, recorder: Recorder | None,
-        options: argparse.Namespace) -> int:
+class _Demonstration:
+    """A network with one surface: its processes, observer, recording and report."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.scenario, self._codebook_file = load_files(options.config, options.codebook)
+        self.options = options
+        self.recorder = Recorder(options.record, self.scenario) if options.record else None
+        self.board = EmulatedBoard() if options.port == 'emulated' else None
+
+    def start(self, processes: Processes, together: bool) -> None:
+        """Start all processes."""
+        options = self.options
+        start_network(
+            processes, options.users, self.scenario, together=together, first_cycle=1,
+            seed=options.seed, scenario_file=options.config, codebook_file=self._codebook_file,
+            prior=options.prior, calibration_file=options.calibration,
+            states_file=options.calibration, surface=options.surface,
+            surface_options=_surface_options(options, self.board),
+            # Other radios have noise of their own.
+            radio=options.radio, radio_options=options.radio_options,
+            samples_folder=options.samples, receiver_noise=options.radio == 'emulated',
+            # The parameter does not admit 0.
+            track_speed_mps=None if options.prior == REGION else max(
+                self.scenario.max_user_speed_mps, 0.01))
+
+    def observer(self, log: CycleLog) -> CycleObserver:
+        """Create the observer of the cycles."""
+        return CycleObserver(self.recorder, log=log, **WITHOUT_SERVICES)
+
+    def report(self, log: CycleLog) -> None:
+        """Print and draw at least one complete cycle."""
+        print(table(log.complete))
+        print(summary(log.complete, log.given_up))
+        write_picture(self.options.picture, compose_cycles(log.complete, self.scenario))
+        print(f'picture: {self.options.picture}')
+
+
+class _SiteDemonstration(_Demonstration):
+    """A site, in which one base station leads, and the other surfaces follow."""
+
+    def __init__(self, parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+        if other := [name for name in (
+                'config', 'codebook', 'record', 'calibration', 'surface', 'port', 'radio',
+                'radio_options', 'samples', 'picture')
+                # Defaults of files are texts.
+                if str(getattr(options, name)) != str(parser.get_default(name))]:
+            option = other[0].replace('_', '-')
+            parser.error(f'argument --{option}: not allowed with --site')
+        self._site = Site.from_yaml(options.site)
+        self.scenario = self._site.surfaces[self._site.leader].scenario
+        self.options, self.recorder, self.board = options, None, None
+
+    def start(self, processes: Processes, together: bool) -> None:
+        given = {'seed': self.options.seed, 'prior': self.options.prior}
+        start_others(processes, self.options.site, self._site, **given)
+        start_network(
+            processes, self.options.users, self.scenario, together=together, first_cycle=1,
+            namespace=self._site.leader, site_file=self.options.site.resolve(), **given)
+
+    def observer(self, log: CycleLog) -> CycleObserver:
+        self._observer = SiteObserver(self._site, log=log, **WITHOUT_SERVICES)
+        return self._observer
+
+    def report(self, log: CycleLog) -> None:
+        for line in report(self._observer):
+            print(line)
+
+
+def _run(demonstration: _Demonstration, options: argparse.Namespace) -> int:
     """Run the network until the cycles are complete, report them, and return the exit code."""
+    # A signal must not interrupt the recorder while it writes.
+    signals: list[int] = []
+    on_end_signals(lambda number, _: signals.append(number))
     log, code = CycleLog(), 0
-    together = options.users > min(MAX_USER_NODES, max_user_processes())
+    together = options.users > MAX_USER_NODES
     if together:
         print(f'the {options.users} users share one process', file=sys.stderr)
-    with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
+    with (tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs,
+          contextlib.ExitStack() as stack):
         # The processes run until the cycles have been observed.
-        with Processes(Path(logs), {'ROS_LOG_DIR': logs}, fork=True) as processes:
-            problem = ''
+        with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
             try:
-                with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-                    start_network(
-                        processes, options.users, scenario, together=together, first_cycle=1,
-                        seed=options.seed, scenario_file=options.config,
-                        codebook_file=codebook_file, prior=options.prior,
-                        # The parameter does not admit 0.
-                        track_speed_mps=None if options.prior == REGION else max(
-                            scenario.max_user_speed_mps, 0.01))
-                    problem = _observe(log, processes, recorder, options.cycles)
+                demonstration.start(processes, together)
+                if demonstration.board:
+                    stack.enter_context(demonstration.board)
+                problem = '' if signals else _observe(
+                    log, processes, demonstration, options.cycles, lambda: bool(signals))
             finally:
-                # A signal may arrive before the observer exists.
-                if recorder is not None:
-                    recorder.close()
+                if demonstration.recorder is not None:
+                    demonstration.recorder.close()
             processes.interrupt()
+            on_end_signals(signal.default_int_handler)
             with contextlib.suppress(KeyboardInterrupt):
-                code = _report(log, scenario, options, problem)
+                code = _report(log, demonstration, options, problem)
     return code
 
 
+def _surface_options(options: argparse.Namespace, board: EmulatedBoard | None) -> str | None:
+    port = board.port if board else options.port
+    return f'port={shlex.quote(port)}' if port else None
+
+
 def _observe(
-        log: CycleLog, processes: Processes, recorder: Recorder | None, cycles: int) -> str:
+        log: CycleLog, processes: Processes, demonstration: _Demonstration, cycles: int,
+        stopped: Callable[[], bool]) -> str:
     """Observe a number of cycles, and return the error that ended the observation, or ''."""
-    rclpy.init(args=startup.prepare(['demo']))
-    with startup.one_line():
-        observer = CycleObserver(recorder, log=log, **startup.WITHOUT_SERVICES)
+    init(['demo'])
+    with starting():
+        observer = demonstration.observer(log)
     # Use the time that the network takes to start.
     prepare_drawing()
     try:
-        return watch(observer, processes, cycles, _show_progress)
+        return watch(observer, processes, cycles, _show_progress, stopped)
     finally:
         observer.destroy_node()  # type: ignore[no-untyped-call]
         try_shutdown()
@@ -241,13 +316,10 @@ def _show_progress(complete: int, goal: int) -> None:
 
 
 def _report(
-        log: CycleLog, scenario: Scenario, options: argparse.Namespace, problem: str) -> int:
-    complete, given_up = log.complete, log.given_up
-    if complete:
-        print(table(complete))
-        print(summary(complete, given_up))
-        write_picture(options.picture, compose_cycles(complete, scenario))
-        print(f'picture: {options.picture}')
+        log: CycleLog, demonstration: _Demonstration, options: argparse.Namespace,
+        problem: str) -> int:
+    if log.complete:
+        demonstration.report(log)
     if options.record:
         print(f'recording: {options.record}')
     if problem:
@@ -263,6 +335,19 @@ def _parser() -> argparse.ArgumentParser:
     add('--users', type=integer(1, MAX_USERS), default=2, help='number of users')
     add('--cycles', type=positive_int, default=20, help='cycles to wait for')
     add_network_options(parser)
+    add('--calibration', type=input_file, metavar='FILE',
+        help='calibration file of the surface; by default the surface of the scenario')
+    add('--surface', metavar='NAME', default='emulated',
+        help=f'surface that shows the configurations: {", ".join(SURFACES)}, or a plug-in')
+    add('--port', metavar='PORT',
+        help='port of the surface, or emulated: an emulated board Open Source RIS')
+    add('--site', type=input_file, metavar='FILE',
+        help='site file, instead of --config and --codebook')
+    add('--radio', metavar='NAME', default='emulated',
+        help=f'radio that measures the pilots: {", ".join(RADIOS)}, or a plug-in')
+    add('--radio-options', metavar='OPTIONS', help='options of the radio, as in path=samples')
+    add('--samples', metavar='FOLDER',
+        help='folder in which the samples of the radio are recorded (SigMF)')
     add('--prior', choices=PRIORS, default=REGION,
         help='prior of the positions: the region, or the track of each user')
     add('--record', type=output_file, metavar='FILE', help='recording to write (MCAP)')

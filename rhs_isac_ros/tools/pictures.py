@@ -1,5 +1,6 @@
 """Pictures of a network: its cycles for ``demo``, its scene for ``snapshot``."""
 
+import itertools
 import math
 from collections.abc import Collection, Sequence
 from typing import Any
@@ -8,7 +9,7 @@ import numpy as np
 
 from rhs_isac_ros.link import BeamPattern
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import element_interval_m, feed_positions
+from rhs_isac_ros.model.geometry import element_intervals_m, feed_positions
 from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
 from rhs_isac_ros.monitoring.network_state import SceneState, UserState
@@ -87,8 +88,6 @@ def compose_scene(scene: SceneState, scenario: Scenario) -> Any:
     figure = new_figure(PAGE_IN, _SCENE_IN)
     limits_m = _limits_m(scenario, [user.estimate for user in scene.users.values()
                                     if user.estimate], _SCENE_MAX_MARGIN)
-    limits_m[1, 1:] = np.abs(limits_m[:, 1:]).max(axis=0)
-    limits_m[0, 1:] = -limits_m[1, 1:]
     # Both views have the same scale, so that their x axes are aligned.
     heights = np.diff(limits_m, axis=0)[0, 1:]
     grid = figure.add_gridspec(3, 2, width_ratios=(1.75, 1),
@@ -99,7 +98,7 @@ def compose_scene(scene: SceneState, scenario: Scenario) -> Any:
         axes = figure.add_subplot(grid[row, 0])
         _draw_room(axes, plane, scenario)
         if beam and pattern:
-            _draw_lobe(axes, plane, pattern, beam.user)
+            _draw_lobe(axes, plane, scenario, pattern, beam.user)
         for user in scene.users.values():
             _draw_user(axes, plane, user)
         axes.set_title(title, loc='left')
@@ -119,7 +118,9 @@ def _limits_m(
         scenario: Scenario, estimates: Collection[m.PositionEstimate], max_margin: float
 ) -> np.ndarray:
     """Return the limits of a view of region, surface and ellipses, float64 [2, 3] [m]."""
-    region, board = scenario.roi_bounds_m, shapes.board(scenario, None).centres
+    corners, board = _corners(scenario), scenario.pose.to_site(
+        shapes.board(scenario, None).centres)
+    region = np.stack([corners.min(axis=0), corners.max(axis=0)])
     means = np.reshape([estimate.position for estimate in estimates], (-1, 3))
     variances = np.reshape([estimate.covariance_m2.diagonal() for estimate in estimates], (-1, 3))
     # The extent of an ellipse along an axis depends only on the variance along this axis.
@@ -132,18 +133,29 @@ def _limits_m(
         np.maximum(np.maximum(region[1], board.max(axis=0)) + _MARGIN_M, high)])
 
 
-def _draw_room(axes: Any, plane: list[int], scenario: Scenario) -> None:
-    """Draw the region and the surface in a plane of two coordinates."""
-    from matplotlib.patches import Rectangle
+def _corners(scenario: Scenario) -> np.ndarray:
+    """Return the corners of the region of interest, float64 [8, 3] [m]."""
+    region = shapes.region(scenario)
+    signs = np.array(list(itertools.product((-1, 1), repeat=3)))
+    return scenario.pose.to_site(region.centres + signs * region.half_sizes_m)
 
-    region, board = shapes.region(scenario), shapes.board(scenario, None)
-    half_m = region.half_sizes_m[0, plane]
-    axes.add_patch(Rectangle(
-        region.centres[0, plane] - half_m, *(2 * half_m), **_REGION, zorder=0))
+
+def _draw_room(axes: Any, plane: list[int], scenario: Scenario) -> None:
+    """Draw the region and the middle line of the surface in a plane of two coordinates."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+    from scipy.spatial import ConvexHull
+
+    corners, board = _corners(scenario)[:, plane], shapes.board(scenario, None)
+    outline = corners[ConvexHull(corners).vertices]
+    axes.add_patch(PathPatch(
+        Path(np.append(outline, outline[:1], axis=0), closed=True), **_REGION, zorder=0))
     top_m = (board.centres + board.half_sizes_m)[:, plane[1]].max()
-    axes.plot([0, 0], [-top_m, top_m], color='black', linewidth=_SURFACE_WIDTH_POINTS,
+    ends = np.outer([-top_m, top_m], np.eye(3)[plane[1]])
+    low, high = scenario.pose.to_site(ends)[:, plane]
+    axes.plot(*np.transpose([low, high]), color='black', linewidth=_SURFACE_WIDTH_POINTS,
               solid_capstyle='butt', zorder=4)
-    axes.annotate('surface', (0, top_m), xytext=(0, 8), textcoords='offset points', ha='center')
+    axes.annotate('surface', high, xytext=(0, 8), textcoords='offset points', ha='center')
     axes.set(xlabel='$x$ [m]', ylabel=f'${"xyz"[plane[1]]}$ [m]')
 
 
@@ -190,10 +202,12 @@ def _draw_errors(axes: Any, user: int, cycles: Sequence[CompleteCycle]) -> None:
               color=own.colour, markersize=7, markeredgewidth=1.2)
 
 
-def _draw_lobe(axes: Any, plane: list[int], pattern: BeamPattern, user: int) -> None:
+def _draw_lobe(
+        axes: Any, plane: list[int], scenario: Scenario, pattern: BeamPattern, user: int) -> None:
     """Draw the cut of a lobe through its peak."""
     row, column = pattern.peak
-    points, colour = shapes.lobe(pattern, user).points, look(user - 1).colour
+    points = scenario.pose.to_site(shapes.lobe(pattern, user).points)
+    colour = look(user - 1).colour
     cut = (points[row] if plane == [0, 1] else points[:, column])[:, plane].T
     axes.fill(*cut, facecolor=colour, alpha=0.13, zorder=1)
     axes.plot(*cut, color=colour, alpha=0.5, linewidth=0.8, zorder=1)
@@ -220,7 +234,7 @@ def _draw_user(axes: Any, plane: list[int], user: UserState) -> None:
 def _draw_surface(axes: Any, message: m.RhsConfiguration | None, scenario: Scenario) -> None:
     """Draw the configuration of the surface from the front: y to the right, z up."""
     shape = scenario.n_rows, scenario.n_columns
-    half_z_cm, half_y_cm = (50 * element_interval_m(scenario) * n for n in shape)
+    half_y_cm, half_z_cm = 50 * element_intervals_m(scenario) * shape[::-1]
     amplitudes = np.full(shape, np.nan) if message is None else message.analog.mean(axis=0)
     image = axes.imshow(
         amplitudes.reshape(shape), origin='lower', vmin=0, vmax=1,

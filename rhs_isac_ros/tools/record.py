@@ -4,8 +4,8 @@ import argparse
 
 from rclpy.node import Node
 
+from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import Recorder
-from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, output_file
 from rhs_isac_ros.tools.command import ToolError, choose_scenario, entry, observe
 

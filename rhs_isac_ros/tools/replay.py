@@ -21,10 +21,11 @@ from rclpy.parameter_client import AsyncParameterClient
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog
+from rhs_isac_ros.monitoring.cycle_log import ANSWERS, RECEIVES, CompleteCycle, CycleLog
 from rhs_isac_ros.nodes.optimizer import OptimizerNode, ros_parameters
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
+    REGION_ESTIMATORS,
     BayesEstimator,
     Estimator,
     Motion,
@@ -35,11 +36,16 @@ from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer
-from rhs_isac_ros.ros.peers import full_name
+from rhs_isac_ros.ros.endpoints import (
+    create_publisher,
+    full_name,
+    steady_timer,
+    subscribe_messages,
+)
+from rhs_isac_ros.ros.environment import is_secure
+from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import RecordingError, read, recorded_topics
 from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.ros.startup import WITHOUT_SERVICES, is_enabled
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
 from rhs_isac_ros.tools import command
@@ -56,6 +62,17 @@ _SECURE_DISCOVERY_TIMEOUT_S = 8.0
 # time [s]. Another publisher may be discovered after the first subscriber.
 _SETTLING_TIME_S = 1.0
 _ACK_TIMEOUT = Duration(seconds=5)
+# Number of messages without answers after which acknowledgements are awaited, within the depth of
+# the queues.
+_BATCH = 64
+# Period of publishing signals again that have no answer, because an estimator may still wait for
+# the codebook; maximum time to wait for an answer after another one is missing [s].
+_REPEAT_S, _SHORT_S = 2.0, 0.5
+# A recorded pause that is longer than the first number, and a clock that was set back by more than
+# the second, are shortened to the third [s].
+_MAX_GAP_S, _MAX_BACK_S, _GAP_S = 10.0, 1.0, 1.0
+# Maximum time between two looks at the clock [s].
+_MAX_WAIT_S = 1.0
 # Topics that can be published again. The codebook is set as parameters; recorded diagnostics and
 # announcements would contradict the running nodes.
 _TOPICS = sorted(set(recorded_topics()) - {topics.CODEBOOK, topics.DIAGNOSTICS, topics.PRESENCE})
@@ -69,16 +86,23 @@ class RepublisherNode(Node):
 
     `messages` contains the topic, the content and the time [s] of each message, sorted by time.
     `names` are the relative names of the topics. `rate` is the speed relative to the recording.
+    After signals, the node waits up to `timeout_s` for an estimate, so that no queue overflows.
     `optimizer`, unless it is None, receives the codebooks. `waits_for` is the first topic without
-    the expected subscribers, or ''. `count` is the number of published messages.
+    the expected subscribers, or ''. `count` is the number of published messages, `unanswered` that
+    of signals without an estimate, and `unconfirmed` contains topics with messages that were not
+    acknowledged.
     """
 
     def __init__(
             self, messages: Iterable[tuple[str, bytes, float]], names: Collection[str],
-            rate: float) -> None:
+            rate: float, timeout_s: float) -> None:
         super().__init__('replay', **WITHOUT_SERVICES)
         self.optimizer: OptimizerNode | None = None
         self.count, self.finished, self.waits_for = 0, False, next(iter(names))
+        self.unanswered, self.unconfirmed = 0, set[str]()
+        # Cycle and user of signals without an answer.
+        self._pending: tuple[int, int] | None = None
+        self._answer_timeout_s = timeout_s
         self._waits_s = self._publish(messages, rate)
         # Numbers of publishers and subscribers by topic, and the time of their last change [s].
         self._endpoints: list[tuple[int, int]] = []
@@ -87,6 +111,14 @@ class RepublisherNode(Node):
         self._message_publishers = {
             name: create_publisher(self, kinds[name][0], name, kinds[name][1]) for name in names}
         self._timer = steady_timer(self, _POLL_PERIOD_S, self._poll_subscribers)
+        if _SIGNALS in names:
+            subscribe_messages(self, ANSWERS, None, self._on_answer)
+
+    def _on_answer(self, message: m.Message) -> None:
+        if isinstance(message, m.PositionEstimate | m.NoFix) and self._pending == (
+                message.cycle_id, message.user):
+            self._pending = None
+            self._continue()
 
     def _poll_subscribers(self) -> None:
         self.waits_for = next(
@@ -127,27 +159,47 @@ class RepublisherNode(Node):
             self._timer.reset()
             return
         self._timer.cancel()
-        for publisher in self._message_publishers.values():
-            publisher.wait_for_all_acked(_ACK_TIMEOUT)
+        for name in self._message_publishers:
+            self._confirm(name)
         self.finished = True
+
+    def _confirm(self, name: str) -> None:
+        if not self._message_publishers[name].wait_for_all_acked(_ACK_TIMEOUT):
+            self.unconfirmed.add(name)
 
     def _publish(
             self, messages: Iterable[tuple[str, bytes, float]], rate: float) -> Iterator[float]:
-        """Publish each message when it is due; until then, yield the remaining time [s]."""
-        # Steady time at the recorded time 0 [s]. Codebooks before the first message are due now.
-        origin_s = -math.inf
-        for name, content, time_s in messages:
-            if origin_s == -math.inf and name != topics.CODEBOOK:
-                origin_s = time.monotonic() - time_s / rate
-            while (wait_s := origin_s + time_s / rate - time.monotonic()) > 0:
-                yield wait_s
-            if name != topics.CODEBOOK:
-                self._message_publishers[name].publish(content)
-                self.count += 1
-            elif self.optimizer:
-                codebook = convert.from_bytes(convert.CodebookMessage, content).codebook()
-                self.optimizer.set_parameters_atomically(
-                    ros_parameters(codebook.to_parameters()))
+        """Publish each message when it is due; until then, yield times to wait [s]."""
+        begin_s = time.monotonic()
+        for name, content, due_s in _without_gaps(messages):
+            while (wait_s := begin_s + due_s / rate - time.monotonic()) > 0:
+                yield min(wait_s, _MAX_WAIT_S)
+            if name == topics.CODEBOOK:
+                if self.optimizer:
+                    codebook = convert.from_bytes(convert.CodebookMessage, content).codebook()
+                    self.optimizer.set_parameters_atomically(
+                        ros_parameters(codebook.to_parameters()))
+                continue
+            self._message_publishers[name].publish(content)
+            self.count += 1
+            if name == _SIGNALS:
+                yield from self._until_answered(content)
+            elif self.count % _BATCH == 0:
+                self._confirm(name)
+
+    def _until_answered(self, content: bytes) -> Iterator[float]:
+        """Yield times to wait [s] until published signals are answered; publish them again."""
+        signals = convert.from_bytes(m.ReceivedSignals, content)
+        self._pending = signals.cycle_id, signals.user
+        begin_s = sent_s = time.monotonic()
+        while self._pending and (now_s := time.monotonic()) < begin_s + self._answer_timeout_s:
+            if now_s > sent_s + _REPEAT_S:
+                self._message_publishers[_SIGNALS].publish(content)
+                sent_s = now_s
+            yield _POLL_PERIOD_S
+        if self._pending:
+            self.unanswered += 1
+            self._answer_timeout_s = _SHORT_S
 
     def check(self, end_s: float, timeout_s: float) -> None:
         """Raise ToolError if a topic has another publisher, or lacks subscribers after `end_s`."""
@@ -156,6 +208,30 @@ class RepublisherNode(Node):
                 raise ToolError(f'{name}: already published by another node')
         if self.waits_for and time.monotonic() > end_s:
             raise ToolError(f'{self.waits_for}: no subscriber within {timeout_s:g} s')
+
+
+def _without_gaps(
+        messages: Iterable[tuple[str, bytes, float]]) -> Iterator[tuple[str, bytes, float]]:
+    """Replace recorded times by times since the first message that is no codebook [s].
+
+    Long pauses and steps of the recorded clock are shortened, and printed. A codebook before the
+    first other message is due at once.
+    """
+    last_s, due_s = math.nan, 0.0
+    for name, content, time_s in messages:
+        if math.isnan(last_s):
+            if name != topics.CODEBOOK:
+                last_s = time_s
+            yield name, content, 0.0
+            continue
+        step_s, last_s = time_s - last_s, time_s
+        if step_s > _MAX_GAP_S or step_s < -_MAX_BACK_S:
+            what = 'a pause of' if step_s > 0 else 'a clock that was set back by'
+            print(f'replay: {what} {abs(step_s):.0f} s in the recording is shortened to '
+                  f'{_GAP_S:.0f} s', file=sys.stderr)
+            step_s = _GAP_S
+        due_s += step_s
+        yield name, content, due_s
 
 
 def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
@@ -168,7 +244,8 @@ def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     end_s = time.monotonic() + options.timeout
 
     def create() -> list[Node]:
-        node = RepublisherNode(_messages(options, [*names, topics.CODEBOOK]), names, options.rate)
+        node = RepublisherNode(_messages(options, [*names, topics.CODEBOOK]), names,
+                               options.rate, options.timeout)
         nodes.append(node)
         if first_codebook is None:
             return [node]
@@ -185,6 +262,10 @@ def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     code = run(create, arguments, done)
     if nodes:
         print(f'{nodes[0].count} messages published')
+        if nodes[0].unanswered:
+            raise ToolError(f'{nodes[0].unanswered} signals without {_ESTIMATES} or no_fix')
+        if nodes[0].unconfirmed:
+            raise ToolError(f'not all acknowledged: {", ".join(sorted(nodes[0].unconfirmed))}')
     return code
 
 
@@ -232,7 +313,7 @@ def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
 
 def _optimizer_present(node: Node) -> bool:
     return AsyncParameterClient(node, topics.OPTIMIZER_NODE).wait_for_services(
-        _SECURE_DISCOVERY_TIMEOUT_S if is_enabled() else _DISCOVERY_TIMEOUT_S)
+        _SECURE_DISCOVERY_TIMEOUT_S if is_secure() else _DISCOVERY_TIMEOUT_S)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -265,7 +346,7 @@ def load(path: Path, namespace: str = '/', config: Path | None = None) -> Record
 
 
 def errors_m(
-        cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator],
+        recording: Recording, estimators: Mapping[str, Estimator],
         track_speed_mps: float | None = None) -> np.ndarray:
     """Repeat the position estimate of each cycle, and return the errors, float64 [N] [m].
 
@@ -273,14 +354,15 @@ def errors_m(
     speed `track_speed_mps` [m/s] is given, users are tracked over the cycles.
     """
     tracks, errors = Tracks(), []
-    for cycle in cycles:
+    for cycle in recording.cycles:
         signals, estimator = cycle.signals.signals, estimators[cycle.signals.codebook_id]
         if track_speed_mps is None:
             estimate = estimator.estimate(signals.reshape(len(signals), -1))
         else:
             estimate = tracks.locate(
                 cycle.signals, estimator, track_speed_mps, cycle.signals.time_s(cycle.ended_s))
-        errors.append(np.linalg.norm(estimate.mean - cycle.truth.position)
+        position = estimate.to_site(recording.scenario.pose).mean
+        errors.append(np.linalg.norm(position - cycle.truth.position)
                       if estimate.fix else np.nan)
     return np.array(errors)
 
@@ -318,14 +400,14 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     if options.calibration:
         known['surface'] = load_surface(str(options.calibration), recording.scenario)
     for name in options.estimator or [BayesEstimator.name]:
+        region = {'reject_outside': True} if name in REGION_ESTIMATORS else {}
         estimators = {codebook_id: make_estimator(
-            name, recording.scenario, codebook,
-            **file_options(name, default_folder(), options.model or ''), **known)
+            name, recording.scenario, codebook, **region, **known,
+            **file_options(name, default_folder(), options.model or ''))
             for codebook_id, codebook in codebooks.items()}
-        rows.append(_row(name, errors_m(recording.cycles, estimators)))
+        rows.append(_row(name, errors_m(recording, estimators)))
         if options.track and name == BayesEstimator.name:
-            rows.append(_row('track', errors_m(
-                recording.cycles, estimators, options.track_speed)))
+            rows.append(_row('track', errors_m(recording, estimators, options.track_speed)))
     print(command.text_table(['', 'median error', 'root mean square', 'no fix'], rows, '<>>>'))
     return 0
 
@@ -380,7 +462,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--topic', action='append', choices=_TOPICS, metavar='NAME',
         help=f'relative name; may be repeated (default: {_SIGNALS})')
     add('--timeout', type=positive_float, default=_TIMEOUT_S, metavar='S',
-        help='maximum time to wait for subscribers (default: 60 s)')
+        help='maximum time to wait for subscribers, and for an estimate (default: 60 s)')
     return parser
 
 

@@ -165,6 +165,8 @@ def _archetype(entity: shapes.Entity) -> Any:
 
     mode = rr.components.FillMode
     match entity:
+        case shapes.Placement(origin, rotation):
+            return rr.Transform3D(translation=origin, mat3x3=rotation)
         case shapes.Points(positions, colours, radii_m, labels):
             points = rr.Points2D if positions.shape[1] == _PLANE else rr.Points3D
             return points(positions, colors=_colours(colours), radii=radii_m,

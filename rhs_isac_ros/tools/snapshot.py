@@ -13,7 +13,7 @@ from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user_registry import join_users
 from rhs_isac_ros.ros.endpoints import subscribe_messages
-from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
+from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float, picture_file
 from rhs_isac_ros.support.pictures import write_picture
 from rhs_isac_ros.tools import command
@@ -39,7 +39,7 @@ class SnapshotNode(Node):
         # Time of the first message, and first time at which the scene was drawable.
         self._began_s = self._drawable_s = math.inf
         subscribe_messages(
-            self, SCENE_RECEIVES, scenario.sizes, self._on_message, self._on_mismatch)
+            self, SCENE_RECEIVES, scenario, self._on_message, self._on_mismatch)
 
     def _on_message(self, message: m.Message) -> None:
         now_s = time.monotonic()

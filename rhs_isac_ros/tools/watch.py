@@ -14,7 +14,7 @@ from rhs_isac_ros.monitoring.network_state import Overview
 from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
 from rhs_isac_ros.ros.endpoints import subscribe_messages
-from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
+from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.support.optional import optional_import
 from rhs_isac_ros.tools.command import entry, none_within, observe, print_now

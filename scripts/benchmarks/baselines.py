@@ -16,30 +16,18 @@ element. The estimator is the posterior mean. The receiver with all elements ave
 over the frames. This is exact except for the decorrelation of the multipath between the frames.
 """
 
-import os
-
-# One thread, as in the positioner node. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import dataclasses
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from parts.array_receiver import ArrayReceiver, posterior_means
-from parts.command import benchmark_parser, write_results
+from parts.frame import CONFIG, Table, benchmark_parser, run, shown, write_results
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.codebook.unoptimised import SCANS
-from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.experiments import markdown_table
-from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.surface import radiation_matrix
-from rhs_isac_ros.support.arguments import positive_int
-
-CONFIG = Path(__file__).parents[2] / 'config'
 
 
 def all_elements(scenario: Scenario) -> ArrayReceiver:
@@ -106,16 +94,18 @@ def receivers(scenario: Scenario, seed: int) -> dict[str, Callable[[], ArrayRece
 
 def main() -> None:
     """Run the benchmark."""
-    parser = benchmark_parser('baselines', __doc__)
-    parser.add_argument('--positions', type=positive_int, default=1000,
-                        help='number of positions (default: %(default)s)')
+    parser = benchmark_parser('baselines', __doc__, 1000)
     parser.add_argument('--multipath', type=float, default=0.0, metavar='DB',
-                        help='level of the multipath [dB] (default: %(default)s)')
+                        help='level of the multipath [dB]')
     options = parser.parse_args()
     scenario = Scenario(multipath_to_los_db=options.multipath)
     positions = scenario.sample_positions(
         options.positions, np.random.default_rng(options.seed))
-    figures, rows = {}, []
+    print(f'{options.positions} positions, seed {options.seed}, posterior mean, multipath '
+          f'{options.multipath:g} dB\n')
+    table = Table('receiver', 'average CRLB [m²]', 'mean squared error [m²]', 'standard error',
+                  'median')
+    figures = {}
     for name, make in receivers(scenario, options.seed).items():
         receiver = make()
         received = receiver.simulate(positions, np.random.default_rng(options.seed + 1))
@@ -124,13 +114,9 @@ def main() -> None:
             'average_crlb_m2': receiver.crlb(positions).mean(), 'mse_m2': errors.mean(),
             'standard_error_m2': errors.std() / np.sqrt(len(errors)),
             'median_m2': np.median(errors)}
-        rows.append([name, *(f'{value:.4f}' for value in figures[name].values())])
-    print(f'{options.positions} positions, seed {options.seed}, posterior mean, multipath '
-          f'{options.multipath:g} dB\n')
-    print(markdown_table(['receiver', 'average CRLB [m²]', 'mean squared error [m²]',
-                          'standard error', 'median'], rows))
+        table.row(name, *(shown(value, 4) for value in figures[name].values()))
     write_results(options.json, figures)
 
 
 if __name__ == '__main__':
-    sys.exit(exit_code_of(main, (ScenarioError,)))
+    run(main)

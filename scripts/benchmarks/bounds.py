@@ -8,51 +8,37 @@ those of `bayes`, and intervals are twice the standard error. The bound and the 
 independent random numbers.
 """
 
-import os
-
-# One thread, as in the positioner node. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import argparse
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
-from parts.command import benchmark_parser, write_results
+from parts.frame import CONFIG, add_plans, benchmark_parser, run, write_results
 
 from rhs_isac_ros.bounds import crlb, global_bound
-from rhs_isac_ros.codebook import (
-    Codebook,
-    CodebookError,
-    directional_codebook,
-    optimize,
-    random_codebook,
-)
-from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.codebook import Codebook, directional_codebook, optimize, random_codebook
 from rhs_isac_ros.experiments import markdown_table
-from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import make_estimator, simulate_pairs
 from rhs_isac_ros.support import streams
-from rhs_isac_ros.support.arguments import (
-    input_file,
-    integer,
-    positive_int,
-)
+from rhs_isac_ros.support.arguments import integer, positive_int
 
-CONFIG = Path(__file__).parents[2] / 'config'
 PLANS = {'equal': (2.5e9, 2.667e9, 2.833e9, 3.0e9), 'unequal': (2.5e9, 2.55e9, 2.7e9, 3.0e9)}
 # Update steps and positions of the optimisations: seconds for the bound, a minute for ambiguity.
 STEPS, POSITIONS = {'crlb': 300, 'ambiguity': 150}, {'crlb': 256, 'ambiguity': 64}
-BATCH = 50
 HEADER = ('plan', 'codebook', 'MSE [m²]', '±', 'CRLB [m²]', 'bound [m²]', '±', 'MSE / CRLB',
           'MSE / bound', 'time of the bound [s]')
 
 
 def main() -> None:
     """Run the benchmark."""
-    options = parse_options()
+    parser = benchmark_parser('bounds', __doc__, 2000)
+    parser.add_argument('--phases', type=integer(2), default=2048,
+                        help='positioning phases of the bound')
+    parser.add_argument('--steps', type=positive_int, help='steps of the optimisations')
+    add_plans(parser)
+    options = parser.parse_args()
     print(f'{options.positions} positions, {options.phases} phases for the bound, seed '
           f'{options.seed}\n')
     figures, rows = [], []
@@ -66,21 +52,6 @@ def main() -> None:
     ratios = [entry['mse_to_bound'] for entry in figures]
     print(f'\nMSE / bound from {min(ratios):.3f} to {max(ratios):.3f} over {len(ratios)} pairs')
     write_results(options.json, figures)
-
-
-def parse_options() -> argparse.Namespace:
-    """Parse the command line."""
-    parser = benchmark_parser('bounds', __doc__)
-    add = parser.add_argument
-    add('--positions', type=integer(2), default=2000,
-        help='positions of the errors (default: %(default)s)')
-    add('--phases', type=integer(2), default=2048,
-        help='positioning phases of the bound (default: %(default)s)')
-    add('--steps', type=positive_int, help='steps of the optimisations')
-    add('--plan', type=input_file, nargs=2, action='append', default=[],
-        metavar=('SCENARIO', 'CODEBOOK'), help='another scenario and its codebook')
-    add('--only-plans', action='store_true', help='leave out the pairs that are built in')
-    return parser.parse_args()
 
 
 def pairs(options: argparse.Namespace) -> Iterator[tuple[str, str, Scenario, Codebook]]:
@@ -113,9 +84,7 @@ def compare(
 ) -> dict[str, float | str]:
     """Measure the error and compute the bounds."""
     positions, received = simulate_pairs(scenario, codebook, options.positions, options.seed)
-    estimator = make_estimator('bayes', scenario, codebook)
-    means = np.concatenate([estimator.estimate(received[k:k + BATCH]).mean
-                            for k in range(0, len(received), BATCH)])
+    means = make_estimator('bayes', scenario, codebook).estimate(received).mean
     means[~np.isfinite(means).all(axis=1)] = scenario.roi_center_m
     errors = np.sum((means - positions)**2, axis=1)
     local = float(crlb(scenario, codebook, positions).mean())
@@ -132,4 +101,4 @@ def compare(
 
 
 if __name__ == '__main__':
-    sys.exit(exit_code_of(main, (CodebookError, ScenarioError)))
+    run(main)

@@ -12,36 +12,22 @@ over surfaces and positions together; for shares, Wilson's. The calibration assu
 distribution of surfaces, or with --silent the default distribution.
 """
 
-import os
-
-# One thread, as in the positioner node. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import argparse
 import dataclasses
 import time
 from typing import Any
 
 import numpy as np
-from parts.command import benchmark_parser, write_results
-from scipy.special import chdtri
+from parts import frame
 
 from rhs_isac_ros.calibration import Calibration, Pilots, calibrate
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.experiments.resampling import replicate, share_percent
-from rhs_isac_ros.model import (
-    ElementErrors,
-    MeasurementModel,
-    Scenario,
-    draw_surface,
-)
-from rhs_isac_ros.positioning import Estimate, make_estimator
+from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario, draw_surface
+from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.arguments import input_file, positive_int
 
-# Squared Mahalanobis radius of the 95 % region.
-REGION_RADIUS = float(chdtri(3, 0.05))
 DEVIATIONS: dict[str, dict[str, float]] = {
     '3 % rms, 2 % failed': {'element_error_rms': 0.03, 'failed_element_share': 0.02},
     '1 % stuck': {'failed_element_share': 0.01},
@@ -56,16 +42,18 @@ def main() -> int:
     scenario, codebook = Scenario(), Codebook.load(options.codebook)
     print(f'{options.surfaces} surfaces, {options.pilots} pilots each, {options.positions} fresh '
           f'positions, seed {options.seed}\n')
-    print('| surface | knowledge | no fix [%] | MSE [m^2] | to exact | in the 95 % region [%] |'
-          '\n|---|---|---|---|---|---|')
+    table = frame.Table('surface', 'knowledge', 'no fix [%]', 'MSE [m²]', 'to exact',
+                  'in the 95 % region [%]')
     rows, passed = [], True
     for name, changes in DEVIATIONS.items():
         declared = dataclasses.replace(scenario, **changes)
         results, took_s, found = measure(declared, scenario, codebook, options)
-        rows += [report(name, knowledge, squares, covered, results['exact'][0])
-                 for knowledge, (squares, covered) in results.items()]
-        after, exact = results['after'][0], results['exact'][0]
-        reference = results['undamaged'][0] if name == '1 % stuck' else exact
+        after, exact = squares_of(results['after']), squares_of(results['exact'])
+        for knowledge, fixes in results.items():
+            rows.append(row := figures(name, knowledge, fixes, exact))
+            table.row(name, knowledge, *(frame.shown(row.get(key), digits) for key, digits in (
+                ('no_fix_share', 1), ('mse_m2', 3), ('to_exact', 3), ('covered_share', 1))))
+        reference = squares_of(results['undamaged']) if name == '1 % stuck' else exact
         ratio, low, high = interval(after, reference)
         fixes = float(np.mean(np.isfinite(after)))
         reached = ratio <= MAX_RATIO and fixes >= MIN_FIXES
@@ -75,35 +63,32 @@ def main() -> int:
               f'{100 * fixes:.1f} % (limit {100 * MIN_FIXES:.0f} %): '
               f'{"reached" if reached else "NOT reached"}; '
               f'{found}; a calibration takes {took_s:.1f} s', flush=True)
-    write_results(options.json, rows)
+    frame.write_results(options.json, rows)
     return 0 if passed else 1
 
 
 def parse_options() -> argparse.Namespace:
     """Parse the command line."""
-    parser = benchmark_parser('calibration', __doc__)
+    parser = frame.benchmark_parser('calibration', __doc__, 600)
     add = parser.add_argument
     add('--pilots', type=positive_int, default=200, help='pilots of each surface')
     add('--surfaces', type=positive_int, default=6, help='number of surfaces')
-    add('--positions', type=positive_int, default=600, help='number of positions of other users')
     add('--codebook', type=input_file, default=default_codebook_file(), help='codebook file')
     add('--silent', action='store_true', help='calibrate with the default prior')
     return parser.parse_args()
 
 
 def measure(declared: Scenario, silent: Scenario, codebook: Codebook,
-            options: argparse.Namespace
-            ) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], float, str]:
+            options: argparse.Namespace) -> tuple[dict[str, list[frame.Fixes]], float, str]:
     """Measure all surfaces with each kind of knowledge.
 
-    Returns squared errors [surfaces, positions], NaN without a fix, and whether the regions
-    contain the position, by knowledge; the duration of a calibration [s]; and how many failed
-    elements were found.
+    Returns the fixes of each surface by knowledge; the duration of a calibration [s]; and how many
+    failed elements were found.
     """
     positions = silent.sample_positions(
         options.positions, streams.generator(options.seed, streams.HELD_OUT))
-    of_surface: list[dict[str, tuple[np.ndarray, np.ndarray]]] = []
-    counts, begin_s, elapsed_s = np.zeros(3, int), 0.0, 0.0
+    found: dict[str, list[frame.Fixes]] = {}
+    counts, elapsed_s = np.zeros(3, int), 0.0
     for index in range(options.surfaces):
         rng = streams.generator(options.seed, streams.SURFACE, index)
         surface = draw_surface(declared, rng)
@@ -120,15 +105,12 @@ def measure(declared: Scenario, silent: Scenario, codebook: Codebook,
             'silent': (silent, None, received),
             'after': (silent, calibration.surface, received),
             'exact': (silent, surface, received), 'undamaged': (silent, None, undamaged)}
-        of_surface.append({
-            name: squares_and_coverage(
-                make_estimator('bayes', scenario, codebook, surface=known).estimate(signals),
-                positions)
-            for name, (scenario, known, signals) in cases.items()})
-    found = f'{counts[0]} of {counts[1]} failed elements found, {counts[2]} false'
-    stacked = {name: (np.stack([one[name][0] for one in of_surface]),
-                      np.stack([one[name][1] for one in of_surface])) for name in of_surface[0]}
-    return stacked, elapsed_s / options.surfaces, found
+        for name, (scenario, known, signals) in cases.items():
+            estimator = make_estimator('bayes', scenario, codebook, surface=known)
+            fixes = frame.Fixes.of(estimator.estimate(signals), positions)
+            found.setdefault(name, []).append(fixes)
+    return found, elapsed_s / options.surfaces, (
+        f'{counts[0]} of {counts[1]} failed elements found, {counts[2]} false')
 
 
 def failures(surface: ElementErrors, calibration: Calibration) -> np.ndarray:
@@ -137,19 +119,15 @@ def failures(surface: ElementErrors, calibration: Calibration) -> np.ndarray:
     return np.array([np.sum(true & found), np.sum(true), np.sum(found & ~true)])
 
 
-def squares_and_coverage(
-        estimate: Estimate, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return squared errors and whether the 95 % regions contain the positions, [positions]."""
-    errors = estimate.mean - positions
-    normalised = np.full(len(errors), np.nan)
-    fix = estimate.fix
-    normalised[fix] = np.sum(errors[fix] * np.linalg.solve(
-        estimate.covariance[fix], errors[fix][..., None])[..., 0], axis=1)
-    return np.sum(errors**2, axis=1), normalised <= REGION_RADIUS
+def squares_of(surfaces: list[frame.Fixes]) -> np.ndarray:
+    """Return squared errors [surfaces, positions], NaN without a fix."""
+    squares = np.full((len(surfaces), len(surfaces[0].fix)), np.nan)
+    for row, fixes in zip(squares, surfaces, strict=True):
+        row[fixes.fix] = fixes.squared
+    return squares
 
 
-def interval(results: np.ndarray, baseline: np.ndarray | None = None
-             ) -> tuple[float, float, float]:
+def interval(results: np.ndarray, baseline: np.ndarray | None = None) -> frame.Interval:
     """Return a mean, or its ratio to that of a baseline, with its interval."""
     own = replicate(results, 0)[0]
     if baseline is None:
@@ -158,27 +136,21 @@ def interval(results: np.ndarray, baseline: np.ndarray | None = None
     return 1 - value / 100, 1 - high / 100, 1 - low / 100
 
 
-def report(surface: str, knowledge: str, squares: np.ndarray, covered: np.ndarray,
-           exact: np.ndarray) -> dict[str, Any]:
-    """Print a row of the table and return it."""
+def figures(surface: str, knowledge: str, surfaces: list[frame.Fixes], exact: np.ndarray
+            ) -> dict[str, Any]:
+    """Compute the figures of a row."""
+    squares = squares_of(surfaces)
     fixes = np.isfinite(squares)
     row: dict[str, Any] = {
         'surface': surface, 'knowledge': knowledge,
         'no_fix_share': share_percent(int(np.sum(~fixes)), squares.size)}
     # Few fixes are not a sample of all positions.
     if fixes.mean() > 0.5:
+        covered = sum(int(one.inside.sum()) for one in surfaces)
         row |= {'mse_m2': interval(squares), 'to_exact': interval(squares, exact),
-                'covered_share': share_percent(int(np.sum(covered)), int(np.sum(fixes)))}
-
-    def text(key: str, digits: int) -> str:
-        if key not in row:
-            return '-'
-        return '{:.{d}f} [{:.{d}f}, {:.{d}f}]'.format(*row[key], d=digits)
-
-    print(f'| {surface} | {knowledge} | {text("no_fix_share", 1)} | {text("mse_m2", 3)} | '
-          f'{text("to_exact", 3)} | {text("covered_share", 1)} |', flush=True)
+                'covered_share': share_percent(covered, int(np.sum(fixes)))}
     return row
 
 
 if __name__ == '__main__':
-    raise SystemExit(exit_code_of(main))
+    frame.run(main)

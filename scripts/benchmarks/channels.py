@@ -15,53 +15,26 @@ estimator always assumes that this is the case for 10 % of the users.
 The folder contains empty_test.npz, hall_test.npz and hall_survey.npz with propagation paths.
 """
 
-import os
-
-# One thread, as in the positioner node. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import dataclasses
-import sys
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from parts.command import benchmark_parser, write_results
-from scipy.stats import chi2
+from parts import frame
 
 from rhs_isac_ros.calibration import SurveyWarning, survey
-from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.experiments.resampling import share_percent
-from rhs_isac_ros.model import Scenario, ScenarioError, simulate_received
+from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.positioning import make_estimator
-from rhs_isac_ros.support.arguments import (
-    positive_int,
-    share,
-)
+from rhs_isac_ros.support.arguments import positive_int, share
 
-ROOT = Path(__file__).parents[2]
 SYSTEMS = {'table1': ('table1.yaml', 'codebook.yaml'),
            'bandplan': ('bandplan.yaml', 'codebook_bandplan.yaml')}
-REGION_RADIUS = float(chi2.ppf(0.95, 3))
 # Assumed share of blocked users.
 PRIOR = 0.1
-
-
-class Result(NamedTuple):
-    """Numbers of users, of fixes and of those in the 95 % region, and the error of the fixes."""
-
-    n: int
-    fixes: int
-    inside: int
-    rms_m: float
-
-    @property
-    def shares(self) -> dict[str, float]:
-        """Shares of users with a fix, of fixes in the region, of users with one outside; error."""
-        return {'fix': self.fixes / self.n, 'in_region': self.inside / max(self.fixes, 1),
-                'wrong': (self.fixes - self.inside) / self.n, 'rms_m': self.rms_m}
 
 
 class Received(NamedTuple):
@@ -74,30 +47,30 @@ class Received(NamedTuple):
 
 def main() -> None:
     """Run the benchmark."""
-    parser = benchmark_parser('channels', __doc__)
+    parser = frame.benchmark_parser('channels', __doc__)
     add = parser.add_argument
-    add('folder', type=Path, nargs='?', default=ROOT.parent / 'shared' / 'channels',
-        help='folder of the channel files (default: ../shared/channels of the repository)')
+    add('folder', type=Path, nargs='?', default=frame.CONFIG.parents[1] / 'shared' / 'channels',
+        help='folder of the channel files')
     add('--surveys', type=positive_int, default=5,
-        help='random surveys of each size (default: %(default)s)')
+        help='random surveys of each size')
     add('--positions', type=positive_int, nargs='+', default=[10, 30, 100, 300],
-        help='sizes of the surveys (default: 10 30 100 300)')
+        help='sizes of the surveys')
     add('--blocked', type=share, nargs='+', default=[], metavar='SHARE',
         help='also measure with this share of users without direct path, from 0 to 1')
     options = parser.parse_args()
-    print('| hall | system | survey | fix [%] | in the 95 % region [%] | range over surveys [%] | '
-          'confidently wrong [%] | rms error [m] |\n|---|---|---|---|---|---|---|---|')
+    table = frame.Table('hall', 'system', 'survey', 'fix [%]', 'in the 95 % region [%]',
+                  'range over surveys [%]', 'confidently wrong [%]', 'rms error [m]')
     figures: dict[str, dict] = {'hall': {}, 'empty': {}}
     for name, (scenario_file, codebook_file) in SYSTEMS.items():
-        scenario = Scenario.from_yaml(ROOT / 'config' / scenario_file)
-        codebook = Codebook.load(ROOT / 'config' / codebook_file)
+        scenario = Scenario.from_yaml(frame.CONFIG / scenario_file)
+        codebook = Codebook.load(frame.CONFIG / codebook_file)
         rng = np.random.default_rng(options.seed)
         empty, hall, known = (
             dataclasses.replace(scenario, channel=options.folder / f'{file}.npz')
             for file in ('empty_test', 'hall_test', 'hall_survey'))
-        figures['empty'][name] = report('empty', name, 'none', [
+        figures['empty'][name] = report(table, 'empty', name, 'none', [
             measure(scenario, codebook, receive(empty, codebook, rng))])['']
-        figures['hall'][name] = {'shipped': report('hall', name, 'none', [
+        figures['hall'][name] = {'shipped': report(table, 'hall', name, 'none', [
             measure(scenario, codebook, receive(hall, codebook, rng))])['']}
         for hidden in (0.0, *options.blocked):
             place = f'hall, {100 * hidden:g} % blocked' if hidden else 'hall'
@@ -114,10 +87,11 @@ def main() -> None:
                         blocked_probability=PRIOR if hidden else 0.0)
                     results.append(measure(
                         measured, codebook, receive(hall, codebook, rng, hidden=hidden)))
-                for users, found in report(place, name, f'{n} positions', results).items():
+                for users, found in report(
+                        table, place, name, f'{n} positions', results).items():
                     key = f'{users}, {hidden:g} blocked' if users else 'hall'
                     figures.setdefault(key, {}).setdefault(name, {})[str(n)] = found
-    write_results(options.json, figures)
+    frame.write_results(options.json, figures)
 
 
 def receive(traced: Scenario, codebook: Codebook, rng: np.random.Generator,
@@ -127,9 +101,10 @@ def receive(traced: Scenario, codebook: Codebook, rng: np.random.Generator,
     users = traced.channel.users
     if n is not None:
         users = rng.permutation(users)[:n]
+    n_bands, n_subbands, n_frames, _, _ = codebook.shape
     # A generator of its own leaves the other figures as they are without blocked users.
     blocked = rng.spawn(1)[0].permutation(len(users)) < round(hidden * len(users))
-    signals = np.empty((len(users), *codebook_shape(codebook)), complex)
+    signals = np.empty((len(users), n_bands, n_subbands * n_frames), complex)
     for state in (False, True):
         if (chosen := blocked == state).any():
             signals[chosen] = simulate_received(
@@ -138,34 +113,35 @@ def receive(traced: Scenario, codebook: Codebook, rng: np.random.Generator,
     return Received(users, signals, blocked)
 
 
-def codebook_shape(codebook: Codebook) -> tuple[int, int]:
-    """Return the numbers N_B of bands and N_SB F of measurements of each band."""
-    n_bands, n_subbands, n_frames, _, _ = codebook.shape
-    return n_bands, n_subbands * n_frames
-
-
-def measure(scenario: Scenario, codebook: Codebook, received: Received) -> dict[str, Result]:
+def measure(scenario: Scenario, codebook: Codebook, received: Received) -> dict[str, frame.Fixes]:
     """Locate users with the estimator that also considers positions outside of the region.
 
     The results are those of all users, or if some are blocked, of those in sight and the others.
     """
     users, signals, blocked = received
     estimate = make_estimator('bayes', scenario, codebook, reject_outside=True).estimate(signals)
-    fix = estimate.fix
-    errors = np.where(fix[:, None], estimate.mean - users, 0.0)
-    covariance = np.where(fix[:, None, None], estimate.covariance, np.eye(3))
-    inside = fix & (np.einsum('na,na->n', errors, np.linalg.solve(
-        covariance, errors[..., None])[..., 0]) <= REGION_RADIUS)
-    squares = np.sum(errors**2, axis=1)
     groups = {'in sight': ~blocked, 'blocked': blocked} if blocked.any() else {'': ~blocked}
-    return {name: Result(
-        int(chosen.sum()), int(fix[chosen].sum()), int(inside[chosen].sum()),
-        float(np.sqrt(squares[chosen & fix].mean())) if fix[chosen].any() else np.nan)
-        for name, chosen in groups.items() if chosen.any()}
+    return {name: frame.Fixes.of(dataclasses.replace(
+        estimate, mean=estimate.mean[chosen], covariance=estimate.covariance[chosen]),
+        users[chosen]) for name, chosen in groups.items() if chosen.any()}
 
 
-def report(hall: str, system: str, known: str, results: list[dict[str, Result]]
-           ) -> dict[str, dict[str, float | list]]:
+def shares_of(fixes: frame.Fixes) -> dict[str, float]:
+    """Return shares of users with a fix, of fixes in the region, of users outside; and error."""
+    n, inside = len(fixes.fix), int(fixes.inside.sum())
+    n_fixes = len(fixes.squared)
+    return {'fix': n_fixes / n, 'in_region': inside / max(n_fixes, 1),
+            'wrong': (n_fixes - inside) / n,
+            'rms_m': float(fixes.squared.mean()**0.5) if n_fixes else np.nan}
+
+
+def mean_share(pairs: Sequence[tuple[int, int]]) -> str:
+    """Return a mean share over surveys, with the interval of one, because they share the users."""
+    return frame.shown(np.mean([share_percent(*pair) for pair in pairs], axis=0).tolist(), 1)
+
+
+def report(table: frame.Table, hall: str, system: str, known: str,
+           results: list[dict[str, frame.Fixes]]) -> dict[str, dict[str, float | list]]:
     """Print a row for each group of users, and return its figures.
 
     They are means, and the worst share in the region.
@@ -173,20 +149,17 @@ def report(hall: str, system: str, known: str, results: list[dict[str, Result]]
     figures: dict[str, dict[str, float | list]] = {}
     for users in results[0]:
         found = [result[users] for result in results]
-        shares = [result.shares for result in found]
+        shares = [shares_of(fixes) for fixes in found]
         covered = [one['in_region'] for one in shares]
-        # A mean of several surveys has the interval of one, because they share the users.
-        fix, inside, wrong = (
-            '{:.1f} [{:.1f}, {:.1f}]'.format(*np.mean(
-                [share_percent(*pair) for pair in pairs], axis=0)) for pairs in (
-                    [(one.fixes, one.n) for one in found],
-                    [(one.inside, max(one.fixes, 1)) for one in found],
-                    [(one.fixes - one.inside, one.n) for one in found]))
+        counts = [(len(one.fix), len(one.squared), int(one.inside.sum())) for one in found]
         rms_m = float(np.mean([one['rms_m'] for one in shares]))
-        place = f'{hall}: {users}' if users else hall
-        print(f'| {place} | {system} | {known} | {fix} | {inside} | {100 * min(covered):.1f} to '
-              f'{100 * max(covered):.1f} | {wrong} | '
-              f'{"" if np.isnan(rms_m) else f"{rms_m:.3f}"} |', flush=True)
+        table.row(
+            f'{hall}: {users}' if users else hall, system, known,
+            mean_share([(fixes, n) for n, fixes, _ in counts]),
+            mean_share([(inside, max(fixes, 1)) for _, fixes, inside in counts]),
+            f'{100 * min(covered):.1f} to {100 * max(covered):.1f}',
+            mean_share([(fixes - inside, n) for n, fixes, inside in counts]),
+            '' if np.isnan(rms_m) else f'{rms_m:.3f}')
         figures[users] = {
             'fix': float(np.mean([one['fix'] for one in shares])), 'in_region': min(covered),
             'wrong': max(one['wrong'] for one in shares), 'rms_m': rms_m, 'each': shares}
@@ -194,4 +167,4 @@ def report(hall: str, system: str, known: str, results: list[dict[str, Result]]
 
 
 if __name__ == '__main__':
-    sys.exit(exit_code_of(main, (CodebookError, ScenarioError)))
+    frame.run(main)

@@ -22,19 +22,18 @@ import numpy as np
 import rclpy
 from parts.bare_cycle import bare_cycles
 from parts.chain import ChainObserver, Cycle
-from parts.command import benchmark_parser, write_results
+from parts.frame import benchmark_parser, run, write_results
 from parts.hops import CHAIN, ping_pong
+from parts.serializers import SERIALIZERS
 from rclpy.experimental import EventsExecutor
 from system.trial_processes import TrialProcesses
 
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros.processes import private_domain
-from rhs_isac_ros.ros.run import check_domain
-from rhs_isac_ros.ros.startup import use_discovery_profile
+from rhs_isac_ros.ros.environment import check_environment, private_domain, use_discovery_profile
+from rhs_isac_ros.ros.processes import MAX_USER_NODES
 from rhs_isac_ros.support.arguments import integer, positive_int
-from rhs_isac_ros.tools.demo import max_user_processes, start_network
+from rhs_isac_ros.tools.demo import start_network
 
 # Pause between cycles, so that the report of one does not compete with the next for the cores.
 REST_S = 0.05
@@ -53,31 +52,34 @@ WHERE = {'processes': 'one process per node', 'composed': 'all nodes in one proc
 def main() -> int:
     """Run the benchmark."""
     parser = benchmark_parser('cycle', __doc__, default_seed=None)
-    parser.add_argument('--users', type=integer(1, max_user_processes()), default=2,
+    parser.add_argument('--users', type=integer(1, MAX_USER_NODES), default=2,
                         help='number of users, each a process')
     parser.add_argument('--cycles', type=positive_int, default=300, help='number of cycles')
     parser.add_argument('--layout', choices=WHERE, action='append',
                         help='only this arrangement of the nodes; by default both')
+    parser.add_argument('--serializer', choices=SERIALIZERS,
+                        help='convert the messages of the nodes with this library')
     options = parser.parse_args()
-    check_domain(parser)
+    check_environment(parser)
     os.environ.update(private_domain())
     use_discovery_profile()
     results = {}
     for layout in options.layout or WHERE:
-        results[layout] = measure(options.users, options.cycles, composed=layout == 'composed')
+        results[layout] = measure(
+            options.users, options.cycles, layout == 'composed', options.serializer)
         report(results[layout], layout)
     write_results(options.json, results)
     return 0
 
 
-def measure(users: int, cycles: int, composed: bool) -> dict:
+def measure(users: int, cycles: int, composed: bool, serializer: str | None) -> dict:
     """Run ping-pong, the network, and ping-pong again; return the figures."""
     scenario = Scenario()
     faulthandler.dump_traceback_later(HANG_S + HANG_CYCLE_S * cycles, exit=True)
     rclpy.init(args=[])
     try:
         before_s = ping_pong(scenario, composed)
-        chains, cpu_s = run_cycles(scenario, users, cycles, composed)
+        chains, cpu_s = run_cycles(scenario, users, cycles, composed, serializer)
         bare_s = None if composed else np.median(bare_cycles(REST_S))
         after_s = ping_pong(scenario, composed)
     finally:
@@ -110,12 +112,16 @@ def measure(users: int, cycles: int, composed: bool) -> dict:
 
 
 def run_cycles(
-        scenario: Scenario, users: int, cycles: int, composed: bool) -> tuple[list[Cycle], float]:
+        scenario: Scenario, users: int, cycles: int, composed: bool, serializer: str | None
+) -> tuple[list[Cycle], float]:
     """Run the network and return its cycles, and the CPU time of all nodes for each [s]."""
     observer, executor = ChainObserver(), EventsExecutor()
     executor.add_node(observer)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
-        with TrialProcesses(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
+        prefix = [sys.executable, '-m', 'parts.serializers', serializer] if serializer else []
+        paths = os.pathsep.join([str(Path(__file__).parent), os.environ.get('PYTHONPATH', '')])
+        with TrialProcesses(Path(logs), {'ROS_LOG_DIR': logs, 'PYTHONPATH': paths},
+                            lambda name: prefix) as processes:
             if composed:
                 processes.start('network', users=users, rest_s=REST_S, mobility='random_walk',
                                 speed_mps=scenario.max_user_speed_mps)
@@ -181,4 +187,4 @@ def report(figures: dict, layout: str) -> None:
 
 
 if __name__ == '__main__':
-    sys.exit(exit_code_of(main))
+    run(main)

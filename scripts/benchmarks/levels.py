@@ -5,30 +5,17 @@ bound grow if the continuous amplitudes of a codebook are rounded to these level
 the codebook is optimised for them? All codebooks are evaluated on the same held-out positions.
 """
 
-import os
-
-# One thread. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import dataclasses
-import sys
 import time
 
-from parts.command import benchmark_parser, write_results
+from parts.frame import Table, benchmark_parser, run, scenario_of, shown, write_results
 
 from rhs_isac_ros.bounds import crlb
-from rhs_isac_ros.codebook import Codebook, optimize
-from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.experiments import markdown_table
-from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.codebook import optimize
 from rhs_isac_ros.model.surface import on_levels
 from rhs_isac_ros.support import streams
-from rhs_isac_ros.support.arguments import (
-    input_file,
-    positive_int,
-)
+from rhs_isac_ros.support.arguments import input_file, positive_int
 
-LEVELS = (2, 3, 4)
 HELD_OUT = 2000
 
 
@@ -39,32 +26,29 @@ def main() -> None:
     parser.add_argument('--steps', type=positive_int, default=3000,
                         help='maximum number of update steps of each codebook')
     options = parser.parse_args()
-    given = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
-    free = dataclasses.replace(given, amplitude_levels=0)
+    free = dataclasses.replace(scenario_of(options.scenario), amplitude_levels=0)
     held_out = free.sample_positions(
         HELD_OUT, streams.generator(options.seed, streams.HELD_OUT))
-
-    def bound(codebook: Codebook) -> float:
-        return float(crlb(free, codebook, held_out).mean())
-
-    begin = time.thread_time()
-    continuous = optimize(free, seed=options.seed, max_steps=options.steps).codebook
-    figures = {'continuous': {
-        'optimised_m2': bound(continuous), 'time_s': time.thread_time() - begin}}
-    for levels in LEVELS:
+    print(f'average CRLB on {HELD_OUT} held-out positions, seed {options.seed}\n')
+    table = Table('levels', 'rounded [m²]', 'optimised [m²]', 'CPU time [s]')
+    figures, continuous = {}, None
+    for levels in (0, 2, 3, 4):
         scenario, begin = dataclasses.replace(free, amplitude_levels=levels), time.thread_time()
         optimised = optimize(scenario, seed=options.seed, max_steps=options.steps).codebook
-        rounded = dataclasses.replace(continuous, analog=on_levels(scenario, continuous.analog))
-        figures[str(levels)] = {
-            'optimised_m2': bound(optimised), 'rounded_m2': bound(rounded),
-            'time_s': time.thread_time() - begin}
-    print(f'average CRLB on {HELD_OUT} held-out positions, seed {options.seed}\n')
-    print(markdown_table(
-        ['levels', 'rounded [m²]', 'optimised [m²]', 'CPU time [s]'],
-        [[name, f'{row["rounded_m2"]:.4f}' if 'rounded_m2' in row else '–',
-          f'{row["optimised_m2"]:.4f}', f'{row["time_s"]:.1f}'] for name, row in figures.items()]))
+        time_s, rounded_m2 = time.thread_time() - begin, None
+        continuous = continuous or optimised
+        if levels:
+            rounded = dataclasses.replace(
+                continuous, analog=on_levels(scenario, continuous.analog))
+            rounded_m2 = crlb(free, rounded, held_out).mean()
+        name = str(levels or 'continuous')
+        figures[name] = {'optimised_m2': crlb(free, optimised, held_out).mean(), 'time_s': time_s}
+        if levels:
+            figures[name]['rounded_m2'] = rounded_m2
+        table.row(name, shown(rounded_m2, 4), shown(figures[name]['optimised_m2'], 4),
+                  shown(time_s, 1))
     write_results(options.json, figures)
 
 
 if __name__ == '__main__':
-    sys.exit(exit_code_of(main, (ScenarioError,)))
+    run(main)

@@ -18,10 +18,9 @@ from collections.abc import Callable
 
 import numpy as np
 from parts.ambiguity_speed import ambiguity_speed
-from parts.command import benchmark_parser, write_results
+from parts.frame import Table, benchmark_parser, run, shown, write_results
+from parts.jax_crlb import JaxAverageCrlb
 from parts.optimizer_growth import POSITIONS, growth, side_by_side, surfaces
-from parts.optimizer_picture import draw
-from peers.jax_crlb import JaxAverageCrlb
 from scipy.optimize import minimize
 
 from rhs_isac_ros.bounds import AverageCrlb, crlb
@@ -29,16 +28,9 @@ from rhs_isac_ros.codebook import METHODS, random_codebook
 from rhs_isac_ros.codebook.objective import ROW_TOLERANCE, sobol
 from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS
 from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Search
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import streams
-from rhs_isac_ros.support.arguments import (
-    check_distinct,
-    integer,
-    picture_file,
-    positive_float,
-)
-from rhs_isac_ros.support.pictures import write_picture
+from rhs_isac_ros.support.arguments import integer, positive_float
 
 HAVE_JAX = importlib.util.find_spec('jax') is not None
 TARGET_M2 = 0.0415
@@ -53,10 +45,7 @@ def main() -> None:
     parser.add_argument('--limit', type=positive_float, default=120.0,
                         help='time limit per method in (b) [s]')
     parser.add_argument('--parts', type=parts, default='abcd', help='letters of abcde')
-    parser.add_argument('--picture', type=picture_file,
-                        help='file for the picture of (a) to (c): PNG, PDF or SVG')
     options = parser.parse_args()
-    check_distinct(parser, options)
     restrict_to(options.threads)
     if not HAVE_JAX:
         print('JAX is not installed, so its figures are omitted; to install it: '
@@ -68,8 +57,6 @@ def main() -> None:
         if part in options.parts:
             figures |= measure()
     write_results(options.json, figures)
-    if options.picture:
-        write_picture(options.picture, draw(figures))
 
 
 def parts(text: str) -> str:
@@ -81,8 +68,9 @@ def parts(text: str) -> str:
 
 def restrict_to(n: int) -> None:
     """Restart this process on n cores with n threads; libraries read the number when loaded."""
-    if threads() != n:
-        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:n])
+    cores = sorted(os.sched_getaffinity(0))
+    if threads() != n or len(cores) > n:
+        os.sched_setaffinity(0, cores[:n])
         os.environ['OPENBLAS_NUM_THREADS'] = str(n)
         os.execv(sys.executable, [sys.executable, *sys.argv])
 
@@ -111,9 +99,9 @@ def gradient() -> dict:
     value = {name: contenders[name]()[0] for name in ('this package', 'this package, exact rows')}
     ours = times_s['this package']
     print(f'(a) value and gradient, Table I, {POSITIONS} positions, {threads()} thread(s)\n')
-    print('| implementation | ms | speed-up of this package |\n|---|---|---|')
+    table = Table('implementation', 'ms', 'speed-up of this package')
     for name, time_s in times_s.items():
-        print(f'| {name} | {1e3 * time_s:.2f} | {time_s / ours:.2f} |')
+        table.row(name, shown(1e3 * time_s, 2), shown(time_s / ours, 2))
     error = value['this package'] / value['this package, exact rows'] - 1
     print(f'\nrelative error of the value: {error:.1e}; ranks {fast.objective.rows.ranks}\n')
     return {
@@ -139,19 +127,18 @@ def target(limit_s: float) -> dict:
     # Import the lazily loaded parts of SciPy before the measurement starts.
     sobol(scenario, 1, np.random.default_rng(0))
     held_out = scenario.sample_positions(HELD_OUT, streams.generator(0, streams.HELD_OUT))
-    runs = {f'lbfgs, {DEFAULT_POSITIONS} Sobol': run(scenario, 'lbfgs', sobol, limit_s),
-            'lbfgs, 1024 Sobol': run(scenario, 'lbfgs', sobol, limit_s, 1024),
-            f'lbfgs, {POSITIONS} random': run(
+    runs = {f'lbfgs, {DEFAULT_POSITIONS} Sobol': trace_of(scenario, 'lbfgs', sobol, limit_s),
+            'lbfgs, 1024 Sobol': trace_of(scenario, 'lbfgs', sobol, limit_s, 1024),
+            f'lbfgs, {POSITIONS} random': trace_of(
                 scenario, 'lbfgs', Scenario.sample_positions, limit_s, POSITIONS)}
     for method in ('alternating', 'direct', 'genetic'):
-        runs[f'{method}, {POSITIONS} random'] = run(
+        runs[f'{method}, {POSITIONS} random'] = trace_of(
             scenario, method, Scenario.sample_positions, limit_s, POSITIONS)
     compiled_s = 0.0
     if HAVE_JAX:
         runs['JAX + L-BFGS-B'], compiled_s = run_peer(scenario, limit_s)
     print(f'(b) time to an average bound of {TARGET_M2} m^2 on {HELD_OUT} held-out positions\n')
-    print('| method | s | evaluations | final bound [m^2] | final time [s] |')
-    print('|---|---|---|---|---|')
+    table = Table('method', 's', 'evaluations', 'final bound [m²]', 'final time [s]')
     reached = {}
     for name, trace in runs.items():
         hit = first_below(scenario, trace, held_out)
@@ -159,8 +146,8 @@ def target(limit_s: float) -> dict:
         reached[name] = {
             'target_s': hit and hit[0], 'evaluations': hit and hit[1], 'final_m2': end_m2,
             'final_s': trace[-1][0]}
-        when = f'{hit[0]:.2f} | {hit[1]}' if hit else 'not reached | '
-        print(f'| {name} | {when} | {end_m2:.5f} | {trace[-1][0]:.1f} |')
+        table.row(name, *((shown(hit[0], 2), str(hit[1])) if hit else ('not reached', '')),
+                  shown(end_m2, 5), shown(trace[-1][0], 1))
     ours = reached[f'lbfgs, {DEFAULT_POSITIONS} Sobol']
     peer = reached.get('JAX + L-BFGS-B', {}).get('target_s')
     figures = {
@@ -181,7 +168,7 @@ def target(limit_s: float) -> dict:
 Trace = list[tuple[float, int, np.ndarray]]
 
 
-def run(scenario: Scenario, method: str, sample: Callable, limit_s: float,
+def trace_of(scenario: Scenario, method: str, sample: Callable, limit_s: float,
         n_positions: int = DEFAULT_POSITIONS) -> Trace:
     """Run a method with its default limit of steps; the times include sampling and set-up."""
     begin = time.perf_counter()
@@ -260,4 +247,4 @@ def first_below(scenario: Scenario, trace: Trace, held_out: np.ndarray) -> tuple
 
 
 if __name__ == '__main__':
-    sys.exit(exit_code_of(main))
+    run(main)

@@ -20,38 +20,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from parts import frame
 from parts.exhaustive_posterior import exhaustive_posterior
-from scipy.special import chdtri
 
 from rhs_isac_ros.bounds import crlb
-from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.positioning import (
-    ESTIMATORS,
-    Estimate,
-    ModelError,
-    make_estimator,
-    simulate_pairs,
-)
-from rhs_isac_ros.support.arguments import ArgumentParser, input_file, integer, positive_int, seed
-from rhs_isac_ros.support.optional import optional_import
-
-DEFAULT_CODEBOOK = Path(__file__).parents[2] / 'config' / 'codebook.yaml'
-# Squared Mahalanobis radius of the 95 % region.
-REGION_RADIUS = float(chdtri(3, 0.05))
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.positioning import ESTIMATORS, Estimate, make_estimator, simulate_pairs
+from rhs_isac_ros.support.arguments import input_file, integer
 
 
 def main() -> None:
     """Run the benchmark."""
     options = parse_options()
-    scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
-    codebook = Codebook.load(options.codebook)
-    settings: dict[str, Any] = {}
-    if options.model:
-        settings['model_file'] = options.model
-    if options.table_folder:
-        settings['table_folder'] = options.table_folder
+    scenario, codebook = frame.scenario_of(options.scenario), Codebook.load(options.codebook)
+    settings: dict[str, Any] = {
+        name: value for name in ('model_file', 'table_folder')
+        if (value := getattr(options, name))}
     begin = time.perf_counter()
     estimator = make_estimator(options.estimator, scenario, codebook, **settings)
     ready_s = time.perf_counter() - begin
@@ -59,48 +43,43 @@ def main() -> None:
         print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
         return
     positions, received = simulate_pairs(scenario, codebook, options.positions, options.seed)
-    times_s, busy_s, estimates = [], [], []
-    for signals in received:
-        begin, busy = time.perf_counter(), time.process_time()
-        estimates.append(estimator.estimate(signals))
-        times_s.append(time.perf_counter() - begin)
-        busy_s.append(time.process_time() - busy)
+    estimate, times_s = frame.estimate_singly(estimator, received)
     begin, busy = time.perf_counter(), time.process_time()
     together = estimator.estimate(received)
     batch_s = np.array([time.perf_counter() - begin, time.process_time() - busy])
-    deviation = np.nanmax(np.abs(together.mean - [one.mean for one in estimates]), initial=0.0)
+    deviation = np.nanmax(np.abs(together.mean - estimate.mean), initial=0.0)
     print(f'estimator {options.estimator}, codebook {codebook.id}, {options.positions} positions, '
           f'seed {options.seed}')
-    print_accuracy(estimates, positions)
-    print(f'average CRLB         {crlb(scenario, codebook, positions).mean():.4f} m^2')
+    figures = accuracy(frame.Fixes.of(estimate, positions))
+    figures['average_crlb_m2'] = crlb(scenario, codebook, positions).mean()
+    print(f'average CRLB         {figures["average_crlb_m2"]:.4f} m^2')
     if options.reference:
-        print_ratio(
-            exhaustive_reference(scenario, codebook, received, options.reference), estimates,
-            positions)
-    print(f'time of a fix        {1e3 * np.median(times_s):.1f} ms median, '
-          f'{1e3 * np.quantile(times_s, 0.99):.1f} ms 99th percentile, '
-          f'{1e3 * np.median(busy_s):.1f} ms CPU time')
-    ratio = np.array([np.sum(times_s), np.sum(busy_s)]) / batch_s
-    wall_ms, busy_ms = 1e3 * batch_s / len(received)
-    print(f'all in one call      {wall_ms:.2f} ms, {busy_ms:.2f} ms CPU time for each fix')
-    print(f'rate of one call     {ratio[0]:.1f} times that of single fixes, {ratio[1]:.1f} times '
+        reference = exhaustive_posterior(scenario, codebook, received, options.reference)
+        figures |= ratio(reference, estimate, positions)
+    wall_ms, busy_ms = 1e3 * np.median(times_s, axis=0)
+    print(f'time of a fix        {wall_ms:.1f} ms median, '
+          f'{1e3 * np.quantile(times_s[:, 0], 0.99):.1f} ms 99th percentile, '
+          f'{busy_ms:.1f} ms CPU time')
+    rates, each_ms = times_s.sum(axis=0) / batch_s, 1e3 * batch_s / len(received)
+    print(f'all in one call      {each_ms[0]:.2f} ms, {each_ms[1]:.2f} ms CPU time for each fix')
+    print(f'rate of one call     {rates[0]:.1f} times that of single fixes, {rates[1]:.1f} times '
           f'by CPU time; positions differ by up to {deviation:.0e} m')
     print(f'time to create       {ready_s:.1f} s, including its tables')
     print_loading(settings)
+    frame.write_results(options.json, figures | {
+        'fix_ms': wall_ms, 'fix_cpu_ms': busy_ms, 'rate_of_one_call': rates.tolist()})
 
 
 def parse_options() -> argparse.Namespace:
     """Parse the command line."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark positioning', description=__doc__.partition('\n')[0],
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = frame.benchmark_parser('positioning', __doc__, 1000)
     add = parser.add_argument
     add('--estimator', choices=sorted(ESTIMATORS), default='bayes', help='estimator')
-    add('--model', type=input_file, help='trained model of the estimator neural')
-    add('--codebook', type=input_file, default=DEFAULT_CODEBOOK, help='codebook file')
+    add('--model', type=input_file, dest='model_file', metavar='FILE',
+        help='trained model of the estimator neural')
+    add('--codebook', type=input_file, default=frame.CONFIG / 'codebook.yaml',
+        help='codebook file')
     add('--scenario', type=input_file, help='YAML file of the scenario')
-    add('--positions', type=positive_int, default=1000, help='number of positions')
-    add('--seed', type=seed, default=1, help='seed of all random numbers')
     add('--reference', type=integer(0, 24), default=0, metavar='N',
         help='compare with the posterior mean over 2^N points; 0 to omit')
     add('--table-folder', type=Path, help=argparse.SUPPRESS)
@@ -108,47 +87,29 @@ def parse_options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def print_accuracy(estimates: list[Estimate], positions: np.ndarray) -> None:
-    """Print squared errors and their consistency with the covariances."""
-    fix = np.array([bool(estimate.fix) for estimate in estimates])
-    errors, normalised = [], []
-    for estimate, position in zip(estimates, positions, strict=True):
-        if estimate.fix:
-            error = estimate.mean - position
-            errors.append(error @ error)
-            normalised.append(error @ np.linalg.solve(estimate.covariance, error))
-    spread = np.std(errors) / np.sqrt(len(errors))
-    print(f'mean squared error   {np.mean(errors):.3f} m^2 (standard error {spread:.3f})')
-    print(f'median squared error {np.median(errors):.3f} m^2')
-    print(f'normalised error     {np.mean(normalised):.2f} (3 if the covariances are consistent)')
-    contained = np.mean(np.array(normalised) <= REGION_RADIUS)
-    print(f'95 % regions         contain {100 * contained:.1f} %')
-    print(f'no fix               {np.sum(~fix)}')
+def accuracy(fixes: frame.Fixes) -> dict[str, Any]:
+    """Print and return squared errors and their consistency with the covariances."""
+    squares = fixes.squared
+    figures = {'mse_m2': squares.mean(), 'standard_error_m2': squares.std() / len(squares)**0.5,
+               'median_m2': np.median(squares), 'nees': fixes.normalised.mean(),
+               'in_region': 100 * fixes.inside.mean(), 'no_fix': int(np.sum(~fixes.fix))}
+    print('mean squared error   {mse_m2:.3f} m^2 (standard error {standard_error_m2:.3f})\n'
+          'median squared error {median_m2:.3f} m^2\n'
+          'normalised error     {nees:.2f} (3 if the covariances are consistent)\n'
+          '95 % regions         contain {in_region:.1f} %\n'
+          'no fix               {no_fix}'.format(**figures))
+    return figures
 
 
-def exhaustive_reference(
-        scenario: Scenario, codebook: Codebook, received: np.ndarray, log2_points: int
-) -> Estimate:
-    """Evaluate the posterior over the whole region, with a progress bar."""
-    with optional_import('--reference', extra='experiments'):
-        from tqdm import tqdm
-
-    with tqdm(total=1.0, bar_format='{percentage:3.0f} % |{bar}| {remaining} left',
-              leave=False, disable=None) as bar:
-        return exhaustive_posterior(
-            scenario, codebook, received, log2_points, lambda share: bar.update(share - bar.n))
-
-
-def print_ratio(reference: Estimate, estimates: list[Estimate], positions: np.ndarray) -> None:
-    """Print the ratio of the mean squared error to that of the posterior mean."""
-    fix = np.array([bool(estimate.fix) for estimate in estimates])
-    means = np.array([estimate.mean for estimate in estimates])
-    own = np.sum((means - positions)**2, axis=1)[fix]
-    best = np.sum((reference.mean - positions)**2, axis=1)[fix]
-    ratio = own.mean() / best.mean()
-    spread = np.std(own - ratio * best) / np.sqrt(len(own)) / best.mean()
+def ratio(reference: Estimate, estimate: Estimate, positions: np.ndarray) -> dict[str, float]:
+    """Print and return the ratio of the mean squared error to that of the posterior mean."""
+    own, best = (np.sum((one.mean - positions)[estimate.fix]**2, axis=1)
+                 for one in (estimate, reference))
+    value = own.mean() / best.mean()
+    spread = np.std(own - value * best) / np.sqrt(len(own)) / best.mean()
     print(f'posterior mean       {best.mean():.3f} m^2, evaluated exhaustively')
-    print(f'ratio to it          {ratio:.4f} (standard error {spread:.4f})')
+    print(f'ratio to it          {value:.4f} (standard error {spread:.4f})')
+    return {'mse_to_reference': value, 'mse_to_reference_standard_error': spread}
 
 
 def print_loading(settings: dict[str, Any]) -> None:
@@ -167,4 +128,4 @@ def print_loading(settings: dict[str, Any]) -> None:
 
 
 if __name__ == '__main__':
-    sys.exit(exit_code_of(main, (CodebookError, ModelError, ScenarioError)))
+    frame.run(main)

@@ -23,39 +23,29 @@ point. Failed elements permit no such sum: their reference is the mixture of the
 true set and position among its hypotheses, so the ratio covers only what the search misses.
 """
 
-import os
-
-# One thread, as in the positioner node. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import argparse
 import copy
 import dataclasses
 import itertools
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from parts.command import benchmark_parser, write_results
-from parts.posterior_ratio import ratio_to_reference, reference_means
-from parts.warning_windows import warnings
-from scipy.special import chdtri
+from parts import frame
+from parts.exhaustive_posterior import exhaustive_posterior, posterior_with_truth
 
 from rhs_isac_ros.codebook import Codebook, random_codebook
-from rhs_isac_ros.experiments.resampling import share_percent
+from rhs_isac_ros.experiments.resampling import replicate, share_percent
 from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario
 from rhs_isac_ros.model.impairments import draw_impairments
-from rhs_isac_ros.positioning import Estimate, Estimator, make_estimator
+from rhs_isac_ros.positioning import Estimate, make_estimator
+from rhs_isac_ros.positioning.diagnosis import WINDOW, InnovationTest
+from rhs_isac_ros.positioning.failures import can_enumerate
 from rhs_isac_ros.support import streams
-from rhs_isac_ros.support.arguments import positive_int
+from rhs_isac_ros.support.arguments import integer, positive_int
 
-DEFAULT_CODEBOOK = Path(__file__).parents[2] / 'config' / 'codebook.yaml'
-# Squared Mahalanobis radius of the 95 % region.
-REGION_RADIUS = float(chdtri(3, 0.05))
 # Positions that share a surface with its errors and failures.
 PER_SURFACE = 5
-RESAMPLES = 2000
 SHELL_M = (0.5, 20.0)
 FOUR_BANDS_HZ = (2.5e9, 2.7e9, 3.1e9, 3.6e9)
 UNIFORM_RAD = 2 * np.pi
@@ -91,52 +81,112 @@ OUTSIDE = {'x = 18 m': (18.0, 0.0, 0.0), 'x = 30 m': (30.0, 0.0, 0.0),
            'y = 6 m': (10.0, 6.0, 0.0), 'z = 3 m': (10.0, 0.0, 3.0)}
 
 
+class Measurement:
+    """The rows of the table, which are printed and written as soon as they are known."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self._options = options
+        self.rows: list[dict[str, Any]] = []
+        print(f'{options.positions} positions, seed {options.seed}, estimator '
+              f'{options.estimator}\n')
+        self._table = frame.Table(
+            'signals from', 'scenario', 'no fix [%]', 'MSE [m²]', 'predicted',
+            'in the 95 % region [%]', 'median residual', 'warning', 'warned [%]', 'time [ms]')
+
+    def wants(self, name: str) -> bool:
+        """Return whether a row was requested."""
+        return not self._options.only or any(text in name for text in self._options.only)
+
+    def add_inside(self, name: str, silent: Scenario, codebook: Codebook,
+                   changes: dict[str, Any]) -> None:
+        """Measure users inside the region, with a silent and a declaring scenario."""
+        options, declared = self._options, dataclasses.replace(silent, **changes)
+        positions, received, surfaces = draw(declared, codebook, options)
+        if changes and not options.pairs:
+            self._add(name, 'silent', silent, codebook, positions, received)
+        estimate, row = self._add(name, 'declared', declared, codebook, positions, received)
+        if n := options.reference:
+            row['mse_to_reference'] = ratio = ratio_to_reference(
+                reference_means(declared, codebook, positions[:n], received[:n], surfaces[:n],
+                                options.log2_points), estimate, positions[:n])
+            row['reference_positions'] = n
+            self._table.row('', 'ratio to the posterior', '', frame.shown(ratio, 3), *6 * [''])
+
+    def add_outside(self, scenario: Scenario, codebook: Codebook) -> None:
+        """Measure users outside of the region."""
+        rng = streams.generator(self._options.seed, streams.HELD_OUT)
+        model, n = MeasurementModel(scenario, codebook), self._options.positions
+        places = {f'a user at {name}': np.tile(place, (n, 1)) for name, place in OUTSIDE.items()}
+        places[f'a shell {SHELL_M[0]:g} m to {SHELL_M[1]:g} m outside'] = shell(scenario, n, rng)
+        for name, positions in places.items():
+            if self.wants(name):
+                self._add(name, 'silent', scenario, codebook, positions,
+                          model.sample(positions, rng))
+
+    def _add(self, name: str, kind: str, scenario: Scenario, codebook: Codebook,
+             positions: np.ndarray, received: np.ndarray) -> tuple[Estimate, dict[str, Any]]:
+        options = self._options
+        estimate, times_s = frame.estimate_singly(make_estimator(
+            options.estimator, scenario, codebook, reject_outside=not options.inside), received)
+        row = {'signals': name, 'scenario': kind,
+               **figures(estimate, positions, options.windows),
+               'time_ms': 1e3 * float(np.median(times_s[:, 1]))}
+        after = row['warns_after']
+        self._table.row(
+            name, kind, frame.shown(row['no_fix_share'], 1), frame.shown(row['mse_m2'], 2),
+            frame.shown(row['predicted_mse_m2'], 2), frame.shown(row['covered_share'], 1),
+            frame.shown(row['median_residual'], 0), f'after {after} phases' if after else 'none',
+            frame.shown(row['warned_share'], 0), frame.shown(row['time_ms'], 1))
+        self.rows.append(row)
+        return estimate, row
+
+
 def main() -> None:
     """Run the benchmark."""
-    parser = benchmark_parser('robustness', __doc__)
+    options = parse_options()
+    base, codebook = frame.scenario_of(options.config), Codebook.load(options.codebook)
+    measurement = Measurement(options)
+    if options.pairs:
+        for names in (*itertools.combinations(DECLARATIONS, 2), *TRIPLES):
+            changes = {key: value for name in names for key, value in DECLARATIONS[name].items()}
+            if len(changes) == len(names) and measurement.wants(' + '.join(names)):
+                measurement.add_inside(' + '.join(names), base, codebook, changes)
+                rows = [pair(row) for row in measurement.rows]
+                frame.write_results(options.json, {'pairs': rows})
+        return
+    four = Scenario(center_frequencies_hz=FOUR_BANDS_HZ)
+    cases = [(name, base, codebook, changes) for name, changes in DEVIATIONS.items()]
+    cases.append((FOUR_BANDS, four, random_codebook(
+        four, streams.generator(options.seed, streams.START)),
+        {'band_phase_std_rad': UNIFORM_RAD}))
+    for case in cases:
+        if measurement.wants(case[0]):
+            measurement.add_inside(*case)
+            # All rows take long.
+            frame.write_results(options.json, measurement.rows)
+    measurement.add_outside(base, codebook)
+    frame.write_results(options.json, measurement.rows)
+
+
+def parse_options() -> argparse.Namespace:
+    """Parse the command line."""
+    parser = frame.benchmark_parser('robustness', __doc__, 600)
     add = parser.add_argument
-    add('--positions', type=positive_int, default=600, help='number of positions of each row')
     add('--estimator', choices=['bayes', 'ml'], default='bayes', help='estimator')
     add('--inside', action='store_true',
         help='estimate without reject_outside, as if no user were outside of the region')
-    add('--config', type=Path, help='scenario file; Table I if omitted')
-    add('--codebook', type=Path, default=DEFAULT_CODEBOOK, help='codebook file')
+    add('--config', type=Path, help='scenario file; frame.Table I if omitted')
+    add('--codebook', type=Path, default=frame.CONFIG / 'codebook.yaml', help='codebook file')
     add('--only', action='append', default=[], metavar='TEXT',
         help='only rows whose name contains the text; may be repeated')
-    add('--reference', type=int, default=0, metavar='N',
+    add('--reference', type=integer(0), default=0, metavar='N',
         help='compare the first N positions with the exhaustive posterior; 0 to omit')
     add('--log2-points', type=positive_int, default=18,
         help='binary logarithm of the number of points of that posterior, of which there are two')
     add('--windows', type=positive_int, default=200,
         help='number of windows to which the monitor of the residuals is applied')
     add('--pairs', action='store_true', help='all pairs of declarations, and some triples')
-    options = parser.parse_args()
-    print(f'{options.positions} positions, seed {options.seed}, estimator {options.estimator}\n')
-    print('| signals from | scenario | no fix [%] | MSE [m^2] | predicted | in the 95 % region '
-          '[%] | median residual | warning | warned [%] | time [ms] |\n'
-          '|---|---|---|---|---|---|---|---|---|---|')
-    base = Scenario.from_yaml(options.config) if options.config else Scenario()
-    codebook = Codebook.load(options.codebook)
-    four = Scenario(center_frequencies_hz=FOUR_BANDS_HZ)
-    cases = [(name, base, codebook, changes) for name, changes in DEVIATIONS.items()]
-    cases.append((FOUR_BANDS, four, random_codebook(
-        four, streams.generator(options.seed, streams.START)),
-        {'band_phase_std_rad': UNIFORM_RAD}))
-    rows = []
-    if options.pairs:
-        for names in (*itertools.combinations(DECLARATIONS, 2), *TRIPLES):
-            changes = {key: value for name in names for key, value in DECLARATIONS[name].items()}
-            if len(changes) == len(names) and wanted(' + '.join(names), options):
-                rows += inside_rows(' + '.join(names), base, codebook, changes, options)
-                write_results(options.json, {'pairs': [pair(row) for row in rows]})
-        return
-    for name, silent, its_codebook, changes in cases:
-        if wanted(name, options):
-            rows += inside_rows(name, silent, its_codebook, changes, options)
-            # All rows take long.
-            write_results(options.json, rows)
-    rows += outside_rows(base, codebook, options)
-    write_results(options.json, rows)
+    return parser.parse_args()
 
 
 def pair(row: dict[str, Any]) -> dict[str, Any]:
@@ -144,75 +194,6 @@ def pair(row: dict[str, Any]) -> dict[str, Any]:
     return {'declared': row['signals'].split(' + '), 'in_region': row['covered_share'],
             'no_fix': row['no_fix_share'], 'mse_m2': row['mse_m2'],
             'mse_ratio': row.get('mse_to_reference'), 'time_ms': row['time_ms']}
-
-
-def wanted(name: str, options: argparse.Namespace) -> bool:
-    """Return whether a row was requested."""
-    return not options.only or any(text in name for text in options.only)
-
-
-def inside_rows(name: str, silent: Scenario, codebook: Codebook, changes: dict[str, Any],
-                options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Measure users inside the region, with a silent and a declaring scenario."""
-    declared = dataclasses.replace(silent, **changes)
-    positions, received, surfaces = draw(declared, codebook, options)
-    rows = []
-    for kind, scenario in (('silent', silent), ('declared', declared)):
-        if kind == 'silent' and (not changes or options.pairs):
-            continue
-        estimator = estimator_for(scenario, codebook, options)
-        estimate, time_ms = estimate_timed(estimator, received)
-        row = {'signals': name, 'scenario': kind, **figures(estimate, positions, options.windows),
-               'time_ms': time_ms}
-        if options.reference and kind == 'declared':
-            n = options.reference
-            reference = reference_means(
-                scenario, codebook, positions[:n], received[:n], surfaces[:n],
-                options.log2_points)
-            row |= ratio_to_reference(
-                reference, estimate, positions[:n], np.arange(n) // PER_SURFACE)
-        rows.append(report(row))
-    return rows
-
-
-def outside_rows(scenario: Scenario, codebook: Codebook,
-                 options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Measure users outside of the region."""
-    estimator = estimator_for(scenario, codebook, options)
-    rng = streams.generator(options.seed, streams.HELD_OUT)
-    model, rows = MeasurementModel(scenario, codebook), []
-    places = {f'a user at {name}': np.tile(place, (options.positions, 1))
-              for name, place in OUTSIDE.items()}
-    places[f'a shell {SHELL_M[0]:g} m to {SHELL_M[1]:g} m outside'] = shell(
-        scenario, options.positions, rng)
-    for name, positions in places.items():
-        if wanted(name, options):
-            received = model.sample(positions, rng)
-            estimate, time_ms = estimate_timed(estimator, received)
-            rows.append(report({
-                'signals': name, 'scenario': 'silent',
-                **figures(estimate, positions, options.windows), 'time_ms': time_ms}))
-    return rows
-
-
-def estimator_for(
-        scenario: Scenario, codebook: Codebook, options: argparse.Namespace) -> Estimator:
-    """Make the estimator of a row."""
-    return make_estimator(
-        options.estimator, scenario, codebook, reject_outside=not options.inside)
-
-
-def estimate_timed(estimator: Estimator, received: np.ndarray) -> tuple[Estimate, float]:
-    """Estimate positions one by one; also return the median CPU time of an estimate [ms]."""
-    estimates, times_s = [], []
-    for signals in received:
-        start_s = time.process_time()
-        estimates.append(estimator.estimate(signals))
-        times_s.append(time.process_time() - start_s)
-    fields = [np.stack([getattr(one, name) for one in estimates])
-              for name in ('mean', 'covariance', 'residual', 'expected_residual')]
-    reasons = tuple(str(one.reason) for one in estimates)
-    return Estimate(fields[0], fields[1], reasons, *fields[2:]), 1e3 * float(np.median(times_s))
 
 
 def draw(scenario: Scenario, codebook: Codebook, options: argparse.Namespace
@@ -247,63 +228,68 @@ def shell(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
 
 def figures(estimate: Estimate, positions: np.ndarray, n_windows: int) -> dict[str, Any]:
     """Compute the figures of a row."""
-    fix, n = estimate.fix, len(positions)
-    errors, covariance = (estimate.mean - positions)[fix], estimate.covariance[fix]
-    squares = np.sum(errors**2, axis=1)
-    normalised = np.sum(
-        errors * np.linalg.solve(covariance, errors[..., None])[..., 0], axis=1)
-    covered = int(np.sum(normalised <= REGION_RADIUS))
-    n_fixes = len(errors)
-    residual = np.asarray(estimate.residual)[fix]
+    fixes, n = frame.Fixes.of(estimate, positions), len(positions)
+    n_fixes, predicted = len(fixes.squared), np.trace(estimate.covariance, axis1=1, axis2=2)
     # The covariance of users who may be outside includes the positions there.
-    certain = np.isfinite(np.asarray(estimate.expected_residual)[fix])
+    certain = fixes.fix & np.isfinite(estimate.expected_residual)
+    residuals = np.stack([estimate.residual, estimate.expected_residual], axis=1)
+    order = np.random.default_rng(0).integers(n, size=(n_windows, WINDOW))
+    n_warned = sum(first_warning(residuals[window]) is not None for window in order)
     return {
-        'positions': n, 'no_fix': n - n_fixes, 'no_fix_share': share_percent(n - n_fixes, n),
+        'positions': n, 'no_fix': n - n_fixes, 'no_fix_share': fixes.without_fix,
         'reasons': {text: sum(reason.startswith(text) for reason in estimate.reason)
                     for text in ('position', 'residual', 'energy')},
-        'mse_m2': mean_interval(squares, np.flatnonzero(fix) // PER_SURFACE),
-        'covered_share': share_percent(covered, n_fixes) if n_fixes else None,
-        'missed_share': share_percent(n_fixes - covered, n),
-        'predicted_mse_m2': float(np.trace(covariance, axis1=1, axis2=2)[certain].mean())
-        if certain.any() else None,
+        'mse_m2': frame.mean_interval(fixes.squared, np.flatnonzero(fixes.fix) // PER_SURFACE),
+        'covered_share': fixes.covered,
+        'missed_share': share_percent(n_fixes - int(fixes.inside.sum()), n),
+        'predicted_mse_m2': float(predicted[certain].mean()) if certain.any() else None,
         'possibly_outside_share': share_percent(n_fixes - int(certain.sum()), n),
-        'median_residual': float(np.median(residual)) if n_fixes else None,
-        **warnings(estimate, n_windows),
-    }
+        'median_residual': float(np.median(estimate.residual[fixes.fix])) if n_fixes else None,
+        'warns_after': first_warning(residuals),
+        'warned_share': share_percent(n_warned, n_windows)}
 
 
-def mean_interval(samples: np.ndarray, surface: np.ndarray) -> tuple[float, float, float] | None:
-    """Return a mean with its 95 % interval by the percentile bootstrap over surfaces [N]."""
-    if not len(samples):
-        return None
-    _, index = np.unique(surface, return_inverse=True)
-    sums, counts = np.bincount(index, samples), np.bincount(index)
-    picks = np.random.default_rng(0).integers(len(sums), size=(RESAMPLES, len(sums)))
-    means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
-    low, high = np.percentile(means, (2.5, 97.5))
-    return float(samples.mean()), float(low), float(high)
+def first_warning(residuals: np.ndarray) -> int | None:
+    """Return the number of phases until the monitor of the positioner warns, None without one."""
+    monitor = InnovationTest()
+    for count, (energy, expected) in enumerate(residuals.tolist(), 1):
+        monitor.add(energy, expected)
+        if monitor.drifts:
+            return count
+    return None
 
 
-def report(row: dict[str, Any]) -> dict[str, Any]:
-    """Print a row as a line of the table."""
-    def interval(value: tuple[float, float, float] | None, digits: int) -> str:
-        if value is None:
-            return '-'
-        return f'{value[0]:.{digits}f} [{value[1]:.{digits}f}, {value[2]:.{digits}f}]'
+def reference_means(
+        scenario: Scenario, codebook: Codebook, positions: np.ndarray, received: np.ndarray,
+        surfaces: list[ElementErrors | None], log2_points: int) -> np.ndarray:
+    """Compute the means of the reference from two sets of points, float64 [2, N, 3] [m]."""
+    if can_enumerate(scenario):
+        known = [surface for surface in surfaces if surface]
+        return np.tile(
+            posterior_with_truth(scenario, codebook, received, known, positions).mean, (2, 1, 1))
+    return np.stack([
+        exhaustive_posterior(scenario, codebook, received, log2_points, seed=seed).mean
+        for seed in range(2)])
 
-    def number(value: float | None, digits: int) -> str:
-        return '-' if value is None else f'{value:.{digits}f}'
 
-    warning = f'after {row["warns_after"]} phases' if row['warns_after'] else 'none'
-    print(f'| {row["signals"]} | {row["scenario"]} | {interval(row["no_fix_share"], 1)} | '
-          f'{interval(row["mse_m2"], 2)} | {number(row["predicted_mse_m2"], 2)} | '
-          f'{interval(row["covered_share"], 1)} | {number(row["median_residual"], 0)} | '
-          f'{warning} | {interval(row["warned_share"], 0)} | {row["time_ms"]:.1f} |', flush=True)
-    if 'mse_to_reference' in row:
-        print(f'|  | ratio to the posterior | | {interval(row["mse_to_reference"], 3)} '
-              '| | | | | | |', flush=True)
-    return row
+def ratio_to_reference(reference: np.ndarray, estimate: Estimate, positions: np.ndarray
+                       ) -> frame.Interval:
+    """Compare the squared errors of the first fixes with those of the exhaustive posterior.
+
+    The mean of finitely many points has an additional error. It is independent between the two
+    sets of points, so that the product of their errors has the expectation without it. The
+    interval resamples surfaces, because the errors at positions that share one are not
+    independent.
+    """
+    n = len(positions)
+    fix = estimate.fix[:n]
+    own = np.sum((estimate.mean[:n] - positions)[fix]**2, axis=1)
+    best = np.sum(np.prod(reference - positions, axis=0)[fix], axis=1)
+    surface = np.flatnonzero(fix) // PER_SURFACE
+    found, exact = (replicate(np.bincount(surface, errors)[None], 0)[0] for errors in (own, best))
+    value, low, high = found.reduction_from(exact)
+    return 1 - value / 100, 1 - high / 100, 1 - low / 100
 
 
 if __name__ == '__main__':
-    main()
+    frame.run(main)

@@ -6,60 +6,47 @@ depend on the number of samples and on how they are drawn? All codebooks are eva
 held-out Sobol points.
 """
 
-import os
-
-# One thread. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
-import sys
 import time
 
 import numpy as np
-from parts.command import benchmark_parser, write_results
+from parts.frame import Table, benchmark_parser, run, shown, write_results
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import optimize
 from rhs_isac_ros.codebook.objective import sobol
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import streams
-from rhs_isac_ros.support.arguments import positive_int
 
 CHOICES = (('monte_carlo', 300), ('monte_carlo', 600), ('monte_carlo', 1200), ('sobol', 64),
            ('sobol', 128), ('sobol', 256), ('sobol', 1024))
 HELD_OUT, HELD_OUT_SEED = 16384, 1 << 20
+# Runs of each choice, and their update steps.
+SEEDS, STEPS = 5, 600
 
 
 def main() -> None:
     """Run the benchmark."""
     parser = benchmark_parser('sampling', __doc__, default_seed=None)
-    parser.add_argument('--seeds', type=positive_int, default=5, help='number of runs per choice')
-    parser.add_argument('--steps', type=positive_int, default=600,
-                        help='update steps of each run')
     options = parser.parse_args()
     scenario = Scenario()
     held_out = sobol(scenario, HELD_OUT, streams.generator(HELD_OUT_SEED, streams.HELD_OUT))
-    print(f'average CRLB on {HELD_OUT} held-out points after {options.steps} steps of L-BFGS, '
-          f'{options.seeds} seeds\n')
-    print('| samples | mean [m^2] | standard deviation [m^2] | time per run [s] |')
-    print('|---|---|---|---|')
+    print(f'average CRLB on {HELD_OUT} held-out points after {STEPS} steps of L-BFGS, '
+          f'{SEEDS} seeds\n')
+    table = Table('samples', 'mean [m²]', 'standard deviation [m²]', 'time per run [s]')
     figures = {}
     for sampling, n in CHOICES:
-        bounds, times_s = [], []
-        for seed in range(options.seeds):
-            begin = time.thread_time()
-            result = optimize(scenario, sampling=sampling, n_positions=n, seed=seed,
-                              max_steps=options.steps)
-            times_s.append(time.thread_time() - begin)
-            bounds.append(np.mean([crlb(scenario, result.codebook, part).mean()
-                                   for part in np.split(held_out, 16)]))
-        name = f'{n} {sampling}'
-        figures[name] = {'mean_m2': np.mean(bounds), 'std_m2': np.std(bounds, ddof=1),
-                         'time_s': np.mean(times_s)}
-        print('| {} | {mean_m2:.5f} | {std_m2:.5f} | {time_s:.1f} |'.format(name, **figures[name]),
-              flush=True)
+        begin = time.thread_time()
+        codebooks = [optimize(scenario, sampling=sampling, n_positions=n, seed=seed,
+                              max_steps=STEPS).codebook for seed in range(SEEDS)]
+        time_s = (time.thread_time() - begin) / SEEDS
+        bounds = [np.mean([crlb(scenario, codebook, part).mean()
+                           for part in np.split(held_out, 16)]) for codebook in codebooks]
+        figures[f'{n} {sampling}'] = {
+            'mean_m2': np.mean(bounds), 'std_m2': np.std(bounds, ddof=1), 'time_s': time_s}
+        table.row(f'{n} {sampling}', shown(np.mean(bounds), 5), shown(np.std(bounds, ddof=1), 5),
+                  shown(time_s, 1))
     write_results(options.json, figures)
 
 
 if __name__ == '__main__':
-    sys.exit(exit_code_of(main))
+    run(main)

@@ -1,35 +1,25 @@
 """Capacity that the beam search does not reach, and its time, in all bands.
 
 Problem: the capacity has many local maxima. A position error costs well under one per cent of it,
-so the loss can only be measured if the search finds nearly the global maximum everywhere. Four
-figures test this: the capacity relative to that of a plain search, one band after the other, and
-the CPU time of both; the capacity relative to that of a long multi-start optimisation, which only
-shares the objective with the search; and the most negative loss, which occurs if the
-beam for an estimate near the true position has a higher capacity there than the beam for that
-position itself.
+so the loss can only be measured if the search finds nearly the global maximum everywhere. Two
+figures test this: the capacity relative to that of a long multi-start optimisation, which only
+shares the objective with the search; and the most negative loss, which occurs if the beam for an
+estimate near the true position has a higher capacity there than the beam for that position itself.
 """
 
-import os
-
-# One thread, as in the transmission node. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
-import argparse
-import sys
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
-from parts.sequential_steering import steer_sequentially
+from parts.frame import benchmark_parser, run, scenario_of, write_results
 from scipy.optimize import minimize
 
-from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacities, steer
+from rhs_isac_ros.link import Beam, capacity, choose_beam, steer
 from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.link.steering import steer_bands
-from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.model.surface import matched_configuration
-from rhs_isac_ros.support.arguments import ArgumentParser, input_file, integer, positive_int, seed
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.support.arguments import input_file
 
 # Standard deviations of the estimates around the true position [m].
 SPREADS_M = (0.01, 0.1, 0.3, 1.0, 3.0)
@@ -37,63 +27,48 @@ SPREADS_M = (0.01, 0.1, 0.3, 1.0, 3.0)
 COVARIANCE_M2 = np.diag([0.9, 0.2, 0.12])**2
 # Positions between which the calls alternate.
 BLOCK = 10
-# Ascents of the long optimisation that are refined element by element.
-REFINED = 5
+# Positions of the long optimisation, its random starts at each, and the number of ascents that are
+# refined element by element.
+N_LONG, STARTS, REFINED = 100, 150, 5
+# Pairs of true position and estimate.
+PAIRS = 2000
 
 
 def main() -> None:
     """Run the benchmark."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark steer', description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = benchmark_parser('steer', __doc__, 300)
     parser.add_argument('--scenario', type=input_file, help='YAML file of the scenario')
-    parser.add_argument('--band', type=integer(0), help='index of the band; all by default')
-    parser.add_argument('--positions', type=positive_int, default=300,
-                        help='positions for the times and the plain search')
-    parser.add_argument('--long', type=integer(0), default=100, metavar='POSITIONS',
-                        help='positions for the long optimisation, of those')
-    parser.add_argument('--starts', type=positive_int, default=150,
-                        help='random starts of the long optimisation per position')
-    parser.add_argument('--pairs', type=positive_int, default=2000,
-                        help='number of pairs of true position and estimate')
-    parser.add_argument('--seed', type=seed, default=1, help='seed of all random numbers')
     options = parser.parse_args()
-    scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
-    bands = range(scenario.n_bands) if options.band is None else [options.band]
-    if bands[-1] >= scenario.n_bands:
-        parser.error(f'argument --band: {options.band}, expected at most {scenario.n_bands - 1}')
+    scenario = scenario_of(options.scenario)
+    bands = range(scenario.n_bands)
     rng = np.random.default_rng(options.seed)
     positions = scenario.sample_positions(options.positions, rng)
     print(f'{len(positions)} positions, seed {options.seed}')
-    compare_times(scenario, bands, positions)
+    figures: dict[str, Any] = {'time_ms': compare_times(scenario, bands, positions)}
     for band in bands:
         print(f'band {band}')
-        found = compare_with_plain(scenario, band, positions)
-        compare_with_matched(scenario, band, positions, found)
-        n_long = min(options.long, len(positions))
-        if n_long:
-            compare_with_long(scenario, band, positions[:n_long], found, options.starts, rng)
-        compare_with_estimates(scenario, band, options.pairs, rng)
+        found = np.array([
+            rate_bps(scenario, steer(scenario, position, band), position)
+            for position in positions])
+        print(f'capacity                   {np.median(found) / 1e6:.2f} Mbit/s median')
+        figures[f'band {band}'] = row = {'capacity_bps': np.median(found)}
+        row['to_long_percent'] = compare_with_long(
+            scenario, band, positions[:N_LONG], found, rng)
+        row['losses_percent'] = compare_with_estimates(scenario, band, rng)
+    write_results(options.json, figures)
 
 
-def compare_times(scenario: Scenario, bands: Sequence[int], positions: np.ndarray) -> None:
-    """Print the CPU times of the choice of a beam and of its parts, and those of a plain search.
+def compare_times(scenario: Scenario, bands: Sequence[int], positions: np.ndarray
+                  ) -> dict[str, float]:
+    """Measure CPU times of the choice of a beam and of its beams alone; return medians [ms].
 
-    The calls alternate every few positions, so that the load of the machine affects all of them.
+    The calls alternate every few positions, so that the load of the machine affects both.
     """
-    def plain(position: np.ndarray) -> None:
-        for band in bands:
-            expected_capacities(
-                scenario, [steer_sequentially(scenario, position, band)], position,
-                COVARIANCE_M2)[0]
-
     calls = {
         'choice of the band': lambda position: choose_beam(
             scenario, position, COVARIANCE_M2, bands),
-        'beams alone': lambda position: steer_bands(scenario, position, bands),
-        'plain search': plain,
-    }
-    times_s = {name: [] for name in calls}
+        'beams alone': lambda position: steer_bands(scenario, position, bands)}
+    times_ms = {name: [] for name in calls}
     for call in calls.values():
         call(positions[0])
     for start in range(0, len(positions), BLOCK):
@@ -101,31 +76,12 @@ def compare_times(scenario: Scenario, bands: Sequence[int], positions: np.ndarra
             for position in positions[start:start + BLOCK]:
                 begin_s = time.process_time()
                 call(position)
-                times_s[name].append(time.process_time() - begin_s)
+                times_ms[name].append(1e3 * (time.process_time() - begin_s))
     print(f'CPU time for {len(bands)} bands')
-    for name, values in times_s.items():
-        print(f'  {name:22}   {1e3 * np.median(values):.2f} ms median, '
-              f'{1e3 * np.quantile(values, 0.95):.2f} ms 95th percentile')
-    ratio = np.median(times_s['plain search']) / np.median(times_s['choice of the band'])
-    print(f'  {"ratio":22}   {ratio:.1f}, plain search over choice of the band')
-
-
-def compare_with_plain(scenario: Scenario, band: int, positions: np.ndarray) -> np.ndarray:
-    """Print the capacity relative to a plain search; return the capacities [bit/s]."""
-    found = [rate_bps(scenario, steer(scenario, position, band), position)
-             for position in positions]
-    plain = [rate_bps(scenario, steer_sequentially(scenario, position, band), position)
-             for position in positions]
-    print_share('plain search', 100 * np.divide(found, plain))
-    print(f'capacity                   {np.median(found) / 1e6:.2f} Mbit/s median')
-    return np.array(found)
-
-
-def print_share(of: str, share: np.ndarray) -> None:
-    """Print statistics of capacities relative to others [per cent]."""
-    print(f'share of the {of:13} {share.min():.4f} % minimum, {np.median(share):.4f} % '
-          f'median, {share.mean():.4f} % mean of {len(share)}; {np.sum(share > 100.0001)} times '
-          'above it')
+    for name, values in times_ms.items():
+        print(f'  {name:22}   {np.median(values):.2f} ms median, '
+              f'{np.quantile(values, 0.95):.2f} ms 95th percentile')
+    return {name: np.median(values) for name, values in times_ms.items()}
 
 
 def rate_bps(scenario: Scenario, beam: Beam, position: np.ndarray) -> float:
@@ -134,21 +90,24 @@ def rate_bps(scenario: Scenario, beam: Beam, position: np.ndarray) -> float:
 
 
 def compare_with_long(
-        scenario: Scenario, band: int, positions: np.ndarray, found: np.ndarray, n_starts: int,
-        rng: np.random.Generator) -> None:
-    """Print the capacity of the search relative to the long optimisation."""
+        scenario: Scenario, band: int, positions: np.ndarray, found: np.ndarray,
+        rng: np.random.Generator) -> float:
+    """Return the least capacity of the search relative to the long optimisation [%]."""
     best, long_s = [], []
     for position in positions:
         begin = time.process_time()
-        best.append(long_optimisation(scenario, band, position, n_starts, rng))
+        best.append(long_optimisation(scenario, band, position, rng))
         long_s.append(time.process_time() - begin)
-    print_share('long optimum', 100 * found[:len(best)] / best)
     print(f'CPU time of the long optimisation {np.median(long_s):.1f} s')
+    share = 100 * found[:len(best)] / best
+    print(f'share of the long optimum  {share.min():.4f} % minimum, {np.median(share):.4f} % '
+          f'median, {share.mean():.4f} % mean of {len(share)}; {np.sum(share > 100.0001)} times '
+          'above it')
+    return float(share.min())
 
 
 def long_optimisation(
-        scenario: Scenario, band: int, position: np.ndarray, n_starts: int,
-        rng: np.random.Generator) -> float:
+        scenario: Scenario, band: int, position: np.ndarray, rng: np.random.Generator) -> float:
     """Return the best capacity of quasi-Newton ascents from random starts [bit/s].
 
     The variable is the configuration, within its bounds; the digital part is always the optimum
@@ -157,7 +116,7 @@ def long_optimisation(
     """
     link = BandLink.to(scenario, position, band)
     ends = []
-    for number in range(n_starts):
+    for number in range(STARTS):
         start = rng.uniform(size=scenario.n_elements)
         start = np.round(start) if number % 2 else start
         result = minimize(negative_capacity(link), start, jac=True, method='L-BFGS-B',
@@ -200,24 +159,11 @@ def refine(link: BandLink, analog: np.ndarray) -> np.ndarray:
     return analog
 
 
-def compare_with_matched(
-        scenario: Scenario, band: int, positions: np.ndarray, found: np.ndarray) -> None:
-    """Print the gain over the holographic principle with the optimal digital part."""
-    gains = []
-    for position, rate in zip(positions, found, strict=True):
-        link = BandLink.to(scenario, position, band)
-        analog = matched_configuration(link.los, link.onboard)
-        matched = rate_bps(scenario, Beam(analog, link.best_digital(analog), band), position)
-        gains.append(100 * (rate / matched - 1))
-    print(f'gain over matched filter   {np.median(gains):.2f} % median, '
-          f'{min(gains):.2f} % minimum')
-
-
 def compare_with_estimates(
-        scenario: Scenario, band: int, n_pairs: int, rng: np.random.Generator) -> None:
-    """Print the loss by position error, and the most negative loss."""
+        scenario: Scenario, band: int, rng: np.random.Generator) -> dict[str, float]:
+    """Return the median loss by position error, and the most negative loss [%]."""
     losses = {spread: [] for spread in SPREADS_M}
-    while sum(map(len, losses.values())) < n_pairs:
+    while sum(map(len, losses.values())) < PAIRS:
         position = scenario.sample_positions(1, rng)[0]
         perfect = rate_bps(scenario, steer(scenario, position, band), position)
         for spread, lost in losses.items():
@@ -227,8 +173,11 @@ def compare_with_estimates(
     for spread, lost in losses.items():
         print(f'loss at {spread:4.2f} m            {np.median(lost):.4f} % median, '
               f'{min(lost):+.4f} % minimum of {len(lost)}')
-    print(f'largest negative loss      {-min(0.0, *map(min, losses.values())):.4f} %')
+    largest = -min(0.0, *map(min, losses.values()))
+    print(f'largest negative loss      {largest:.4f} %')
+    return {f'{spread:g} m': np.median(lost) for spread, lost in losses.items()} | {
+        'largest negative': largest}
 
 
 if __name__ == '__main__':
-    sys.exit(exit_code_of(main, (ScenarioError,)))
+    run(main)

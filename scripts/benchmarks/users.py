@@ -6,71 +6,58 @@ of a cycle in bare rclpy, measured in the same run.
 """
 
 import os
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import rclpy
-from parts.command import benchmark_parser, write_results
+from parts.frame import benchmark_parser, run, write_results
 from parts.hops import CHAIN, ping_pong
 from system.observer import NetworkObserver
 from system.trial_processes import TrialProcesses
 
-from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.ros.processes import private_domain
-from rhs_isac_ros.ros.run import check_domain
-from rhs_isac_ros.ros.startup import use_discovery_profile
+from rhs_isac_ros.ros.environment import check_environment, private_domain, use_discovery_profile
 from rhs_isac_ros.support.arguments import positive_int
-from rhs_isac_ros.tools.demo import max_user_processes, start_network
+from rhs_isac_ros.tools.demo import start_network
 
 TIMEOUT_S = 600.0
 # Minimum number of measured cycles.
 MIN_CYCLES = 200
+# Users of the network to compare with, and users as processes of their own: in the discovery range
+# LOCALHOST, 32 processes of one machine discover each other.
+FEW, SEPARATE = 2, 25
 
 
 def main() -> int:
     """Run the benchmark."""
     parser = benchmark_parser('users', __doc__, default_seed=None)
-    parser.add_argument('--few', type=positive_int, default=2,
-                        help='number of users of the network to compare with')
-    parser.add_argument('--separate', type=positive_int, default=64,
-                        help='number of users as processes of their own; fewer if this machine '
-                        'cannot run as many, and at most 25 in the discovery range LOCALHOST')
     parser.add_argument('--users', type=positive_int, default=1000,
                         help='number of users that share one process')
-    parser.add_argument('--only', choices=('separate', 'together'),
-                        help='compare only one of the two networks with many users')
     parser.add_argument('--rounds', type=positive_int, default=2, help='cycles for each user')
     options = parser.parse_args()
-    check_domain(parser)
-    separate = min(options.separate, max_user_processes())
-    if separate < options.separate and options.only != 'together':
-        print(f'{separate} instead of {options.separate} users as processes, because this '
-              'machine cannot run or discover more')
-    networks = {'separate': (separate, False), 'together': (options.users, True)}
-    chosen = {name: networks[name] for name in ([options.only] if options.only else networks)}
+    check_environment(parser)
+    networks = {'separate': (SEPARATE, False), 'together': (options.users, True)}
     os.environ.update(private_domain())
     use_discovery_profile()
     rclpy.init(args=[])
     scenario = Scenario()
     try:
         # Before and after, because other programs may slow down the machine for a while.
-        few = [run_network(scenario, options.few, options.rounds, False)]
+        few = [run_network(scenario, FEW, options.rounds, False)]
         many = {name: run_network(scenario, users, options.rounds, together)
-                for name, (users, together) in chosen.items()}
-        few.append(run_network(scenario, options.few, options.rounds, False))
+                for name, (users, together) in networks.items()}
+        few.append(run_network(scenario, FEW, options.rounds, False))
         hop_s = np.median(ping_pong(scenario)) / 2
     finally:
         rclpy.try_shutdown()
     hops = len(CHAIN)
-    rate_hz = np.mean([run['rate_hz'] for run in few])
-    for run in many.values():
-        run['rate_ratio'] = run['rate_hz'] / rate_hz
-    for run in (*few, *many.values()):
-        print(describe(run))
+    rate_hz = np.mean([one['rate_hz'] for one in few])
+    for one in many.values():
+        one['rate_ratio'] = one['rate_hz'] / rate_hz
+    for one in (*few, *many.values()):
+        print(describe(one))
     print(f'bare rclpy: {1e3 * hops * hop_s:.2f} ms for the {hops} hops of a cycle')
     write_results(options.json, {
         'hop_us': 1e6 * hop_s, 'floor_ms': 1e3 * hops * hop_s, 'few': few, **many})
@@ -143,4 +130,4 @@ def longest_wait(order: list[int], ended_s: np.ndarray) -> tuple[int, float]:
 
 
 if __name__ == '__main__':
-    sys.exit(exit_code_of(main))
+    run(main)

@@ -19,11 +19,6 @@ method may overfit ten samples.
 Duration on two cores: two minutes with --quick, about 20 minutes without.
 """
 
-import os
-
-# One thread per job. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import argparse
 import json
 import time
@@ -31,7 +26,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from parts.options import parse_options
+from parts.options import parse_options, write_results
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import crlb
@@ -46,8 +41,7 @@ from rhs_isac_ros.experiments import (
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.arguments import positive_int
-from rhs_isac_ros.support.files import write_whole
-from rhs_isac_ros.support.pictures import PAGE_IN, look, new_panels, paper_style, write_picture
+from rhs_isac_ros.support.pictures import PAGE_IN, look, new_panels, paper_style
 
 BANDS = (1, 2, 4, 8)
 TOTAL_FRAMES = 8
@@ -200,9 +194,8 @@ def picture(summary: Summary) -> Any:
 
 def reproduce(options: argparse.Namespace) -> None:
     """Run the jobs that have no results yet, print the report and write the files."""
-    trials, output, name = options.trials, options.output, f'fig3.{options.format}'
-    jobs = make_jobs(trials, options.steps)
-    results = run_jobs(trial, jobs, output / 'jobs', options.jobs, options.dask)
+    trials, jobs = options.trials, make_jobs(options.trials, options.steps)
+    results = run_jobs(trial, jobs, options.output / 'jobs', options.jobs, options.dask)
     entries = [{**job.arguments, **result} for job, result in zip(jobs, results, strict=True)]
     summary = Summary(entries)
     report = '\n\n'.join([
@@ -210,11 +203,8 @@ def reproduce(options: argparse.Namespace) -> None:
         f'held-out positions. Time is CPU time on one core, normalised to {PROPOSED} with '
         f'N_B = {BANDS[0]}.',
         summary.table(), *summary.claims()])
-    write_picture(output / name, picture(summary))
-    write_whole(output / 'fig3.json', json.dumps(
-        {'version': __version__, 'trials': entries}, indent=1) + '\n')
-    write_whole(output / 'fig3.md', f'# Fig. 3\n\n![Fig. 3]({name})\n\n{report}\n')
-    print(f'{report}\n\nwritten: {output}/{name}, fig3.md and fig3.json')
+    write_results(options, 'fig3', 'Fig. 3', report, picture(summary), {'fig3.json': json.dumps(
+        {'version': __version__, 'trials': entries}, indent=1) + '\n'})
 
 
 def mean_and_std(values: Sequence[float]) -> tuple[float, float]:
@@ -241,15 +231,12 @@ def plus_minus(mean: float, std: float, digits: int = 3) -> str:
     return f'{mean:.{places}f}' + ('' if np.isnan(std) else f' ± {std:.{places}f}')
 
 
-def add_steps(parser: argparse.ArgumentParser) -> None:
-    """Add the option that limits the steps of every method."""
-    parser.add_argument('--steps', type=positive_int, metavar='N',
-                        help="limit of update steps (default: each method's own)")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
-    options = parse_options(__doc__, 'fig3', TRIALS, QUICK_TRIALS, arguments, add_steps)
+    options = parse_options(
+        __doc__, 'fig3', TRIALS, QUICK_TRIALS, arguments, lambda parser: parser.add_argument(
+            '--steps', type=positive_int, metavar='N',
+            help="limit of update steps (default: each method's own)"))
     return run_command(lambda: reproduce(options))
 
 

@@ -25,18 +25,13 @@ trial serves an equal share of the positions.
 Duration on two cores: four minutes with --quick, about six hours without.
 """
 
-import os
-
-# One thread per job. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from parts import fig4_grid, fig4_report
+from parts import fig4_report
 from parts.fig4_results import NEURAL, ROWS, Condition, Results, codebook_of
 from parts.options import parse_options
 
@@ -59,12 +54,12 @@ POSITIONS = 10_000
 QUICK_LOSSES = 500
 # N_sam of Table I.
 SAMPLES = 1200
-LEVELS_DB, GRID_LEVELS_DB = (0.0, -30.0), (0.0, -10.0, -20.0, -25.0, -30.0, -40.0)
+LEVELS_DB = (0.0, -30.0)
 QUICK_ROWS = ('algorithm-1', 'scan-width', 'scan-per-band', 'scan-grid', 'random')
 QUICK_CONDITIONS = (Condition(NEURAL, 'parts', 0.0), Condition(NEURAL, 'magnitudes', -30.0),
                     Condition('bayes', '', 0.0), Condition('bayes', '', -30.0))
-# Positions per job of (b), and per call of an estimator.
-BLOCK, BATCH = 250, 50
+# Positions per job of (b).
+BLOCK = 250
 # Seed of the test pairs, which are the same for all; trainings use other seeds.
 TEST_SEED = 1 << 20
 
@@ -105,9 +100,7 @@ def locate(estimator: str, inputs: str, scenario: Mapping[str, Any], codebook: M
         network = train(world, book, pairs, seed, inputs=inputs)
         means, about = network.positions(received), network.about
     else:
-        locator = make_estimator(estimator, world, book)
-        means = np.concatenate([locator.estimate(received[k:k + BATCH]).mean
-                                for k in range(0, len(received), BATCH)])
+        means = make_estimator(estimator, world, book).estimate(received).mean
     lost = ~np.isfinite(means).all(axis=1)
     means[lost] = world.roi_center_m
     return {'means': means.round(5).tolist(), 'without_fix': int(lost.sum()),
@@ -207,9 +200,6 @@ def reproduce(options: argparse.Namespace) -> None:
     """Run the experiment, print the report and write the files."""
     experiment = Experiment(options)
     results = experiment.results(options.conditions)
-    if options.grid:
-        fig4_grid.write(results, options)
-        return
     experiment.add_losses(results)
     fig4_report.write(results, options)
 
@@ -224,18 +214,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add('--losses', type=integer(0, 10**6), metavar='N',
         help=f'positions of panel (b) (default: all, quick {QUICK_LOSSES}; 0 for none)')
     add('--rows', nargs='+', choices=ROWS, help='codebooks (default: all)')
-    add('--inputs', nargs='*', choices=sorted(INPUTS), default=sorted(INPUTS),
-        help='inputs of the network; none for bayes alone')
-    add('--multipath', nargs='+', type=float, metavar='DB',
-        help='levels of the multipath relative to the direct path [dB] (default: '
-             f'{", ".join(f"{level:g}" for level in LEVELS_DB)}; with --grid '
-             f'{", ".join(f"{level:g}" for level in GRID_LEVELS_DB)})')
-    add('--no-bayes', action='store_true', help='leave out the posterior mean')
     add('--conditions', nargs='+', type=condition, metavar='NAME:DB',
-        help='estimators with a level of the multipath each, instead of the previous three '
-             'options; NAME is bayes or an input of the network, as in magnitudes:-30 bayes:0')
-    add('--grid', action='store_true',
-        help='search, after the fact, for the reading of the paper that matches its errors best')
+        help='estimators with the level of the multipath relative to the direct path [dB]; NAME '
+             'is bayes or an input of the network, as in magnitudes:-30 bayes:0')
     add('--ros', action='store_true',
         help='measure (b) in a running network with the default codebook instead, and compare it '
              'with the library; --positions is the number of cycles')
@@ -247,16 +228,10 @@ def complete(options: argparse.Namespace) -> None:
     options.rows = options.rows or (QUICK_ROWS if options.quick else ROWS)
     if options.losses is None:
         options.losses = QUICK_LOSSES if options.quick else options.positions
-    levels = options.multipath or (GRID_LEVELS_DB if options.grid else LEVELS_DB)
-    if options.conditions:
-        return
-    if options.quick and not options.multipath and not options.grid:
-        options.conditions = QUICK_CONDITIONS
-        return
-    neural = [Condition(NEURAL, inputs, level) for inputs in options.inputs for level in levels]
-    bayes = [] if options.no_bayes or options.grid else [
-        Condition('bayes', '', level) for level in levels]
-    options.conditions = (*neural, *bayes)
+    if not options.conditions:
+        readings = [(NEURAL, inputs) for inputs in sorted(INPUTS)] + [('bayes', '')]
+        options.conditions = QUICK_CONDITIONS if options.quick else [
+            Condition(*reading, level) for reading in readings for level in LEVELS_DB]
 
 
 def over_ros(options: argparse.Namespace) -> None:

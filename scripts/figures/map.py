@@ -10,18 +10,13 @@ A trial is a block of 250 positions of `bayes`. Codebooks are optimised against 
 Duration on two cores: two minutes with --quick, about 20 minutes without.
 """
 
-import os
-
-# One thread per job. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import argparse
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from parts.options import parse_options
+from parts.options import parse_options, write_results
 from parts.plans import SEED, add_plan_options, read_plans
 
 from rhs_isac_ros import __version__
@@ -33,8 +28,7 @@ from rhs_isac_ros.experiments.sweep_settings import Setting
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import simulate_pairs
 from rhs_isac_ros.support import streams
-from rhs_isac_ros.support.files import write_whole
-from rhs_isac_ros.support.pictures import PAGE_IN, new_figure, paper_style, write_picture
+from rhs_isac_ros.support.pictures import PAGE_IN, new_figure, paper_style
 
 TRIALS, QUICK_TRIALS = 40, 4
 PHASES, QUICK_PHASES = 10_240, 1024
@@ -115,14 +109,11 @@ def picture(maps: Mapping[str, Mapping[str, np.ndarray]]) -> Any:
     return figure
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of this experiment."""
-    add_plan_options(parser, STEPS, QUICK_STEPS)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
-    options = parse_options(__doc__, 'map', TRIALS, QUICK_TRIALS, arguments, add_options)
+    options = parse_options(
+        __doc__, 'map', TRIALS, QUICK_TRIALS, arguments,
+        lambda parser: add_plan_options(parser, STEPS, QUICK_STEPS))
     phases = QUICK_PHASES if options.quick else PHASES
     steps = options.steps or (QUICK_STEPS if options.quick else STEPS)
 
@@ -132,13 +123,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             [np.nanmin(own[key]), np.nanmax(own[key])])) for key in TITLES)]
             for name, own in maps.items()]
         report = markdown_table(['plan', *(f'{title} [m]' for title in TITLES.values())], rows)
-        name = f'map.{options.format}'
-        write_picture(options.output / name, picture(maps))
-        write_whole(options.output / 'map.json', json.dumps({'version': __version__, 'maps_m2': {
-            name: {key: own[key].tolist() for key in TITLES} for name, own in maps.items()}},
-            indent=1) + '\n')
-        write_whole(options.output / 'map.md', f'# Map\n\n![map]({name})\n\n{report}\n')
-        print(f'{report}\n\nwritten: {options.output}/{name}, map.md and map.json')
+        data = {name: {key: own[key].tolist() for key in TITLES} for name, own in maps.items()}
+        write_results(options, 'map', 'Map', report, picture(maps), {'map.json': json.dumps(
+            {'version': __version__, 'maps_m2': data}, indent=1) + '\n'})
 
     return run_command(reproduce)
 

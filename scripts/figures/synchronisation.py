@@ -12,17 +12,11 @@ Timing and carrier offsets act within a band only.
 Duration on two cores: three minutes with --quick, about half an hour without.
 """
 
-import os
-
-# One thread per job. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
-import argparse
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from parts.options import parse_options
+from parts.options import parse_options, write_results
 from parts.plans import SEED, Plan, add_plan_options, read_plans
 
 from rhs_isac_ros.experiments import markdown_table, run_command
@@ -30,8 +24,7 @@ from rhs_isac_ros.experiments.sweep import BLOCK, Point, Sweep, run_sweep, table
 from rhs_isac_ros.experiments.sweep_picture import add_legend, draw_panel
 from rhs_isac_ros.experiments.sweep_settings import FIELDS, Axis, Setting
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.support.files import write_whole
-from rhs_isac_ros.support.pictures import PAGE_IN, new_panels, paper_style, write_picture
+from rhs_isac_ros.support.pictures import PAGE_IN, new_panels, paper_style
 
 TRIALS, QUICK_TRIALS = 20, 1
 STEPS, QUICK_STEPS = 600, 100
@@ -117,28 +110,20 @@ def picture(points: Sequence[Point], plans: Sequence[str]) -> Any:
     return figure
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of this experiment."""
-    add_plan_options(parser, STEPS, QUICK_STEPS)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = parse_options(
-        __doc__, 'synchronisation', TRIALS, QUICK_TRIALS, arguments, add_options)
+        __doc__, 'synchronisation', TRIALS, QUICK_TRIALS, arguments,
+        lambda parser: add_plan_options(parser, STEPS, QUICK_STEPS))
     plans = read_plans(options.plan)
     sweep = sweep_of(plans, options.trials,
                      options.steps or (QUICK_STEPS if options.quick else STEPS))
 
     def reproduce() -> None:
         points = run_sweep(sweep, options.output / 'jobs', options.jobs, options.dask)
-        report, name = report_of(points, list(plans)), f'synchronisation.{options.format}'
-        write_picture(options.output / name, picture(points, list(plans)))
-        write_whole(options.output / 'synchronisation.csv', table(sweep, points))
-        write_whole(options.output / 'synchronisation.md',
-                    f'# Synchronisation\n\n![synchronisation]({name})\n\n{report}\n')
-        print(f'{report}\n\nwritten: {options.output}/{name}, synchronisation.csv and '
-              'synchronisation.md')
+        write_results(
+            options, 'synchronisation', 'Synchronisation', report_of(points, list(plans)),
+            picture(points, list(plans)), {'synchronisation.csv': table(sweep, points)})
 
     return run_command(reproduce)
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rhs_isac_ros.bounds import AverageCrlb, average_crlb, crlb, rows
+from rhs_isac_ros.bounds import AverageCrlb, average_crlb, crlb
 from rhs_isac_ros.bounds.average import Average, Gradient
 from rhs_isac_ros.bounds.rows import RowSource
 from rhs_isac_ros.codebook import Codebook
@@ -37,9 +37,9 @@ def items(request):
                                 2, 3, 9)
 
 
-def make(scenario, items, loss, tolerance=0.0):
+def make(scenario, items, loss, tolerance=0.0, **options):
     return Average(RowSource(
-        scenario, lambda block, band: items[block, :, band], N_ITEMS, items.shape[1]),
+        scenario, lambda block, band: items[block, :, band], N_ITEMS, items.shape[1], **options),
         loss, tolerance)
 
 
@@ -111,43 +111,14 @@ def test_value_alone_equals_the_value_with_gradients(faded, items, loss, toleran
 @pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
 @pytest.mark.parametrize('size', [1, 3, 7])
 def test_results_do_not_depend_on_the_blocks(
-        faded, items, loss, monkeypatch, tolerance, size):
+        faded, items, loss, tolerance, size):
     """The last block is shorter, of equal size, or the only one; the loss depends on the item."""
     scenario, codebook = faded
     expected = make(scenario, items, loss)(codebook)
-    monkeypatch.setattr(rows, '_BLOCK', size)
-    average = make(scenario, items, loss, tolerance)
+    average = make(scenario, items, loss, tolerance, block=size)
     assert len(average.rows.blocks()) == -(-N_ITEMS // (size * max(3 // items.shape[1], 1)))
     assert_is(average(codebook), expected, max(1e-12, 10 * tolerance))
     assert average.value(codebook) == pytest.approx(expected.value, rel=max(1e-12, 10 * tolerance))
-
-
-def test_evaluations_do_not_affect_each_other(faded, items, loss, random_beams):
-    scenario, codebook = faded
-    average = make(scenario, items, loss)
-    expected = average(codebook)
-    average(random_beams(scenario, np.random.default_rng(6)))
-    average.value(random_beams(scenario, np.random.default_rng(7)))
-    assert_is(average(codebook), expected, 1e-14)
-
-
-def test_the_loss_receives_every_item_once_and_in_order(faded, items, plain, monkeypatch):
-    scenario, codebook = faded
-    monkeypatch.setattr(rows, '_BLOCK', 3)
-    seen = []
-
-    def record(block, forms):
-        seen.append((range(N_ITEMS)[block], forms.copy()))
-        return np.zeros(len(forms)), np.zeros_like(forms)
-
-    average = make(scenario, items, record)
-    p = plain(scenario, codebook.analog, codebook.digital)
-    expected = plain_forms(p, items, multipath_covariance(scenario))
-    for evaluate in (average, average.value):
-        seen.clear()
-        evaluate(codebook)
-        assert [n for numbers, _ in seen for n in numbers] == list(range(N_ITEMS))
-        assert_is([np.concatenate([forms for _, forms in seen])], [expected], 1e-9)
 
 
 def assert_matches_vectors(outcome, vectors, tolerance=1e-8, value_tolerance=1e-8):
@@ -213,18 +184,6 @@ def test_the_bound_is_the_mean_of_the_bounds_of_many_positions(small):
         assert average(small.codebook).value == pytest.approx(expected, rel=allowed)
 
 
-def test_the_bound_does_not_depend_on_a_common_phase_of_a_frame(small):
-    """Noise and multipath are circular, so the gradient has no component along the phase."""
-    value, _, by_digital = average_crlb(
-        small.scenario, small.codebook, small.vectors['positions'])
-    turned = dataclasses.replace(
-        small.codebook, digital=small.codebook.digital * np.exp(0.7j))
-    assert average_crlb(small.scenario, turned, small.vectors['positions']).value == pytest.approx(
-        value, rel=1e-9)
-    along = np.sum(by_digital.conj() * 1j * small.codebook.digital, axis=(1, 3)).real
-    assert np.abs(along).max() < 1e-7 * value
-
-
 @pytest.mark.parametrize('tolerance', [0, 1e-5], ids=['exact', 'compressed'])
 def test_singular_information_is_infinite_and_flat_without_a_warning(small, tolerance):
     dark = Codebook(np.zeros((1, 2, 16)), small.codebook.digital)
@@ -235,13 +194,11 @@ def test_singular_information_is_infinite_and_flat_without_a_warning(small, tole
     np.testing.assert_array_equal(by_digital, 0)
 
 
-@pytest.mark.parametrize('positions', [
-    np.zeros((0, 3)), [10.0, 0.0, 0.0], [[10.0, 0.0]], [[np.nan, 0.0, 0.0]]])
-def test_malformed_positions_are_errors(small, positions):
-    with pytest.raises(ValueError, match='^positions: .*, expected '):
-        average_crlb(small.scenario, small.codebook, np.array(positions))
-    with pytest.raises(ValueError, match='^positions: .*, expected '):
-        AverageCrlb(small.scenario, np.array(positions), 1e-3)
+def test_an_average_over_no_positions_is_an_error(small):
+    for call in (lambda empty: average_crlb(small.scenario, small.codebook, empty),
+                 lambda empty: AverageCrlb(small.scenario, empty, 1e-3)):
+        with pytest.raises(ValueError, match='^positions: .*, expected '):
+            call(np.zeros((0, 3)))
 
 
 FACTORS = tuple(one.field for one in BUILT_IN)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import (
+    average_crlb,
     crlb,
     crlb_of,
     fisher,
@@ -15,7 +16,8 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.model.multipath import multipath_covariance
+from rhs_isac_ros.model.scenario import ScenarioError
+from rhs_isac_ros.positioning import make_estimator
 
 
 def test_information_and_bound_match_the_vectors(case):
@@ -25,52 +27,6 @@ def test_information_and_bound_match_the_vectors(case):
     np.testing.assert_allclose(information, case.vectors['fim'], rtol=1e-8, atol=1e-10 * scale)
     bound = crlb(case.scenario, case.codebook, positions)
     assert bound.dtype == float
-    np.testing.assert_allclose(bound, case.vectors['crlb'], rtol=1e-8)
-
-
-@pytest.fixture(scope='module')
-def faded(random_beams):
-    """Three bands whose sub-bands and frames are far from fully correlated."""
-    scenario = Scenario(
-        center_frequencies_hz=(1.2e9, 2e9, 3.1e9), n_subbands=2, n_frames=3, n_feeds=2,
-        elements_per_side=3, subband_width_hz=4e5, frame_duration_s=3e-3, noise_psd_dbm_hz=-150,
-        roi_center_m=(3, 0, 0), roi_size_m=(2, 4, 2))
-    return scenario, random_beams(scenario, np.random.default_rng(0))
-
-
-def test_information_and_bound_match_the_definition_for_low_correlation(faded, plain):
-    scenario, codebook = faded
-    p = plain(scenario, codebook.analog, codebook.digital)
-    spatial = multipath_covariance(scenario)
-    positions = scenario.sample_positions(3, np.random.default_rng(1))
-    information = fisher_information(MeasurementModel(scenario, codebook), positions)
-    for n, position in enumerate(positions):
-        expected = p.information(position, spatial)
-        np.testing.assert_allclose(
-            information[n], expected, rtol=0, atol=1e-8 * np.abs(expected).max())
-    np.testing.assert_allclose(
-        crlb(scenario, codebook, positions), p.crlb(positions, spatial), rtol=1e-8)
-
-
-def test_a_model_serves_all_positions(case, monkeypatch):
-    model = MeasurementModel(case.scenario, case.codebook).prepare()
-
-    def fail(*arguments):
-        raise AssertionError('factored again')
-
-    monkeypatch.setattr(np.linalg, 'cholesky', fail)
-    for n, position in enumerate(case.vectors['positions']):
-        np.testing.assert_allclose(
-            crlb_of(model, position[None]), case.vectors['crlb'][n], rtol=1e-8)
-        scale = np.abs(case.vectors['fim'][n]).max()
-        np.testing.assert_allclose(
-            fisher_information(model, position[None])[0], case.vectors['fim'][n], rtol=1e-8,
-            atol=1e-8 * scale)
-
-
-def test_bound_does_not_depend_on_the_blocks(case, monkeypatch):
-    monkeypatch.setattr(fisher, '_BLOCK', 4)
-    bound = crlb(case.scenario, case.codebook, case.vectors['positions'])
     np.testing.assert_allclose(bound, case.vectors['crlb'], rtol=1e-8)
 
 
@@ -178,12 +134,6 @@ def test_no_positions_give_no_bounds(small):
     assert crlb(small.scenario, small.codebook, np.zeros((0, 3))).shape == (0,)
 
 
-@pytest.mark.parametrize('positions', [[10.0, 0.0, 0.0], [[10.0, 0.0]], [[np.nan, 0.0, 0.0]]])
-def test_malformed_positions_are_errors(small, positions):
-    with pytest.raises(ValueError, match='^positions: .*, expected '):
-        crlb(small.scenario, small.codebook, np.array(positions))
-
-
 DECLARED = {
     'user_gain_std_db': 2.0, 'carrier_offset_std_hz': 700.0, 'phase_std_rad': 0.4,
     'timing_std_s': 30e-9, 'band_phase_std_rad': 0.7}
@@ -262,3 +212,33 @@ def test_a_flat_region_determines_the_coordinate(table1):
     information = fisher_information(model, positions)[:, :2, :2]
     expected = np.linalg.inv(information + np.eye(2) * 12 / 100).trace(axis1=1, axis2=2)
     np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize('changes', [
+    {'noise_psd_dbm_hz': -300.0}, {'noise_psd_dbm_hz': -250.0}, {'max_power_w': 1e6},
+    {'multipath_to_los_db': 100.0},
+    {'noise_psd_dbm_hz': -300.0, 'failed_element_share': 0.01, 'element_error_rms': 0.0}])
+def test_a_singular_covariance_is_an_error_that_names_the_fields(random_beams, changes):
+    """The multipath is the same in all sub-bands, and stronger than the noise by 15 orders."""
+    scenario = Scenario(delay_spread_s=0.0, **changes)
+    codebook = random_beams(scenario, np.random.default_rng(0))
+    if scenario.failed_element_share:
+        # The errors of the elements make the covariance regular.
+        assert np.isfinite(crlb(scenario, codebook, [[10.0, 1.0, 0.2]])).all()
+        with pytest.raises(ScenarioError, match='^noise_psd_dbm_hz: '):
+            make_estimator('bayes', scenario, codebook).estimate(np.zeros((2, 32), complex) + 1e-6)
+        return
+    for call in (crlb, average_crlb):
+        with pytest.raises(ScenarioError, match=(
+                '^noise_psd_dbm_hz: .*multipath_to_los_db.*delay_spread_s.*singular')):
+            call(scenario, codebook, [[10.0, 1.0, 0.2]])
+
+
+def test_weak_noise_is_no_error_if_the_covariance_is_regular(random_beams):
+    """Without noise, the bound depends on the multipath alone."""
+    bounds = []
+    for noise_psd_dbm_hz in (-250.0, -400.0):
+        scenario = Scenario(noise_psd_dbm_hz=noise_psd_dbm_hz, max_power_w=1e6)
+        codebook = random_beams(scenario, np.random.default_rng(0))
+        bounds.append(crlb(scenario, codebook, [[10.0, 1.0, 0.2]]))
+    np.testing.assert_allclose(*bounds, rtol=1e-6)

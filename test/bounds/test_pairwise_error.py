@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 
-from rhs_isac_ros.bounds import rows
 from rhs_isac_ros.bounds.pairwise_error import PairwiseErrorCost, best_phases
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
@@ -74,13 +73,6 @@ def assert_near(outcome, expected, tolerance):
             actual, wanted, rtol=0, atol=tolerance * np.abs(wanted).max())
 
 
-def test_the_pairs_of_these_tests_are_sometimes_confused(
-        scenario, codebook, pairs, plain):
-    p = plain(scenario, codebook.analog, codebook.digital)
-    q = plain_distances(p, *pairs, multipath_covariance(scenario))
-    assert 0.05 < q.min() < 2 < q.max() < 50
-
-
 @pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
 def test_value_matches_the_definition(scenario, codebook, pairs, plain_of, tolerance):
     cost = PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)
@@ -138,30 +130,6 @@ def test_gradients_are_the_limit_of_differences_of_the_value(
 
 
 @pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
-def test_pairs_are_weighted_in_all_blocks(
-        scenario, codebook, pairs, plain_of, monkeypatch, tolerance):
-    monkeypatch.setattr(rows, '_BLOCK', 1)
-    weights = np.random.default_rng(3).uniform(0, 2, N_PAIRS)
-    weights[5] = 0
-    expected = np.mean(weights * plain_of(codebook.analog, codebook.digital, *pairs))
-    outcome = PairwiseErrorCost(scenario, *pairs, weights, tolerance)(codebook)
-    assert outcome.value == pytest.approx(expected, rel=1e-5)
-    # A pair of weight 2 counts twice, and a pair of weight 0 does not count.
-    ones = PairwiseErrorCost(
-        scenario, *pairs, np.where(np.arange(N_PAIRS) == 2, 2.0, weights > 1), tolerance)
-    chosen = [*np.flatnonzero((weights > 1) & (np.arange(N_PAIRS) != 2)), 2, 2]
-    assert len(chosen) < N_PAIRS
-    repeated = PairwiseErrorCost(scenario, *pairs[:, chosen], tolerance=tolerance)(codebook)
-    assert_near(ones(codebook), [x * len(chosen) / N_PAIRS for x in repeated], 1e-5)
-
-
-@pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
-def test_the_order_in_a_pair_does_not_matter(scenario, codebook, pairs, tolerance):
-    assert_near(PairwiseErrorCost(scenario, *pairs[::-1], tolerance=tolerance)(codebook),
-                PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)(codebook), 1e-5)
-
-
-@pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
 def test_a_pair_of_the_same_position_costs_nothing(scenario, codebook, pairs, tolerance):
     expected = PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)(codebook)
     same = np.concatenate([pairs, pairs[[0, 0], :2]], axis=1)
@@ -195,16 +163,6 @@ def test_pairs_that_are_never_confused_cost_nothing_without_a_warning(
     assert value == 0
     np.testing.assert_array_equal(by_analog, 0)
     np.testing.assert_array_equal(by_digital, 0)
-
-
-@pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
-@pytest.mark.parametrize('bad', [
-    [10.0, 0.0, 0.0], [[10.0, 0.0]], [[np.nan, 0.0, 0.0]], [[np.inf, 0.0, 0.0]]])
-def test_malformed_positions_are_errors(scenario, bad, tolerance):
-    good = np.array([[3.0, 0.0, 0.0]])
-    for first, second in ((bad, good), (good, bad)):
-        with pytest.raises(ValueError, match='^positions: .*, expected '):
-            PairwiseErrorCost(scenario, np.array(first), np.array(second), tolerance=tolerance)
 
 
 @pytest.mark.parametrize(('n_first', 'n_second'), [(0, 0), (3, 2), (1, 3), (2, 0)])

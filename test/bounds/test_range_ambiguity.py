@@ -82,9 +82,3 @@ def test_a_strong_signal_without_multipath_is_not_confused(scenario):
 
 def test_a_region_shorter_than_a_wavelength_has_no_confused_ranges(scenario):
     assert error_of(dataclasses.replace(scenario, roi_size_m=(0.02, 0.02, 0.02))) == 0
-
-
-def test_malformed_positions_are_an_error(scenario):
-    model = MeasurementModel(scenario, random_codebook(scenario, np.random.default_rng(0)))
-    with pytest.raises(ValueError, match='^positions: '):
-        range_confusion_error_of(model, np.zeros((2, 2)), np.random.default_rng(0))

@@ -51,9 +51,10 @@ def source_of(items):
     return lambda block, band: items[block, :, band].copy()
 
 
-def make(scenario, items, tolerance=0.0):
-    source = RowSource(scenario, source_of(items), len(items), items.shape[1])
-    return CompressedRows(source, tolerance) if tolerance else ExactRows(source)
+def make(scenario, items, tolerance=0.0, block=16, **options):
+    source = RowSource(scenario, source_of(items), len(items), items.shape[1], block=block)
+    return (CompressedRows(source, tolerance, **options) if tolerance
+            else ExactRows(source, **options))
 
 
 def evaluate(some_rows, model, n_rows, seed=2):
@@ -61,7 +62,7 @@ def evaluate(some_rows, model, n_rows, seed=2):
     evaluation, rng = Evaluation(some_rows, model), np.random.default_rng(seed)
     bands = range(len(model.radiation))
     whitened = [[] for _ in bands]
-    for block in rows.blocks(some_rows.n_items, 3, 0):
+    for block in some_rows.blocks():
         weights = rng.normal(size=(block.stop - block.start, n_rows, n_rows))
         for band in bands:
             whitened[band].append(evaluation.whitened(block, band).copy())
@@ -98,7 +99,7 @@ def recovered(some_rows, scenario):
     evaluation = Evaluation(some_rows, SimpleNamespace(
         radiation=np.stack([elements] * scenario.n_bands),
         whitener=np.stack([np.eye(size, dtype=complex)] * scenario.n_bands)))
-    blocks = rows.blocks(some_rows.n_items, 3, 0)
+    blocks = some_rows.blocks()
     bands = [np.concatenate([evaluation.whitened(block, i) for block in blocks])
              for i in range(scenario.n_bands)]
     whole = np.stack(bands, axis=2)
@@ -137,16 +138,14 @@ def assert_same(first, second, tolerance):
             assert_near(a, b, tolerance)
 
 
-def test_exact_evaluations_match_the_definition(wide, items, model, monkeypatch):
-    monkeypatch.setattr(rows, '_BLOCK', 16)
+def test_exact_evaluations_match_the_definition(wide, items, model):
     assert_same(evaluate(make(wide, items), model, items.shape[1]),
                 plain_evaluation(wide, items, model), 1e-12)
 
 
 @pytest.mark.parametrize('tolerance', [1e-7, 1e-5, 1e-3])
 def test_compressed_evaluations_match_exact_ones_to_the_tolerance(
-        wide, items, model, monkeypatch, tolerance):
-    monkeypatch.setattr(rows, '_BLOCK', 16)
+        wide, items, model, tolerance):
     compressed = evaluate(make(wide, items, tolerance), model, items.shape[1])
     assert_same(compressed, plain_evaluation(wide, items, model), 10 * tolerance)
     assert_same(compressed, evaluate(make(wide, items), model, items.shape[1]), 10 * tolerance)
@@ -173,17 +172,6 @@ def test_errors_are_relative_to_the_norm_of_each_row(wide, items):
         assert least <= rank <= least + 1
 
 
-@pytest.mark.parametrize('n_items', [1, 2, 7])
-def test_the_rank_does_not_exceed_the_number_of_rows(wide, items, model, n_items):
-    few = items[:n_items]
-    assert few.shape[0] * few.shape[1] < rows._MIN_SKETCH
-    compressed = make(wide, few, 1e-6)
-    assert max(compressed.ranks) <= few.shape[0] * few.shape[1]
-    assert (relative_errors(compressed, wide, few) <= 1e-6).all()
-    assert_same(evaluate(compressed, model, few.shape[1]),
-                plain_evaluation(wide, few, model), 1e-5)
-
-
 @pytest.fixture
 def sizes(monkeypatch):
     """Numbers of columns of the sketches, in order."""
@@ -198,14 +186,12 @@ def sizes(monkeypatch):
 
 
 def test_a_sketch_that_is_too_small_doubles_until_it_suffices(
-        wide, items, model, monkeypatch, sizes):
+        wide, items, model, sizes):
     tolerance = 1e-4
     expected = make(wide, items, tolerance)
     assert sizes == [min(128, items.shape[0] * items.shape[1])] * 2
     sizes.clear()
-    monkeypatch.setattr(rows, '_MIN_SKETCH', 2)
-    monkeypatch.setattr(rows, '_MAX_RANK', 2)
-    grown = make(wide, items, tolerance)
+    grown = make(wide, items, tolerance, n_columns=2)
     firsts = [k for k, size in enumerate(sizes) if size == 2]
     assert len(firsts) == 2
     for made, least in zip((sizes[:firsts[1]], sizes[firsts[1]:]),
@@ -245,19 +231,6 @@ def test_zero_rows_stay_zero_and_do_not_affect_the_rank(wide, items, model):
         assert abs(rank - least) <= 1
 
 
-@pytest.mark.parametrize('n_items', [1, 40, 200])
-def test_zero_rows_alone_give_zeros(wide, model, n_items):
-    items = np.zeros((n_items, 1, 2, 4, 36), complex)
-    for some_rows in (make(wide, items), make(wide, items, 1e-5)):
-        whitened, sums = evaluate(some_rows, model, 1)
-        for band in range(2):
-            assert whitened[band].shape == (n_items, 1, 12)
-            np.testing.assert_array_equal(whitened[band], 0)
-            mean_term, covariance_term = sums[band]
-            np.testing.assert_array_equal(mean_term, np.zeros((12, 36)))
-            np.testing.assert_array_equal(covariance_term, np.zeros((12, 12)))
-
-
 @pytest.mark.parametrize('tolerance', [
     0.0, np.nextafter(rows.MIN_TOLERANCE, 0), 1e-300, -1.0, 1.0, np.inf, -np.inf,
     np.nan])
@@ -275,36 +248,16 @@ def test_results_are_reproducible_to_the_bit(wide, items, model, tolerance):
         assert_same(outcome, outcomes[0], 0)
 
 
-@pytest.mark.parametrize('tolerance', [0, 1e-5], ids=['exact', 'compressed'])
-def test_concurrent_evaluations_are_independent(
-        wide, items, model, random_beams, tolerance):
-    some_rows = make(wide, items, tolerance)
-    other_model = MeasurementModel(wide, random_beams(wide, np.random.default_rng(5)))
-    expected = evaluate(some_rows, model, items.shape[1])
-    first, second = Evaluation(some_rows, model), Evaluation(some_rows, other_model)
-    rng = np.random.default_rng(2)
-    for block in rows.blocks(some_rows.n_items, 3, 0):
-        weights = rng.normal(size=(block.stop - block.start, *[items.shape[1]] * 2))
-        for band in range(2):
-            part = first.whitened(block, band).copy()
-            other = second.whitened(block, band)
-            second.accumulate(block, band, weights @ other)
-            first.accumulate(block, band, weights @ part)
-    for band in range(2):
-        for actual, wanted in zip(first.sums(band), expected[1][band], strict=True):
-            assert_near(actual, wanted, 1e-13)
-
-
 @pytest.mark.parametrize('size', [1, 7, 30, 60, 100])
-def test_results_do_not_depend_on_the_blocks(wide, items, model, monkeypatch, size):
+def test_results_do_not_depend_on_the_blocks(wide, items, model, size):
     expected = plain_evaluation(wide, items, model)
-    monkeypatch.setattr(rows, '_BLOCK', size)
-    for some_rows, tolerance in ((make(wide, items), 1e-12), (make(wide, items, 1e-6), 1e-5)):
-        blocks = [range(N_ITEMS)[block] for block in rows.blocks(some_rows.n_items, 3, 0)]
+    for tolerance, error in ((0.0, 1e-12), (1e-6, 1e-5)):
+        some_rows = make(wide, items, tolerance, size)
+        blocks = [range(N_ITEMS)[block] for block in some_rows.blocks()]
         assert [n for block in blocks for n in block] == list(range(N_ITEMS))
         lengths = [len(block) for block in blocks]
-        assert lengths[:-1] == [size] * (len(lengths) - 1)
-        assert_same(evaluate(some_rows, model, items.shape[1]), expected, tolerance)
+        assert lengths[:-1] == [size * max(3 // items.shape[1], 1)] * (len(lengths) - 1)
+        assert_same(evaluate(some_rows, model, items.shape[1]), expected, error)
 
 
 class RecordingSource:
@@ -318,13 +271,12 @@ class RecordingSource:
 
 @pytest.mark.parametrize(('spare', 'kept'), [(0, True), (-1, False)], ids=['fits', 'too large'])
 def test_exact_rows_are_kept_only_within_the_memory_limit(
-        wide, items, model, monkeypatch, spare, kept):
-    monkeypatch.setattr(rows, '_CACHE_BYTES', items.nbytes + spare)
-    monkeypatch.setattr(rows, '_BLOCK', 25)
+        wide, items, model, spare, kept):
     source = RecordingSource(items)
-    some_rows = ExactRows(RowSource(wide, source, N_ITEMS, items.shape[1]))
-    every = {(start, stop, band) for start, stop in ((0, 25), (25, 50), (50, 60))
-             for band in range(2)}
+    some_rows = ExactRows(RowSource(wide, source, N_ITEMS, items.shape[1], block=8),
+                          max_bytes=items.nbytes + spare)
+    every = {(block.start, block.stop, band) for block in some_rows.blocks() for band in range(2)}
+    assert len(every) > 4
     expected = plain_evaluation(wide, items, model)
     for evaluation in range(2):
         source.calls.clear()
@@ -335,11 +287,9 @@ def test_exact_rows_are_kept_only_within_the_memory_limit(
             assert set(source.calls) == every
 
 
-def test_memory_of_rows_beyond_the_limit_is_released(wide, items, model, monkeypatch):
+def test_memory_of_rows_beyond_the_limit_is_released(wide, items, model):
     """After an evaluation, little more than one of six blocks remains in memory."""
-    monkeypatch.setattr(rows, '_CACHE_BYTES', 0)
-    monkeypatch.setattr(rows, '_BLOCK', 10)
-    some_rows = make(wide, items)
+    some_rows = make(wide, items, block=10 // max(3 // items.shape[1], 1), max_bytes=0)
     evaluate(some_rows, model, items.shape[1])
     tracemalloc.start()
     try:

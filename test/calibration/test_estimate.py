@@ -5,7 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rhs_isac_ros.calibration import Pilots, SurfacePrior, calibrate, prior_of
+from rhs_isac_ros.calibration import (
+    CalibrationWarning,
+    Pilots,
+    SurfacePrior,
+    calibrate,
+    prior_of,
+    report,
+)
 from rhs_isac_ros.calibration.estimate import initial_values
 from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario
 from rhs_isac_ros.model.elements import DeclaredElements, SurfaceEstimate
@@ -53,6 +60,35 @@ def test_deviations_are_those_of_the_errors(scenario, beams, damaged, send, trut
         # Offsets of elements that surely work are zero without any uncertainty.
         normalised.append((np.abs(errors) / np.maximum(std, 1e-12))[std > 1e-4])
     assert 0.8 < np.mean(np.concatenate(normalised)**2) < 1.25
+
+
+def test_repeated_pilots_add_nothing(scenario, beams, damaged, send):
+    """The multipath of a user at rest is the same in all cycles."""
+    pilots = send(scenario, beams, damaged(3), 10)
+    repeated = Pilots(beams, np.repeat(pilots.positions, 6, 0), np.repeat(pilots.received, 6, 0))
+    one, six = (calibrate(scenario, [group]).surface for group in (pilots, repeated))
+    np.testing.assert_array_equal(six.failed, one.failed)
+    np.testing.assert_allclose(six.gains, one.gains, rtol=1e-6)
+    np.testing.assert_allclose(six.std(), one.std(), atol=1e-6)
+
+
+@pytest.mark.parametrize(('change', 'error'), [
+    (lambda x, y: (1000 * x, y), r'^positions: .* m outside of the region .* in metres'),
+    (lambda x, y: (x, 0 * y), '^received: signals of 0 W in row 0, band 0, expected'),
+])
+def test_impossible_pilots_are_refused(scenario, beams, send, change, error):
+    pilots = send(scenario, beams, None, 5)
+    with pytest.raises(ValueError, match=error):
+        calibrate(scenario, [Pilots(beams, *change(pilots.positions, pilots.received))])
+
+
+def test_shifted_positions_cause_a_warning(scenario, beams, damaged, send):
+    pilots = send(scenario, beams, damaged(3))
+    shifted = Pilots(beams, pilots.positions + [1.0, 0.0, 0.0], pilots.received)
+    with pytest.warns(CalibrationWarning, match=r'^positions: \d+ of 60 pilots do not fit'):
+        calibration = calibrate(scenario, [shifted])
+    (text,) = calibration.about['warnings']
+    assert f'warning: {text}' in report(calibration, scenario).splitlines()
 
 
 def test_without_pilots_the_estimate_is_the_prior(scenario, beams):

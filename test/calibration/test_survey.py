@@ -1,6 +1,10 @@
 """The covariance of the multipath from signals at known positions."""
 
 import dataclasses
+import runpy
+import sys
+import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,15 +17,36 @@ from rhs_isac_ros.calibration import (
     survey,
     survey_report,
 )
-from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario
+from rhs_isac_ros.calibration.survey import PLACE_WAVELENGTHS
+from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario, simulate_received
 from rhs_isac_ros.positioning import make_estimator
 
 # The multipath of the hall differs from the declared one.
 DECLARED = Scenario(elements_per_side=5, n_subbands=4, n_frames=3, n_feeds=2)
 FIELDS = {'multipath_to_los_db': -5.0, 'delay_spread_s': 200e-9, 'angular_spread_deg': 30.0}
 HALL = dataclasses.replace(DECLARED, **FIELDS)
+# The package has a function of the same name.
+survey_module = sys.modules['rhs_isac_ros.calibration.survey']
+EXAMPLES = Path(__file__).parents[2] / 'docs' / 'examples'
 # Squared Mahalanobis radius of the 95 % region.
 RADIUS = 7.815
+
+
+def measured(*arguments):
+    """Survey without a warning of few places."""
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', SurveyWarning)
+        return survey(*arguments)
+
+
+def covered(scenario, beams, positions, received):
+    """Share of users with a fix, and share of these in their 95 % region."""
+    estimate = make_estimator('bayes', scenario, beams).estimate(received)
+    fix = estimate.fix
+    errors = (estimate.mean - positions)[fix]
+    distances = np.einsum('na,na->n', errors, np.linalg.solve(
+        estimate.covariance[fix], errors[..., None])[..., 0])
+    return fix.mean(), np.sum(distances <= RADIUS) / max(fix.sum(), 1)
 
 
 def send(scenario, beams, n, seed=1):
@@ -61,7 +86,8 @@ def test_the_covariance_is_that_of_the_hall(estimate, beams):
 def test_the_report_lists_what_was_found(estimate):
     text = survey_report(estimate)
     assert text.startswith('100 positions, 0 more without a direct path, codebook ')
-    assert 'in the 95 % region' in text
+    assert f'\nplaces: {estimate.about["places"]};' in text
+    assert 'of the places left out are in the 95 % region' in text
     assert 'warning' not in text
 
 
@@ -85,12 +111,7 @@ def test_estimates_after_a_survey_are_in_their_regions(shipped):
             'declared': declared,
             'measured': dataclasses.replace(
                 declared, multipath=survey(declared, shipped, *receive(100, 7)))}.items():
-        estimate = make_estimator('bayes', scenario, shipped).estimate(received)
-        fix = estimate.fix
-        errors = (estimate.mean - positions)[fix]
-        distances = np.einsum('na,na->n', errors, np.linalg.solve(
-            estimate.covariance[fix], errors[..., None])[..., 0])
-        shares[name] = fix.mean(), np.sum(distances <= RADIUS) / max(fix.sum(), 1)
+        shares[name] = covered(scenario, shipped, positions, received)
     assert shares['measured'][0] >= 0.98
     assert 0.91 <= shares['measured'][1] <= 0.995
     assert min(shares['declared']) < 0.8
@@ -178,12 +199,126 @@ def test_one_position_yields_nearly_the_fields_and_a_warning(beams):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize('jitter_m', [0.0, 0.05])
+def test_repeated_signals_add_nothing(beams, jitter_m):
+    """A survey of 10 places whose signals were recorded six times is one of 10 places."""
+    positions, received = send(HALL, beams, 10)
+    estimates = []
+    for n in (1, 6):
+        places = np.repeat(positions, n, axis=0)
+        offsets = np.random.default_rng(0).uniform(-jitter_m, jitter_m, places.shape)
+        residuals = received - MeasurementModel(HALL, beams).mean(positions)
+        signals = np.repeat(residuals, n, axis=0) + MeasurementModel(HALL, beams).mean(
+            places + offsets)
+        with pytest.warns(SurveyWarning, match='positions: 10, expected at least 20'):
+            estimates.append(survey(DECLARED, beams, places + offsets, signals))
+    one, six = estimates
+    assert (one.about['positions'], six.about['positions']) == (10, 60)
+    assert six.about['places'] == 10
+    # Errors, but not the covariance without inflation, depend on the positions.
+    for name in ('coverage', 'level_std_db', 'prior_weight'):
+        assert six.about[name] == pytest.approx(one.about[name], rel=1e-6), name
+    assert six.about['inflation'] == pytest.approx(
+        one.about['inflation'], rel=0.1 if jitter_m else 1e-6)
+
+
+@pytest.fixture(scope='module')
+def hall():
+    return Scenario.from_yaml(EXAMPLES.parents[1] / 'config' / 'hall.yaml')
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('n', 'cycles'), [(10, 6), (30, 4), (60, 2)])
+def test_cycles_at_one_place_are_one_place(hall, shipped, n, cycles):
+    """In a hall whose paths do not fade, more cycles at a place only repeat its multipath."""
+    rng, declared = np.random.default_rng(n), Scenario()
+    places, users = (rng.permutation(hall.channel.users)[:size] for size in (n, 200))
+    signals, results = simulate_received(hall, shipped, users, rng), []
+    for visits in (cycles, 1):
+        visited = np.repeat(places, visits, axis=0)
+        estimate = measured(
+            declared, shipped, visited, simulate_received(hall, shipped, visited, rng))
+        assert (estimate.about['positions'], estimate.about['places']) == (n * visits, n)
+        results.append([*estimate.about['coverage'], *covered(dataclasses.replace(
+            declared, multipath=estimate), shipped, users, signals)])
+    assert min(results[0][3:]) > 0.93
+    np.testing.assert_allclose(*results, atol=0.04)
+
+
+@pytest.mark.slow
+def test_a_walk_is_divided_into_places(shipped, monkeypatch):
+    """Positions 3 cm apart, in a hall whose paths do not fade."""
+    trace = runpy.run_path(str(EXAMPLES / 'box_hall.py'))['trace']
+    rng, declared = np.random.default_rng(2), Scenario()
+
+    def receive(positions):
+        channel = dataclasses.replace(declared, channel=trace(positions))
+        return simulate_received(channel, shipped, positions, rng)
+
+    corners = declared.sample_positions(5, rng)
+    lengths = np.cumsum([0.0, *np.linalg.norm(np.diff(corners, axis=0), axis=1)])
+    route = np.transpose([np.interp(0.03 * np.arange(300), lengths, axis) for axis in corners.T])
+    users, signals = declared.sample_positions(150, rng), receive(route)
+    located = receive(users)
+    shares = []
+    for wavelengths in (PLACE_WAVELENGTHS, 1e-9):
+        monkeypatch.setattr(survey_module, 'PLACE_WAVELENGTHS', wavelengths)
+        shares.append(covered(
+            dataclasses.replace(declared, multipath=measured(declared, shipped, route, signals)),
+            shipped, users, located))
+    assert min(shares[0]) > 0.93
+    assert shares[1][1] < 0.85
+
+
+@pytest.mark.slow
 def test_a_survey_in_a_corner_causes_a_warning(beams):
     positions, received = send(HALL, beams, 120)
     corner = (positions[:, 1] < -2)
     with pytest.warns(SurveyWarning, match='along y, expected at least half of the 10 m'):
         estimate = survey(DECLARED, beams, positions[corner], received[corner])
     assert len(estimate.about['warnings']) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('shift', [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+def test_shifted_positions_cause_a_warning(shipped, shift):
+    positions, received = send(Scenario(), shipped, 60)
+    with pytest.warns(SurveyWarning, match=r'positions: \d+ of 60 do not fit a direct path'):
+        survey(Scenario(), shipped, positions + shift, received)
+
+
+@pytest.mark.slow
+def test_a_declared_share_of_blocked_users_causes_no_warning(beams):
+    positions, received = send(HALL, beams, 60)
+    model = MeasurementModel(HALL, beams)
+    received[::2] -= model.mean(positions[::2])
+    declared = dataclasses.replace(DECLARED, blocked_probability=0.5)
+    assert survey(declared, beams, positions, received).about['blocked'] == 30
+
+
+@pytest.mark.parametrize('scale', [1000.0, 100.0, 1 / 0.3048])
+def test_positions_in_other_units_are_refused(beams, scale):
+    positions, received = send(HALL, beams, 30)
+    with pytest.raises(ValueError, match=r'^positions: .* m outside of the region .* in metres'):
+        survey(DECLARED, beams, scale * positions, received)
+
+
+def test_signals_that_no_receiver_measures_are_refused(beams):
+    positions, received = send(HALL, beams, 30)
+    received[7, 1] = 0
+    with pytest.raises(ValueError, match='^received: signals of 0 W in row 7, band 1, expected'):
+        survey(DECLARED, beams, positions, received)
+    noiseless = MeasurementModel(HALL, beams).mean(positions)
+    with pytest.raises(ValueError, match='^received: residuals of .* W in row .* with noise'):
+        survey(DECLARED, beams, positions, noiseless)
+
+
+def test_signals_of_other_positions_are_refused(beams):
+    """Half a wavelength makes the multipath alone more probable at all positions."""
+    positions, received = send(HALL, beams, 30)
+    quiet = MeasurementModel(HALL, beams).mean(positions) + 1e-3 * received
+    with pytest.raises(ValueError, match='^positions: no direct path at any of 30, expected'):
+        survey(DECLARED, beams, positions + [0.06, 0.0, 0.0], quiet)
 
 
 def test_invalid_arrays_are_refused(beams):
@@ -194,3 +329,7 @@ def test_invalid_arrays_are_refused(beams):
         survey(DECLARED, beams, positions, received[:, :1])
     with pytest.raises(ValueError, match='received: not finite'):
         survey(DECLARED, beams, positions, received * np.nan)
+    with pytest.raises(ValueError, match='positions: .*of type <U.*, expected numbers'):
+        survey(DECLARED, beams, positions.astype(str), received)
+    with pytest.raises(ValueError, match='positions: complex numbers, expected real numbers'):
+        survey(DECLARED, beams, positions + 1j, received)

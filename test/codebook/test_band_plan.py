@@ -9,6 +9,7 @@ import pytest
 from rhs_isac_ros.bounds.range_ambiguity import range_confusion_error
 from rhs_isac_ros.codebook import band_plan, optimize
 from rhs_isac_ros.codebook.band_plan import (
+    EFFORT,
     best_of,
     choose_bands,
     expected_error,
@@ -19,6 +20,7 @@ from rhs_isac_ros.codebook.band_plan import (
 from rhs_isac_ros.model import Scenario
 
 SPECTRUM = [(2.5e9, 2.7e9)]
+SHORT = EFFORT._replace(short_positions=4, short_steps=3, short_shots=8, shots=8)
 
 
 @pytest.fixture
@@ -26,16 +28,6 @@ def small():
     """Two bands with four frames each."""
     return Scenario(n_subbands=2, n_feeds=2, elements_per_side=3, max_power_w=0.02,
                     roi_center_m=(4, 0, 0), roi_size_m=(4, 4, 2))
-
-
-@pytest.fixture
-def short(monkeypatch):
-    """Make the optimisations short."""
-    monkeypatch.setattr(band_plan, '_SHORT_POSITIONS', 4)
-    monkeypatch.setattr(band_plan, '_SHORT_STEPS', 3)
-    monkeypatch.setattr(band_plan, '_POSITIONS', 16)
-    monkeypatch.setattr(band_plan, '_SHORT_PHASES', 8)
-    monkeypatch.setattr(band_plan, '_PHASES', 8)
 
 
 def test_the_raster_begins_at_the_low_end_of_each_interval():
@@ -90,11 +82,11 @@ def test_the_number_of_pilots_stays_the_same(small):
 
 
 @pytest.mark.slow
-def test_the_candidates_are_sorted_and_reported(small, short, monkeypatch):
-    monkeypatch.setattr(band_plan, '_CANDIDATES', 3)
+def test_the_candidates_are_sorted_and_reported(small):
     reported = []
     candidates = choose_bands(
-        small, SPECTRUM, 4, raster_hz=10e6, seed=1, report=reported.append)
+        small, SPECTRUM, 4, raster_hz=10e6, seed=1, report=reported.append,
+        effort=SHORT._replace(candidates=3))
     assert sorted(reported, key=lambda candidate: candidate.error_m2) == list(candidates)
     assert len({candidate.frequencies_hz for candidate in candidates}) == 3
     for one, other in itertools.combinations(candidates, 2):
@@ -105,23 +97,24 @@ def test_the_candidates_are_sorted_and_reported(small, short, monkeypatch):
         assert candidate.error_m2 > 0
 
 
-def test_a_raster_with_few_plans_has_few_candidates(small, short):
-    (only,) = choose_bands(small, [(2.5e9, 2.5e9), (3e9, 3e9)], 2, raster_hz=10e6)
+def test_a_raster_with_few_plans_has_few_candidates(small):
+    (only,) = choose_bands(small, [(2.5e9, 2.5e9), (3e9, 3e9)], 2, raster_hz=10e6,
+                           effort=SHORT)
     assert only.frequencies_hz == (2.5e9, 3e9)
 
 
 @pytest.mark.slow
-def test_the_result_has_the_lowest_expected_error_up_to_chance(small, short):
+def test_the_result_has_the_lowest_expected_error_up_to_chance(small):
     def search(world):
         return optimize(world, objective='error', seed=1, max_steps=2)
 
-    candidates = choose_bands(small, SPECTRUM, 2, raster_hz=25e6, seed=1)
-    plan = best_of(small, candidates, search, 1)
+    candidates = choose_bands(small, SPECTRUM, 2, raster_hz=25e6, seed=1, effort=SHORT)
+    plan = best_of(small, candidates, search, 1, effort=SHORT)
     plan.result.codebook.check(plan.scenario)
     assert 'objective=error' in plan.result.codebook.provenance
     assert plan.error_m2 == expected_error(plan.scenario, plan.result.codebook, 1, 8)
     tried = []
-    again = best_of(small, plan.candidates, search, 1, tried.append)
+    again = best_of(small, plan.candidates, search, 1, tried.append, SHORT)
     least = plan.candidates[0].error_m2
     assert [candidate.frequencies_hz for candidate in tried] == [
         candidate.frequencies_hz for candidate in plan.candidates[:3]
@@ -133,9 +126,9 @@ def test_the_result_has_the_lowest_expected_error_up_to_chance(small, short):
     assert again.result.codebook.id == plan.result.codebook.id
 
 
-def test_an_interrupted_search_ends_with_the_best_plan_so_far(small, short, monkeypatch):
-    monkeypatch.setattr(band_plan, '_CANDIDATES', 2)
-    candidates = choose_bands(small, SPECTRUM, 2, raster_hz=25e6)
+def test_an_interrupted_search_ends_with_the_best_plan_so_far(small):
+    candidates = choose_bands(
+        small, SPECTRUM, 2, raster_hz=25e6, effort=SHORT._replace(candidates=2))
     results = [optimize(with_bands(small, candidate.frequencies_hz), max_steps=1)
                for candidate in candidates]
     interrupted = [dataclasses.replace(result, reason='interrupted') for result in results]
@@ -147,18 +140,18 @@ def test_an_interrupted_search_ends_with_the_best_plan_so_far(small, short, monk
     assert not reported
     outcomes = iter([results[0], interrupted[1]])
     candidates = [dataclasses.replace(candidate, error_m2=1.0) for candidate in candidates]
-    assert best_of(small, candidates, lambda _: next(outcomes)).result is results[0]
+    assert best_of(small, candidates, lambda _: next(outcomes), effort=SHORT).result is results[0]
     with pytest.raises(ValueError, match='^candidates: none'):
         best_of(small, [], lambda _: results[0])
 
 
-def test_ctrl_c_ends_the_comparison_of_plans(small, short, monkeypatch):
+def test_ctrl_c_ends_the_comparison_of_plans(small, monkeypatch):
     def interrupted(*args, **options):
         return dataclasses.replace(optimize(*args, **options), reason='interrupted')
 
     monkeypatch.setattr(band_plan, 'optimize', interrupted)
     with pytest.raises(KeyboardInterrupt):
-        choose_bands(small, SPECTRUM, 2, raster_hz=25e6)
+        choose_bands(small, SPECTRUM, 2, raster_hz=25e6, effort=SHORT)
 
 
 @pytest.fixture
@@ -178,7 +171,7 @@ def test_unequal_spacing_pays_only_if_phases_are_known(
         plan = dataclasses.replace(
             long_region, center_frequencies_hz=bands, band_phase_std_rad=phase_std_rad)
         codebook = optimize(plan, objective='error', n_positions=8, max_steps=15).codebook
-        errors.append(expected_error(plan, codebook, n_phases=64))
+        errors.append(expected_error(plan, codebook, n_shots=64))
     assert least < errors[0] / errors[1] < most
 
 

@@ -1,11 +1,9 @@
 """The optimiser as a command: its files, also after errors and interrupts."""
 
-import argparse
 import dataclasses
 import errno
+import functools
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -167,10 +165,10 @@ def test_invalid_arguments_leave_the_last_output(call, files, capsys, arguments,
 
 
 def test_the_bands_are_chosen_with_the_codebook(call, files, scenario, capsys, monkeypatch):
-    monkeypatch.setattr(band_plan, '_SHORT_STEPS', 2)
-    monkeypatch.setattr(band_plan, '_SHORT_POSITIONS', 4)
-    monkeypatch.setattr(band_plan, '_SHORT_PHASES', 4)
-    monkeypatch.setattr(band_plan, '_PHASES', 4)
+    short = band_plan.EFFORT._replace(short_steps=2, short_positions=4, short_shots=4, shots=4)
+    for name in ('choose_bands', 'best_of'):
+        monkeypatch.setattr(__main__, name, functools.partial(
+            getattr(band_plan, name), effort=short))
     plan, optimize = files / 'plan.yaml', __main__.optimize
 
     def checked(scenario, **options):
@@ -189,7 +187,7 @@ def test_the_bands_are_chosen_with_the_codebook(call, files, scenario, capsys, m
     assert f'{plan}: ' in capsys.readouterr().out
 
     def first_of_two(scenario, candidates, search, *rest):
-        best = band_plan.best_of(scenario, candidates[:1], search, *rest)
+        best = band_plan.best_of(scenario, candidates[:1], search, *rest, short)
         search(band_plan.with_bands(scenario, candidates[1].frequencies_hz))
         return best
     monkeypatch.setattr(__main__, 'best_of', first_of_two)
@@ -222,32 +220,6 @@ def test_ctrl_c_while_plans_are_compared_writes_no_codebook(call, files, monkeyp
 def test_invalid_band_plans_are_errors(call, files, capsys, arguments, words):
     fails_with(call, capsys, words, '--plan', files / 'plan.yaml', *arguments)
     assert not (files / 'plan.yaml').exists()
-
-
-@pytest.mark.parametrize('option', ['--method', '--objective', '--sampling'])
-def test_unknown_names_are_usage_errors(call, capsys, option):
-    with pytest.raises(SystemExit) as caught:
-        call(option, 'magic')
-    assert caught.value.code == 2
-    assert "'magic'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize('spoil', ['other scenario', 'nan', 'power', 'cut off'])
-def test_an_unusable_start_is_an_error(call, files, capsys, table1, small, spoil):
-    bad = files / 'bad.yaml'
-    (table1 if spoil == 'other scenario' else small).codebook.save(bad)
-    text = bad.read_text(encoding='utf-8')
-    if spoil == 'cut off':
-        bad.write_text(text[:len(text) // 2], encoding='utf-8')
-    elif spoil in ('nan', 'power'):
-        data = yaml.safe_load(text)
-        values = next(iter(data.values()))['ros__parameters']['codebook']['digital_re']
-        values[0] = float('nan') if spoil == 'nan' else 7.0
-        bad.write_text(yaml.safe_dump(data), encoding='utf-8')
-    words = {'other scenario': ['analog: shape'], 'nan': ['digital'], 'power': ['codebook'],
-             'cut off': ['bad.yaml']}
-    fails_with(call, capsys, [] if spoil == 'power' else words[spoil], '--start', bad)
-    assert not (files / 'codebook.yaml').exists()
 
 
 @pytest.mark.parametrize(('text', 'word'), [
@@ -348,28 +320,7 @@ def test_progress_shows_value_and_step(files, capfd):
         assert 'm^2' in capfd.readouterr().err
 
 
-def test_without_tqdm_progress_is_printed_as_lines(files, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'tqdm', None)
-    assert main(['--scenario', str(files / 'scenario.yaml'), '--positions', '16',
-                 '--steps', '3', '--output', str(files / 'codebook.yaml')]) == 0
-    assert 'step 0: ' in capsys.readouterr().err
-
-
 def test_the_picture_is_drawn(call, files):
     pytest.importorskip('matplotlib')
     assert call('--steps', 3, '--plot', files / 'picture.png') == 0
     assert (files / 'picture.png').read_bytes().startswith(b'\x89PNG')
-
-
-def test_the_package_is_executable():
-    done = subprocess.run([sys.executable, '-m', 'rhs_isac_ros.codebook', '--help'],
-                          capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    assert '--objective' in done.stdout
-
-
-def test_options_can_be_added_to_another_parser():
-    parser = argparse.ArgumentParser()
-    __main__.add_options(parser)
-    options = parser.parse_args([])
-    assert (options.method, options.objective, options.seed) == ('lbfgs', None, 0)

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook import Progress, directional_codebook, plot
+from rhs_isac_ros.codebook import Progress, directional_codebook
 from rhs_isac_ros.codebook.plot import beam_powers, plot_optimization
 from rhs_isac_ros.codebook.unoptimised import width_points
 from rhs_isac_ros.model import Scenario
@@ -13,11 +13,6 @@ from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.pictures import write_picture
 
 HISTORY = [Progress(0, 1, 3.0, 0.1), Progress(1, 2, 1.0, 0.2)]
-
-
-@pytest.fixture(autouse=True)
-def coarse(monkeypatch):
-    monkeypatch.setattr(plot, '_N_MAP_POINTS', 6)
 
 
 @pytest.mark.parametrize('n_bands', [1, 2, 4])

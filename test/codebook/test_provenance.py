@@ -78,23 +78,6 @@ def test_parsing_any_other_text_returns_none(text):
     assert Provenance.parse(text) is None
 
 
-@pytest.mark.parametrize('text', ['2023-99-99', '{method: 0b_}', '[' * 3000],
-                         ids=['date', 'number', 'deep'])
-def test_parsing_text_that_breaks_the_yaml_parser_returns_none(text):
-    assert Provenance.parse(text) is None
-
-
 def test_resuming_returns_the_earlier_progress(small):
     earlier = PLAIN.resumed(text_of())
     assert (earlier.steps, earlier.evaluations, earlier.reason) == (5, 9, 'done')
-
-
-@pytest.mark.parametrize(('name', 'value'), [
-    ('method', 'direct'), ('objective', 'ambiguity'), ('seed', 4), ('sampling', 'given'),
-    ('positions', 65), ('scenario', {'n_feeds': 2})])
-def test_a_result_of_other_arguments_cannot_be_resumed(small, name, value):
-    codebook = dataclasses.replace(small.codebook, provenance=text_of(**{name: value}))
-    with pytest.raises(ValueError, match=f'^{name}: .*, expected .* as in the codebook') as caught:
-        PLAIN.resumed(codebook.provenance)
-    assert f'expected {value!r}' in str(caught.value)
-    assert f'{name}: {getattr(PLAIN, name)!r}' in str(caught.value)

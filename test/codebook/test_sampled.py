@@ -12,6 +12,7 @@ from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Search
 
 # With 128 pairs each: 5120 pairs.
 N_POSITIONS = 40
+ROUNDS = ((500, 15), (1000, 15))
 
 
 @pytest.fixture(scope='module')
@@ -32,23 +33,18 @@ def search_from(problem, scenario):
     return make
 
 
-@pytest.fixture
-def rounds(monkeypatch):
-    monkeypatch.setattr(methods, '_ROUNDS', ((500, 15), (1000, 15)))
-
-
-def test_samples_lead_to_the_value_that_all_pairs_lead_to(search_from, rounds):
+def test_samples_lead_to_the_value_that_all_pairs_lead_to(search_from):
     search, plain = search_from(120), search_from(60)
-    methods.minimize_sampled(search)
+    methods.minimize_sampled(search, ROUNDS)
     minimize_lbfgs(plain)
     start = search.history[0].value_m2
     assert plain.value_m2 < 0.6 * start
     assert search.value_m2 < plain.value_m2 + 0.05 * start
 
 
-def test_the_value_is_that_of_all_pairs(search_from, problem, rounds):
+def test_the_value_is_that_of_all_pairs(search_from, problem):
     search = search_from(40)
-    assert methods.minimize_sampled(search) == 'max_steps reached'
+    assert methods.minimize_sampled(search, ROUNDS) == 'max_steps reached'
     assert search.value_m2 == problem.value(search.best)
     assert len(search.history) == 41
     # The value falls at the end of a round, of which there are three.
@@ -59,10 +55,10 @@ def test_the_value_is_that_of_all_pairs(search_from, problem, rounds):
 
 
 @pytest.mark.parametrize('budget', [2, 3, 10, 25])
-def test_the_last_evaluation_of_a_budget_is_with_all_pairs(search_from, rounds, budget, problem):
+def test_the_last_evaluation_of_a_budget_is_with_all_pairs(search_from, budget, problem):
     search = search_from(1000, budget)
     with pytest.raises(BudgetSpent):
-        methods.minimize_sampled(search)
+        methods.minimize_sampled(search, ROUNDS)
     search.finish()
     assert search.history[-1].evaluations <= budget
     assert search.value_m2 == problem.value(search.best)

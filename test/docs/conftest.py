@@ -1,9 +1,9 @@
-"""The notebooks of the documentation, executed once for all tests."""
+"""The pages of the documentation, built once for all tests."""
 
+import json
 import os
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -14,15 +14,37 @@ sys.path.insert(0, str(DOCS / 'extensions'))
 
 
 @pytest.fixture(scope='session')
-def notebooks(tmp_path_factory):
-    """Processes that executed the notebooks, by name, and the folder of their results."""
-    folder = tmp_path_factory.mktemp('notebooks')
+def build(tmp_path_factory):
+    """Folder of a build with the command of scripts/docs, which must not warn."""
+    for library in ('furo', 'matplotlib', 'myst_nb', 'sphinx'):
+        pytest.importorskip(library, reason=f'{library} is not installed')
+    pytest.importorskip('rclpy', reason='the pages of the interfaces need ROS')
+    folder = tmp_path_factory.mktemp('docs')
+    done = subprocess.run(
+        [sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-E', '-q', '-b', 'html',
+         '-w', folder / 'warnings', '-d', folder / 'doctrees', DOCS, folder / 'html'],
+        capture_output=True, text=True, timeout=480, check=False,
+        # A proxy that does not exist: reading from the network fails.
+        env={**os.environ, 'http_proxy': 'http://127.0.0.1:9', 'https_proxy': 'http://127.0.0.1:9',
+             'OPENBLAS_NUM_THREADS': '1'})
+    warnings = (folder / 'warnings').read_text(encoding='utf-8')
+    # Without standard error: the kernel of a notebook may print to it while it shuts down.
+    assert (done.returncode, done.stdout, warnings) == (0, '', ''), done.stderr
+    return folder
 
-    def execute(source):
-        return source.stem, subprocess.run(
-            [sys.executable, DOCS / 'extensions' / 'run_notebook.py', source,
-             folder / f'{source.stem}.ipynb'],
-            capture_output=True, text=True, timeout=240, check=False,
-            env={**os.environ, 'OPENBLAS_NUM_THREADS': '1'})
-    with ThreadPoolExecutor(2) as pool:
-        return dict(pool.map(execute, (DOCS / 'notebooks').glob('*.md'))), folder
+
+@pytest.fixture(scope='session')
+def site(build):
+    """Folder of the pages."""
+    return build / 'html'
+
+
+@pytest.fixture(scope='session')
+def outputs(build):
+    """Callable that returns the outputs of a notebook of one type, such as ``stream``."""
+    def of(name, kind):
+        path = build / 'jupyter_execute' / 'notebooks' / f'{name}.ipynb'
+        cells = json.loads(path.read_text(encoding='utf-8'))['cells']
+        return [output for cell in cells for output in cell.get('outputs', ())
+                if output['output_type'] == kind]
+    return of

@@ -1,10 +1,14 @@
 """The examples of the documentation run as described."""
 
 import dataclasses
+import re
 import runpy
 import shutil
+import socket
 import subprocess
 import sys
+import threading
+import types
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +19,7 @@ from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.calibration import Pilots, calibrate
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.experiments.sweep_settings import parse_axis, settings_of
+from rhs_isac_ros.frontend import Air, SurfaceFault, make_radio, make_surface
 from rhs_isac_ros.model import Scenario, draw_surface, mobility, simulate_received
 from rhs_isac_ros.model.impairments import draw_factors
 from rhs_isac_ros.model.los import los_and_derivative
@@ -54,6 +59,8 @@ def test_the_plugins_are_found():
     assert 'circle' in plugins.names(plugins.MOBILITIES)
     assert 'patch' in plugins.names(plugins.GAIN_PATTERNS)
     assert 'phase_noise' in plugins.names(plugins.IMPAIRMENTS)
+    assert 'openris' in plugins.names(plugins.SURFACES)
+    assert 'adi' in plugins.names(plugins.RADIOS)
 
 
 def test_the_estimator_locates_users():
@@ -209,3 +216,131 @@ def test_the_box_hall_is_that_of_the_package():
     # Two reflections at most, and nothing from behind the surface.
     assert set(traced.n[traced.a != 0]) == {0, 1, 2}
     assert (traced.src[traced.a != 0][:, 0] > 0).all()
+
+
+def test_two_surfaces_locate_better_than_one(monkeypatch, capsys):
+    site_file = EXAMPLES.parents[1] / 'config' / 'site.yaml'
+    monkeypatch.setattr(sys, 'argv', ['two_surfaces.py', str(site_file)])
+    runpy.run_path(str(EXAMPLES / 'two_surfaces.py'))
+    printed = capsys.readouterr().out
+    errors = np.array(re.findall(r'error (\S+) m with one surface, (\S+) m', printed), float)
+    assert len(errors) == 5
+    one, both = np.mean(errors**2, axis=0)
+    assert both < one / 2
+
+
+@pytest.fixture
+def server():
+    """A server as that of the board: it drops what does not come as one message of 1025 bytes."""
+    listener = socket.create_server(('127.0.0.1', 0))
+    state = types.SimpleNamespace(
+        port=listener.getsockname()[1], shown=None, answers=iter(()), connections=0)
+
+    def serve():
+        while True:
+            try:
+                connection, _ = listener.accept()
+            except OSError:
+                return
+            state.connections += 1
+            with connection:
+                while message := connection.recv(1025):
+                    answer = next(state.answers, b'a')
+                    if len(message) != 1025 or answer == b'':
+                        continue
+                    if answer == b'a':
+                        state.shown = message
+                    connection.sendall(answer)
+                    if answer == b'b':
+                        break
+    thread = threading.Thread(target=serve)
+    thread.start()
+    yield state
+    # A connection ends the wait of the thread.
+    listener.shutdown(socket.SHUT_RDWR)
+    listener.close()
+    thread.join()
+
+
+@pytest.fixture
+def openris(server):
+    surface = make_surface(
+        'openris', 512, address='127.0.0.1', port=server.port, tile=3, timeout_s=0.2)
+    yield surface
+    surface.close()
+
+
+def test_the_board_over_tcp_shows_rows_from_the_top(openris, server):
+    for element in (0, 511):
+        openris.apply(np.eye(512)[element])
+        bits = server.shown[2:].replace(b';', b' ').split()
+        assert (server.shown[:2], len(bits)) == (b'03', 512)
+        row, column = divmod(bits.index(b'1'), 16)
+        assert (31 - row, column) == divmod(element, 16)
+    assert server.connections == 1
+
+
+@pytest.mark.parametrize(('answer', 'kind'), [
+    (b'', 'silence'), (b'b', 'garbled'), (b'x', 'garbled'), (b'aa', 'garbled')])
+def test_the_board_over_tcp_recovers_with_a_new_connection(openris, server, answer, kind):
+    server.answers = iter([answer])
+    with pytest.raises(SurfaceFault) as caught:
+        openris.apply(np.ones(512))
+    assert caught.value.kind == kind
+    openris.apply(np.ones(512))
+    assert server.connections == 2
+
+
+def test_a_missing_server_is_a_fault(openris, server):
+    missing = make_surface('openris', 512, address='127.0.0.1', port=1)
+    with pytest.raises(SurfaceFault) as caught:
+        missing.apply(np.ones(512))
+    assert caught.value.kind == 'closed'
+    with pytest.raises(plugins.PluginError, match='n_elements: 256, expected 512'):
+        make_surface('openris', 256)
+
+
+class Transceiver:
+    """A transceiver that receives its own signal with a delay, after stale buffers."""
+
+    FEEDS = np.array([[0.5j], [-0.25]])
+
+    def __init__(self, uri):
+        self.uri, self.rx_lo, self.tx_lo, self.n_stale = uri, 0, 0, 5
+
+    def __setattr__(self, name, value):
+        if name == 'rx_lo':
+            self.n_stale = 5
+        super().__setattr__(name, value)
+
+    def tx(self, samples):
+        self.sent = samples
+
+    def rx(self):
+        self.n_stale -= 1
+        repeated = np.resize(self.sent, self.rx_buffer_size)
+        return list(self.FEEDS * np.roll(repeated, 21) * (self.n_stale < 0))
+
+    def tx_destroy_buffer(self):
+        pass
+
+    rx_destroy_buffer = tx_destroy_buffer
+
+
+def test_the_transceiver_measures_both_bands_with_one_timing(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'adi', types.SimpleNamespace(ad9361=Transceiver))
+    scenario = Scenario(n_feeds=2, n_frames=2, frame_duration_s=0.01, timing_std_s=1e-7,
+                        band_phase_std_rad=6.2832)
+    radio = make_radio('adi', scenario, Air(scenario, np.random.default_rng(0)), scale=1e-4)
+    symbols, found = np.array([1.0, 1j]), []
+    for band in range(2):
+        captures = [radio.capture(band, radio.modem.pilot(symbol)) for symbol in symbols]
+        found.append(radio.modem.receive(1, np.stack(captures), symbols))
+        assert radio._device.rx_lo == radio._device.tx_lo == scenario.center_frequencies_hz[band]
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-9)
+    # The feeds differ as the receivers do; the delay is removed, up to a common phase.
+    np.testing.assert_allclose(found[0][..., 0] / found[0][..., 1], -2j, rtol=1e-9)
+    np.testing.assert_allclose(found[0], np.broadcast_to(found[0][:1, :1], found[0].shape),
+                               rtol=1e-6)
+    radio.close()
+    assert radio._device is None

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.experiments.resampling import replicate
 from rhs_isac_ros.experiments.sweep_settings import MEASURES, measured, names_of, parse_measures
 
 
@@ -18,12 +17,6 @@ def test_a_mean_has_the_interval_of_its_standard_error(squares):
     assert value == pytest.approx(squares.mean(), rel=1e-12)
     assert low == pytest.approx(value - 1.96 * error, abs=0.25 * error)
     assert high == pytest.approx(value + 1.96 * error, abs=0.25 * error)
-
-
-def test_measures_of_the_same_results_have_the_same_interval(squares):
-    results = squares * [[0.5], [1.0], [1.5]]
-    (replicates,) = replicate(results, 0)
-    assert measured(MEASURES['mse'], results) == pytest.approx(replicates.interval(), rel=1e-6)
 
 
 def test_roots_and_quantiles(squares):

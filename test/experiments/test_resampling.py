@@ -41,14 +41,6 @@ def test_comparisons_of_the_same_cases_are_paired():
     assert own.reduction_from(baseline) == pytest.approx((40, 40, 40), abs=1e-3)
 
 
-def test_differences_of_the_same_results_are_paired():
-    results = np.random.default_rng(0).exponential(size=(3, 50))
-    one, other = (replicate(results + shift, 0)[0] for shift in (0.5, 0.0))
-    difference = one.minus(other)
-    assert difference.interval() == pytest.approx((0.5, 0.5, 0.5), abs=1e-5)
-    np.testing.assert_allclose(difference.by_member, 0.5, atol=1e-5)
-
-
 def test_the_interval_of_many_cases_is_that_of_their_standard_error():
     results = np.random.default_rng(0).normal(10, 1, size=(1, 4000))
     value, low, high = replicate(results, 0)[0].interval()
@@ -77,13 +69,6 @@ def test_intervals_of_positive_statistics_are_positive():
     less, low, high = found.reduction_from(replicate(2 * results, 1)[0])
     assert less == pytest.approx(50)
     assert low < less < high < 100
-
-
-def test_the_variance_of_the_cases_alone_does_not_widen_the_interval():
-    results = np.random.default_rng(0).normal(size=(1, 400))
-    value, low, high = replicate(results, 0)[0].interval()
-    assert high - low == pytest.approx(2 * 1.96 * results.std() / 20, rel=0.1)
-    assert low < value < high
 
 
 def test_the_interval_of_a_share_is_that_of_wilson():

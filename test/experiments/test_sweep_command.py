@@ -1,7 +1,6 @@
 """The command: the same files however the jobs run, and errors before anything runs."""
 
 import csv
-import sys
 
 import pytest
 
@@ -100,6 +99,8 @@ def test_without_matplotlib_the_table_is_written(sweep, tmp_path, monkeypatch, c
     (['--vary', 'n_frames=1', '--vary', 'n_frames=2'], 'n_frames: varied more than once'),
     (['--with', 'n_frames=1'], 'argument --with: expected after --vary'),
     (['--vary', 'n_frames=1,2', '--with', 'n_feeds=1'], 'n_feeds: 1 values, expected 2'),
+    (['--vary', 'n_frames=1,2', '--with', 'n_subbands=1,2', '--with', 'n_feeds=1'],
+     'n_feeds: 1 values, expected 2'),
     (['--vary', 'n_frames=1', '--measure', 'mse,fame'], "argument --measure: 'fame', expected"),
     (['--vary', 'n_frames=1', '--measure', 'mse+rmse'], 'expected a measure in m²'),
     (['--vary', 'roi_size_m=[30,1,1]'], 'reaches behind the surface'),
@@ -123,19 +124,3 @@ def test_an_error_is_one_line_and_nothing_runs(options, expected, tmp_path, monk
     assert expected in errors
     assert len(errors.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ['bad.yaml']
-
-
-def test_the_help_lists_experiments_fields_and_measures(capsys):
-    for arguments, expected in ((['--help'], ['sweep']), (['sweep', '--help'], [
-            'n_frames', 'codebook, estimator', 'global_bound', '--optimize-for'])):
-        with pytest.raises(SystemExit, match='0'):
-            __main__.main(arguments)
-        shown = ' '.join(capsys.readouterr().out.split())
-        assert all(text in shown for text in expected)
-
-
-def test_the_arguments_are_those_of_the_process_by_default(monkeypatch, capsys):
-    monkeypatch.setattr(sys, 'argv', ['experiments', 'fly'])
-    with pytest.raises(SystemExit, match='2'):
-        __main__.main()
-    assert "invalid choice: 'fly'" in capsys.readouterr().err

@@ -83,14 +83,14 @@ def test_a_position_without_fix_counts_with_the_region(case, monkeypatch):
     assert min(result['capacity_bps']) > 0
 
 
-def test_the_global_bound_of_a_coarse_lattice_is_missing(case, monkeypatch):
+def test_the_global_bound_of_a_coarse_lattice_is_missing(case):
     found = evaluate('bound', **case, first=0, n=4)['bound_m2']
     assert len(found) == 4
     assert np.isfinite(found).all()
     assert found != evaluate('bound', **case, first=250, n=4)['bound_m2']
     assert len(evaluate('bound', **case, first=250, n=1)['bound_m2']) == 1
-    monkeypatch.setattr(sweep_jobs, '_MAX_COARSENESS', 0.5)
-    assert np.isnan(evaluate('bound', **case, first=0, n=4)['bound_m2']).all()
+    coarse = evaluate('bound', **case, first=0, n=4, max_coarseness=0.5)['bound_m2']
+    assert np.isnan(coarse).all()
 
 
 def test_codebooks_of_every_kind_fit_their_scenario():

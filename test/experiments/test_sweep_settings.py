@@ -94,6 +94,7 @@ def test_values_of_a_file_can_be_read_back():
     for name, value in scenario.fields().items():
         ((again,),) = parse_axis(f'{name}={plain(value)}').values
         assert again == getattr(scenario, name)
+        assert parse_axis(f'{name}={plain(again)}').values == ((again,),)
 
 
 def test_every_field_has_a_label_without_its_unit():

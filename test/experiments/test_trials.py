@@ -133,20 +133,6 @@ def test_a_result_may_be_infinite_or_missing(tmp_path):
     assert calls == [0]
 
 
-def test_a_failed_write_leaves_only_the_old_file(tmp_path, monkeypatch):
-    run_jobs(Worker(), JOBS[:1], tmp_path, n_jobs=1)
-    (file,) = tmp_path.iterdir()
-    before = file.read_bytes()
-
-    def full(*_):
-        raise OSError('disk full')
-
-    monkeypatch.setattr(os, 'replace', full)
-    with pytest.raises(OSError, match='disk full'):
-        run_jobs(Worker(), [Job('square-0', {'number': 9, 'of': ()})], tmp_path, n_jobs=1)
-    assert [path.read_bytes() for path in tmp_path.iterdir()] == [before]
-
-
 @pytest.mark.parametrize('n_jobs', [1, 2])
 def test_an_error_names_its_job_and_other_results_are_kept(tmp_path, n_jobs):
     def work(number, of):
@@ -263,12 +249,12 @@ def test_an_error_on_a_dask_cluster_names_its_job(tmp_path, cluster):
         run_jobs(worker, JOBS[:2], tmp_path, dask=cluster.scheduler_address)
 
 
-def test_a_dask_cluster_without_workers_is_an_error(tmp_path, monkeypatch):
+def test_a_dask_cluster_without_workers_is_an_error(tmp_path):
     distributed = pytest.importorskip('distributed')
-    monkeypatch.setattr(jobs_module, '_WORKER_TIMEOUT_S', 0.1)
     with distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=':0') as empty:
         with pytest.raises(ConnectionError, match='^Dask cluster inproc://.*workers'):
-            run_jobs(Worker(), JOBS, tmp_path, dask=empty.scheduler_address)
+            run_jobs(Worker(), JOBS, tmp_path, dask=empty.scheduler_address,
+                     worker_timeout_s=0.1)
 
 
 def test_duplicate_names_are_an_error(tmp_path):
@@ -282,13 +268,6 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch, library, purpose):
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(MissingLibraryError, match=f'^{purpose} needs {library}, .*experiments'):
         run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
-
-
-def test_results_are_plain_json(tmp_path):
-    run_jobs(Worker(), JOBS[:1], tmp_path, n_jobs=1)
-    record = json.loads((tmp_path / 'square-0.json').read_text())
-    assert record['arguments'] == {'number': 0, 'of': [1, 2]}
-    assert record['result'] == {'square': 0}
 
 
 def test_a_library_missing_in_a_job_is_reported_in_one_line(tmp_path):

@@ -69,30 +69,6 @@ def test_the_table_has_a_row_for_each_method_and_number_of_bands(fig3, entries):
                      '1.00 ± 0.00']
 
 
-def test_the_picture_names_symbols_units_and_every_method(fig3, entries):
-    figure = fig3.picture(fig3.Summary(entries))
-    above, (left, right) = figure.axes[-1], figure.axes[:2]
-    assert r'$N_\mathrm{B}$' in left.get_xlabel() and r'N_\mathrm{B} F = 8' in left.get_xlabel()
-    assert left.get_ylabel() == r'average CRLB of $N_\mathrm{sam} = 10$ samples [m$^2$]'
-    assert 'relative to alternating' in right.get_ylabel()
-    legend = above.get_legend()
-    assert [text.get_text() for text in legend.get_texts()] == [
-        fig3.NAMES[method] for method in fig3.METHODS]
-    assert legend.get_title().get_text() == 'mean and standard deviation of 3 trials'
-    for axes in (left, right):
-        lines = [container.lines[0] for container in axes.containers]
-        for attribute in ('marker', 'color', 'linestyle'):
-            assert len({getattr(line, f'get_{attribute}')() for line in lines}) == 4
-        # A bar on every point.
-        assert all(len(container.lines[2][0].get_segments()) == 4
-                   for container in axes.containers)
-
-
-def test_a_single_trial_is_drawn_without_deviation(fig3, entries):
-    figure = fig3.picture(fig3.Summary([entry for entry in entries if entry['seed'] == 0]))
-    assert len(figure.axes[0].containers) == 4
-
-
 def test_a_trial_optimises_with_its_arguments(fig3):
     result = fig3.trial('lbfgs', 2, 5, samples=6, held_out=50, max_steps=3)
     assert (result['steps'], result['reason']) == (3, 'max_steps reached')

@@ -133,42 +133,6 @@ def test_the_report_has_tables_picture_and_data(fig4, results, tmp_path, capsys)
     assert len((tmp_path / 'fig4a.csv').read_text().splitlines()) == 1 + len(LEVELS) * 3
 
 
-@pytest.mark.slow
-def test_every_mark_of_the_picture_is_in_the_legend_and_every_box_is_visible(fig4):
-    results = synthetic(fig4, 300, 2)
-    figure = fig4.fig4_report.picture(results)
-    upper, lower, above = figure.axes
-    assert (upper.get_ylabel(), lower.get_ylabel()) == (
-        'mean squared error [m$^2$]', 'capacity loss of band 1 [bit/s]')
-    assert [text.get_text() for text in above.get_legend().get_texts()] == [
-        'network, re/im, 0 dB', '(a): a single trial', 'mean and its 95 % interval',
-        '(b): quartiles', 'median', '5 to 95 %, or beyond the scale']
-    assert len(upper.containers) == len(lower.patches) == len(LEVELS)
-    assert lower.get_yscale() == 'log'
-    low, high = lower.get_ylim()
-    for box in lower.patches:
-        vertices = box.get_path().vertices[:, 1]
-        assert low < vertices.min() < vertices.max() < high
-    assert [text.get_text() for text in lower.get_xticklabels()] == list(LEVELS)
-
-
-def test_a_loss_below_zero_leaves_the_scale_positive(fig4):
-    results = synthetic(fig4, 300, 1)
-    for losses in results.losses.values():
-        losses -= np.percentile(losses, 40)
-    figure = fig4.fig4_report.picture(results)
-    low, high = figure.axes[1].get_ylim()
-    assert 0 < low < high
-
-
-def test_without_losses_there_is_one_panel(fig4):
-    results = synthetic(fig4, 300, 1)
-    results.losses.clear()
-    figure = fig4.fig4_report.picture(results)
-    assert [axes.get_ylabel() for axes in figure.axes] == ['mean squared error [m$^2$]', '']
-    assert len(figure.axes[1].get_legend().get_texts()) == 3
-
-
 @pytest.mark.parametrize('text', ['bayes', 'ml:0', 'parts:', 'parts:nan', 'parts:x'])
 def test_an_invalid_condition_is_refused(fig4, text, capsys):
     with pytest.raises(SystemExit):
@@ -177,33 +141,12 @@ def test_an_invalid_condition_is_refused(fig4, text, capsys):
             in capsys.readouterr().err)
 
 
-def test_the_grid_ranks_readings_by_their_distance_from_the_paper(fig4, results):
-    ranked = fig4.fig4_grid.readings(results)
-    assert [(scan.own, scan.benchmark) for _, scan, _ in ranked[:2]] == [
-        ('algorithm-1', 'scan-per-band'), ('crlb', 'scan-per-band')]
-    assert len(ranked) == 9
-    distance, scan, random = ranked[0]
-    assert distance == pytest.approx(np.hypot(scan.percent - 42, random.percent - 69))
-
-
-def test_the_report_of_the_grid_is_a_match_after_the_fact(fig4, results, tmp_path, capsys):
-    options = argparse.Namespace(trials=3, pairs=7, output=tmp_path)
-    fig4.fig4_grid.write(results, options)
-    out = capsys.readouterr().out
-    assert '9 readings' in out and 'no evidence for the claims' in out
-    assert len([line for line in out.splitlines() if line.startswith('|')]) == 2 + 9
-    assert '| network, re/im, 0 dB |' in (tmp_path / 'fig4_grid.md').read_text(encoding='utf-8')
-
-
 @pytest.mark.parametrize(('arguments', 'conditions'), [
     ([], ['magnitudes-+0dB', 'magnitudes--30dB', 'parts-+0dB', 'parts--30dB', 'bayes-+0dB',
           'bayes--30dB']),
-    (['--inputs', '--multipath', '-20'], ['bayes--20dB']),
-    (['--no-bayes', '--multipath', '0', '--inputs', 'parts'], ['parts-+0dB']),
+    (['--conditions', 'bayes:-20'], ['bayes--20dB']),
     (['--conditions', 'magnitudes:-30', 'bayes:0'], ['magnitudes--30dB', 'bayes-+0dB']),
-    (['--quick'], ['parts-+0dB', 'magnitudes--30dB', 'bayes-+0dB', 'bayes--30dB']),
-    (['--grid', '--inputs', 'parts'], [f'parts-{level:+}dB' for level in (
-        0, -10, -20, -25, -30, -40)])])
+    (['--quick'], ['parts-+0dB', 'magnitudes--30dB', 'bayes-+0dB', 'bayes--30dB'])])
 def test_options_select_the_conditions(fig4, monkeypatch, arguments, conditions):
     seen = []
     monkeypatch.setattr(fig4, 'reproduce', seen.append)
@@ -217,7 +160,7 @@ def test_the_command_writes_all_files_and_repeats_no_job(fig4, tmp_path, monkeyp
     monkeypatch.setattr(fig4, 'SAMPLES', 4)
     monkeypatch.setattr(fig4, 'MIN_DRAWS', 2)
     call = ['--trials', '1', '--pairs', '200', '--positions', '6', '--losses', '2', '--rows',
-            'algorithm-1', 'random', '--inputs', 'magnitudes', '--no-bayes', '--multipath', '-30',
+            'algorithm-1', 'random', '--conditions', 'magnitudes:-30',
             '--jobs', '1', '--output', str(tmp_path)]
     assert fig4.main(call) == 0
     out = capsys.readouterr().out

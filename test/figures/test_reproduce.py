@@ -1,7 +1,6 @@
 """``scripts/reproduce``: the help, and the options that all experiments share."""
 
 import ast
-import re
 import subprocess
 from pathlib import Path
 
@@ -34,23 +33,6 @@ def parse(load_figure):
     return lambda *arguments: parse_options('About.', 'fig0', 30, 3, arguments)
 
 
-def test_the_help_describes_every_experiment_and_its_duration(reproduce, scripts):
-    text = reproduce('--help')
-    assert len(scripts) >= 4
-    for name, description in scripts.items():
-        first = description.splitlines()[0]
-        duration = re.search(r'^Duration on two cores: (.*--quick.*)$', description, re.M)[1]
-        assert f'\n  {name}\n    {first}\n    Takes {duration}\n' in text
-
-
-def test_the_help_has_the_options_that_all_experiments_share(reproduce, parse, capsys):
-    with pytest.raises(SystemExit, match='0'):
-        parse('--help')
-    options = set(re.findall(r'^  (--\w+)', capsys.readouterr().out, re.M))
-    assert '--format' in options
-    assert set(re.findall(r'^  (--\w+)', reproduce('--help'), re.M)) == options
-
-
 def test_without_arguments_it_lists_the_names(reproduce, scripts):
     assert reproduce().split() == sorted(scripts)
 
@@ -59,11 +41,6 @@ def test_defaults_are_those_of_the_full_run(parse):
     options = parse()
     assert (options.trials, options.quick, options.jobs, options.dask) == (30, False, -1, None)
     assert (options.output, options.format) == (Path('results/fig0'), 'png')
-
-
-def test_quick_and_trials_set_the_number_of_trials(parse):
-    assert parse('--quick').trials == 3
-    assert parse('--trials', '7').trials == 7
 
 
 @pytest.mark.parametrize('arguments', [

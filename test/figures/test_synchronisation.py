@@ -7,8 +7,6 @@ import pytest
 
 from rhs_isac_ros.codebook import default_codebook_file, random_codebook
 from rhs_isac_ros.experiments import sweep
-from rhs_isac_ros.experiments.sweep import Point
-from rhs_isac_ros.experiments.sweep_settings import Interval
 from rhs_isac_ros.model import Scenario
 
 pytest.importorskip('joblib')
@@ -72,17 +70,6 @@ def test_the_command_gives_advice_and_repeats_no_job(figure, located, tmp_path, 
         assert len([*csv.DictReader(stream)]) == 3 * (7 + 4 + 5) * len(figure.MEASURES)
     assert {path.name for path in tmp_path.glob('*.p*')} == {
         'synchronisation.png', 'synchronisation.pdf'}
-
-
-def test_the_picture_has_a_panel_for_each_error(figure):
-    points = [Point(setting, 'rmse', Interval(0.5, 0.4, 0.6), ())
-              for setting in figure.sweep_of(figure.read_plans([]), 1, 1).settings]
-    *panels, above = figure.picture(points, [*figure.read_plans([])]).axes
-    assert [panel.get_xlabel() for panel in panels] == [
-        'phase of a band, standard deviation [rad]', 'timing offset, standard deviation [s]',
-        'carrier offset, standard deviation [Hz]']
-    assert [text.get_text() for text in above.get_legend().get_texts()] == [
-        *figure.read_plans([])]
 
 
 @pytest.mark.parametrize(('plans', 'expected'), [

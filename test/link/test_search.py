@@ -101,8 +101,7 @@ def test_modes_of_many_elements_are_found_by_products_alone(monkeypatch, directi
     expected = search_module._modes(scenario)
     multipath.spatial_covariance.cache_clear()
     monkeypatch.setattr(multipath, '_MAX_MATRIX', 1)
-    monkeypatch.setattr(search_module, '_MAX_MODES', 30)
-    found = search_module._modes(scenario)
+    found = search_module._modes(scenario, 30)
     multipath.spatial_covariance.cache_clear()
     assert np.isrealobj(found) == (direction == (0, 0))
     assert found.shape == expected.shape

@@ -6,6 +6,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from rhs_isac_ros.model.gaussian import (
+    likelihood_loss,
     log_evidence_of_level,
     marginalise,
     quadratic_form,
@@ -117,3 +118,11 @@ def test_the_evidence_of_a_level_is_the_average_over_it(median_db):
         axis=1) + np.log(db[1] - db[0])
     np.testing.assert_allclose(
         log_evidence_of_level(energy, n, std_db, median_db), expected, atol=0.05)
+
+
+def test_the_loss_is_the_quadratic_form():
+    offset = np.array([[1e-3, 0.02, -0.01]])
+    curvature = np.array([[1e6, 2e3, -1e3], [2e3, 1e3, 0.0], [-1e3, 0.0, 1e3]])
+    expected = sum(offset[0, a] * curvature[a, b] * offset[0, b] for a in range(3)
+                   for b in range(3)) / 2
+    np.testing.assert_allclose(likelihood_loss(offset, curvature[None]), [expected])

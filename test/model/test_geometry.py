@@ -24,11 +24,12 @@ def test_positions_and_frequencies_match_the_vectors(case):
     Scenario(elements_per_side=5, n_feeds=4, n_subbands=5, center_frequencies_hz=(1e9, 2e9, 9e9),
              element_interval_wavelengths=0.5),
     Scenario(elements_per_side=(5, 2), n_feeds=2),
-], ids=['one of each', 'odd', 'rectangle'])
+    Scenario(elements_per_side=(2, 3), n_feeds=2, element_interval_wavelengths=(0.4, 0.25)),
+], ids=['one of each', 'odd', 'rectangle', 'two intervals'])
 def test_positions_and_frequencies_match_the_definition(scenario, plain):
     p = plain(scenario)
     n_elements, n_feeds = scenario.n_elements, scenario.n_feeds
-    assert g.element_interval_m(scenario) == pytest.approx(p.interval, rel=1e-14)
+    assert g.element_intervals_m(scenario) == pytest.approx(p.intervals, rel=1e-14)
     np.testing.assert_allclose(
         g.element_positions(scenario), [p.element(m) for m in range(n_elements)], atol=1e-15)
     np.testing.assert_allclose(
@@ -41,8 +42,8 @@ def test_positions_and_frequencies_match_the_definition(scenario, plain):
 
 def test_mean_wavelength_is_that_of_the_bands_not_of_the_mean_frequency():
     scenario = Scenario(center_frequencies_hz=(1e9, 3e9))
-    assert g.element_interval_m(scenario) == pytest.approx(
-        scenario.element_interval_wavelengths * (0.299792458 + 0.299792458 / 3) / 2)
+    interval_m = 0.3 * (0.299792458 + 0.299792458 / 3) / 2
+    assert g.element_intervals_m(scenario) == pytest.approx([interval_m, interval_m])
 
 
 def test_given_feed_positions_are_used():

@@ -5,7 +5,6 @@ import pytest
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import (
-    checked_positions,
     los_and_derivative,
     los_gain,
     los_sums,
@@ -67,23 +66,6 @@ def test_one_subband_works(plain):
     position = np.array([[7.0, -1.0, 0.5]])
     expected = [[[plain(scenario).los(position[0], 1, 0, m) for m in range(4)]]]
     np.testing.assert_allclose(los_gain(scenario, position, 1), expected, rtol=1e-11)
-
-
-@pytest.mark.parametrize('function', [los_gain, los_and_derivative])
-@pytest.mark.parametrize(('positions', 'words'), [
-    ([1.0, 2.0, 3.0], r'positions: shape \(3,\), expected \[N, 3\]'),
-    ([[1.0, 2.0]], r'positions: shape \(1, 2\), expected \[N, 3\]'),
-    ([[1.0, np.nan, 0.0]], 'positions: not finite, expected finite'),
-    ([[1.0, np.inf, 0.0]], 'positions: not finite, expected finite')])
-def test_malformed_positions_are_errors(function, positions, words):
-    with pytest.raises(ValueError, match=words):
-        function(Scenario(), np.array(positions), 0)
-
-
-def test_checked_positions_accepts_lists():
-    positions = checked_positions([[1, 2, 3]])
-    assert positions.dtype == float
-    assert positions.tolist() == [[1.0, 2.0, 3.0]]
 
 
 def test_sums_over_the_elements_are_those_of_the_gains(table1):

@@ -140,6 +140,17 @@ def test_the_quadrature_resolves_large_surfaces(monkeypatch):
     np.testing.assert_allclose(found, finer, atol=1e-10 * finer[0, 0, 0].real)
 
 
+def test_two_intervals_are_those_of_the_elements(small):
+    """Every other row of a denser lattice."""
+    dense = dataclasses.replace(small.scenario, elements_per_side=(3, 5))
+    sparse = dataclasses.replace(
+        small.scenario, elements_per_side=3, element_interval_wavelengths=(0.3, 0.6))
+    chosen = np.flatnonzero(np.arange(15) // 3 % 2 == 0)
+    np.testing.assert_allclose(
+        mp.multipath_covariance(sparse)[0],
+        mp.multipath_covariance(dense)[0][np.ix_(chosen, chosen)], rtol=1e-9)
+
+
 def test_the_multipath_from_a_side_is_coherent_with_a_wave_from_there(small):
     aside = dataclasses.replace(
         small.scenario, angular_spread_deg=0.05, multipath_direction_deg=(60.0, 0.0))
@@ -232,13 +243,6 @@ def test_drawn_gains_have_the_covariance(fading, plain):
     # Bands are independent.
     power = np.sqrt(np.prod([np.mean(np.abs(gains)**2) for gains in (first, second)]))
     assert_sample_covariance(first, second, 0, power)
-
-
-def test_drawn_gains_are_reproducible(small):
-    one, same, other = (mp.draw_multipath(small.scenario, 0, 2, np.random.default_rng(seed))
-                        for seed in (7, 7, 8))
-    np.testing.assert_array_equal(one, same)
-    assert not np.isclose(one, other).any()
 
 
 def test_complex_normal_is_circular_with_unit_variance():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario, ScenarioError
+from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Pose, Scenario, ScenarioError
 from rhs_isac_ros.model.hall import PathChannel
 from rhs_isac_ros.support import plugins
 
@@ -35,7 +35,8 @@ def test_defaults_are_table_1_of_the_paper():
              'timing_std_s', 'carrier_offset_std_hz', 'element_error_rms',
              'failed_element_share', 'amplitude_levels'), 0),
         'multipath_direction_deg': (0.0, 0.0), 'impairments': (),
-        'blocked_probability': 0.0, 'multipath': None, 'channel': None}
+        'blocked_probability': 0.0, 'outside_probability': 0.5, 'multipath': None, 'channel': None,
+        'pose': dataclasses.asdict(Pose())}
     assert dataclasses.asdict(Scenario()) == expected
 
 
@@ -88,6 +89,13 @@ def test_a_surface_has_one_or_two_numbers_of_elements():
     assert len({wide.id, square.id, Scenario(elements_per_side=(3, 12)).id}) == 3
 
 
+def test_elements_may_have_two_intervals():
+    assert Scenario(element_interval_wavelengths=[0.3, 0.3]) == Scenario()
+    uneven = Scenario(element_interval_wavelengths=(0.4, 0.25))
+    assert uneven == Scenario(**uneven.changes())
+    assert len({uneven.id, Scenario().id, Scenario(element_interval_wavelengths=0.4).id}) == 3
+
+
 def test_ids_precede_later_fields():
     """Files hold the ids of scenarios that leave these fields at their defaults."""
     assert Scenario().id == 'sc337b8b24c90a1923'
@@ -128,6 +136,9 @@ BAD = [
     ('elements_per_side', [4, 5, 6], '[4, 5, 6]', 'expected an integer or two'),
     ('elements_per_side', [4, 2.5], '2.5', 'expected an integer'),
     ('elements_per_side', [4, 129], '129', 'expected 1 to 128'),
+    ('element_interval_wavelengths', [0.3], '[0.3]', 'expected a number or two'),
+    ('element_interval_wavelengths', [], '[]', 'expected a list of numbers'),
+    ('element_interval_wavelengths', [0.3, 0], '0.0', 'expected 0.001 to 10'),
     ('roi_size_m', [1, -1, 1], '-1.0', 'expected 0 to 1e+06 m'),
     ('roi_size_m', [0, 0, 0], '(0.0, 0.0, 0.0)', 'expected at least one length above 0'),
     ('angular_spread_deg', 0.005, '0.005', 'expected 0.01 to 1000 deg'),
@@ -177,6 +188,8 @@ def test_values_just_outside_the_bounds_are_errors(field, plugin):
             value = [1e9, value]
         elif field.name == 'impairments':
             value = {plugin: value}
+        elif field.name == 'pose':
+            value = {'position_m': [10, value, 1]}
         elif isinstance(field.default, tuple):
             value = [10, value, 1][:len(field.default)]
         with pytest.raises(ScenarioError, match=f'^{field.name}: .*, expected .* to .*'):
@@ -190,7 +203,8 @@ def test_bounds_are_inclusive(field, value):
     assert getattr(Scenario(**{field: value}), field) == value
 
 
-@pytest.mark.parametrize('field', ['failed_element_share', 'blocked_probability'])
+@pytest.mark.parametrize('field', [
+    'failed_element_share', 'blocked_probability', 'outside_probability'])
 def test_probabilities_are_at_most_one(field):
     assert getattr(Scenario(**{field: 1.0}), field) == 1
     with pytest.raises(ScenarioError, match=f'^{field}: .*, expected .*0 to 1'):
@@ -274,6 +288,11 @@ def test_an_empty_file_is_table_1(tmp_path):
     ('n_feeds', ['expected a mapping of field names to values']),
     ('n_feeds: [', ['cannot be read']),
     ('n_feeds: 3e0', ["n_feeds: '3e0'", 'expected an integer']),
+    ('n_feeds: 010', ["n_feeds: '010'", 'expected an integer']),
+    ('noise_psd_dbm_hz: -1:30', ["noise_psd_dbm_hz: '-1:30'", 'expected a number']),
+    ('noise_psd_dbm_hz: -0170', ["noise_psd_dbm_hz: '-0170'", 'expected a number']),
+    ('roi_center_m: [010, 0, 0]', ["roi_center_m: '010'", 'expected a number']),
+    ('n_feeds: 2\nn_frames: 4\nn_feeds: 3', ['n_feeds: repeated in line 3', 'expected one value']),
     ('max_power_w: -28e9', ['max_power_w: -28000000000.0', 'expected 1e-15 to 1e+06 W']),
     ('roi_center_m: [1, 2]', ['roi_center_m: 2 values', 'expected a list of 3 numbers']),
     ('max_power_w: 2023-99-99', ['cannot be read']),
@@ -313,6 +332,44 @@ def test_the_id_is_a_hash_of_the_content():
     ({'center_frequencies_hz': [28e9]}, 'scd6c6596ccd3b8041')], ids=str)
 def test_without_impairments_the_id_is_that_of_existing_files(changes, expected):
     assert Scenario(**changes).id == Scenario(**changes, impairments={}).id == expected
+
+
+class TestPose:
+    """The pose of the surface in the frame of the site."""
+
+    PLACED = {'position_m': [0.0, 10.0, 1.0], 'quaternion': [0.0, 0.0, -0.5, 0.5],
+              'uncertainty': [0.01, 0.1]}
+
+    def test_a_file_is_read_and_written(self, tmp_path):
+        path = tmp_path / 'scenario.yaml'
+        path.write_text('pose: {position_m: [0, 10, 1], quaternion: [0, 0, -0.5, 0.5], '
+                        'uncertainty: [0.01, 0.1]}', encoding='utf-8')
+        scenario = Scenario.from_yaml(path)
+        assert scenario.pose == Pose((0, 10, 1), (0, 0, -0.5, 0.5), (0.01, 0.1))
+        assert scenario.changes() == {'pose': self.PLACED}
+        path.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
+        assert Scenario.from_yaml(path) == Scenario(**scenario.fields()) == scenario
+
+    def test_an_omitted_part_has_its_default(self):
+        scenario = Scenario(pose={'position_m': [0, 0, 1.5]})
+        assert scenario.pose == Pose((0.0, 0.0, 1.5))
+
+    def test_the_id_depends_on_every_part(self):
+        parts = [{name: value} for name, value in self.PLACED.items()]
+        assert len({Scenario().id, *(Scenario(pose=part).id for part in parts)}) == 4
+        assert Scenario(pose=self.PLACED).unplaced == Scenario()
+
+    @pytest.mark.parametrize(('value', 'words'), [
+        ([0, 0, 1], ['[0, 0, 1]', 'expected a mapping of', 'position_m']),
+        ({'position': [0, 0, 1]}, ['position', 'expected a mapping of', 'position_m']),
+        ({'position_m': [0, 1]}, ['position_m: shape (2,), expected [3]']),
+        ({'quaternion': [0, 0, 0, 0]}, ['quaternion: zeros']),
+        ({'uncertainty': [0.1, -1]}, ['uncertainty: -1, expected at least 0'])], ids=str)
+    def test_an_error_names_the_part(self, value, words):
+        with pytest.raises(ScenarioError, match='^pose: ') as caught:
+            Scenario(pose=value)
+        for word in words:
+            assert word in str(caught.value)
 
 
 class TestImpairments:
@@ -380,3 +437,17 @@ def test_positions_are_uniform_in_the_region():
     np.testing.assert_allclose(unit.mean(axis=0), 0.5, atol=0.01)
     np.testing.assert_allclose(np.cov(unit.T), np.eye(3) / 12, atol=0.003)
     np.testing.assert_array_equal(positions, s.sample_positions(20_000, np.random.default_rng(0)))
+
+
+@pytest.mark.parametrize(('field', 'value'), [
+    ('delay_spread_s', np.complex128(3 + 2j)), ('delay_spread_s', 1e-7 + 0j),
+    ('n_feeds', np.complex128(3)), ('element_gain', 2 + 1j), ('user_gain', np.complex64(1)),
+    ('center_frequencies_hz', np.array([2.5e9 + 1j, 3e9])), ('roi_center_m', [10, 1j, 0]),
+    ('feed_positions_m', np.zeros((3, 3), complex)), ('delay_spread_s', np.ma.masked),
+    ('roi_center_m', np.ma.array([10.0, 0, 0], mask=[1, 0, 0])), ('n_feeds', np.ma.array(3)),
+    ('elements_per_side', np.ma.array([8, 8], mask=[1, 0])), ('roi_size_m', [np.ma.masked, 1, 1]),
+    ('feed_positions_m', np.ma.zeros((3, 3))), ('impairments', {'x': 1j}), ('n_feeds', np.True_),
+    ('delay_spread_s', b'1e-7'), ('center_frequencies_hz', np.array(2.5e9))])
+def test_only_real_numbers_are_values(field, value):
+    with pytest.raises(ScenarioError, match=rf'(?s)^{field}: .*(expected|not installed)'):
+        Scenario(**{field: value})

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog
+from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CycleLog
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 
@@ -101,13 +101,6 @@ def test_a_cycle_without_a_position_is_given_up_but_has_not_failed():
     assert log.failed == log.complete == []
 
 
-def test_a_running_cycle_is_neither_complete_nor_given_up(network):
-    net = network()
-    net.run_to(State.STEERING)
-    log = log_of(net)
-    assert log.complete == log.given_up == []
-
-
 @pytest.mark.parametrize('kind', [
     m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Capacity])
 def test_a_served_cycle_is_complete_once_its_last_message_arrives(network, kind):
@@ -195,14 +188,6 @@ def test_old_cycles_without_an_end_are_discarded(example):
     for cycle_id in (1, 50, 99, 100):
         log.add(example(m.ProtocolState, cycle_id=cycle_id, outcome='user_gone'), 200.0)
     assert [record.cycle_id for record in log.given_up] == [99, 100]
-
-
-def test_the_error_is_the_distance(example):
-    cycle = CompleteCycle(
-        1, truth=example(m.GroundTruth, position=np.array([1.0, 2.0, 3.0])),
-        signals=example(m.ReceivedSignals), capacity=example(m.Capacity),
-        estimate=example(m.PositionEstimate, position=np.array([1.0, 5.0, -1.0])))
-    assert cycle.error_m == pytest.approx(5.0)
 
 
 def test_clearing_keeps_the_running_cycle(network):

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.monitoring import network_state
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES
 from rhs_isac_ros.monitoring.network_state import RESTING, Overview
 from rhs_isac_ros.monitoring.role_statistics import Report
@@ -24,12 +23,6 @@ def overview_of(net, until_s=np.inf):
     return overview
 
 
-def test_the_overview_is_empty_before_the_first_message():
-    overview = Overview()
-    assert (overview.phase, overview.users, overview.nodes) == ('', {}, {})
-    assert overview.rate_hz(5.0) == 0
-
-
 def test_users_have_the_results_of_their_latest_cycle(network, codebooks):
     net = network(users=2, rest_s=0.5)
     net.run_cycles(4)
@@ -44,10 +37,8 @@ def test_users_have_the_results_of_their_latest_cycle(network, codebooks):
     assert (overview.phase, overview.cycle_id) == (RESTING, 4)
 
 
-def test_the_numbers_of_users_and_nodes_are_bounded(monkeypatch):
-    monkeypatch.setattr(network_state, 'MAX_USERS', 2)
-    monkeypatch.setattr(network_state, '_MAX_NODES', 2)
-    overview = Overview()
+def test_the_numbers_of_users_and_nodes_are_bounded():
+    overview = Overview(max_users=2, max_nodes=2)
     for number in (1, 2, 3):
         overview.add(m.GroundTruth(
             cycle_id=1, user=number, position=np.ones(3), velocity=np.zeros(3)), 0.0)

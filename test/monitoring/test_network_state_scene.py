@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from rhs_isac_ros.monitoring import network_state
-from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState
+from rhs_isac_ros.monitoring.network_state import SceneState
 from rhs_isac_ros.protocol import messages as m
 
 
@@ -49,22 +48,8 @@ def test_the_scene_is_complete_once_every_user_has_an_estimate():
     assert scene.complete
 
 
-def test_the_messages_of_a_network_complete_it(network):
-    net = network()
-    net.run_cycles(3)
-    scene = SceneState()
-    for sent in net.log:
-        if isinstance(sent.message, SCENE_RECEIVES):
-            scene.add(sent.message, sent.time_s)
-    assert scene.complete
-    assert scene.shown_user.estimate.cycle_id == 3
-    assert len(scene.users[1].estimated_path) == 3
-    assert scene.beam.cycle_id == 3
-
-
-def test_the_number_of_users_is_bounded(monkeypatch):
-    monkeypatch.setattr(network_state, 'MAX_USERS', 2)
-    scene = SceneState()
+def test_the_number_of_users_is_bounded():
+    scene = SceneState(max_users=2)
     scene.add(m.GroundTruths(
         cycle_id=0, users=np.arange(1, 4), position=np.ones((3, 3)), velocity=np.zeros((3, 3))),
         1.0)
@@ -106,6 +91,7 @@ def test_a_silent_user_is_discarded_with_its_beam():
         scene.add(truth(user, [9, 0, 0]), time_s)
     scene.add(beam(1), 1.0)
     assert scene.discard_stale(1.0) == []
+    assert scene.beam.user == 1
     scene.add(estimate(2, [9, 0, 0], 1), 3.0)
     assert scene.discard_stale(2.5) == [1]
     assert list(scene.users) == [2]

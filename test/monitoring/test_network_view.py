@@ -7,12 +7,12 @@ import types
 import numpy as np
 import pytest
 
+from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.monitoring import network_view
 from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView
 from rhs_isac_ros.monitoring.role_statistics import Report
-from rhs_isac_ros.monitoring.shapes import Clear, Number, Series, Text
-from rhs_isac_ros.positioning import WeightedModes
+from rhs_isac_ros.monitoring.shapes import Clear, Number, Text
 from rhs_isac_ros.protocol import messages as m
 
 N_CYCLES = 4
@@ -28,7 +28,6 @@ def watched(network, scenario):
     run = network(users=2)
     run.run_cycles(N_CYCLES)
     view = NetworkView(scenario)
-    view.set_bound(run.sent(m.ReceivedSignals)[0].codebook_id, 0.25)
     entries = [*view.begin()]
     for sent in messages_of(run):
         entries += view.add(sent.message, sent.time_s)
@@ -71,9 +70,20 @@ def test_truth_and_estimate_are_those_of_the_messages(watched):
             assert any((shown == truth.position).all() for shown in truths)
 
 
+def test_the_surface_is_placed_once_and_its_shapes_are_below_it(scenario):
+    pose = Pose((1.0, 2.0, 3.0), (0.0, 0.0, 1.0, 1.0))
+    placed = NetworkView(dataclasses.replace(scenario, pose=pose)).begin()
+    ((cycle, placement),) = on(placed, network_view.SURFACE)
+    assert cycle == 0
+    np.testing.assert_array_equal(placement.origin, pose.origin)
+    np.testing.assert_array_equal(placement.rotation, pose.rotation)
+    ((_, region),) = on(placed, f'{network_view.SURFACE}/region')
+    np.testing.assert_array_equal(region.centres[0], scenario.roi_center_m)
+
+
 def test_the_board_shows_each_configuration(watched, scenario):
     sent = watched.run.sent(m.RhsConfiguration)
-    shown = on(watched.entries, f'{network_view.WORLD}/board')
+    shown = on(watched.entries, f'{network_view.SURFACE}/board')
     assert len(shown) == len(sent)
     for (_, board), message in zip(shown, sent, strict=True):
         assert board.centres / board.centres.max() == pytest.approx(
@@ -103,40 +113,44 @@ def test_charts_show_each_served_cycle(watched):
     *_, (cycle, mean) = on(watched.entries, 'error/root_mean_square')
     assert (cycle, mean.value) == (
         N_CYCLES, pytest.approx(np.sqrt(np.mean(np.square(expected)))))
-    *_, (_, bound) = on(watched.entries, 'error/global_bound')
-    assert bound.value == 0.5
     crlbs = [entity.value for _, entity in on(watched.entries, 'error/crlb')
              if isinstance(entity, Number)]
     assert crlbs == pytest.approx([
         np.sqrt(sent.crlb_m2) for sent in watched.run.sent(m.PositionEstimate)][:N_CYCLES])
 
 
-def test_each_series_has_a_chart_and_one_style(watched):
-    series = [entry for entry in watched.entries if isinstance(entry.entity, Series)]
-    paths = [entry.path for entry in series]
-    assert len(set(paths)) == len(paths) > 10
-    assert {path.partition('/')[0] for path in paths} <= set(network_view.TITLES)
-    assert {entry.cycle for entry in series} == {0}
-    assert {entry.path for entry in watched.entries if isinstance(entry.entity, Number)} == set(
-        paths)
+def test_charts_have_milliseconds_and_megabits(watched):
+    (state,) = watched.run.sent(m.ProtocolState, cycle_id=1, phase=m.Phase.BEACONING)
+    (capacity,) = watched.run.sent(m.Capacity, cycle_id=1)
+    values = {entry.path: entry.entity.value for entry in reversed(watched.entries)
+              if isinstance(entry.entity, Number)}
+    phases = ('beaconing', 'positioning', 'estimating', 'transmitting')
+    assert sum(values[f'latency/{phase}'] for phase in phases) == pytest.approx(
+        1e3 * state.elapsed_s)
+    assert values['capacity/actual'] == pytest.approx(1e-6 * capacity.actual_bps)
 
 
 def test_the_bars_of_the_modes_are_at_the_errors_of_their_ranges(watched):
     received = watched.run.sent(m.ReceivedSignals)[0]
     (truth,) = watched.run.sent(m.GroundTruth, cycle_id=received.cycle_id, user=received.user)
     sight = truth.position / np.linalg.norm(truth.position)
-    found = WeightedModes(np.array([0.7, 0.299, 0.001]), np.stack([
-        truth.position, truth.position + 0.6 * sight, truth.position - 1.2 * sight]),
-        np.tile(np.eye(3), (3, 1, 1)))
-    entries = watched.view.add_modes(received, found)
+    probabilities = np.array([0.7, 0.299, 0.001])
+    posterior = m.Posterior(
+        cycle_id=received.cycle_id, user=received.user, codebook_id='cb',
+        log_weights=np.log(probabilities), means=np.stack([
+            truth.position, truth.position + 0.6 * sight, truth.position - 1.2 * sight]),
+        covariances_m2=np.tile(np.eye(3), (3, 1, 1)), log_evidence=0.0,
+        missing_probability=0.001, surface_position_m=np.zeros(3),
+        surface_quaternion=np.array([0.0, 0.0, 0.0, 1.0]), surface_uncertainty=np.zeros((6, 6)))
+    entries = watched.view.add(posterior, 0.0)
     ((cycle, bars),) = on(entries, f'{network_view.MODES}/found')
     assert cycle == 1
     assert np.array([bar[1, 0] for bar in bars.strips]) == pytest.approx([0, 0.6, -1.2])
     heights = np.array([-bar[1, 1] for bar in bars.strips])
-    assert heights / heights.sum() == pytest.approx(found.probabilities)
+    assert heights / heights.sum() == pytest.approx(probabilities)
     # In the scene, those of little probability are left out.
     ((_, balls),) = on(entries, f'{network_view.WORLD}/user_{received.user}/modes')
-    assert balls.positions == pytest.approx(found.positions[:2])
+    assert balls.positions == pytest.approx(posterior.means[:2])
     assert balls.radii_m[0] > balls.radii_m[1]
 
 
@@ -144,7 +158,6 @@ def test_signals_without_a_position_end_what_was_shown_of_the_user(watched):
     received = watched.run.sent(m.ReceivedSignals)[-1]
     entries = watched.view.add(m.NoFix(
         cycle_id=received.cycle_id, user=received.user, codebook_id='cb', reason='noise'), 99.0)
-    entries += watched.view.add_modes(received, None)
     path = f'{network_view.WORLD}/user_{received.user}'
     for part in (f'{path}/estimate', f'{path}/modes', f'{network_view.MODES}/found'):
         assert all(isinstance(entity, Clear) for _, entity in on(entries, part))
@@ -155,7 +168,7 @@ def test_a_track_continues(watched):
     path = f'{network_view.WORLD}/user_1/track'
     for step in range(3):
         entries = watched.view.add_track(
-            0, 1, np.array([9.0, step, 0.0]), np.eye(3), np.array([0.0, 1.0, 0.0]))
+            1, np.array([9.0, step, 0.0]), np.eye(3), np.array([0.0, 1.0, 0.0]))
     ((cycle, lines),) = on(entries, path)
     assert cycle == watched.view.n_cycles
     places, velocity = lines.strips
@@ -187,26 +200,8 @@ def test_dropped_messages_are_shown_for_all_nodes_and_for_those_with_any(scenari
     assert values == {'drops/bs': 4, 'drops/all': 4}
 
 
-def test_few_nodes_that_drop_messages_have_a_series_of_their_own(scenario):
-    view = NetworkView(scenario)
-    entries = [entry for number in range(20) for entry in view.add_report(
-        f'node_{number}', Report(True, '', {'dropped.duplicate': '1'}))]
-    series = [entry.path for entry in entries if isinstance(entry.entity, Series)]
-    assert series == ['drops/all', *(f'drops/node_{number}' for number in range(4))]
-    assert on(entries, 'drops/all')[-1][1].value == 20
-
-
-def test_the_name_of_a_user_is_above_the_user(watched):
-    ((_, ball), *_), ((_, name), *_) = (
-        on(watched.entries, f'{network_view.WORLD}/user_1/{part}') for part in ('truth', 'name'))
-    assert (ball.labels, name.labels) == ((), ('user 1',))
-    assert (name.positions - ball.positions)[0] == pytest.approx([0, 0, 1])
-
-
-def test_cycles_of_further_users_are_in_the_charts(watched, scenario, monkeypatch):
-    monkeypatch.setattr(network_view, '_MAX_USERS', 1)
-    monkeypatch.setattr(network_view, '_MAX_SERIES', 1)
-    view = NetworkView(scenario)
+def test_cycles_of_further_users_are_in_the_charts(watched, scenario):
+    view = NetworkView(scenario, network_view.Charts(max_series=1), max_users=1)
     entries = [entry for sent in messages_of(watched.run)
                for entry in view.add(sent.message, sent.time_s)]
     assert view.n_ended == N_CYCLES
@@ -223,11 +218,3 @@ def test_the_number_of_users_is_bounded(scenario):
     shown = [user for user in range(1, 200) if view.add(m.GroundTruth(
         cycle_id=0, user=user, position=np.ones(3), velocity=np.zeros(3)), 0.0)]
     assert shown == list(range(1, 65))
-
-
-def test_the_names_of_few_users_are_shown(scenario):
-    view = NetworkView(scenario)
-    named = [entry.path for user in range(1, 20) for entry in view.add(m.GroundTruth(
-        cycle_id=0, user=user, position=np.ones(3), velocity=np.zeros(3)), 0.0)
-        if entry.path.endswith('/name')]
-    assert named == [f'{network_view.WORLD}/user_{user}/name' for user in range(1, 9)]

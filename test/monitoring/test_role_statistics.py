@@ -76,34 +76,38 @@ def test_latencies_are_percentiles_of_the_latest_durations(example):
         assert float(values[f'estimate_ms.p{percent}']) == pytest.approx(2 * expected, abs=1e-3)
 
 
-def test_a_fault_is_reported_once_and_a_missing_role_until_it_is_present():
+MISSING = ('channel', 'bs')
+DEVIATING = {'warning.residual': 'signals deviate', 'residual.ratio': '1.200'}
+
+
+@pytest.mark.parametrize('reports', [
+    # A fault is reported once, and a missing role until it is present.
+    [('', {'wrong_user': 2, 'unanswered': 5}, (), {}, 'new faults: wrong_user 2'),
+     ('', {'wrong_user': 2, 'unanswered': 5}, (), {}, ''),
+     ('', {'wrong_user': 2, 'unanswered': 5}, MISSING, {}, 'waiting for channel, bs'),
+     ('', {'wrong_user': 2, 'unanswered': 5}, MISSING, {}, 'waiting for channel, bs'),
+     ('', {'wrong_user': 2, 'unanswered': 9}, (), {}, '')],
+    # The summary names the most frequent new faults.
+    [('', {'late_ack': 50, 'user_gone': 1}, (), {}, 'new faults: late_ack 50, user_gone 1'),
+     ('', {'late_ack': 51, 'user_gone': 4, 'stale': 2, 'wrong_cycle': 2, 'retry_rhs': 1,
+           'unanswered': 9}, (), {},
+      'new faults: user_gone 3, stale 2, wrong_cycle 2, others 2')],
+    # A pause is no fault.
+    [('paused', {'late_ack': 1}, (), {}, 'new faults: late_ack 1'),
+     ('paused', {'late_ack': 1}, (), {}, '')],
+    # A conflict precedes all other faults.
+    [('', {'no_fix': 1}, MISSING, {'conflict.role': 'two nodes'} | DEVIATING, 'two nodes')],
+    # A lasting fault of the role is in every summary.
+    [('', {'no_fix': 1}, (), DEVIATING, 'signals deviate'),
+     ('', {'no_fix': 1}, (), DEVIATING, 'signals deviate'), ('', {'no_fix': 1}, (), {}, '')]])
+def test_faults_are_summarised(reports):
     statistics = RoleStatistics()
-    counters = {'wrong_user': 2, 'unanswered': 5}
-    first, second = (statistics.report('', counters) for _ in range(2))
-    assert (first.fault, second.fault) == (True, False)
-    assert first.summary == 'new faults: wrong_user 2'
-    statistics.missing = ('channel', 'bs')
-    for _ in range(2):
-        report = statistics.report('', counters)
-        assert (report.fault, report.summary) == (True, 'waiting for channel, bs')
-    statistics.missing = ()
-    assert not statistics.report('', counters | {'unanswered': 9}).fault
-
-
-def test_the_summary_names_the_most_frequent_new_faults():
-    statistics = RoleStatistics()
-    statistics.report('', {'late_ack': 50, 'user_gone': 1})
-    report = statistics.report('', {
-        'late_ack': 51, 'user_gone': 4, 'stale': 2, 'wrong_cycle': 2, 'retry_rhs': 1,
-        'unanswered': 9})
-    assert report.summary == 'new faults: user_gone 3, stale 2, wrong_cycle 2, others 2'
-
-
-def test_a_pause_is_no_fault():
-    statistics = RoleStatistics()
-    assert statistics.report('paused', {'late_ack': 1}).fault
-    report = statistics.report('paused', {'late_ack': 1})
-    assert (report.fault, report.summary) == (False, 'paused')
+    for phase, counters, missing, status, expected in reports:
+        statistics.missing = missing
+        report = statistics.report(phase, counters, status=status)
+        assert report.fault == bool(expected)
+        assert report.summary == (expected or phase or 'no fault')
+        assert report.values.items() >= status.items()
 
 
 def test_statistics_of_a_base_station_match_its_messages(network):
@@ -123,22 +127,3 @@ def test_statistics_of_a_base_station_match_its_messages(network):
     assert (values['cycles.served'], values['cycles.positioner_silent']) == ('3', '1')
     assert int(values['sent.Beacon']) == len(net.sent(m.Beacon)) - 1
     assert 10 < float(values['cycle_ms.p50']) < 50
-
-
-def test_a_conflict_is_reported_before_all_other_faults():
-    statistics = RoleStatistics()
-    statistics.missing = ('channel',)
-    status = {'conflict.role': 'two nodes', 'warning.residual': 'signals deviate'}
-    report = statistics.report('', {'no_fix': 1}, status=status)
-    assert (report.fault, report.summary) == (True, 'two nodes')
-
-
-def test_a_lasting_fault_of_the_role_is_in_every_summary():
-    statistics = RoleStatistics()
-    status = {'warning.residual': 'signals deviate', 'residual.ratio': '1.200'}
-    for counters in ({'no_fix': 1}, {'no_fix': 1}):
-        report = statistics.report('', counters, status=status)
-        assert report.fault
-        assert report.summary == 'signals deviate'
-        assert report.values.items() >= status.items()
-    assert not statistics.report('', {'no_fix': 1}).fault

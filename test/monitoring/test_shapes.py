@@ -1,5 +1,7 @@
 """Shapes of a scene, compared with their geometry."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -57,17 +59,21 @@ def test_the_radius_of_a_lobe_is_the_level_in_decibels():
         np.array([[[8, 0, 0], [0, 4, 0]], [[0, 0, 0], [0, 0, 0]]]))
 
 
-def test_the_board_is_to_scale_or_enlarged(small):
-    configuration = np.linspace(0, 1, 2 * small.scenario.n_elements).reshape(2, -1)
-    true, large = (board(small.scenario, configuration, enlarged) for enlarged in (False, True))
-    assert true.centres == pytest.approx(element_positions(small.scenario))
+@pytest.mark.parametrize('intervals', [0.3, (0.4, 0.2)])
+def test_the_board_is_to_scale_or_enlarged(small, intervals):
+    scenario = dataclasses.replace(small.scenario, element_interval_wavelengths=intervals)
+    configuration = np.linspace(0, 1, 2 * scenario.n_elements).reshape(2, -1)
+    true, large = (board(scenario, configuration, enlarged) for enlarged in (False, True))
+    assert true.centres == pytest.approx(element_positions(scenario))
     factor = large.half_sizes_m[0, 1] / true.half_sizes_m[0, 1]
     assert factor > 1
     assert large.centres == pytest.approx(factor * true.centres)
     for shown in (true, large):
         assert shown.colours[:, 0] == pytest.approx(configuration.mean(axis=0))
-        assert 0 < 2 * shown.half_sizes_m[0, 1] < np.diff(np.unique(shown.centres[:, 1])).min()
-    assert len(np.unique(board(small.scenario, None).colours[:, 0])) == 1
+        for axis in (1, 2):
+            gap_m = np.diff(np.unique(shown.centres[:, axis])).min()
+            assert 0 < 2 * shown.half_sizes_m[0, axis] < gap_m
+    assert len(np.unique(board(scenario, None).colours[:, 0])) == 1
 
 
 def test_the_paths_of_a_traced_scenario_are_straight_or_bend_at_the_wall():

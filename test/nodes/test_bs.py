@@ -1,14 +1,13 @@
 """The action ``locate``, called by a client, during the messages of a cycle."""
 
+import time
 import types
-from unittest import mock
 
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Time
 from rclpy.action.client import ActionClient
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from rhs_isac_msgs.action import Locate
@@ -20,7 +19,7 @@ from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.topics import LOCATE
 
 PHASES = (m.Phase.POSITIONING, m.Phase.ESTIMATING)
-FRAME = Frame('odom', origin=np.array([1.0, 0.0, 0.0]))
+FRAME = Frame('odom')
 
 
 def state(user, phase, outcome='', cycle_id=7):
@@ -35,12 +34,13 @@ def estimate(user, cycle_id=7):
 
 
 @pytest.fixture
-def action(bench):
+def action(bench, request):
     """The action, the users it requested, and a function that sends a goal."""
     requested = []
     server = LocateServer(
         bench.add(Node, 'bs'), requested.append,
-        lambda found: convert.pose(found, Time(sec=4), FRAME), max_users=8)
+        lambda found: convert.pose(found, Time(sec=4), FRAME), max_users=8,
+        max_goals=getattr(request, 'param', 100))
     client = ActionClient(bench.add(Node, 'client'), Locate, LOCATE)
     bench.until(client.server_is_ready, 'the action')
 
@@ -75,7 +75,7 @@ def test_the_position_arrives_after_the_feedback_of_each_phase(bench, action):
     assert goal.feedback == [(m.Phase.BEACONING, 0), *((phase, 7) for phase in PHASES)]
     assert (result.cycle_id, result.reason) == (7, '')
     assert (result.pose.header.frame_id, result.pose.header.stamp.sec) == ('odom', 4)
-    assert (result.pose.pose.pose.position.x, result.pose.pose.pose.position.y) == (10.0, 1.0)
+    assert (result.pose.pose.pose.position.x, result.pose.pose.pose.position.y) == (9.0, 1.0)
 
 
 @pytest.mark.parametrize('phases', [PHASES[:n] for n in range(3)])
@@ -130,19 +130,8 @@ def test_a_goal_ends_after_its_timeout(bench, action):
         'no position within 0.05 s')
 
 
-def test_a_goal_whose_timer_was_refused_succeeds(bench, action, monkeypatch):
-    monkeypatch.setattr(Node, 'create_timer', mock.Mock(
-        side_effect=rclpy_implementation.RCLError('no memory, at a.cpp:1')))
-    goal = action.send(1)
-    action.server.observe(state(1, m.Phase.POSITIONING))
-    action.server.observe(estimate(1))
-    assert finish(bench, goal, GoalStatus.STATUS_SUCCEEDED).cycle_id == 7
-    assert 'timer of 60 s was refused: no memory' in endpoints.refusals(
-        action.server._node).values()
-
-
-def test_the_number_of_goals_and_of_timers_is_limited(bench, action, monkeypatch):
-    monkeypatch.setattr(bs, '_MAX_GOALS', 3)
+@pytest.mark.parametrize('action', [3], indirect=True)
+def test_the_number_of_goals_and_of_timers_is_limited(bench, action):
     node = action.server._node
     for _ in range(2):
         goals = [action.send(1) for _ in range(3)]
@@ -151,6 +140,48 @@ def test_the_number_of_goals_and_of_timers_is_limited(bench, action, monkeypatch
             bench.result(goal.handle.cancel_goal_async())
             finish(bench, goal, GoalStatus.STATUS_CANCELED)
         bench.until(lambda: not [*node.timers], 'no timers')
+
+
+@pytest.mark.parametrize('n_clients', [1, 50])
+@pytest.mark.parametrize('action', [40], indirect=True)
+def test_each_of_many_goals_at_once_is_accepted_or_refused(bench, action, n_clients):
+    node = bench.add(Node, 'clients')
+    # Each client receives the answers to all others.
+    clients = [ActionClient(node, Locate, LOCATE, goal_service_qos_profile=endpoints.SERVICES)
+               for _ in range(n_clients)]
+    bench.until(lambda: all(client.server_is_ready() for client in clients), 'the action')
+    sent = [clients[n % n_clients].send_goal_async(Locate.Goal(user=1, timeout_s=60.0))
+            for n in range(50)]
+    bench.until(lambda: all(future.done() for future in sent), 'the answers')
+    assert sum(future.result().accepted for future in sent) == 40
+    for client in clients:
+        client.destroy()
+
+
+def test_answers_to_many_goals_leave_a_client_the_time_to_take_them(bench, action):
+    """By default, the queue of a client holds ten answers."""
+    client = ActionClient(bench.add(Node, 'eager'), Locate, LOCATE)
+    bench.until(client.server_is_ready, 'the action')
+    begin_s = time.monotonic()
+    sent = [client.send_goal_async(Locate.Goal(user=1, timeout_s=60.0)) for _ in range(20)]
+    bench.until(lambda: all(future.done() for future in sent), 'the answers')
+    assert time.monotonic() >= begin_s + 18 * bs._ANSWER_S
+    client.destroy()
+
+
+def test_answers_to_many_goals_leave_many_clients_in_one_process_the_time_to_take_them(
+        bench, action, monkeypatch):
+    monkeypatch.setattr(bs, '_ANSWER_PER_CLIENT_S', 0.01)
+    node = bench.add(Node, 'eager')
+    clients = [ActionClient(node, Locate, LOCATE) for _ in range(5)]
+    topic = f'/{LOCATE}/_action/feedback'
+    bench.until(lambda: action.server._node.count_subscribers(topic) >= 5, 'the clients')
+    begin_s = time.monotonic()
+    sent = [client.send_goal_async(Locate.Goal(user=1, timeout_s=60.0)) for client in clients]
+    bench.until(lambda: all(future.done() for future in sent), 'the answers')
+    assert time.monotonic() >= begin_s + 4 * 5 * 0.01
+    for client in clients:
+        client.destroy()
 
 
 def test_a_goal_ends_with_the_action(bench, action):

@@ -102,13 +102,7 @@ def test_changes_of_policy_and_noise_are_reported(running):
     assert running.set('bs', policy='round_robin', receiver_noise=True).successful
     running.watch.until_served(2, processes=[running.process])
     assert len(running.watch.given_up) == before
-    assert "settings applied: policy 'first', receiver_noise 'false'" in running.process.log
-
-
-def test_an_invalid_value_is_rejected_with_the_reason(running):
-    result = running.set('bs', rest_s=1)
-    assert not result.successful
-    assert result.reason.startswith('rest_s: 1, expected a number with a decimal point, 0 to')
+    assert "settings applied: receiver_noise 'false', policy 'first'" in running.process.log
 
 
 def test_the_estimator_changes_without_the_loss_of_a_cycle(running):
@@ -149,24 +143,6 @@ def test_users_are_tracked_on_request(running):
     assert len(watch.given_up) == before
 
 
-def test_a_model_for_another_codebook_keeps_the_old_estimator(running, model):
-    before = len(running.watch.given_up)
-    assert running.set('positioner', estimator='neural', model_file=model('second')).successful
-    running.until_reported('positioner', parameter__estimator='bayes', pending__estimator=None)
-    assert 'trained for codebook' in running.diagnostics['positioner']['failed.estimator']
-    assert set(running.next_estimators().values()) == {'bayes'}
-    assert running.get('positioner', 'estimator') == 'bayes'
-    assert running.process.log.count('cannot build estimator neural, keeping bayes') == 1
-    # Set separately, the model comes first.
-    assert running.set('positioner', model_file=model('first')).successful
-    assert running.set('positioner', estimator='neural').successful
-    running.until_reported('positioner', parameter__estimator='neural', failed__estimator=None)
-    assert set(running.next_estimators().values()) == {'neural'}
-    assert not running.set('positioner', model_file='').successful
-    assert running.set('positioner', estimator='bayes', model_file='').successful
-    assert len(running.watch.given_up) == before
-
-
 def test_band_and_impairments_change(running):
     for band in (0, 1):
         assert running.set('transmission', band=band).successful
@@ -182,29 +158,6 @@ def test_band_and_impairments_change(running):
                        parameter__delay_s='0.001', pending__delay_s=None)
     assert int(running.diagnostics['channel']['dropped.emulated_double']) > 0
     assert running.set('channel', double_probability=0.0, delay_s=0.0).successful
-
-
-def frame_change(running):
-    """Largest relative change of the feed signals between the first two frames of a band."""
-    latest = running.watch.received[m.FeedSignals][-1].signals
-    return np.abs(latest[1] - latest[0]).max() / np.abs(latest[0]).max()
-
-
-def test_failed_elements_are_switched_on_and_off(running):
-    """If all elements are stuck, the configurations of the frames have no effect."""
-    assert running.set('channel', failed_element_share=1.0).successful
-    running.until_reported('channel', parameter__failed_element_share='1.0',
-                           pending__failed_element_share=None)
-    n_before = len(running.watch.received[m.FeedSignals])
-    running.watch.until(lambda: len(running.watch.received[m.FeedSignals]) > n_before + 5,
-                        'feed signals', [running.process])
-    # Doppler changes the multipath by about 1e-3 from frame to frame.
-    assert frame_change(running) < 5e-3
-    assert running.set('channel', failed_element_share=-1.0).successful
-    running.until_reported('channel', parameter__failed_element_share='-1.0',
-                           pending__failed_element_share=None)
-    running.watch.until_served(3, processes=[running.process])
-    assert frame_change(running) > 1e-2
 
 
 def test_the_codebook_in_use_is_reported(running, small_files):
@@ -228,11 +181,15 @@ def test_the_base_station_can_be_paused_stepped_and_resumed(running):
     assert message == 'paused' or message.startswith('the pause begins after cycle ')
     running.until_reported('bs', phase='paused')
     assert request('pause') == (True, 'already paused')
-    served = len(watch.served)
+
+    def ended():
+        # Some signals have no position, and their cycle ends without being served.
+        return sum(bool(message.outcome) for message in watch.received[m.ProtocolState])
+    before = ended()
     success, message = request('step')
     assert success
-    watch.until(lambda: len(watch.served) > served, 'the cycle', [running.process])
+    watch.until(lambda: ended() > before, 'the end of the cycle', [running.process])
     running.until_reported('bs', phase='paused')
-    assert len(watch.served) == served + 1
+    assert ended() == before + 1
     assert request('resume') == (True, 'resumed')
     watch.until_served(2, processes=[running.process])

@@ -2,7 +2,6 @@
 
 import gc
 import importlib
-import signal
 from pathlib import Path
 
 import pytest
@@ -51,7 +50,57 @@ CASES = {
                         ['argument -p: policy is a parameter of bs, expected one of user']),
     'of a viewer': ('network', {'forget_s': 2.0}, ['forget_s is a parameter of visualizer']),
     'of the optimizer': ('bs', ['--param', 'codebook.id:=x'], ['codebook.id']),
-    'of several nodes': ('optimizer', {'seed': 1}, ['seed is a parameter of bs, channel, user,']),
+    'of several nodes': ('optimizer', {'seed': 1}, [
+        'seed is a parameter of bs, channel, fusion, receiver, user,']),
+    'topic': ('user', {'mobility': 'odometry', 'odometry_topic': '/robot-1/odom'},
+              ['odometry_topic: ', "'/robot-1/odom'"]),
+    'empty topic': ('user', {'mobility': 'odometry', 'odometry_topic': "''"},
+                    ["odometry_topic: ''"]),
+    'topic with a blank': ('user', {'mobility': 'odometry', 'odometry_topic': 'my odom'},
+                           ['odometry_topic: ', 'my odom']),
+    'topic with an unknown substitution': (
+        'user', {'mobility': 'odometry', 'odometry_topic': '"{robot}/odom"'},
+        ['odometry_topic: ', '{robot}']),
+    'long topic': ('user', {'mobility': 'odometry', 'odometry_topic': 300 * 'a'},
+                   ['odometry_topic: ']),
+    'frame': ('positioner', {'frame_id': '/map'}, ["frame_id: '/map', expected the name"]),
+    'empty frame': ('bs', {'frame_id': "''"}, ["frame_id: '', expected the name"]),
+    'frame of a robot': ('user', {'robot_frame': '/base_link'}, ['robot_frame: ']),
+    'node name': ('user', ['-r', '__node:=robot-1'], ['__node:=robot-1']),
+    'node name of one node': ('network', ['-r', 'bs:__node:=robot-1'], ['bs:__node:=robot-1']),
+    'one name for all nodes': ('network', ['-r', '__node:=rhs'],
+                               ['argument -r: 9 nodes are renamed to /rhs', 'NAME:__node:=']),
+    'one name in another notation': ('network', ['--remap', '__name:=rhs'],
+                                     ['argument -r: 9 nodes are renamed']),
+    'one name for two nodes': ('network', ['-r', 'bs:__node:=channel'],
+                               ['-r: 2 nodes', '/channel']),
+    'namespace': ('user', ['-r', '__ns:=/robot-1'], ['__ns:=/robot-1']),
+    'relative namespace': ('user', ['-r', '__ns:=robot'], ['__ns:=robot']),
+    'remapped topic': ('user', ['-r', 'odom:=/robot-1/odom'], ['odom:=/robot-1/odom']),
+    'log level': ('bs', ['--log-level', 'loud'], ['--log-level loud']),
+    'enclave': ('bs', ['--enclave', 'robot-1'], ['nclave name']),
+    'not UTF-8': ('bs', ['-p', 'scenario_file:=\udcff.yaml'], ["\\udcff.yaml'", 'expected UTF-8']),
+    'file not in UTF-8': ('bs', ['--params-file', 'latin.yaml'], ['latin.yaml']),
+    'scenario not in UTF-8': ('bs', {'scenario_file': 'latin.yaml'}, ['latin.yaml: cannot be']),
+    'codebook not in UTF-8': ('optimizer', {'codebook_file': 'latin.yaml'},
+                              ['latin.yaml: cannot be']),
+    'override of reliability': (
+        'positioner', {'qos_overrides./position.publisher.reliability': 'best_efort'},
+        ['qos_overrides./position.publisher.reliability', "'best_efort'", 'best_effort']),
+    'override of depth': ('visualizer', {'qos_overrides./markers.publisher.depth': -1},
+                          ['qos_overrides./markers.publisher.depth: -1', '0 to 2147483647']),
+    'override with another type': (
+        'bs', {'qos_overrides./position.publisher.depth': 'ten'}, ["publisher.depth: 'ten'"]),
+    # Such a topic is created when its user appears.
+    'override of a later topic': (
+        'network', {'qos_overrides./users/user_1/pose.publisher.history': 'keep_lats'},
+        ['user_1/pose.publisher.history', "'keep_lats'", 'keep_last']),
+    'override without a topic': (
+        'user', {'qos_overrides.odom.subscription.depth': 3}, ['qos_overrides./TOPIC.']),
+    'override of an unknown policy': (
+        'user', {'qos_overrides./odom.subscription.dept': 3}, ['subscription.dept: invalid name']),
+    'override of no endpoint': (
+        'user', {'qos_overrides./odom.subscriber.depth': 3}, ['subscriber.depth: invalid name']),
     'no parameter file': ('bs', ['--params-file', '/no/parameters.yaml'],
                           ['/no/parameters.yaml']),
 }
@@ -67,8 +116,10 @@ def files(shipped, tmp_path_factory):
     (folder / 'shared.yaml').write_text(
         '/**:\n  ros__parameters: {seed: 3, policy: random, use_sim_time: false,\n'
         '    start_type_description_service: true,\n'
-        '    qos_overrides: {/beacon: {publisher: {depth: 3}}}}\n'
+        '    qos_overrides: {/beacon: {publisher: {depth: 3, reliability: BEST_EFFORT}},\n'
+        '      /tf: {publisher: {durability: volatile}}}}\n'
         'another_node:\n  ros__parameters: {anything: 1}\n')
+    (folder / 'latin.yaml').write_bytes(b'/**:\n  ros__parameters: {frame_id: "caf\xe9"}\n')
     (folder / 'broken.yaml').write_text('n_feeds: [\nn_frames: }\n')
     shipped.save(folder / 'good.yaml')
     first = repr(float(shipped.analog.flat[0]))
@@ -118,14 +169,10 @@ def no_node_is_left():
 
 @pytest.fixture
 def never_spins(monkeypatch):
-    """Raise where a start succeeds, and restore the signal handlers."""
+    """Raise where a start succeeds."""
     def refuse():
         raise AssertionError('the executable starts')
     monkeypatch.setattr(run, 'EventsExecutor', refuse)
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 @pytest.mark.parametrize('name', CASES)

@@ -1,6 +1,5 @@
 """The executable that runs a whole network in one process; two of them on one domain."""
 
-import signal
 import types
 
 import pytest
@@ -86,15 +85,3 @@ def test_a_new_codebook_is_used_from_one_cycle_to_the_next(networks):
     assert changes == [{networks.a.codebook.id}]
     serve_all(networks.b)
     assert codebook_ids(networks.b.watch) == {networks.b.codebook.id}
-
-
-def test_networks_end_after_one_or_many_signals(networks, crashed):
-    for network in (networks.a, networks.b):
-        network.watch.until_served(processes=[network.process])
-    for number in (signal.SIGINT, signal.SIGINT, signal.SIGTERM, signal.SIGINT):
-        networks.a.process.signal(number)
-    networks.b.process.signal(signal.SIGTERM)
-    for network in (networks.a, networks.b):
-        assert network.process.wait() == 0, network.process.log
-        assert not crashed(network.process.log), network.process.log
-        assert '[ERROR]' not in network.process.log, network.process.log

@@ -80,13 +80,6 @@ def test_the_codebook_is_in_the_parameter_services(bench, client, shipped):
         assert not descriptor.read_only
 
 
-def test_a_late_joiner_receives_the_codebook(bench, optimizer, probe, shipped):
-    message, = latched(bench, probe)
-    assert message.codebook_id == shipped.id
-    assert message.header.frame_id == 'rhs_link'
-    assert codebook_from_ros(message).id == shipped.id
-
-
 def test_a_complete_change_is_accepted_and_published(bench, optimizer, client, probe, other):
     received = latched(bench, probe)
     answer = bench.result(client.set_parameters_atomically(as_parameters(other)))
@@ -209,13 +202,6 @@ def test_a_codebook_file_can_be_loaded_at_run_time(
     assert held(optimizer).provenance == new.provenance
 
 
-def test_a_shipped_codebook_file_can_be_loaded_at_run_time(bench, optimizer, client):
-    path = default_codebook_file().with_name('codebook_crlb.yaml')
-    response = bench.result(client.load_parameter_file(str(path), use_wildcard=True))
-    assert all(result.successful for result in response.results), response
-    assert held(optimizer).id == Codebook.load(path).id
-
-
 def test_a_dump_can_be_loaded_again(bench, optimizer, client, probe, shipped, other, tmp_path):
     """It also contains read-only parameters, which keep their values."""
     names = bench.result(client.list_parameters()).result.names
@@ -270,11 +256,3 @@ def test_a_file_of_an_earlier_version_is_converted_at_the_start(bench, other, tm
         cli_args=['--ros-args', '--params-file', str(path), '-p', 'codebook.id:=""'])
     assert node.get_parameter('codebook.provenance').value == 'seed=0'
     assert node.get_parameter('codebook.id').value == other.id
-
-
-def test_scenario_and_codebook_come_from_the_given_files(bench, small, bench_files):
-    node = bench.add(OptimizerNode, parameter_overrides=[
-        Parameter('scenario_file', value=str(bench_files / 'scenario.yaml')),
-        Parameter('codebook_file', value=str(bench_files / 'first.yaml'))])
-    assert held(node).id == Codebook.load(bench_files / 'first.yaml').id
-    held(node).check(small.scenario)

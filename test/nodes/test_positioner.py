@@ -20,7 +20,6 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.support import plugins
-from rhs_isac_ros.support.fields import ParameterError
 
 PLACE = np.array([10.0, 0.5, 0.2])
 
@@ -67,7 +66,7 @@ def send(bench, node, codebooks):
 def test_the_estimate_equals_that_of_the_library(bench, node, send, codebooks, tmp_path):
     estimates = bench.collect(bench.add(Node, 'receiver'), m.PositionEstimate)
     node.dispatch(CodebookOffered(codebooks[0]))
-    signals = send(3)
+    signals = send(8)
     (estimate,) = bench.until(lambda: estimates)
     expected = make_estimator(
         'bayes', node.scenario, codebooks[0], reject_outside=True).estimate(signals)
@@ -100,9 +99,9 @@ def second_estimate(bench, node, send, codebooks):
         subscription = receiver.create_subscription(kind, topic, messages.append, EXCHANGE)
         node.dispatch(CodebookOffered(codebooks[0]))
         # The first estimate creates the topic.
-        send(3)
+        send(6)
         bench.until(subscription.get_publisher_count, 'the topic')
-        send(4)
+        send(8)
         bench.until(lambda: len(estimates) == 2, 'the estimates')
         last = estimates[-1]
         bench.until(lambda: messages and messages[-1].pose.pose.position.x == last.position[0],
@@ -129,47 +128,17 @@ def test_signals_are_answered_while_another_estimator_is_built(
     monkeypatch.setattr(positioner.positioning, 'make_estimator', slowly)
     estimates = bench.collect(bench.add(Node, 'receiver'), m.PositionEstimate)
     node.dispatch(CodebookOffered(codebooks[0]))
-    send(1)
+    send(6)
     bench.until(lambda: len(estimates) == 1)
     node.dispatch(CodebookOffered(codebooks[1]))
     bench.until(begun.is_set)
-    send(2, 1)
-    send(3)
+    send(7, 1)
+    send(8)
     bench.until(lambda: len(estimates) == 2)
     released.set()
     bench.until(lambda: len(estimates) == 3)
     assert [(e.cycle_id, e.codebook_id) for e in estimates] == [
-        (1, codebooks[0].id), (3, codebooks[0].id), (2, codebooks[1].id)]
-
-
-def test_a_node_can_be_destroyed_while_an_estimator_is_built(bench, node, codebooks, monkeypatch):
-    begun, made = threading.Event(), []
-
-    def slowly(name, scenario, codebook, **options):
-        begun.set()
-        made.append(make_estimator(name, scenario, codebook, **options))
-        return made[0]
-    monkeypatch.setattr(positioner.positioning, 'make_estimator', slowly)
-    node.dispatch(CodebookOffered(codebooks[0]))
-    assert begun.wait(10)
-    bench.remove(node)
-    assert len(made) == 1
-    assert not [t for t in threading.enumerate() if t.name.startswith('positioner')]
-
-
-def test_invalid_signals_are_answered_without_a_fix(bench, node, send, codebooks):
-    receiver = bench.add(Node, 'receiver')
-    missed = bench.collect(receiver, m.NoFix)
-    estimates = bench.collect(receiver, m.PositionEstimate)
-    node.dispatch(CodebookOffered(codebooks[0]))
-    send(1, factor=0.0)
-    send(2, factor=1e3)
-    send(3)
-    bench.until(lambda: estimates and len(missed) == 2)
-    assert [message.cycle_id for message in missed] == [1, 2]
-    assert [message.cycle_id for message in estimates] == [3]
-    assert 'energy' in missed[0].reason
-    assert 'residual' in missed[1].reason
+        (6, codebooks[0].id), (8, codebooks[0].id), (7, codebooks[1].id)]
 
 
 class TestTrack:
@@ -187,11 +156,6 @@ class TestTrack:
         velocity = track.twist.twist.linear
         assert np.linalg.norm([velocity.x, velocity.y, velocity.z]) > 0
         assert np.linalg.eigvalsh(np.reshape(track.twist.covariance, (6, 6))).min() > 0
-
-    def test_an_estimator_without_modes_is_refused(self, node):
-        result = node.set_parameters_atomically([Parameter('estimator', value='ml')])
-        assert not result.successful
-        assert "prior: 'track', expected 'region'" in result.reason
 
 
 class TestNeural:
@@ -266,30 +230,3 @@ def fails(scenario, codebook):
         assert estimate.estimator == 'centre'
         np.testing.assert_array_equal(estimate.position, node.scenario.roi_center_m)
         assert estimate.covariance_m2[0, 0] == 1 + len(values['model_file'])
-
-
-@pytest.mark.parametrize(('name', 'words'), [
-    ('best', r"estimator: 'best', expected one of bayes, ml, neural or a plug-in of "
-             r"rhs_isac_ros.estimators; installed: absent, fails"),
-    ('absent', 'estimator: entry point .*: absent = guesses:Absent of guesses: cannot be loaded'),
-])
-def test_a_missing_plug_in_is_rejected_at_the_start(bench, install, name, words):
-    install('guesses', TestPlugin.CODE, {
-        plugins.ESTIMATORS: {'fails': 'fails', 'absent': 'Absent'}})
-    with pytest.raises(ParameterError, match=words):
-        bench.add(PositionerNode, parameter_overrides=[Parameter('estimator', value=name)])
-
-
-def test_the_log_names_a_plug_in_that_fails(
-        bench, install, codebooks, bench_files, monkeypatch):
-    install('guesses', TestPlugin.CODE, {plugins.ESTIMATORS: {'fails': 'fails'}})
-    node = bench.add(PositionerNode, parameter_overrides=[
-        Parameter('scenario_file', value=str(bench_files / 'scenario.yaml')),
-        Parameter('estimator', value='fails')])
-    logged = []
-    monkeypatch.setattr(node, 'get_logger', lambda: types.SimpleNamespace(
-        info=logged.append, warning=logged.append))
-    node.dispatch(CodebookOffered(codebooks[0]))
-    bench.until(lambda: logged)
-    assert logged[0].endswith(
-        "fails = guesses:fails of guesses: failed: KeyError: 'no such file'")

@@ -25,7 +25,9 @@ def test_two_robots_are_located_in_the_map(mobility, processes, tmp_path):
             f'    robot_frame: robot_{user}/base_link\n' for user in (1, 2)), encoding='utf-8')
         files += ['--params-file', str(tmp_path / 'tf.yaml')]
     space = f'/robots_{mobility}'
-    processes.start('network', *files, namespace=space, rest_s=0.0)
+    processes.start('network', *files, namespace=space, rest_s=0.0,
+                    scenario_file=EXAMPLES / 'wall.yaml',
+                    codebook_file=EXAMPLES.parents[1] / 'config' / 'codebook_bandplan.yaml')
     done = subprocess.run(
         [sys.executable, EXAMPLES / 'two_robots.py', '--rate', '2', '--poses', '10',
          '--picture', tmp_path / 'robots.png', '--ros-args', '-r', f'__ns:={space}'],

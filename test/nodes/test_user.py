@@ -4,20 +4,20 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import Pose, TransformStamped
+from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node as Node_
 
+from rhs_isac_ros.model import Pose
+from rhs_isac_ros.nodes import user
 from rhs_isac_ros.nodes.user import RobotMobility, follow_frame, follow_odometry
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import refusals
-from rhs_isac_ros.ros.frames import Frame, rotation_matrix
 from rhs_isac_ros.support.fields import ParameterError
 
 # Turned by 90 degrees about z, and moved.
-TURNED = Frame('odom', origin=np.array([1.0, 2.0, 3.0]),
-               orientation=np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]))
+TURNED = Pose((1.0, 2.0, 3.0), (0.0, 0.0, 1.0, 1.0))
 
 
 class Clock:
@@ -34,21 +34,6 @@ class Node:
 
 def robot():
     return RobotMobility(Node(), TURNED, 'odometry on /odom', 1.0)
-
-
-def test_a_position_makes_the_way_to_the_surface_and_back():
-    place = np.array([4.0, -1.0, 0.5])
-    moved = TURNED.from_surface(place)
-    np.testing.assert_allclose(moved, [2.0, 6.0, 3.5], atol=1e-12)
-    np.testing.assert_allclose(TURNED.to_surface(moved), place, atol=1e-12)
-
-
-def test_a_pose_is_turned_with_the_surface():
-    pose = TURNED.pose(Pose())
-    turn = pose.orientation
-    matrix = rotation_matrix(np.array([turn.x, turn.y, turn.z, turn.w]))
-    np.testing.assert_allclose(matrix, TURNED.rotation, atol=1e-12)
-    assert (pose.position.x, pose.position.y, pose.position.z) == (1.0, 2.0, 3.0)
 
 
 def test_a_robot_without_a_position_is_lacking():
@@ -68,27 +53,56 @@ def test_a_robot_is_continued_with_its_velocity():
 
 
 @pytest.mark.parametrize(('stamp_ns', 'position', 'words'), [
-    (10**9, [2.0, 6.0, 3.5], 'use_sim_time'), (0, [2.0, -6.0, 3.5], 'in front of the surface')])
+    (10**9, [2.0, 6.0, 3.5], 'use_sim_time'), (0, [2.0, -6.0, 3.5], 'in front of the surface'),
+    (0, [2.0, np.nan, 3.5], 'position [2.0, nan, 3.5] m, velocity [0.0, 0.0, 0.0] m/s, expected '
+     'finite numbers'),
+    (0, [2.0, 2e6, 3.5], '2e+06 m from the surface, expected coordinates up to 1e+06 m')])
 def test_a_position_that_cannot_be_used_is_named(stamp_ns, position, words):
     mobility = robot()
     mobility.put(stamp_ns, np.array(position), np.zeros(3))
     assert words in mobility.lack
 
 
+def test_positions_with_the_stamps_of_two_clocks_come_from_two_sources(monkeypatch):
+    now_s = 100.0
+    monkeypatch.setattr(user, 'time', types.SimpleNamespace(monotonic=lambda: now_s))
+    mobility, lacks = robot(), []
+    for number in range(40):
+        now_s += 0.05
+        mobility.put(Clock.nanoseconds - 6 * 10**9 * (number % 2), np.array([2.0, 6.0, 3.5]),
+                     np.zeros(3))
+        lacks.append(mobility.lack)
+    assert set(lacks[1:]) == {'odometry on /odom: from two sources, expected one'}
+    # One of them has gone.
+    now_s += 2.0
+    mobility.put(Clock.nanoseconds, np.array([2.0, 6.0, 3.5]), np.zeros(3))
+    assert mobility.lack == ''
+
+
+def test_positions_in_two_frames_come_from_two_sources():
+    mobility = robot()
+    mobility.put(0, np.array([2.0, 6.0, 3.5]), np.zeros(3))
+    mobility.reject('in the frame', 'other')
+    assert mobility.lack == 'odometry on /odom: from two sources, expected one'
+
+
 def test_odometry_is_read_in_the_frame_of_the_robot(bench):
     node = bench.add(Node_, 'robot_user')
     publisher = bench.add(Node_, 'robot').create_publisher(Odometry, 'odom', 10)
-    mobility = follow_odometry(node, Frame(), 'odom', 60.0)
+    mobility = follow_odometry(node, 'map', Pose(), 'odom', 60.0)
     message = Odometry()
     message.header.frame_id = topics.MAP_FRAME
     message.pose.pose.position.x = 5.0
-    message.pose.pose.orientation.z = message.pose.pose.orientation.w = 0.5
+    message.pose.pose.orientation.w = 0.0
     message.twist.twist.linear.x = 2.0
 
-    def arrived():
+    def lack():
         publisher.publish(message)
-        return not mobility.lack
-    bench.until(arrived, 'the odometry')
+        return mobility.lack
+    bench.until(lambda: lack().endswith(
+        ': orientation [0.0, 0.0, 0.0, 0.0], expected a quaternion'), 'the reason')
+    message.pose.pose.orientation.z = message.pose.pose.orientation.w = 0.5
+    bench.until(lambda: not lack(), 'the odometry')
     np.testing.assert_allclose(mobility.state(0.0)[1], [0.0, 2.0, 0.0], atol=1e-12)
 
 
@@ -99,7 +113,7 @@ def test_transforms_that_were_refused_are_lacking(bench, monkeypatch, refused):
     monkeypatch.setitem(sys.modules, 'tf2_ros', types.SimpleNamespace(**{
         'Buffer': Buffer, 'TransformListener': mock.Mock(), refused: refuse}))
     node = bench.add(Node_, 'robot_user')
-    mobility = follow_frame(node, Frame(), 'base_link', 1.0)
+    mobility = follow_frame(node, 'map', Pose(), 'base_link', 1.0)
     bench.until(lambda: [*node.timers], 'the timer')
     bench.spin_once()
     assert mobility.lack == 'transform from map to base_link'
@@ -133,7 +147,7 @@ def test_a_frame_is_followed_with_the_velocity_between_two_transforms(bench, mon
     monkeypatch.setitem(sys.modules, 'tf2_ros', types.SimpleNamespace(
         Buffer=Buffer, TransformListener=lambda buffer, node: object()))
     node = bench.add(Node_, 'robot_user')
-    mobility = follow_frame(node, Frame(), 'base_link', 60.0)
+    mobility = follow_frame(node, 'map', Pose(), 'base_link', 60.0)
     assert mobility.lack == 'transform from map to base_link'
     begin_ns = node.get_clock().now().nanoseconds
     Buffer.last.put(begin_ns, 5.0)
@@ -147,4 +161,4 @@ def test_a_frame_is_followed_with_the_velocity_between_two_transforms(bench, mon
 def test_a_frame_needs_tf2_ros(monkeypatch):
     monkeypatch.setitem(sys.modules, 'tf2_ros', None)
     with pytest.raises(ParameterError, match="mobility: 'tf', .* tf2_ros is not installed"):
-        follow_frame(Node(), Frame(), 'base_link', 1.0)
+        follow_frame(Node(), 'map', Pose(), 'base_link', 1.0)

@@ -8,6 +8,8 @@ from rclpy.qos import QoSCompatibility, qos_check_compatible
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.endpoints import LATCHED
 from rhs_isac_ros.ros.roster import ROSTER
 
 EXAMPLE = Path(__file__).parents[2] / 'docs' / 'examples' / 'user_node.py'
@@ -66,6 +68,10 @@ def test_one_message_by_hand_is_answered(processes, make_watch):
     running = [processes.start('user', namespace=space, user_id=4),
                processes.start('channel', namespace=space)]
     beacon = watch.node.create_publisher(ros.Beacon, 'beacon', 10)
+    # A node by hand announces its role, as ``ros2 topic pub presence`` does.
+    presence = watch.node.create_publisher(ros.Presence, topics.PRESENCE, LATCHED)
+    watch.node.create_timer(0.4, lambda: presence.publish(
+        ros.Presence(sender=1, role='bs', node=f'{space}/bs', scenario='{}')))
     watch.until(lambda: 'listening for beacons' in running[0].log, 'the user', running)
     watch.until(lambda: beacon.get_subscription_count() > 1, 'the subscription', running)
     beacon.publish(ros.Beacon(cycle_id=5, first_user=1, last_user=9))

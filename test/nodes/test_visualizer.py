@@ -11,7 +11,6 @@ from rclpy.parameter import Parameter
 from ros_messages import to_ros
 from visualization_msgs.msg import Marker, MarkerArray
 
-import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.nodes.visualizer import VisualizerNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import topics
@@ -30,12 +29,10 @@ def shown(bench, probe, bench_files, request):
     latest = {}
 
     def receive(array):
-        # As in RViz, a marker stays until it is deleted.
-        for marker in array.markers:
-            if marker.action == Marker.DELETE:
-                del latest[marker.ns, marker.id]
-            else:
-                latest[marker.ns, marker.id] = marker
+        # As in RViz, a marker disappears unless it is published again.
+        assert {marker.lifetime.nanosec for marker in array.markers} == {60_000_000}
+        latest.clear()
+        latest.update({(marker.ns, marker.id): marker for marker in array.markers})
     probe.create_subscription(MarkerArray, topics.MARKERS, receive, EXCHANGE)
     return latest
 
@@ -84,17 +81,6 @@ def test_rviz_lists_the_namespaces_of_all_markers(bench, probe, shown, small):
     # Only a scenario with propagation paths shows these.
     bench.until(lambda: set(display['Namespaces']) == {'traced', *(name for name, _ in shown)},
                 'every namespace')
-
-
-def test_the_board_has_the_colours_of_its_configuration(bench, probe, shown, small):
-    publisher = bench.publisher(probe, m.RhsConfiguration)
-    scenario = small.scenario
-    analog = np.ones((scenario.n_frames, scenario.n_elements))
-    publisher.publish(ros.RhsConfiguration(cycle_id=1))
-    publisher.publish(to_ros(m.RhsConfiguration(cycle_id=1, mode=m.Mode.POSITIONING,
-        band=0, codebook_id='cb', analog=analog),
-                                  probe.get_clock().now().to_msg()))
-    bench.until(lambda: shown and shown['board', 0].colors[0].r == 1.0, 'the colours')
 
 
 def test_messages_of_another_scenario_are_ignored_without_a_warning(bench, probe, shown, capfd):

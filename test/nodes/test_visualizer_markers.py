@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import importlib.util
-import math
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from ros_messages import to_ros
 from visualization_msgs.msg import Marker
 
 from rhs_isac_ros.link import beam_pattern, steer
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.nodes import visualizer as scene
 from rhs_isac_ros.nodes.visualizer import VisualizerNode
@@ -115,27 +114,33 @@ def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
     assert rgb(marker.color) == pytest.approx(shapes.user_colour(3))
 
 
-def test_a_path_contains_its_positions_in_order():
-    places = np.array([[9.0, 1.0, 0.0], [8.5, 1.5, 0.1], [8.0, 1.0, 0.2]])
-    path = scene.path(places, STAMP, Frame())
-    assert (path.header.frame_id, path.header.stamp) == ('map', STAMP)
-    assert np.array([of(pose.pose.position) for pose in path.poses]) == pytest.approx(places)
-    assert all(pose.header == path.header and pose.pose.orientation.w == 1
-               for pose in path.poses)
+@pytest.mark.parametrize('namespace', ['region', 'board', 'beam', 'traced'])
+def test_the_surface_and_its_shapes_are_at_its_pose(namespace):
+    body = shapes.Lines((np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),), (1.0, 1.0, 1.0), 1.0)
+    placed = scene.place(
+        scene.marker(namespace, 0, body, STAMP), Frame('odom'), Pose((1, 2, 3), (0, 0, 1, 1)))
+    assert placed.header.frame_id == 'odom'
+    assert of(placed.pose.position) == pytest.approx([1.0, 2.0, 3.0])
+    turn = placed.pose.orientation
+    assert [turn.x, turn.y, turn.z, turn.w] == pytest.approx([0, 0, *2 * [np.sqrt(0.5)]])
+    assert of(placed.points[1]) == pytest.approx([1.0, 0.0, 0.0])
 
 
-def test_a_deletion_names_its_marker():
-    marker = scene.deletion('truth', 4, STAMP)
-    assert (marker.ns, marker.id, marker.action) == ('truth', 4, Marker.DELETE)
+def test_users_are_where_their_messages_say():
+    marker, _ = an_estimate(np.eye(3), 1)
+    before = of(marker.pose.position)
+    placed = scene.place(marker, Frame('odom'), Pose((1, 2, 3), (0, 0, 1, 1)))
+    assert placed.header.frame_id == 'odom'
+    assert of(placed.pose.position) == pytest.approx(before)
 
 
 HAS_TF2 = importlib.util.find_spec('tf2_msgs') is not None
 
 
 def test_the_surface_is_at_the_origin_of_the_map():
-    frame = Frame()
+    frame, pose = Frame(), Pose()
     transform = scene.transform(
-        frame, frame.surface, frame.origin, Time(sec=3), frame.orientation)
+        frame, frame.surface, pose.origin, Time(sec=3), pose.unit_quaternion)
     assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'rhs_link')
     assert transform.header.stamp.sec == 3
     assert [getattr(transform.transform.translation, axis) for axis in 'xyz'] == [0.0] * 3
@@ -187,27 +192,28 @@ def test_the_visualizer_publishes_transforms(bench, probe):
 
 
 @pytest.mark.skipif(not HAS_TF2, reason='tf2_msgs is not installed')
-def test_two_networks_share_one_tree(bench, probe):
+def test_two_networks_share_one_tree(bench, probe, tmp_path):
     tf2_ros = pytest.importorskip('tf2_ros')
     buffer = tf2_ros.Buffer(node=probe)
     # It subscribes as long as it exists.
     listener = tf2_ros.TransformListener(buffer, probe)
-    poses = {'left': [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-             'right': [0.0, 4.0, 0.0, 0.0, 0.0, -math.pi / 2]}
-    for space, pose in poses.items():
+    poses = {'left': [1.0, 0.0, 0.0], 'right': [0.0, 4.0, 0.0]}
+    for space, position_m in poses.items():
+        file = tmp_path / f'{space}.yaml'
+        file.write_text(f'pose: {{position_m: {position_m}}}', encoding='utf-8')
         bench.add(VisualizerNode, namespace=f'/{space}', parameter_overrides=[
-            Parameter('frame_id', value='odom'), Parameter('surface_pose', value=pose)])
+            Parameter('frame_id', value='odom'), Parameter('scenario_file', value=str(file))])
         estimates = probe.create_publisher(
             convert.ros_type(m.PositionEstimate), f'/{space}/position_estimate', EXCHANGE)
         estimate = to_ros(m.PositionEstimate(
             cycle_id=1, user=2, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
             covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01), Time())
         probe.create_timer(0.05, functools.partial(estimates.publish, estimate))
-    for space, place in (('left', [9.0, 2.5, 0.1]), ('right', [2.5, -4.0, 0.1])):
-        bench.until(lambda space=space: buffer.can_transform(
-            'odom', f'{space}/user_2', RosTime()), f'the user of {space}')
-        found = buffer.lookup_transform('odom', f'{space}/user_2', RosTime())
-        moved = found.transform.translation
-        np.testing.assert_allclose([moved.x, moved.y, moved.z], place, atol=1e-9)
-        assert buffer.can_transform('odom', f'{space}/rhs_link', RosTime())
+    for space, position_m in poses.items():
+        for child, place in (('user_2', [8.0, 2.5, 0.1]), ('rhs_link', position_m)):
+            bench.until(lambda child=f'{space}/{child}': buffer.can_transform(
+                'odom', child, RosTime()), f'{child} of {space}')
+            found = buffer.lookup_transform('odom', f'{space}/{child}', RosTime())
+            moved = found.transform.translation
+            np.testing.assert_allclose([moved.x, moved.y, moved.z], place, atol=1e-9)
     assert listener

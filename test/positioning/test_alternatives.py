@@ -8,17 +8,12 @@ from scipy.special import ive, logsumexp
 from scipy.stats import norm
 
 from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
+from rhs_isac_ros.model.geometry import to_positions
 from rhs_isac_ros.model.hall import CONDITIONS, MultipathEstimate
 from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.model.los import draw_blocked
 from rhs_isac_ros.positioning import Tracker, alternatives, make_estimator, simulate_pairs
-from rhs_isac_ros.positioning.alternatives import (
-    BLOCKED_LIMIT,
-    OUTSIDE_LIMIT,
-    Outside,
-    tabulate_outside,
-)
-from rhs_isac_ros.positioning.coordinates import to_positions
+from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT, LIMIT, Outside, tabulate_outside
 from rhs_isac_ros.positioning.likelihood import Likelihood
 
 
@@ -61,7 +56,7 @@ def reference(setting):
     direction[:, 0] = np.abs(direction[:, 0])
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     # Half a step beyond both ends, as the cells of the grid.
-    ratio = np.sqrt(alternatives._RANGE_RATIO)
+    ratio = np.sqrt(alternatives.GRID.range_ratio)
     distance = rng.uniform(ranges[0] / ratio, ranges[1] * ratio, n)
     positions = distance[:, None] * direction
     positions = positions[np.linalg.norm(
@@ -162,18 +157,17 @@ def test_users_around_the_region_get_no_fix_or_a_probability_outside(name, shipp
     estimator = make_estimator(name, scenario, shipped, reject_outside=True)
     estimate = estimator.estimate(received)
     fix = estimate.fix
-    assert fix.mean() < 0.1
-    assert (estimate.outside_probability[fix] > 0.05).mean() > 0.7
-    assert (estimate.outside_probability <= OUTSIDE_LIMIT)[fix].all()
-    # Residuals of users who may be outside are not compared with an expectation.
-    assert np.isnan(estimate.expected_residual[fix]).mean() > 0.5
+    assert fix.mean() < 0.03
+    assert (estimate.outside_probability <= LIMIT)[fix].all()
     reasons = [reason for reason in estimate.reason if reason]
     rejected = [
         reason for reason in reasons if reason.startswith('position outside of the region')]
     assert len(rejected) > 0.9 * len(reasons)
     inside = simulate_pairs(scenario, shipped, 300, 5)[1]
     found = estimator.estimate(inside)
-    assert found.fix.mean() > 0.99
+    assert found.fix.mean() > 0.97
+    assert (found.outside_probability <= LIMIT)[found.fix].all()
+    # Residuals of users who may be outside are not compared with an expectation.
     # Position and covariance are those of a user inside.
     plain = make_estimator(name, scenario, shipped).estimate(inside)
     np.testing.assert_array_equal(found.mean[found.fix], plain.mean[found.fix])
@@ -183,6 +177,45 @@ def test_users_around_the_region_get_no_fix_or_a_probability_outside(name, shipp
     np.testing.assert_array_equal(
         np.isfinite(found.expected_residual[found.fix]),
         found.outside_probability[found.fix] <= 0.05)
+
+
+@pytest.mark.slow
+def test_the_prior_shifts_the_odds_of_a_user_outside(shipped):
+    received = simulate_pairs(Scenario(), shipped, 40, 6)[1]
+    log_odds = {}
+    for prior in (0.5, 0.02):
+        scenario = dataclasses.replace(Scenario(), outside_probability=prior)
+        found = make_estimator('bayes', scenario, shipped, reject_outside=True).estimate(received)
+        log_odds[prior] = np.log(found.outside_probability / (1 - found.outside_probability))
+    usual = np.abs(log_odds[0.5]) < 20
+    assert usual.sum() > 10
+    np.testing.assert_allclose(
+        (log_odds[0.02] - log_odds[0.5])[usual], np.log(0.02 / 0.98), atol=1e-4)
+    none = dataclasses.replace(Scenario(), outside_probability=0.0)
+    found = make_estimator('bayes', none, shipped, reject_outside=True).estimate(received)
+    assert np.isnan(found.outside_probability).all()
+
+
+@pytest.mark.slow
+def test_no_position_is_less_probable_than_its_alternatives(shipped):
+    """Also if users may be outside or blocked, and in a track."""
+    scenario = dataclasses.replace(Scenario(), blocked_probability=0.1)
+    estimator = make_estimator('bayes', scenario, shipped, reject_outside=True)
+    tracker, rng = Tracker(estimator), np.random.default_rng(8)
+    places = np.linspace([8.0, 2.0, 0.0], [8.0, 14.0, 0.0], 40)
+    received = MeasurementModel(Scenario(), shipped).sample(places, rng)
+    probable = []
+    for step, one in enumerate(received):
+        found, alone = tracker.update(0.2 * step, one), estimator.estimate(one)
+        for estimate in (found, alone):
+            if estimate.fix and not getattr(estimate, 'is_predicted', False):
+                assert estimate.outside_probability + estimate.blocked_probability <= LIMIT
+            elif estimate.fix:
+                assert estimate.outside_probability <= LIMIT
+        probable.append(alone.fix)
+    # The user leaves the region at y = 5 m.
+    assert np.mean(probable[:8]) > 0.8
+    assert np.mean(probable[-25:]) < 0.1
 
 
 N_USERS = 60

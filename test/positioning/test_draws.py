@@ -7,12 +7,12 @@ import pytest
 from scipy.stats import qmc
 
 from rhs_isac_ros.model import Scenario, simulate_received
-from rhs_isac_ros.positioning import draws as draws_module
+from rhs_isac_ros.model.arrays import log_sum
 from rhs_isac_ros.positioning import make_estimator
-from rhs_isac_ros.positioning.coordinates import log_sum
-from rhs_isac_ros.positioning.draws import DrawnPosterior
-from rhs_isac_ros.positioning.grid import TemplateTable, tabulate
+from rhs_isac_ros.positioning.draws import SAMPLING, DrawnPosterior
+from rhs_isac_ros.positioning.grid import TemplateTable
 from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.positioning.templates import tabulate
 
 # The noise hides most users; many positions explain the signals.
 WEAK = Scenario(elements_per_side=6, multipath_to_los_db=-30.0, noise_psd_dbm_hz=-95.0,
@@ -25,15 +25,15 @@ def codebook(random_beams):
     return random_beams(WEAK, np.random.default_rng(0))
 
 
-def found_and_exact(scenario, codebook, n=N):
-    """Draws for n phases, and mean, covariance and log evidence from 2^15 points."""
+def found_and_exact(scenario, codebook, n=N, sampling=SAMPLING):
+    """Draws for n shots, and mean, covariance and log evidence from 2^15 points."""
     likelihood = Likelihood(scenario, codebook)
     table = TemplateTable(scenario, tabulate(likelihood.model))
-    drawn, rng = DrawnPosterior(scenario, table), np.random.default_rng(1)
+    drawn, rng = DrawnPosterior(scenario, table, sampling), np.random.default_rng(1)
     received = simulate_received(scenario, codebook, scenario.sample_positions(n, rng), rng)
     whitened = likelihood.signals(received).whitened
     query = table.query(whitened, likelihood.nuisance, 8.0)
-    found = [drawn.of(query, phase) for phase in range(n)]
+    found = [drawn.of(query, shot) for shot in range(n)]
     low, high = likelihood.resolution.bounds_m
     positions = low + (high - low) * qmc.Sobol(3, seed=0).random(1 << 15)
     means = likelihood.model.whiten(likelihood.model.mean(positions)).reshape(len(positions), -1)
@@ -64,11 +64,10 @@ def test_draws_have_the_moments_of_the_posterior(changes, codebook):
     assert np.mean(spreads) == pytest.approx(1, abs=0.1)
 
 
-def test_later_rounds_follow_earlier_ones_without_bias(codebook, monkeypatch):
+def test_later_rounds_follow_earlier_ones_without_bias(codebook):
     """A cell whose first draws miss its peak gets few more of them, and must not lose weight."""
-    monkeypatch.setattr(draws_module, '_N_DRAWS', 50)
-    monkeypatch.setattr(draws_module, '_N_EFFECTIVE', 50.0)
-    found, exact = found_and_exact(WEAK, codebook, 30)
+    found, exact = found_and_exact(
+        WEAK, codebook, 30, SAMPLING._replace(draws=50, effective=50.0))
     spreads = [np.trace(draws.covariance) / np.trace(covariance)
                for draws, (_, covariance, _) in zip(found, exact, strict=True)]
     totals = [draws.log_evidence - log_evidence
@@ -77,14 +76,27 @@ def test_later_rounds_follow_earlier_ones_without_bias(codebook, monkeypatch):
     assert np.mean(totals) == pytest.approx(0, abs=0.1)
 
 
-def test_strong_signals_leave_too_few_effective_draws(codebook):
-    scenario = dataclasses.replace(WEAK, noise_psd_dbm_hz=-174.0, multipath_to_los_db=-60.0)
+def table_and_query(codebook, sampling=SAMPLING, **changes):
+    scenario = dataclasses.replace(WEAK, **changes)
     likelihood = Likelihood(scenario, codebook)
     table = TemplateTable(scenario, tabulate(likelihood.model))
-    query = table.query(
+    return DrawnPosterior(scenario, table, sampling), table, table.query(
         likelihood.model.whiten(likelihood.model.mean(np.array([[6.0, 1.0, 0.2]]))),
         likelihood.nuisance, 8.0)
-    assert DrawnPosterior(scenario, table).of(query, 0) is None
+
+
+def test_limited_signals_leave_no_draws(codebook):
+    drawn, table, query = table_and_query(
+        codebook, noise_psd_dbm_hz=-174.0, multipath_to_los_db=-60.0)
+    assert not table.filters.is_exact
+    assert drawn.of(query, 0) is None
+
+
+def test_narrow_peaks_leave_too_few_effective_draws(codebook):
+    drawn, table, query = table_and_query(
+        codebook, SAMPLING._replace(draws=10), noise_psd_dbm_hz=-105.0, multipath_to_los_db=-60.0)
+    assert table.filters.is_exact
+    assert drawn.of(query, 0) is None
 
 
 def test_estimates_from_draws_agree_with_those_from_modes(codebook):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.positioning import SignalError
-from rhs_isac_ros.positioning.estimate import checked_received
+from rhs_isac_ros.positioning.estimate import checked_received, estimate_each
 
 
 def test_signals_of_one_phase_become_a_batch_of_one(small):
@@ -30,3 +30,12 @@ def test_values_that_are_not_finite_are_errors(small, value):
     signals[1, 0, 4] = value
     with pytest.raises(SignalError, match='^received: not finite, expected finite signals'):
         checked_received(small.codebook, signals)
+
+
+def test_a_position_behind_the_surface_is_no_fix(small):
+    places = np.array([[8.0, 1.0, 0.0], [-8.0, 1.0, 0.0]])
+    found = estimate_each(small.scenario, small.codebook, np.zeros((2, 1, 6)), lambda batch: (
+        (place, np.eye(3), '') for place in places))
+    assert found.fix.tolist() == [True, False]
+    assert found.reason[0] == ''
+    assert found.reason[1].startswith('position: x = -8 m, expected x > 0')

@@ -5,15 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from scipy.special import chdtri
 from scipy.stats import qmc
 
 from rhs_isac_ros.bounds.fisher import fisher_information
-from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.positioning import (
-    ESTIMATORS,
-    SignalError,
     make_estimator,
     simulate_pairs,
     weighted_modes,
@@ -62,38 +60,10 @@ def test_modes_outside_the_region_do_not_hide_those_inside(table1):
     assert squared_normalised(error[None], estimate.covariance[None])[0] < 100
 
 
-def test_covariances_are_symmetric_and_positive_definite(table1_estimates):
-    _, _, estimate = table1_estimates
-    assert estimate.mean.shape == (200, 3)
-    assert estimate.covariance.shape == (200, 3, 3)
-    np.testing.assert_allclose(
-        estimate.covariance, np.swapaxes(estimate.covariance, 1, 2), rtol=1e-12, atol=1e-15)
-    assert np.linalg.eigvalsh(estimate.covariance).min() > 0
-
-
 def test_means_are_inside_the_region(table1_estimates):
     low, high = Scenario().roi_bounds_m
     assert (table1_estimates[2].mean >= low - 1e-9).all()
     assert (table1_estimates[2].mean <= high + 1e-9).all()
-
-
-def test_a_single_phase_has_the_same_estimate_as_in_a_batch(table1_estimates, table1_estimator):
-    _, received, estimate = table1_estimates
-    for n in range(0, len(received), 11):
-        single = table1_estimator.estimate(received[n])
-        assert single.mean.shape == (3,)
-        assert single.covariance.shape == (3, 3)
-        # Rounding to single precision on the grid decides about modes at the margin.
-        scale = np.sqrt(np.trace(single.covariance))
-        np.testing.assert_allclose(single.mean, estimate.mean[n], atol=0.01 * scale)
-        np.testing.assert_allclose(
-            single.covariance, estimate.covariance[n], atol=0.02 * scale**2)
-
-
-def test_an_empty_batch_gives_empty_estimates(table1_estimates, table1_estimator):
-    estimate = table1_estimator.estimate(table1_estimates[1][:0])
-    assert estimate.mean.shape == (0, 3)
-    assert estimate.covariance.shape == (0, 3, 3)
 
 
 @pytest.fixture(scope='module')
@@ -269,13 +239,14 @@ def test_the_covariance_is_the_inverse_information_at_the_estimate(strong):
 
 
 def test_a_single_mode_is_not_enough_for_table_1(table1_estimator, shipped):
-    """The errors exceed those of the posterior mean, and the covariances are too small."""
+    """The errors exceed those of the posterior mean, as the covariances state."""
     positions, received = simulate_pairs(Scenario(), shipped, 60, 2)
     ml = make_estimator('ml', Scenario(), shipped).estimate(received)
     mean = table1_estimator.estimate(received)
     errors = [np.sum((e.mean - positions)**2, axis=1) for e in (ml, mean)]
     assert errors[0].mean() > 1.2 * errors[1].mean()
-    assert errors[0].mean() > 5 * np.trace(ml.covariance, axis1=1, axis2=2).mean()
+    assert errors[0].mean() == pytest.approx(
+        np.trace(ml.covariance, axis1=1, axis2=2).mean(), rel=0.4)
     low, high = Scenario().roi_bounds_m
     assert ((ml.mean >= low) & (ml.mean <= high)).all()
 
@@ -319,29 +290,40 @@ def test_signals_without_a_position_have_no_modes(table1_estimator, phases):
     assert weighted_modes(table1_estimator, np.zeros_like(phases[0])) is None
 
 
-@pytest.mark.parametrize(('signals', 'message'), [
-    (np.zeros((2, 31)), r'^received: shape \(2, 31\), expected \[N_B, N_SB F\] = \(2, 32\)'),
-    (np.zeros(64), r'^received: shape \(64,\), expected '),
-    (np.full((2, 32), np.nan), '^received: not finite, expected ')])
-def test_invalid_signals_are_errors(table1_estimator, signals, message):
-    with pytest.raises(SignalError, match=message):
-        table1_estimator.estimate(signals)
+@pytest.mark.parametrize('changes', [
+    {'roi_size_m': (10, 0, 0)}, {'roi_size_m': (0, 10, 2)}, {'roi_size_m': (0, 10, 0)},
+    {'roi_size_m': (10, 10, 0), 'roi_center_m': (10, 0, -2)}, {'delay_spread_s': 0.0},
+    {'delay_spread_s': 1e-9}, {'delay_spread_s': 0.0, 'multipath_to_los_db': -20.0},
+    {'roi_center_m': (1, 20, 5), 'roi_size_m': (1.5, 10, 2)},
+    {'roi_center_m': (0.3, 5, 0), 'roi_size_m': (0.5, 6, 2)}], ids=str)
+def test_regions_contain_users_on_lines_and_planes_in_flat_channels_and_at_wide_angles(
+        changes, shipped):
+    scenario, rng = Scenario(**changes), np.random.default_rng(1)
+    positions = scenario.sample_positions(400, rng)
+    estimate = make_estimator('bayes', scenario, shipped).estimate(
+        simulate_received(scenario, shipped, positions, rng))
+    assert estimate.fix.mean() > 0.995
+    squares = squared_normalised(estimate.mean - positions, estimate.covariance)
+    inside = squares <= chdtri(np.count_nonzero(scenario.roi_size_m), 0.05)
+    # Posteriors are not Gaussian; the standard error is 0.011.
+    assert 0.9 < np.mean(inside) < 0.985
 
 
-def test_the_error_for_an_unknown_estimator_lists_all(small):
-    with pytest.raises(ValueError, match="estimator: 'oracle', expected one of") as caught:
-        make_estimator('oracle', small.scenario, small.codebook)
-    for name in ESTIMATORS:
-        assert repr(name) in str(caught.value)
-
-
-def test_a_codebook_of_other_sizes_is_an_error(small):
-    scenario = dataclasses.replace(small.scenario, n_feeds=3)
-    with pytest.raises(CodebookError, match='digital: shape'):
-        make_estimator('bayes', scenario, small.codebook)
-
-
-def test_estimators_are_registered_by_their_names():
-    assert {name: kind.name for name, kind in ESTIMATORS.items()} == {
-        name: name for name in ESTIMATORS}
-    assert 'bayes' in ESTIMATORS
+@pytest.mark.parametrize('noise_psd_dbm_hz', [-174.0, -80.0])
+def test_the_posterior_on_a_line_is_that_of_points_along_it(shipped, noise_psd_dbm_hz):
+    scenario = Scenario(roi_size_m=(10, 0, 0), noise_psd_dbm_hz=noise_psd_dbm_hz)
+    rng = np.random.default_rng(1)
+    received = simulate_received(scenario, shipped, scenario.sample_positions(60, rng), rng)
+    estimate = make_estimator('bayes', scenario, shipped).estimate(received)
+    model = MeasurementModel(scenario, shipped)
+    x = np.linspace(5, 15, 20_001)
+    means = model.whiten(model.mean(np.stack([x, 0 * x, 0 * x], axis=1))).reshape(len(x), -1)
+    whitened = model.whiten(received).reshape(len(received), -1)
+    value = 2 * (whitened.conj() @ means.T).real - np.sum(np.abs(means)**2, axis=1)
+    weights = np.exp(value - value.max(axis=1, keepdims=True))
+    weights /= weights.sum(axis=1, keepdims=True)
+    mean = weights @ x
+    std = np.sqrt(weights @ x**2 - mean**2)
+    np.testing.assert_array_equal(estimate.mean[:, 1:], 0)
+    assert np.sqrt(np.mean(((estimate.mean[:, 0] - mean) / std)**2)) < 0.25
+    assert np.mean(estimate.covariance[:, 0, 0]) == pytest.approx(np.mean(std**2), rel=0.15)

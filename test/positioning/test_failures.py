@@ -8,13 +8,15 @@ import pytest
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
+from rhs_isac_ros.model.geometry import jacobian, to_polar, to_positions
 from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.positioning import failures, make_estimator
-from rhs_isac_ros.positioning.coordinates import jacobian, to_polar, to_positions
+from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.positioning.failures import (
+    LIMITS,
     FailureModel,
     FailureSearch,
     Whitening,
+    _diverse,
     can_enumerate,
     first_sites,
 )
@@ -189,10 +191,10 @@ def test_the_remainder_adds_to_the_covariance(weighing, codebook, monkeypatch):
     remainder = 0.3 * DeclaredElements(SCENARIO).error_covariance(SCENARIO, codebook)
     for element in (0, 35):
         failed = tuple(sorted((5, element)))
-        surface = model.surface(failed)
+        surface = model.surfaces.surface(failed)
         larger = surface._replace(covariance=surface.covariance + remainder)
         whitening = Whitening.of(larger.covariance[:, None], model.likelihood.nuisance)
-        monkeypatch.setattr(model, 'whitening', lambda _, whitening=whitening: whitening)
+        monkeypatch.setattr(model.surfaces, 'whitening', lambda _, whitening=whitening: whitening)
         (expected,), _ = model.weigh(failed, [site])
         assert values[element] == pytest.approx(expected, **tolerance(model))
 
@@ -236,8 +238,8 @@ def sample_with(model, failed, seed):
         POSITION[None], rng)
 
 
-def search_at_the_truth(model, received):
-    search = FailureSearch(model, model.likelihood.signals(received))
+def search_at_the_truth(model, received, limits=LIMITS):
+    search = FailureSearch(model, model.likelihood.signals(received), limits)
     return search, search.add(POINT[None], NO_VALUES[None])
 
 
@@ -252,12 +254,12 @@ def test_sets_grow_to_the_true_one_or_to_one_that_is_more_probable(ambiguous):
         assert search.values[search.best] >= true - 1e-6
 
 
-def test_without_a_remainder_the_growth_often_ends_with_another_set(ambiguous, monkeypatch):
-    monkeypatch.setattr(failures, '_N_EXTENDED', 1)
+def test_without_a_remainder_the_growth_often_ends_with_another_set(ambiguous):
     rng, missed = np.random.default_rng(6), 0
     for seed in range(12):
         failed = tuple(sorted(rng.choice(36, 3, replace=False).tolist()))
-        search, sites = search_at_the_truth(ambiguous, sample_with(ambiguous, failed, seed))
+        search, sites = search_at_the_truth(
+            ambiguous, sample_with(ambiguous, failed, seed), LIMITS._replace(extended=1))
         search.grow(sites)
         (true,), _ = ambiguous.weigh(failed, search.sites[:1])
         missed += search.values[search.best] < true - 1.0
@@ -275,15 +277,13 @@ def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):
     assert max(len(failed) for failed, _ in search.values) == 4
 
 
-def test_few_hypotheses_of_each_set_and_of_each_site_are_extended(monkeypatch):
+def test_few_hypotheses_of_each_set_and_of_each_site_are_extended():
     ranked = [((1,), site) for site in range(10)] + [((set_,), 0) for set_ in range(2, 20)]
-    monkeypatch.setattr(failures, '_N_EXTENDED', len(ranked))
-    chosen = failures._diverse(ranked)
+    chosen = _diverse(ranked, LIMITS._replace(extended=len(ranked)))
     sets, sites = (collections.Counter(one) for one in zip(*chosen, strict=True))
-    assert max(sets.values()) == failures._MAX_PER_SET
-    assert max(sites.values()) == failures._MAX_PER_SITE
-    monkeypatch.setattr(failures, '_N_EXTENDED', 2)
-    assert failures._diverse(ranked) == ranked[:2]
+    assert max(sets.values()) == LIMITS.per_set
+    assert max(sites.values()) == LIMITS.per_site
+    assert _diverse(ranked, LIMITS._replace(extended=2)) == ranked[:2]
 
 
 def test_neighbours_differ_by_one_element(ambiguous):

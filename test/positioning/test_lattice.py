@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.geometry import element_positions
-from rhs_isac_ros.positioning.coordinates import jacobian, to_polar, to_positions
+from rhs_isac_ros.model.geometry import element_positions, jacobian, to_polar, to_positions
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Expansion, Resolution, lay_grid
 
 REGIONS = {
@@ -89,3 +88,15 @@ def test_an_expansion_has_accurate_means_in_its_cell(changes, random_beams):
     for axis in range(3):
         error = np.linalg.norm(slopes[:, axis] - exact_slopes[:, axis])
         assert error < PHASE_ERROR * np.linalg.norm(exact_slopes[:, axis])
+
+
+def test_a_part_of_the_grid_keeps_its_pairs_and_the_templates_that_they_need():
+    grid, rng = lay_grid(Scenario()), np.random.default_rng(2)
+    chosen = rng.random(len(grid.cell)) < 0.03
+    part = grid.within(chosen)
+    np.testing.assert_array_equal(part.points, grid.points[chosen])
+    assert set(part.node) == set(range(len(part.nodes)))
+    for nodes, cells, pairs in part.segments:
+        assert ((part.node[pairs] >= nodes.start) & (part.node[pairs] < nodes.stop)).all()
+        assert ((part.cell[pairs] >= cells.start) & (part.cell[pairs] < cells.stop)).all()
+    assert sum(pairs.stop - pairs.start for *_, pairs in part.segments) == chosen.sum()

@@ -9,14 +9,11 @@ from scipy.stats import binom
 
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.positioning.coordinates import select, to_polar, to_positions
-from rhs_isac_ros.positioning.grid import tabulate
-from rhs_isac_ros.positioning.likelihood import (
-    Alignment,
-    DispersedLikelihood,
-    Likelihood,
-)
+from rhs_isac_ros.positioning.likelihood import Alignment, DispersedLikelihood, Likelihood
+from rhs_isac_ros.positioning.segments import select
+from rhs_isac_ros.positioning.templates import tabulate
 
 SCENARIO = Scenario(
     center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,

@@ -82,19 +82,6 @@ def test_the_keys_of_the_file_do_not_change(network, tmp_path):
         assert file['loudest'] == network.max_energy
 
 
-def test_a_failed_write_keeps_the_old_file(network, tmp_path, monkeypatch):
-    path = tmp_path / 'model.npz'
-    path.write_text('old')
-
-    def replace(source, target):
-        raise OSError('disk full')
-    monkeypatch.setattr(os, 'replace', replace)
-    with pytest.raises(OSError, match='disk full'):
-        network.save(path)
-    assert path.read_text() == 'old'
-    assert len(list(tmp_path.iterdir())) == 1
-
-
 def flip_bit(path, share):
     content = bytearray(path.read_bytes())
     content[int(share * len(content))] ^= 1

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 import yaml
 
-from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import (
     ModelError,
     Network,
     NeuralEstimator,
-    SignalError,
     make_estimator,
     neural,
     simulate_pairs,
@@ -130,16 +128,6 @@ def test_batches_grow_when_the_validation_error_does_not_fall(scenario, codebook
     assert list(dict.fromkeys(sizes)) == [128, 210]
 
 
-def test_a_single_phase_has_the_same_estimate_as_in_a_batch(scenario, codebook, training):
-    received = simulate_pairs(scenario, codebook, 20, 9)[1]
-    estimator = NeuralEstimator(scenario, codebook, training[0])
-    batch, single = estimator.estimate(received), estimator.estimate(received[7])
-    np.testing.assert_allclose(single.mean, batch.mean[7], rtol=1e-12)
-    assert single.mean.shape == (3,)
-    assert single.covariance.shape == (3, 3)
-    assert (single.reason, single.fix) == ('', True)
-
-
 @pytest.mark.parametrize(('factor', 'message'), [
     (0.0, 'expected at least'), (1e-3, 'expected at least'), (100.0, 'expected at most')])
 def test_signals_too_weak_or_too_strong_give_no_fix(scenario, codebook, training, factor, message):
@@ -149,24 +137,6 @@ def test_signals_too_weak_or_too_strong_give_no_fix(scenario, codebook, training
     assert np.isnan(estimate.mean).all()
     assert np.isnan(estimate.covariance).all()
     assert all(message in reason for reason in estimate.reason)
-
-
-def test_all_valid_signals_are_located(scenario, codebook, training):
-    received = simulate_pairs(scenario, codebook, 2000, 9)[1]
-    assert NeuralEstimator(scenario, codebook, training[0]).estimate(received).fix.all()
-
-
-@pytest.mark.parametrize(
-    'signals', [np.zeros((2, 9)), np.full((2, 8), np.nan)], ids=['shape', 'nan'])
-def test_invalid_signals_are_errors(scenario, codebook, training, signals):
-    with pytest.raises(SignalError, match='^received: '):
-        NeuralEstimator(scenario, codebook, training[0]).estimate(signals)
-
-
-def test_a_codebook_of_another_scenario_is_rejected(scenario, codebook, training):
-    larger = dataclasses.replace(scenario, n_frames=scenario.n_frames + 1)
-    with pytest.raises(CodebookError, match='expected'):
-        NeuralEstimator(larger, codebook, training[0])
 
 
 def test_a_model_of_another_purpose_is_rejected(

@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal, qmc
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import estimators, make_estimator
 from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
-from rhs_isac_ros.positioning.posterior import _SPREAD, BandPhases, _log_proposal
+from rhs_isac_ros.positioning.posterior import _SPREAD, BandPhases, _log_share
 from rhs_isac_ros.positioning.search import Modes
 
 SCENARIO = Scenario(
@@ -56,17 +56,20 @@ def posterior_moments(scenario, codebook, received, log2_points):
             np.array([np.cov(points.T, aweights=one, ddof=0) for one in weights]))
 
 
-def test_the_density_of_samples_is_that_of_all_modes():
+def test_the_shares_of_overlapping_modes_follow_their_densities():
     rng, n = np.random.default_rng(4), 4
     roots = rng.normal(size=(n, 3, 3)) + 3 * np.eye(3)
     means, curvature = rng.normal(5, 1, (n, 3)), roots @ np.swapaxes(roots, 1, 2)
     fields = dict.fromkeys(Modes._fields, np.zeros(n))
+    gradient = 0.1 * curvature.sum(axis=2)
     modes = Modes(**fields | {
-        'points': means - 0.1, 'roi_offset': np.full((n, 3), 0.1), 'curvature': curvature})
-    points = rng.normal(5, 1, (20, 3))
-    expected = sum(multivariate_normal(mean, _SPREAD**2 * np.linalg.inv(one)).pdf(points)
-                   for mean, one in zip(means, curvature, strict=True))
-    np.testing.assert_allclose(np.exp(_log_proposal(points, modes)), expected, rtol=1e-9)
+        'points': means - 0.1, 'gradient': gradient, 'curvature': curvature})
+    points = rng.normal(5, 1, (n, 5, 3))
+    density = np.stack([multivariate_normal(mean, _SPREAD**2 * np.linalg.inv(one)).pdf(points)
+                        for mean, one in zip(means, curvature, strict=True)])
+    np.testing.assert_allclose(
+        np.exp(_log_share(points, modes)), np.einsum('mms->ms', density) / density.sum(axis=0),
+        rtol=1e-9)
 
 
 @pytest.mark.slow

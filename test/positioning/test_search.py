@@ -7,25 +7,13 @@ import pytest
 
 from rhs_isac_ros.bounds.fisher import fisher_information
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.geometry import jacobian, to_polar, to_positions
 from rhs_isac_ros.positioning import simulate_pairs
-from rhs_isac_ros.positioning.coordinates import (
-    jacobian,
-    likelihood_loss,
-    select,
-    to_polar,
-    to_positions,
-)
-from rhs_isac_ros.positioning.grid import Starts, TemplateTable, tabulate
-from rhs_isac_ros.positioning.likelihood import (
-    Alignment,
-    DispersedLikelihood,
-    Likelihood,
-)
-from rhs_isac_ros.positioning.search import (
-    ascend,
-    find_modes,
-    marginal_at,
-)
+from rhs_isac_ros.positioning.grid import Starts, TemplateTable
+from rhs_isac_ros.positioning.likelihood import Alignment, DispersedLikelihood, Likelihood
+from rhs_isac_ros.positioning.search import ascend, find_modes, marginal_at
+from rhs_isac_ros.positioning.segments import select
+from rhs_isac_ros.positioning.templates import tabulate
 
 SCENARIO = Scenario(
     center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
@@ -50,7 +38,7 @@ def codebook(random_beams):
 
 
 def of_each(modes):
-    return [modes.of_phase(phase) for phase in np.unique(modes.phases)]
+    return [modes.of_shot(phase) for phase in np.unique(modes.shots)]
 
 
 def square_residual(likelihood, points, whitened):
@@ -61,10 +49,10 @@ def square_residual(likelihood, points, whitened):
 def test_likelihoods_match_the_exact_model_in_the_region(setting):
     likelihood, _, signals, _, modes = setting
     low, high = likelihood.scenario.roi_bounds_m
-    positions = to_positions(modes.roi_points)
+    positions = to_positions(modes.points)
     assert ((positions > low - 0.05) & (positions < high + 0.05)).all()
-    exact = -square_residual(likelihood, modes.roi_points, signals.whitened[modes.phases])
-    errors = np.abs(modes.roi_log_likelihood - exact)
+    exact = -square_residual(likelihood, modes.points, signals.whitened[modes.shots])
+    errors = np.abs(modes.log_likelihood - exact)
     assert np.median(errors) < 0.05
     assert np.quantile(errors, 0.9) < 1.0
 
@@ -73,7 +61,7 @@ def test_the_true_position_is_not_more_likely_than_the_best_mode(setting):
     """The best mode is a maximum; a failure means that the search missed a mode."""
     likelihood, _, signals, positions, modes = setting
     truths = -square_residual(likelihood, to_polar(positions), signals.whitened)
-    best = np.array([one.roi_log_likelihood.max() for one in of_each(modes)])
+    best = np.array([one.log_likelihood.max() for one in of_each(modes)])
     assert (best > truths - 0.3).all()
     # Half of a chi-square variable with three degrees of freedom.
     assert 0.5 < np.mean(best - truths) < 4
@@ -81,16 +69,16 @@ def test_the_true_position_is_not_more_likely_than_the_best_mode(setting):
 
 def test_every_phase_has_modes_the_most_likely_first(setting):
     modes = setting[4]
-    np.testing.assert_array_equal(np.unique(modes.phases), np.arange(30))
-    assert (np.diff(modes.phases) >= 0).all()
+    np.testing.assert_array_equal(np.unique(modes.shots), np.arange(30))
+    assert (np.diff(modes.shots) >= 0).all()
     for one in of_each(modes):
         assert len(one.points)
-        assert (np.diff(one.roi_log_likelihood) <= 0).all()
+        assert (np.diff(one.log_likelihood) <= 0).all()
 
 
 def test_modes_are_separate(setting):
     for modes in of_each(setting[4]):
-        offsets = modes.roi_points[:, None] - modes.roi_points
+        offsets = modes.points[:, None] - modes.points
         distance = np.einsum('nmp,npq,nmq->nm', offsets, modes.curvature, offsets)
         before = np.tri(len(distance), k=-1, dtype=bool)
         assert (distance[before] >= 0.5).all()
@@ -102,8 +90,8 @@ def test_the_modes_of_a_phase_do_not_depend_on_other_phases(setting):
     for phase in (0, 7, 29):
         alone = find_modes(likelihood, grid, select(signals, [phase]), np.zeros((1, 0)))
         # Rounding decides about modes at the margin.
-        both = [select(one, one.roi_log_likelihood > one.roi_log_likelihood.max() - 5)
-                for one in (alone, modes.of_phase(phase))]
+        both = [select(one, one.log_likelihood > one.log_likelihood.max() - 5)
+                for one in (alone, modes.of_shot(phase))]
         for found, expected in zip(both[0][1:], both[1][1:], strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
@@ -115,7 +103,8 @@ def test_the_curvature_is_the_information_in_polar_coordinates(setting):
     information = fisher_information(likelihood.model, to_positions(modes.points))
     expected = np.swapaxes(by_point, 1, 2) @ information @ by_point
     expected += np.diag(likelihood.nuisance.floor)
-    inside = (np.abs(modes.roi_offset) < 1e-9).all(axis=1)
+    inside = (np.abs(modes.gradient) * np.sqrt(np.diagonal(
+        np.linalg.inv(modes.curvature), axis1=1, axis2=2)) < 1e-9).all(axis=1)
     assert inside.any()
     for found, exact in zip(modes.curvature[inside], expected[inside], strict=True):
         scale = np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
@@ -129,8 +118,8 @@ def test_noiseless_signals_give_the_exact_position(codebook):
     signals = likelihood.signals(likelihood.model.mean(positions))
     found = find_modes(likelihood, grid, signals, np.zeros((10, 0)))
     for position, modes in zip(positions, of_each(found), strict=True):
-        assert np.linalg.norm(to_positions(modes.roi_points[0]) - position) < 1e-3
-        assert modes.roi_log_likelihood[0] == pytest.approx(0, abs=1e-2)
+        assert np.linalg.norm(to_positions(modes.points[0]) - position) < 1e-3
+        assert modes.log_likelihood[0] == pytest.approx(0, abs=1e-2)
         assert modes.residual[0] == pytest.approx(0, abs=1e-2)
 
 
@@ -141,7 +130,7 @@ def test_steps_continue_until_they_gain_nothing(codebook):
     # A tenth of a wavelength.
     starts = Starts(np.arange(50), points + [0.012, 0.0, 0.0], np.zeros((50, 0)))
     modes = ascend(likelihood, likelihood, starts, signals, 8)
-    assert np.abs(modes.points - points[modes.phases]).max() < 5e-5
+    assert np.abs(modes.points - points[modes.shots]).max() < 5e-5
 
 
 @pytest.mark.parametrize('changes', [{'user_gain_std_db': 1.0}, {'phase_std_rad': 0.5}], ids=str)
@@ -181,10 +170,8 @@ def test_the_weights_of_modes_are_likelihoods_and_no_predictions(codebook):
     signals = likelihood.signals(received)
     modes = find_modes(
         likelihood, grid, signals, alignment.values_of_each(received))
-    local = likelihood.local(modes.points, modes.values, select(signals, modes.phases))
-    # Outside of the region, the residual is that of the nearest point inside.
-    beyond = likelihood_loss(modes.roi_offset, modes.curvature)
-    np.testing.assert_allclose(modes.residual - beyond, local.residual, rtol=1e-9)
+    local = likelihood.local(modes.points, modes.values, select(signals, modes.shots))
+    np.testing.assert_allclose(modes.residual, local.residual, rtol=1e-9)
     among = np.linalg.slogdet(local.information[:, 3:, 3:])[1]
     np.testing.assert_allclose(modes.log_likelihood, local.value - among / 2, rtol=1e-9)
 
@@ -200,7 +187,7 @@ def test_a_step_predicts_the_likelihood_after_it(codebook):
     for _ in range(4):
         found.append(ascend(
             errors, likelihood, Starts(np.zeros(1, int), start, np.zeros((1, 0))), signals, 1))
-        start = found[-1].roi_points
+        start = found[-1].points
     first, *_, last = (float(modes.log_likelihood[0]) for modes in found)
     assert first == pytest.approx(last, abs=0.5)
     np.testing.assert_allclose(found[3].points, found[2].points, atol=1e-4)

@@ -1,14 +1,16 @@
 """Tables on disk."""
 
+import dataclasses
 import os
+import pwd
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.positioning import grid, make_estimator, simulate_pairs, store
+from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
+from rhs_isac_ros.positioning import make_estimator, simulate_pairs, store, templates
 from rhs_isac_ros.positioning.alternatives import tabulate_outside
 
 
@@ -26,12 +28,12 @@ def model(scenario, random_beams) -> MeasurementModel:
 @pytest.fixture
 def computed(monkeypatch):
     """Ids of the codebooks for which tables were computed."""
-    ids, original = [], grid.tabulate
+    ids, original = [], templates.tabulate
 
     def tabulate(model, progress=None):
         ids.append(model.beams.id)
         return original(model, progress)
-    monkeypatch.setattr(grid, 'tabulate', tabulate)
+    monkeypatch.setattr(templates, 'tabulate', tabulate)
     return ids
 
 
@@ -49,7 +51,7 @@ def only_file(folder: Path) -> Path:
 
 
 def assert_same(table, model):
-    expected = grid.tabulate(model) | tabulate_outside(model)
+    expected = templates.tabulate(model) | tabulate_outside(model)
     assert table.keys() == expected.keys()
     for name, array in expected.items():
         assert table[name].dtype == array.dtype
@@ -118,6 +120,13 @@ def test_a_table_of_another_codebook_or_scenario_is_not_used_under_a_wrong_name(
     assert len(list(tmp_path.iterdir())) == 3
 
 
+def test_surfaces_that_differ_in_their_pose_share_a_table(tmp_path, scenario, model, computed):
+    placed = dataclasses.replace(scenario, pose=Pose((0.0, 3.0, 1.0)))
+    load_table(model, tmp_path)
+    load_table(MeasurementModel(placed, model.beams), tmp_path)
+    assert computed == [model.beams.id]
+
+
 def test_estimates_with_a_table_from_disk_are_identical(tmp_path, scenario, model):
     received = simulate_pairs(scenario, model.beams, 10, 0)[1]
     estimates = [
@@ -134,25 +143,15 @@ def test_a_folder_that_cannot_be_written_is_a_warning(tmp_path, model):
         assert_same(load_table(model, tmp_path / 'file'), model)
 
 
-def test_a_failed_write_leaves_no_file(tmp_path, model, monkeypatch):
-    def replace(source, target):
-        raise OSError('disk full')
-    monkeypatch.setattr(os, 'replace', replace)
-    with pytest.warns(RuntimeWarning, match='disk full'):
-        load_table(model, tmp_path)
-    assert not list(tmp_path.iterdir())
-
-
-def test_the_oldest_tables_are_deleted(tmp_path, model, monkeypatch):
-    monkeypatch.setattr(store, '_MAX_TABLES', 3)
-    names = [f'table-{n}.npy' for n in range(4)]
+def test_the_oldest_tables_beyond_16_are_deleted(tmp_path, model):
+    names = [f'table-{n}.npy' for n in range(18)]
     for age, name in enumerate(names):
         (tmp_path / name).write_text('')
         os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
     (tmp_path / 'other.npy').write_text('')
     load_table(model, tmp_path)
     left = {path.name for path in tmp_path.iterdir()}
-    assert left == {*names[:2], table_name(model), 'other.npy'}
+    assert left == {*names[:15], table_name(model), 'other.npy'}
 
 
 @pytest.mark.parametrize(('variable', 'expected'), [
@@ -162,6 +161,16 @@ def test_default_folder_follows_the_xdg_convention(monkeypatch, variable, expect
     monkeypatch.setenv('HOME', '/me')
     monkeypatch.setenv('XDG_CACHE_HOME', variable)
     assert store.default_folder() == Path(expected)
+
+
+def test_a_user_without_a_home_directory_has_no_default_folder(monkeypatch):
+    def unknown(uid):
+        raise KeyError(uid)
+    monkeypatch.delenv('XDG_CACHE_HOME', raising=False)
+    monkeypatch.delenv('HOME', raising=False)
+    monkeypatch.setattr(pwd, 'getpwuid', unknown)
+    with pytest.warns(RuntimeWarning, match='the table is not stored: no home directory'):
+        assert store.default_folder() is None
 
 
 def test_the_progress_of_a_table_is_reported_up_to_the_end(model, tmp_path):

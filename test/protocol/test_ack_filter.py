@@ -44,15 +44,7 @@ def test_acks_do_not_fill_the_memory(scenario):
     station = BaseStation(scenario, BaseStationSettings(), np.random.default_rng(0), None)
     for user in range(1, 4000):
         station.handle(m.Ack(cycle_id=0, user=user), user / 100)
-    assert len(station._acks) <= 100
-
-
-def test_users_that_are_not_allowed_are_neither_served_nor_waited_for(network):
-    net = network(2, allowed_users='2')
-    net.run_cycles(4)
-    assert net.served() == [2] * 4
-    assert net['bs'].counters == {'not_allowed': 4}
-    net.verify()
+    assert len(station._admission._acks) <= 100
 
 
 def test_a_flood_of_acks_is_counted_and_does_not_affect_other_users(network):

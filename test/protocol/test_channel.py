@@ -6,49 +6,51 @@ import math
 
 import numpy as np
 import pytest
-from in_memory_network import feed
+from in_memory_network import emulated_front_end, feed
 
-from rhs_isac_ros.link import Beam, capacity, steer
+from rhs_isac_ros.calibration import known_states
+from rhs_isac_ros.frontend import EmulatedSurface, RadioFault, Sounding, SurfaceFault
+from rhs_isac_ros.link import Beam, capacity
+from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.hall import PathChannel
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.events import SettingsOffered
+from rhs_isac_ros.protocol.channel import Channel, apply_patterns
+from rhs_isac_ros.protocol.events import (
+    ApplyPatterns,
+    FrontEndFailed,
+    LogMessage,
+    PatternsApplied,
+    SettingsOffered,
+)
 from rhs_isac_ros.protocol.settings import Impairments
 
 PLACE = np.array([8.0, -2.0, 0.5])
 
 
-@pytest.fixture
-def truth():
-    return m.GroundTruth(cycle_id=3, user=1, position=PLACE, velocity=np.zeros(3))
+def truth_of(cycle_id, user=1):
+    return m.GroundTruth(cycle_id=cycle_id, user=user, position=PLACE, velocity=np.zeros(3))
+
+
+def configured(cycle_id, analog):
+    return m.RhsConfiguration(cycle_id=cycle_id, mode=m.Mode.POSITIONING, band=0,
+                              codebook_id='x', analog=analog)
+
+
+def pilots_of(scenario, cycle_id, user):
+    return m.Pilot(cycle_id=cycle_id, user=user, band=0,
+                   symbols=np.ones(scenario.n_frames, complex))
 
 
 @pytest.fixture
 def configuration(codebooks):
-    return m.RhsConfiguration(
-        cycle_id=3, mode=m.Mode.POSITIONING, band=0, codebook_id=codebooks[0].id,
-        analog=codebooks[0].analog[0])
+    return configured(3, codebooks[0].analog[0])
 
 
 @pytest.fixture
 def pilots(scenario):
     return pilots_of(scenario, 3, 1)
-
-
-@pytest.fixture
-def beam(scenario):
-    found = steer(scenario, PLACE)
-    return m.Beam(
-        cycle_id=3, user=1, codebook_id='x', band=0, analog=found.analog, digital=found.digital,
-        expected_bps=5e6)
-
-
-@pytest.fixture
-def applied(beam):
-    return m.RhsConfiguration(
-        cycle_id=3, mode=m.Mode.TRANSMISSION, band=0, codebook_id='x', analog=beam.analog[None])
 
 
 @pytest.fixture
@@ -73,17 +75,17 @@ def test_the_channel_answers_pilots_for_any_order_of_messages(
     assert not np.isclose(answers[0].signals[0], answers[0].signals[1]).any()
 
 
-def test_feed_signals_follow_configuration_and_symbol(scenario, truth, configuration, pilots):
+def test_feed_signals_follow_the_configuration_and_are_those_of_unit_symbols(
+        scenario, truth, configuration, pilots):
     def signals(analog, symbol):
-        report = m.RhsConfiguration(
-            cycle_id=3, mode=m.Mode.POSITIONING, band=0, codebook_id='x', analog=analog)
         pilot = m.Pilot(cycle_id=3, user=1, band=0, symbols=np.full(2, symbol))
-        (feeds,) = feed(Channel(scenario, 0), [truth, report, pilot])[-1]
+        (feeds,) = feed(Channel(scenario, 0), [truth, configured(3, analog), pilot])[-1]
         return feeds.signals
 
     analog = configuration.analog
     plain = signals(analog, 1 + 0j)
-    np.testing.assert_allclose(signals(analog, 0.6 - 0.8j), (0.6 - 0.8j) * plain)
+    for symbol in (0.6 - 0.8j, -1j, 1.005 + 0j):
+        np.testing.assert_allclose(signals(analog, symbol), plain, rtol=1e-14)
     np.testing.assert_allclose(signals(analog / 2, 1 + 0j), plain / 2)
     assert (signals(0 * analog, 1 + 0j) == 0).all()
     # Element by element: the path, including on-board propagation.
@@ -94,10 +96,7 @@ def test_feed_signals_follow_configuration_and_symbol(scenario, truth, configura
 def test_the_multipath_has_zero_mean_and_the_line_of_sight_is_1(scenario, configuration, pilots):
     sums, n = 0, 400
     for cycle_id in range(1, n + 1):
-        events = [m.GroundTruth(cycle_id=cycle_id, user=1, position=PLACE, velocity=np.zeros(3)),
-                  m.RhsConfiguration(
-                      cycle_id=cycle_id, mode=m.Mode.POSITIONING, band=0, codebook_id='x',
-                      analog=np.ones((2, 16))),
+        events = [truth_of(cycle_id), configured(cycle_id, np.ones((2, 16))),
                   pilots_of(scenario, cycle_id, 1)]
         ((feeds,),) = feed(Channel(scenario, 0), events)[-1:]
         first = feeds.signals[0]
@@ -144,18 +143,15 @@ def test_a_pilot_of_another_cycle_is_discarded_with_the_next_cycle(
         scenario, truth, configuration, example, cycle_id):
     channel = Channel(scenario, 0)
     pilot = example(m.Pilot, cycle_id=cycle_id, user=1)
-    later = m.GroundTruth(cycle_id=5, user=1, position=PLACE, velocity=np.zeros(3))
-    assert feed(channel, [truth, configuration, pilot, later]) == [[]] * 4
+    assert feed(channel, [truth, configuration, pilot, truth_of(5)]) == [[]] * 4
     assert channel.counters == {'stale': 1}
 
 
 def test_a_pilot_of_the_next_cycle_waits_for_it(scenario, truth, configuration, codebooks):
     channel = Channel(scenario, 0)
-    later = m.RhsConfiguration(
-        cycle_id=4, mode=m.Mode.POSITIONING, band=0, codebook_id='x', analog=configuration.analog)
-    events = [truth, configuration, pilots_of(scenario, 4, 1), later,
-              m.GroundTruth(cycle_id=4, user=1, position=PLACE, velocity=np.zeros(3))]
-    sent = feed(channel, events)
+    sent = feed(channel, [
+        truth, configuration, pilots_of(scenario, 4, 1), configured(4, configuration.analog),
+        truth_of(4)])
     assert sent[:4] == [[]] * 4
     assert [f.cycle_id for f in sent[4]] == [4]
 
@@ -190,13 +186,138 @@ def test_the_channel_uses_the_reported_configuration_of_the_surface(
     assert delivered.bits == 0
 
 
-@pytest.fixture
-def signals(codebooks, example):
-    """Function that returns received signals of a cycle with one of the codebooks."""
-    def make(cycle_id, number=0):
-        return example(m.ReceivedSignals, cycle_id=cycle_id, user=2,
-                       codebook_id=codebooks[number].id)
-    return make
+def handle_all(channel, events):
+    """Return all actions of a channel, whose surface has not answered yet."""
+    return [action for event in events for action in channel.handle(event, 0.0)]
+
+
+def test_no_answer_precedes_the_confirmation_of_its_configurations(
+        scenario, truth, configuration, pilots, beam, applied, downlink):
+    channel = Channel(scenario, 0)
+    (sounding,) = handle_all(channel, [truth, configuration, pilots])
+    (steering,) = handle_all(channel, [beam, applied, downlink])
+    np.testing.assert_array_equal(sounding.configurations, configuration.analog)
+    np.testing.assert_array_equal(steering.configurations, beam.analog[None])
+    # A repeated message asks for what is under way.
+    assert handle_all(channel, [pilots, downlink]) == []
+    assert channel.counters == {'duplicate': 2}
+    assert steering.sounding is None
+    (delivered,), (feeds,) = (
+        channel.handle(apply_patterns(emulated_front_end(scenario), request), 0.0)
+        for request in (steering, sounding))
+    assert (type(delivered.message), type(feeds.message)) == (m.Data, m.FeedSignals)
+
+
+def test_elements_have_the_coefficients_of_known_states(
+        scenario, truth, configuration, pilots, beam, applied, downlink):
+    switched = dataclasses.replace(configuration, analog=np.rint(configuration.analog))
+    states = known_states(scenario, 1, -1).surface
+    (feeds,) = feed(Channel(scenario, 0, None, states), [truth, switched, pilots])[-1]
+    plain = [feed(Channel(scenario, 0), [truth, configured(3, analog), pilots])[-1][0].signals
+             for analog in (switched.analog, 1 - switched.analog)]
+    np.testing.assert_allclose(feeds.signals, plain[1] - plain[0], rtol=1e-9)
+    events = [truth, beam, applied, downlink]
+    ((known,), (unknown,)) = (feed(channel, events)[-1] for channel in (
+        Channel(scenario, 0, None, states), Channel(scenario, 0)))
+    assert known.bits != unknown.bits
+
+
+def test_signals_are_those_of_the_configurations_that_were_shown(
+        scenario, truth, configuration, pilots):
+    """A later report, as of another codebook, does not change what the surface showed."""
+    channel = Channel(scenario, 0)
+    (request,) = handle_all(channel, [truth, configuration, pilots])
+    handle_all(channel, [configured(3, 1 - configuration.analog)])
+    (feeds,) = channel.handle(apply_patterns(emulated_front_end(scenario), request), 0.0)
+    (expected,) = feed(Channel(scenario, 0), [truth, configuration, pilots])[-1]
+    np.testing.assert_array_equal(feeds.message.signals, expected.signals)
+
+
+def test_configurations_that_are_confirmed_in_another_cycle_are_not_measured(
+        scenario, truth, configuration, pilots):
+    channel = Channel(scenario, 0)
+    (request,) = handle_all(channel, [truth, configuration, pilots])
+    assert handle_all(channel, [truth_of(4), PatternsApplied(request.key)]) == []
+    assert channel.counters == {'stale': 1}
+
+
+def test_a_fault_of_the_front_end_is_counted_and_logged_and_sends_nothing(
+        scenario, truth, configuration, pilots):
+    channel = Channel(scenario, 0)
+    (request,) = handle_all(channel, [truth, configuration, pilots])
+    assert channel.handle(FrontEndFailed(request.key, 'surface_silence', 'no answer'), 0.0) == [
+        LogMessage('no answer', True, 'surface_silence')]
+    assert channel.counters == {'surface_silence': 1}
+    assert channel.status()['warning.front_end'] == 'no answer'
+    # The base station asks again.
+    (request,) = handle_all(channel, [pilots])
+    recovery, feeds = channel.handle(
+        apply_patterns(emulated_front_end(scenario), request), 0.0)
+    assert recovery == LogMessage(
+        'surface and radio work again', False, 'front end', False)
+    assert feeds.message.band == 0
+    assert 'warning.front_end' not in channel.status()
+
+
+class Refusing(EmulatedSurface):
+    """A surface that fails at its second configuration."""
+
+    def __init__(self, error):
+        super().__init__(16)
+        self.error, self.n = error, 0
+
+    def apply(self, configuration):
+        self.n += 1
+        if self.n == 2:
+            raise self.error
+        super().apply(configuration)
+
+
+@pytest.mark.parametrize(('error', 'kind', 'text'), [
+    (SurfaceFault('restart', 'port: restarted'), 'surface_restart', 'surface: port: restarted'),
+    (ValueError('configuration[1]: 0.5'), 'surface_ValueError',
+     'surface: ValueError: configuration[1]: 0.5'),
+    (OSError('gone'), 'surface_OSError', 'surface: OSError: gone'),
+    (RadioFault('no samples'), 'radio', 'radio: no samples')])
+@pytest.mark.parametrize('measured', [False, True])
+def test_the_first_fault_ends_a_series_of_configurations(scenario, error, kind, text, measured):
+    surface = Refusing(error)
+    front_end = emulated_front_end(scenario, surface)
+    request = ApplyPatterns((1, 2), np.eye(16)[:3], Sounding(
+        1, 0, np.ones(3), np.ones((3, 3, 2)), 1, np.zeros(3)) if measured else None)
+    assert apply_patterns(front_end, request) == FrontEndFailed((1, 2), kind, text)
+    assert (surface.n, np.argmax(surface.applied)) == (2, 0)
+    done = apply_patterns(front_end, request)
+    assert done == PatternsApplied((1, 2))
+    assert (done.feeds is not None) == measured
+    assert np.argmax(surface.applied) == 2
+
+
+class Faulty(EmulatedSurface):
+    """A surface that fails at configurations of given numbers, from 1."""
+
+    def __init__(self, n_elements, faults):
+        super().__init__(n_elements)
+        self.faults, self.n = faults, 0
+
+    def apply(self, configuration):
+        self.n += 1
+        if self.n in self.faults:
+            raise SurfaceFault('silence', 'no answer')
+        super().apply(configuration)
+
+
+def test_a_cycle_is_served_in_spite_of_a_fault_or_given_up(network):
+    net = network(1, retries=1, rest_s=0.0)
+    # The first cycle repeats both bands; the second fails in both attempts and both bands.
+    net.front_end = emulated_front_end(
+        net.scenario, Faulty(net.scenario.n_elements, {2, *range(14, 18)}))
+    net.run_cycles(3)
+    assert [outcome for _, _, outcome in net.outcomes()] == ['served', 'user_gone', 'served']
+    assert net['channel'].counters['surface_silence'] == 5
+    assert len(net.sent(m.PositionEstimate)) == 2
+    assert net.logged('channel').count('surface: no answer') == 5
+    net.verify()
 
 
 DEVIATING = {
@@ -207,19 +328,11 @@ DEVIATING = {
 
 def received(channel, codebook, user, cycle_id):
     """Feed signals of the first band in a cycle without multipath memory, [F, N_SB, K]."""
-    events = [
-        m.GroundTruth(cycle_id=cycle_id, user=user, position=PLACE, velocity=np.zeros(3)),
-        m.RhsConfiguration(cycle_id=cycle_id, mode=m.Mode.POSITIONING, band=0,
-                           codebook_id='x', analog=codebook.analog[0]),
+    ((feeds,),) = feed(channel, [
+        truth_of(cycle_id, user), configured(cycle_id, codebook.analog[0]),
         m.Pilot(cycle_id=cycle_id, user=user, band=0,
-                symbols=np.ones(len(codebook.analog[0]), complex))]
-    ((feeds,),) = feed(channel, events)[-1:]
+                symbols=np.ones(len(codebook.analog[0]), complex))])[-1:]
     return feeds.signals
-
-
-def pilots_of(scenario, cycle_id, user):
-    return m.Pilot(cycle_id=cycle_id, user=user, band=0,
-                   symbols=np.ones(scenario.n_frames, complex))
 
 
 def make_deviating(scenario, **impairments):
@@ -297,3 +410,33 @@ def test_a_channel_file_takes_the_place_of_fading(scenario, truth, configuration
                          configuration.analog, onboard_matrix(scenario)[0])
     expected = expected * pilots.symbols[:, None, None]
     np.testing.assert_allclose(signals[0], expected, rtol=1e-9)
+
+
+def signals_at(scenario, place, **impairments):
+    """Return what the channel sends for the pilots of a user at a place."""
+    pilot = pilots_of(scenario, 3, 1)
+    return feed(Channel(scenario, 0, Impairments(**impairments)), [
+        m.GroundTruth(cycle_id=3, user=1, position=place, velocity=np.zeros(3)),
+        configured(3, np.ones((2, 16))), pilot])[-1]
+
+
+def test_a_user_behind_the_surface_has_no_signals(scenario):
+    """Another surface of the site may have the user in sight."""
+    channel = Channel(scenario, 0)
+    behind = m.GroundTruth(
+        cycle_id=3, user=1, position=np.array([-1.0, 0.0, 0.0]), velocity=np.zeros(3))
+    assert feed(channel, [behind, configured(3, np.ones((2, 16))), pilots_of(scenario, 3, 1)]
+                ) == [[], [], []]
+    assert channel.counters == {'behind': 1}
+
+
+@pytest.mark.parametrize('pose', [Pose(), Pose((3.0, 1.0, 0.0), (0.0, 0.0, 0.6, 0.8))])
+@pytest.mark.parametrize(('impairments', 'undone'), [
+    ({'surface_shift_m': 0.3}, lambda place: place - [0.0, 0.3, 0.0]),
+    ({'surface_turn_deg': 90.0}, lambda place: place @ [[0, -1, 0], [1, 0, 0], [0, 0, 1]])])
+def test_a_surface_may_hang_elsewhere_than_its_pose_says(scenario, pose, impairments, undone):
+    place = np.array([4.0, 3.0, 0.5])
+    posed = dataclasses.replace(scenario, pose=pose)
+    (moved,) = signals_at(posed, pose.to_site(place), **impairments)
+    (expected,) = signals_at(posed, pose.to_site(undone(place)))
+    np.testing.assert_allclose(moved.signals, expected.signals, rtol=1e-9)

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import numpy as np
 import pytest
 from system.invariants import RECEIVES, InvariantChecker
 
@@ -155,25 +154,6 @@ def test_signals_of_another_instance_are_rejected(network, example, changes, acc
     assert station.counters['wrong_instance'] == (not accepted)
 
 
-def test_signals_of_several_channels_are_a_violation(network):
-    net = network()
-    net.run_cycles(1)
-    for number, sent in enumerate(net.log):
-        if isinstance(sent.message, m.FeedSignals) and sent.message.band == 1:
-            net.log[number] = sent._replace(message=dataclasses.replace(sent.message, sender=77))
-    assert any('several channels' in text for text in violations(net))
-
-
-def test_signals_from_another_position_are_a_violation(network, places):
-    net = network()
-    net.run_cycles(1)
-    for number, sent in enumerate(net.log):
-        if isinstance(sent.message, m.GroundTruth):
-            net.log[number] = sent._replace(
-                message=dataclasses.replace(sent.message, position=np.array([0.3, 0.0, 0.0])))
-    assert any('do not match the true position' in text for text in violations(net))
-
-
 @pytest.mark.parametrize('twin', ['positioner', 'transmission', 'rhs_controller'])
 def test_two_nodes_of_another_role_do_no_harm_until_one_stands_by(network, twin):
     net = network(2)
@@ -212,17 +192,6 @@ def test_the_older_of_two_base_stations_stands_by_and_resumes(network):
     assert own[0] == min(own) == last + 1000
     net.verify()
     assert violations(net) == []
-
-
-def test_a_station_that_stands_by_begins_no_cycle(network, codebooks):
-    net = network()
-    net.run_cycles(1)
-    net.dispatch('bs', StoodBy())
-    since = len(net.log)
-    net.offer(codebooks[1])
-    net.run(limit_s=10.0)
-    assert net['bs'].state is State.WAITING
-    assert net.sent(m.Beacon, since) == []
 
 
 def test_a_pause_outlasts_a_time_as_the_older_station(network):

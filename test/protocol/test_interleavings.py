@@ -13,7 +13,7 @@ from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('plain_beams')]
+pytestmark = pytest.mark.slow
 
 STEP_S, ACK_S, REST_S = 0.2, 0.05, 0.08
 # Duration of the faults, and the time within which every user must be served after it.
@@ -106,7 +106,8 @@ def make_network(network_class, scenario, codebooks):
                  for user in (1, 2)}
         return network_class(
             scenario, codebooks[0], users, transport=transport, ordered=ordered,
-            step_timeout_s=STEP_S, ack_timeout_s=ACK_S, rest_s=REST_S, retries=retries)
+            step_timeout_s=STEP_S, ack_timeout_s=ACK_S, rest_s=REST_S, retries=retries,
+            plain_beams=True)
     return make
 
 

@@ -20,17 +20,6 @@ def crowd(network, scenario):
     return net, places[-1]
 
 
-def test_a_new_user_is_served_within_two_rounds(crowd):
-    net, place = crowd
-    begin_s = net.now_s
-    net.run_cycles(N_USERS)
-    round_s = net.now_s - begin_s
-    begin_s, first = net.now_s, len(net.served())
-    net.add_user(N_USERS + 1, place)
-    net.run(lambda: N_USERS + 1 in net.served()[first:])
-    assert net.now_s - begin_s < 2 * round_s
-
-
 def test_a_restarted_user_is_invited_as_its_new_instance(crowd):
     net, _ = crowd
     net.restart('user5')

@@ -1,13 +1,10 @@
 """Roles that crash, restart or are missing at first."""
 
-import numpy as np
 import pytest
 
-from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user as user_role
 from rhs_isac_ros.protocol.base_station import State
-from rhs_isac_ros.protocol.events import PeersChanged
 
 pytestmark = pytest.mark.usefixtures('plain_beams')
 
@@ -82,32 +79,6 @@ def test_the_base_station_waits_for_a_role_and_logs_it_once(network, role):
         assert net.logged('user1')[1:] == ['no beacon for 3 s', 'beacons resumed']
 
 
-def test_every_change_of_the_missing_roles_is_logged_once(network):
-    net = network(absent=['positioner', 'channel'])
-    net.run(limit_s=5.0)
-    net.add('channel')
-    net.run(limit_s=5.0)
-    net.remove('transmission')
-    net.run(limit_s=5.0)
-    net.add('positioner')
-    net.add('transmission')
-    assert net.logged('bs') == [
-        'waiting for channel, positioner', 'waiting for positioner',
-        'waiting for positioner, transmission', 'waiting for transmission']
-    net.run_cycles(1)
-    net.remove('transmission')
-    net.run(limit_s=5.0)
-    assert net.logged('bs')[4:] == ['waiting for transmission']
-
-
-def test_missing_roles_are_not_logged_again_without_a_change(network, codebooks):
-    net = network(absent=['positioner'])
-    for codebook in codebooks:
-        net.offer(codebook)
-        net.dispatch('bs', PeersChanged(('positioner',)))
-    assert net.logged('bs') == ['waiting for positioner']
-
-
 def test_a_role_missing_briefly_between_cycles_costs_no_cycle(network):
     net = network()
     net.run_cycles(1)
@@ -129,50 +100,6 @@ def test_a_user_without_a_base_station_waits_and_logs_it_once(network):
     net.run_cycles(1)
     assert net.served() == [1]
     assert net.logged('user1') == ['waiting for bs', 'listening for beacons']
-
-
-@pytest.mark.parametrize('noticed', [True, False])
-@pytest.mark.parametrize('cycles', [0, 3])
-@pytest.mark.parametrize('state', [
-    State.BEACONING, State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
-    State.TRANSMITTING, State.RESTING])
-def test_a_restarted_base_station_is_answered(network, state, cycles, noticed):
-    net = network(2)
-    net.run_cycles(cycles)
-    net.run_to(state)
-    net.restart('bs', noticed)
-    mark, n_ends = len(net.log), len(net.outcomes())
-    net.run_cycles(6)
-    ends = [(user, outcome) for _, user, outcome in net.outcomes()[n_ends:]]
-    assert {user for user, outcome in ends if outcome == 'served'} == {1, 2}
-    assert [outcome for _, outcome in ends[2:]] == ['served'] * 4
-    assert {ack.user for ack in net.sent(m.Ack, mark)} == {1, 2}
-    net.verify()
-
-
-@pytest.mark.parametrize('state', [State.SOUNDING, State.STEERING])
-def test_a_restarted_base_station_uses_the_present_position_of_the_user(network, scenario, state):
-    """The number of the interrupted cycle is not used again."""
-    walk = mobility.RandomWalk(scenario, 50.0, np.random.default_rng(0))
-    net = network({1: walk})
-    net.run_to(state)
-    net.restart('bs')
-    net.run_cycles(2)
-    assert net.served() == [1, 1]
-    before, again, _ = net.sent(m.GroundTruth)
-    assert before.cycle_id == 1 < again.cycle_id
-    assert np.linalg.norm(again.position - before.position) > 0.1
-    net.verify()
-
-
-def test_users_wait_without_a_base_station(network):
-    net = network(2)
-    net.run_cycles(2)
-    net.run_to(State.SOUNDING)
-    net.remove('bs')
-    assert [net[u].state for u in ('user1', 'user2')] == [user_role.State.DISCONNECTED] * 2
-    net.run(limit_s=5.0)
-    assert net.logged('user1')[-1] == 'waiting for bs'
 
 
 def test_a_base_station_without_acks_detects_a_missing_role(network):

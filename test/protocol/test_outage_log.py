@@ -20,7 +20,10 @@ def outages(scenario):
 
 
 class Outages:
-    """A base station whose cycles end as requested; all methods return what it logs."""
+    """A base station whose cycles end as requested; all methods return the texts that it logs.
+
+    `logged` contains the latest ones with the states that begin or end.
+    """
 
     def __init__(self, station):
         self.station = station
@@ -28,8 +31,9 @@ class Outages:
     def end(self, user, state, event):
         self.station._cycle.user, self.station.state = user, state
         self.station._cycle.cycle_id = event.cycle_id if isinstance(event, m.Message) else 1
-        return [action for action in self.station.handle(event, 0.0)
-                if isinstance(action, LogMessage)]
+        self.logged = [action for action in self.station.handle(event, 0.0)
+                       if isinstance(action, LogMessage)]
+        return [LogMessage(message.text, message.warning) for message in self.logged]
 
     def lose(self, user, reason):
         event = m.NoFix(cycle_id=1, user=user, codebook_id='', reason='')
@@ -93,7 +97,7 @@ def test_the_reasons_of_a_user_are_logged_once_until_that_user_is_served(outages
 def test_the_outages_of_many_users_do_not_fill_the_memory(outages):
     for user in range(1, 6000):
         assert outages.lose(user, 'no_fix')
-    assert len(outages.station._outages) == 4096
+    assert len(outages.station._service._outages) == 4096
 
 
 @pytest.mark.parametrize(('users', 'text'), [
@@ -111,22 +115,25 @@ def test_lost_users_are_logged_in_one_message(outages, users, text):
     assert logged == [LogMessage(text, warning=True)]
 
 
+def test_an_outage_is_a_state_of_its_user_or_of_all(outages):
+    outages.lose(1, 'no_fix')
+    (begin,) = outages.logged
+    outages.serve(1)
+    assert {(message.key, message.holds) for message in outages.logged} == {
+        ('service', False), (begin.key, False)}
+    assert (begin.key, begin.holds) == ('outage of user 1 0', True)
+    outages.lose(1, 'rhs_silent')
+    assert [(message.key, message.holds) for message in outages.logged] == [('outage', True)]
+
+
 def test_missing_roles_are_logged_once_until_a_cycle_begins(outages):
     def report(*missing):
         return outages.station.handle(PeersChanged(missing), 0.0)
 
-    assert report('channel') == [LogMessage('waiting for channel, codebook', warning=True)]
+    def waiting(text):
+        return LogMessage(text, warning=True, key='service', holds=True)
+
+    assert report('channel') == [waiting('waiting for channel, codebook')]
     assert report('channel') == []
-    assert report() == [LogMessage('waiting for codebook', warning=True)]
+    assert report() == [waiting('waiting for codebook')]
     assert report() == []
-
-
-def test_a_network_without_a_positioner_logs_the_outage_once(network):
-    net = network()
-    net.run_cycles(1)
-    net.remove('positioner', noticed=False)
-    net.run_cycles(5)
-    assert net.logged('bs') == ['cycle 2 of user 1 given up: positioner_silent']
-    net.add('positioner')
-    net.run_cycles(2)
-    assert net.logged('bs')[1:] == ['cycle 7: user 1 served again after: positioner_silent']

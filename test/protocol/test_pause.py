@@ -123,6 +123,7 @@ def test_a_paused_base_station_that_lacks_a_role_waits_for_it(network):
 def test_a_base_station_can_be_paused_before_its_first_cycle(network, codebooks):
     net = network(codebook=None)
     assert request(net, PauseRequested()) == Reply(True, 'paused')
+    assert net.logged('bs')[-1] == 'paused'
     assert request(net, StepRequested()) == Reply(False, 'waiting for codebook')
     net.offer(codebooks[0])
     net.run(limit_s=5.0)
@@ -142,14 +143,3 @@ def test_settings_and_codebook_change_during_a_pause(network, codebooks):
     request(net, StepRequested())
     net.run_to(State.PAUSED)
     assert net.sent(m.ReceivedSignals)[-1].codebook_id == codebooks[1].id
-
-
-def test_users_log_a_pause_once(network):
-    net = network(2)
-    net.run_cycles(2)
-    request(net, PauseRequested())
-    logged = len(net.logged('user1'))
-    net.run(limit_s=60.0)
-    request(net, ResumeRequested())
-    net.run_cycles(2)
-    assert net.logged('user1')[logged:] == ['no beacon for 3 s', 'beacons resumed']

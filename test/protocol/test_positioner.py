@@ -1,39 +1,27 @@
 """The positioner."""
 
+import dataclasses
 import itertools
 
 import numpy as np
 import pytest
+from in_memory_network import FIXED_PLACE as PLACE
+from in_memory_network import Fixed, feed
 
 from rhs_isac_ros.bounds import crlb
-from rhs_isac_ros.positioning import Estimate, SignalError
+from rhs_isac_ros.model import Pose, simulate_received
+from rhs_isac_ros.positioning import BayesEstimator, Estimate, SignalError
+from rhs_isac_ros.positioning.fusion import fuse
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
     BuildEstimator,
     CodebookOffered,
     EstimatorBuilt,
     LogMessage,
-    Send,
 )
+from rhs_isac_ros.protocol.fusion import sighting_of
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
-
-PLACE = np.array([8.0, -2.0, 0.5])
-
-
-def feed(role, events):
-    """Return the messages that a role sends, one list for each event."""
-    return [[action.message for action in role.handle(event, float(n))
-             if isinstance(action, Send)] for n, event in enumerate(events)]
-
-
-class Fixed:
-    """An estimator with a fixed result that holds its codebook."""
-
-    def __init__(self, codebook):
-        self.name = f'fixed {codebook.id}'
-
-    def estimate(self, received):
-        return Estimate(PLACE, 4 * np.eye(3))
+from rhs_isac_ros.protocol.settings import PRIORS, PositionerSettings
 
 
 @pytest.fixture
@@ -77,6 +65,72 @@ def test_the_codebook_of_the_signals_selects_the_estimator(
         assert (estimate.covariance_m2 == 4 * np.eye(3)).all()
         assert estimate.crlb_m2 == pytest.approx(crlb(scenario, codebook, PLACE[None])[0])
         assert estimate.latency_s == 1.0
+
+
+class Observers:
+    """Whether anyone receives posteriors."""
+
+    present = False
+
+    def __call__(self):
+        return self.present
+
+
+@pytest.fixture(scope='module')
+def beside(scenario):
+    """A surface that hangs 1 m to the left of the frame of the site, and looks back along x."""
+    pose = Pose((20.0, 1.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.02, 0.2))
+    return dataclasses.replace(scenario, outside_probability=0.0, pose=pose)
+
+
+@pytest.fixture(scope='module')
+def located(beside, codebooks):
+    """Function that locates signals of a user, with or without observers of the posterior."""
+    estimator = BayesEstimator(beside, codebooks[0])
+    received = simulate_received(beside, codebooks[0], PLACE[None], np.random.default_rng(1))
+
+    def locate(observed, **settings):
+        observers = Observers()
+        role = Positioner(beside, lambda: 0.0, PositionerSettings(**settings), observers)
+        feed(role, [CodebookOffered(codebooks[0]), ready(codebooks[0], estimator)])
+        observers.present = observed
+        message = m.ReceivedSignals(
+            cycle_id=3, user=2, user_instance=7, codebook_id=codebooks[0].id, stamp_ns=5,
+            signals=received[0].reshape(codebooks[0].shape[:3]))
+        return feed(role, [message])[0]
+    return locate
+
+
+@pytest.mark.parametrize('prior', PRIORS)
+def test_a_posterior_is_sent_only_to_observers(located, prior):
+    (estimate,) = located(False, prior=prior)
+    again, posterior = located(True, prior=prior)
+    assert m.same(dataclasses.replace(again, latency_s=estimate.latency_s), estimate)
+    assert isinstance(posterior, m.Posterior)
+    assert (posterior.cycle_id, posterior.user, posterior.user_instance, posterior.stamp_ns,
+            posterior.codebook_id) == (3, 2, 7, 5, estimate.codebook_id)
+
+
+def test_a_posterior_contains_all_that_the_fusion_needs(located, beside):
+    """The fusion of a single surface is the posterior of this surface."""
+    estimate, posterior = located(True)
+    m.check(posterior, beside)
+    assert np.exp(posterior.log_weights).sum() == pytest.approx(1)
+    assert posterior.surface_pose.origin.tolist() == list(beside.pose.position_m)
+    assert np.allclose(posterior.surface_pose.covariance, beside.pose.covariance)
+    corners = beside.pose.to_site(beside.roi_bounds_m)
+    fused = fuse([sighting_of(posterior)], np.sort(corners, axis=0))
+    mean, covariance = fused.mixture.moments()
+    deviation_m = np.sqrt(np.trace(covariance))
+    assert np.linalg.norm(mean - estimate.position) < 0.1 * deviation_m
+    assert deviation_m == pytest.approx(np.sqrt(np.trace(estimate.covariance_m2)), rel=0.1)
+
+
+def test_an_estimator_without_modes_has_no_posterior(positioner, codebooks, signals):
+    positioner._is_observed = lambda: True
+    feed(positioner, [CodebookOffered(codebooks[0]), ready(codebooks[0])])
+    (sent,) = feed(positioner, [signals(5)])
+    assert [type(message) for message in sent] == [m.PositionEstimate]
 
 
 def test_duplicate_signals_are_answered_twice_and_estimated_once(
@@ -178,7 +232,8 @@ def test_without_a_fix_the_positioner_reports_the_reason(positioner, codebooks, 
     assert send.message.codebook_id == codebooks[0].id
     assert send.message.reason == 'received: all wrong'
     assert note == LogMessage(
-        'cycle 9: no fix of user 2: received: all wrong', warning=True)
+        'cycle 9: no fix of user 2: received: all wrong', warning=True, key='signals of user 2',
+        holds=True)
     assert positioner.counters == {'no_fix': 1}
     # The answer may be lost, but not the line of the log.
     assert positioner.handle(signals(9), 0.0) == [send]
@@ -201,7 +256,12 @@ def test_a_built_estimator_is_returned_with_its_duration(codebooks):
     assert event.estimator.name == f'fixed {codebooks[0].id}'
 
 
-@pytest.fixture
-def estimate(codebooks, example):
-    return example(m.PositionEstimate, cycle_id=3, user=1, codebook_id=codebooks[0].id,
-                   position=PLACE + [0.5, 0.5, 0.0])
+def test_a_plug_in_that_returns_a_position_behind_the_surface_gives_no_fix(
+        positioner, signals, codebooks):
+    class Behind(Fixed):
+        def estimate(self, received):
+            return Estimate(PLACE * [-1, 1, 1], np.eye(3))
+    *_, (sent,) = feed(positioner, [
+        CodebookOffered(codebooks[0]), ready(codebooks[0], Behind(codebooks[0])), signals(1)])
+    assert isinstance(sent, m.NoFix)
+    assert sent.reason.startswith('position: x = -8 m, expected x > 0')

@@ -27,13 +27,6 @@ def add(watch, user, n, factor, codebook_id='a'):
         user, codebook_id, estimate(factor))) != ('', False)]
 
 
-def test_the_watch_is_silent_without_residuals():
-    watch = ResidualWatch()
-    for _ in range(WINDOW):
-        assert watch.add(1, 'a', Estimate(PLACE, np.eye(3))) == ('', False)
-    assert watch.status() == {}
-
-
 def test_residuals_of_the_model_are_shown_without_a_warning():
     watch = ResidualWatch()
     assert add(watch, 1, 2 * WINDOW, 1.0) == []
@@ -152,20 +145,6 @@ def test_the_positioner_warns_while_the_residuals_deviate(net, estimator):
     assert begin.startswith('the signals do not match the scenario')
     assert end == 'the residuals match the scenario again'
     assert set(net.served()) == {1}
-
-
-def test_a_user_outside_is_reported_once_and_causes_no_warning_of_the_residuals(net, estimator):
-    net.run_cycles(1)
-    estimator.reason = 'position outside of the region: probability 1'
-    net.run_cycles(2 * MIN_FIXES)
-    estimator.reason = ''
-    net.run_cycles(2)
-    assert texts(net) == [
-        f'cycle 2: no fix of user 1: {estimator.reason or "position outside of the region"}: '
-        'probability 1', f'cycle {2 + 2 * MIN_FIXES}: user 1 has a position again']
-    assert warnings(net) == ''
-    assert {message.reason for message in net.sent(m.NoFix)} == {
-        'position outside of the region: probability 1'}
 
 
 def test_a_prediction_through_a_blockage_is_logged_once_with_its_probability(net, estimator):

@@ -4,21 +4,51 @@ import dataclasses
 
 import pytest
 
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
+    FusionSettings,
     Impairments,
     PendingSettings,
     PositionerSettings,
+    ReceiverSettings,
     TransmissionSettings,
     shown,
 )
 
+# Defaults and ranges of all numbers: files of parameters may depend on them.
+NUMBERS = {
+    BaseStationSettings: {
+        'ack_timeout_s': (0.1, 0.001, 60.0), 'step_timeout_s': (1.0, 0.01, 60.0),
+        'retries': (3, 0, 100), 'rest_s': (0.1, 0.0, 3600.0),
+        'data_duration_s': (0.001, 1e-6, 10.0), 'max_users': (4096, 1, 4096),
+        'ack_rate_hz': (200.0, 1.0, 1e6)},
+    PositionerSettings: {'track_speed_mps': (1.0, 0.01, 1000.0)},
+    TransmissionSettings: {'band': (-1, -1, 4095)},
+    Impairments: {
+        'loss_probability': (0.0, 0.0, 1.0), 'double_probability': (0.0, 0.0, 1.0),
+        'delay_s': (0.0, 0.0, 10.0), 'jitter_s': (0.0, 0.0, 10.0),
+        **{name: (-1.0, -1.0, Scenario.__dataclass_fields__[name].metadata['declared'].high)
+           for name in (
+               'user_gain_std_db', 'phase_std_rad', 'band_phase_std_rad', 'timing_std_s',
+               'carrier_offset_std_hz', 'element_error_rms', 'blocked_probability',
+               'failed_element_share')},
+        'surface_shift_m': (0.0, -10.0, 10.0), 'surface_turn_deg': (0.0, -90.0, 90.0)},
+    FusionSettings: {'wait_s': (0.2, 0.0, 60.0), 'track_speed_mps': (1.0, 0.01, 1e3)},
+    ReceiverSettings: {},
+}
 
-@pytest.mark.parametrize(
-    'kind', [BaseStationSettings, Impairments, PositionerSettings, TransmissionSettings])
-def test_defaults_are_valid(kind):
-    for field in dataclasses.fields(kind):
-        assert field.metadata['declared'].problem(field.default) == '', field.name
+
+@pytest.mark.parametrize('kind', NUMBERS)
+def test_settings_have_their_defaults_and_ranges(kind):
+    declared = {field.name: (field.default, field.metadata['declared'])
+                for field in dataclasses.fields(kind)}
+    assert not [name for name, (default, field) in declared.items() if field.problem(default)]
+    assert {name: (default, field.low, field.high) for name, (default, field) in declared.items()
+            if field.kind in (int, float)} == NUMBERS[kind]
+    assert {name: default for name, (default, field) in declared.items()
+            if field.kind is bool}.items() <= {
+        'receiver_noise': True, 'reject_outside': True, 'multipath_memory': True}.items()
 
 
 def test_settings_in_use_and_pending_are_described():

@@ -5,7 +5,7 @@ import enum
 
 import pytest
 
-from rhs_isac_ros.protocol.events import LogMessage, Outcome
+from rhs_isac_ros.protocol.events import Immediately, LogMessage, Outcome
 from rhs_isac_ros.protocol.role import ANY, Row, StateMachine, on, rows_for
 
 
@@ -13,31 +13,16 @@ class State(enum.Enum):
     RED = 'red'
     GREEN = 'green'
     DARK = 'dark'
+    STARTING = 'starting'
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(frozen=True)
 class Go:
     fast: bool = False
 
 
-class Stop:
-    pass
-
-
-class Blink:
-    pass
-
-
-class Wait:
-    pass
-
-
-class Fail:
-    pass
-
-
-class Renew:
-    pass
+Stop, Blink, Wait, Fail, Renew, Start = (
+    type(name, (), {}) for name in ('Stop', 'Blink', 'Wait', 'Fail', 'Renew', 'Start'))
 
 
 class LightSteps(StateMachine):
@@ -73,9 +58,9 @@ class Light(LightSteps):
     TABLE = (
         *on(Go, 'go', {LightSteps.past: Outcome.STALE})(
             Row((State.RED,), target=State.GREEN, guard=LightSteps.fast,
-                       outcome=Outcome.OVERFLOW),
+                outcome=Outcome.OVERFLOW),
             Row((State.RED,), (LightSteps.note, LightSteps.record, LightSteps.note),
-                       State.GREEN),
+                State.GREEN),
             Row((State.GREEN,))),
         *on(Stop, 'stop')(Row((State.GREEN,), target=State.RED)),
         *on(Fail, 'fail')(
@@ -86,31 +71,57 @@ class Light(LightSteps):
             Row((State.RED, State.GREEN), restart_timeout=True),
             Row(ANY, (LightSteps.note,), outcome=Outcome.DUPLICATE)),
         *on(Renew, 'renew')(Row((State.RED,), target=State.RED)),
+        *on(Start, 'start')(Row(ANY, target=State.STARTING)),
+        # A light that starts late goes on to red; otherwise, it goes on to green and is counted.
+        *on(Immediately, 'immediately')(
+            Row((State.STARTING,), target=State.RED, guard=LightSteps.past),
+            Row((State.STARTING,), (LightSteps.note,), State.GREEN, outcome=Outcome.LATE_ACK)),
     )
 
 
-def test_a_machine_begins_without_a_deadline():
+@pytest.mark.parametrize(('events', 'state', 'deadline_s', 'repeats', 'counters'), [
+    # A machine begins without a deadline; a new state sets one.
+    ([], State.RED, None, 0, {}),
+    ([(Go(), 5.0)], State.GREEN, 7.0, 0, {}),
+    ([(Go(), 5.0), (Stop(), 6.0)], State.RED, 16.0, 0, {}),
+    # The first row whose guard holds is taken.
+    ([(Go(fast=True), 101.0)], State.RED, None, 0, {'stale': 1}),
+    ([(Go(fast=True), 5.0)], State.GREEN, 7.0, 0, {'overflow': 1}),
+    # The deadline uses timeouts that an action has changed.
+    ([(Go(), 5.0), (Fail(), 6.0)], State.RED, 7.0, 0, {}),
+    # A state without a timeout has no deadline.
+    ([(Blink(), 5.0), (Fail(), 6.0)], State.DARK, None, 0, {'overflow': 1}),
+    # A row that keeps the state keeps the deadline; so does an event without a matching row.
+    ([(Go(), 5.0), (Go(), 6.0)], State.GREEN, 7.0, 0, {}),
+    ([(Go(), 5.0), (Wait(), 6.0), (Wait(), 6.0)], State.GREEN, 7.0, 0, {'unexpected_wait': 2}),
+    ([(Stop(), 1.0)], State.RED, None, 0, {'unexpected_stop': 1}),
+    ([(Fail(), 1.0), (Go(), 1.0)], State.DARK, None, 0, {'overflow': 1, 'unexpected_go': 1}),
+    # A restarted timeout is counted until the state changes, or is entered again.
+    ([(Blink(), 3.0)], State.RED, 13.0, 1, {}),
+    ([(Blink(), 3.0), (Blink(), 6.0)], State.RED, 16.0, 2, {}),
+    ([(Blink(), 3.0), (Go(), 7.0)], State.GREEN, 9.0, 0, {}),
+    ([(Blink(), 3.0), (Renew(), 4.0)], State.RED, 14.0, 0, {}),
+    # A row without a source applies in any state.
+    ([(Fail(), 0.0), (Blink(), 0.0)], State.DARK, None, 0, {'overflow': 1, 'duplicate': 1}),
+    # Rows for Immediately follow by themselves, at the same time.
+    ([(Start(), 5.0)], State.GREEN, 7.0, 0, {'late_ack': 1}),
+    ([(Start(), 101.0)], State.RED, 111.0, 0, {})])
+def test_events_lead_to_a_state_a_deadline_and_counters(
+        events, state, deadline_s, repeats, counters):
     light = Light()
-    assert light.state is State.RED
-    assert light.next_deadline() is None
-    assert light.counters == {}
+    for event, now_s in events:
+        light.handle(event, now_s)
+    assert (light.state, light.next_deadline(), light.repeats, light.counters) == (
+        state, deadline_s, repeats, counters)
 
 
 def test_actions_run_in_order_in_the_old_state():
     light, go = Light(), Go()
-    actions = light.handle(go, 5.0)
+    assert light.handle(go, 5.0) == [LogMessage('Go 1'), LogMessage('Go 3')]
     assert light.seen == [(go, 5.0, State.RED), 'recorded', (go, 5.0, State.RED)]
-    assert actions == [LogMessage('Go 1'), LogMessage('Go 3')]
-    assert light.state is State.GREEN
-    assert light.counters == {}
-
-
-def test_the_first_row_whose_guard_holds_is_taken():
-    light = Light()
-    assert light.handle(Go(fast=True), 101.0) == []
-    assert (light.state, light.counters) == (State.RED, {'stale': 1})
-    assert light.handle(Go(fast=True), 5.0) == []
-    assert (light.state, light.counters) == (State.GREEN, {'stale': 1, 'overflow': 1})
+    assert light.handle(Wait(), 6.0) == []
+    assert light.handle(Start(), 7.0) == [LogMessage('Immediately 4')]
+    assert light.seen[3:] == [(Immediately(), 7.0, State.STARTING)]
 
 
 def test_rows_for_a_state_include_those_for_any_in_order():
@@ -119,94 +130,10 @@ def test_rows_for_a_state_include_those_for_any_in_order():
     assert Light.TABLE[0].source is ANY
 
 
-def test_a_new_state_sets_its_deadline():
-    light = Light()
-    light.handle(Go(), 5.0)
-    assert light.next_deadline() == 7.0
-    light.handle(Stop(), 6.0)
-    assert light.next_deadline() == 16.0
-
-
-def test_the_deadline_uses_timeouts_that_an_action_changed():
-    light = Light()
-    light.handle(Go(), 5.0)
-    light.handle(Fail(), 6.0)
-    assert light.next_deadline() == 7.0
-
-
-def test_a_state_without_timeout_has_no_deadline():
-    light = Light()
-    light.handle(Blink(), 5.0)
-    light.handle(Fail(), 6.0)
-    assert light.state is State.DARK
-    assert light.next_deadline() is None
-
-
-@pytest.mark.parametrize('event', [Go(), Wait()])
-def test_a_row_that_keeps_the_state_keeps_the_deadline(event):
-    light = Light()
-    light.handle(Go(), 5.0)
-    light.handle(event, 6.0)
-    assert (light.state, light.next_deadline(), light.repeats) == (State.GREEN, 7.0, 0)
-
-
-def test_a_restarted_timeout_is_counted_until_the_state_changes():
-    light = Light()
-    for n in (1, 2):
-        light.handle(Blink(), 3.0 * n)
-        assert (light.state, light.next_deadline(), light.repeats) == (
-            State.RED, 3.0 * n + 10.0, n)
-    light.handle(Go(), 7.0)
-    assert light.repeats == 0
-
-
-def test_a_state_that_is_entered_again_has_a_new_deadline_and_no_repeats():
-    light = Light()
-    light.handle(Blink(), 3.0)
-    light.handle(Renew(), 4.0)
-    assert (light.state, light.next_deadline(), light.repeats) == (State.RED, 14.0, 0)
-
-
-def test_a_row_without_source_applies_in_any_state():
-    light = Light()
-    light.handle(Blink(), 0.0)
-    assert (light.counters, light.seen) == ({}, [])
-    light.handle(Fail(), 0.0)
-    assert light.handle(Blink(), 0.0) == [LogMessage('Blink 2')]
-    assert light.counters == {'overflow': 1, 'duplicate': 1}
-
-
-@pytest.mark.parametrize(('before', 'event', 'name'), [
-    ([], Stop(), 'stop'), ([Go()], Wait(), 'wait'), ([Fail()], Go(), 'go')])
-def test_an_event_without_a_matching_row_is_only_counted(before, event, name):
-    light = Light()
-    for earlier in before:
-        light.handle(earlier, 1.0)
-    state, deadline_s, seen = light.state, light.next_deadline(), list(light.seen)
-    counters = dict(light.counters)
-    for n in (1, 2):
-        assert light.handle(event, 1.5) == []
-        assert (light.state, light.next_deadline(), light.seen) == (state, deadline_s, seen)
-        assert light.counters == counters | {f'unexpected_{name}': n}
-
-
-def test_an_event_that_no_row_names_is_an_error():
-    with pytest.raises(TypeError, match='int is not an event of Light'):
-        Light().handle(3, 0.0)
-
-
-def test_a_subclass_inherits_the_rows_of_its_table():
-    class Lamp(Light):
-        pass
-
-    lamp = Lamp()
-    lamp.handle(Go(), 0.0)
-    assert lamp.state is State.GREEN
-
-
-def test_a_row_cannot_be_changed():
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        Light.TABLE[0].target = State.RED
+@pytest.mark.parametrize(('event', 'name'), [(3, 'int'), (Immediately(), 'Immediately')])
+def test_an_event_that_no_row_awaits_is_an_error(event, name):
+    with pytest.raises(TypeError, match=f'{name} is not an event of Light'):
+        Light().handle(event, 0.0)
 
 
 def test_counting_nothing_adds_no_counter():

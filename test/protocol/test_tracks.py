@@ -112,7 +112,7 @@ def tracked(scenario, codebook, estimator):
     """Function that runs a network with the prior ``track``."""
     def make(users, **options):
         network = Network(scenario, codebook, users, make=lambda codebook: estimator,
-                          rest_s=0.02, ack_timeout_s=0.01, **options)
+                          rest_s=0.02, ack_timeout_s=0.01, plain_beams=True, **options)
         network.change('positioner', prior='track')
         return network
     return make

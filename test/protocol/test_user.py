@@ -14,6 +14,23 @@ DOWN, UP = m.Direction.DOWNLINK, m.Direction.UPLINK
 OFFERED, DELIVERED = m.Stage.OFFERED, m.Stage.DELIVERED
 
 
+def beacon(cycle_id=7, attempt=0, **users):
+    return m.Beacon(cycle_id=cycle_id, attempt=attempt, **users)
+
+
+def grant(cycle_id=7, user=4):
+    return m.Grant(cycle_id=cycle_id, user=user)
+
+
+def request(user=4, band=0, n_frames=2):
+    return m.PilotRequest(cycle_id=7, user=user, band=band, last_band=band, n_frames=n_frames)
+
+
+def data(cycle_id=7, user=4, direction=DOWN, stage=DELIVERED):
+    return m.Data(cycle_id=cycle_id, user=user, direction=direction, stage=stage,
+                  duration_s=0.25, bits=123.0)
+
+
 @pytest.fixture
 def user():
     """User 4, connected, with timeouts of 2 s for a grant and 8 s after it."""
@@ -27,151 +44,76 @@ def answers(user, event, now_s):
     return [action.message for action in user.handle(event, now_s) if isinstance(action, Send)]
 
 
-def grant(user, cycle_id=7, now_s=10.0):
-    user.handle(m.Beacon(cycle_id=cycle_id, attempt=0), now_s)
-    return answers(user, m.Grant(cycle_id=cycle_id, user=4), now_s)
+GRANTED = [(beacon(), 10.0), (grant(), 10.0)]
+LISTENING, ACKNOWLEDGED = State.LISTENING, State.ACKNOWLEDGED
 
 
-def test_a_beacon_is_answered(user):
-    (ack,) = answers(user, m.Beacon(cycle_id=7, attempt=0), 10.0)
-    assert (type(ack), ack.cycle_id, ack.user) == (m.Ack, 7, 4)
-    assert user.state is State.ACKNOWLEDGED
-    assert user.next_deadline() == 12.0
+@pytest.mark.parametrize((
+    'before', 'event', 'now_s', 'answer', 'state', 'deadline_s', 'counters'), [
+    ([], beacon(), 10.0, [m.Ack], ACKNOWLEDGED, 12.0, {}),
+    # Every further beacon is answered and restarts the timeout.
+    ([(beacon(), 10.0)], beacon(7, 1), 11.5, [m.Ack], ACKNOWLEDGED, 13.5, {}),
+    ([(beacon(), 10.0)], beacon(8, 1), 11.5, [m.Ack], ACKNOWLEDGED, 13.5, {}),
+    ([(beacon(), 10.0)], grant(), 10.0, [m.GroundTruth], State.GRANTED, 18.0, {}),
+    # A grant to another user ends the wait; other messages to another user are ignored.
+    ([(beacon(), 10.0)], grant(user=5), 10.5, [], LISTENING, math.inf, {}),
+    *(([(beacon(), 10.0)], other, 10.5, [], ACKNOWLEDGED, 12.0, {})
+      for other in (grant(6, 5), request(user=5), data(6, 5))),
+    *((GRANTED, other, 10.5, [], State.GRANTED, 18.0, {})
+      for other in (grant(6, 5), request(user=5), data(6, 5))),
+    # A pilot request that overtakes the grant implies it.
+    ([(beacon(), 10.0)], request(), 10.5, [m.GroundTruth, m.Pilot], State.GRANTED, 18.5, {}),
+    ([(beacon(), 10.0), (request(), 10.5)], grant(), 11.0, [], State.GRANTED, 18.5, {}),
+    (GRANTED, request(band=1), 12.5, [m.Pilot], State.GRANTED, 20.5, {}),
+    # The downlink is answered and ends the cycle; other data are ignored.
+    (GRANTED, data(), 11.0, [m.Data], LISTENING, math.inf, {}),
+    *((GRANTED, data(direction=way, stage=stage), 11.0, [], State.GRANTED, 18.0, {})
+      for way, stage in ((DOWN, OFFERED), (UP, OFFERED), (UP, DELIVERED))),
+    # Another beacon of a cycle may be in transit while the first ack is granted.
+    (GRANTED, beacon(7, 1), 11.0, [], State.GRANTED, 18.0, {'stale_beacon': 1}),
+    (GRANTED, beacon(8), 11.0, [m.Ack], ACKNOWLEDGED, 13.0, {'abandoned': 1}),
+    ([*GRANTED, (data(), 11.0)], grant(), 11.5, [], LISTENING, math.inf, {'late_grant': 1}),
+    ([*GRANTED, (data(), 11.0)], beacon(), 11.5, [], LISTENING, math.inf, {'stale_beacon': 1}),
+    # A granted user waits through sounding of the last band, estimating and steering.
+    ([(beacon(), 10.0)], Timeout(), 12.0, [], LISTENING, math.inf, {'not_granted': 1}),
+    (GRANTED, Timeout(), 18.0, [], LISTENING, math.inf, {'bs_silent': 1})])
+def test_a_user_answers_the_messages_of_its_cycle(
+        user, before, event, now_s, answer, state, deadline_s, counters):
+    for earlier, at_s in before:
+        user.handle(earlier, at_s)
+    sent = answers(user, event, now_s)
+    assert [type(message) for message in sent] == answer
+    assert {(message.cycle_id, message.user) for message in sent} <= {
+        (getattr(event, 'cycle_id', 0), 4)}
+    assert (user.state, user.next_deadline(), user.counters) == (state, deadline_s, counters)
 
 
-def test_a_late_beacon_or_grant_of_a_cycle_keeps_its_position(user):
-    (truth,) = grant(user)
-    user.handle(m.Data(
-        cycle_id=7, user=4, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=123.0), 11.0)
-    assert answers(user, m.Grant(cycle_id=7, user=4), 11.5) == []
-    assert user.counters == {'late_grant': 1}
-    assert answers(user, m.Beacon(cycle_id=7, attempt=0), 11.5) == []
-    assert user.counters == {'late_grant': 1, 'stale_beacon': 1}
-    user.handle(m.Beacon(cycle_id=7, attempt=1), 12.0)
-    again, *_ = answers(user, m.PilotRequest(
-        cycle_id=7, user=4, band=0, last_band=0, n_frames=2), 12.5)
-    assert again is truth
-
-
-@pytest.mark.parametrize('cycle_id', [7, 8])
-def test_every_further_beacon_is_answered_and_restarts_the_timeout(user, cycle_id):
-    user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
-    (ack,) = answers(user, m.Beacon(cycle_id=cycle_id, attempt=1), 11.5)
-    assert ack.cycle_id == cycle_id
-    assert user.next_deadline() == 13.5
-    assert user.counters == {}
-
-
-def test_a_grant_is_answered_with_the_present_position(user):
+def test_the_answers_have_the_position_the_pilots_and_the_data_of_the_cycle(user):
     assert [truth.cycle_id for truth in user.ground_truths(8.0).each()] == [0]
-    (truth,) = grant(user)
-    assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
+    user.handle(beacon(), 10.0)
+    (truth,) = answers(user, grant(), 10.0)
     np.testing.assert_allclose(truth.position, (7, 0, 0))
     np.testing.assert_allclose(truth.velocity, (0.5, 0, 0))
-    assert user.next_deadline() == 18.0
-
-
-def test_a_pilot_request_is_answered_in_each_frame_and_restarts_the_timeout(user):
-    grant(user)
-    pilots, = answers(user, m.PilotRequest(
-        cycle_id=7, user=4, band=1, last_band=1, n_frames=3), 12.5)
-    assert (pilots.cycle_id, pilots.user, pilots.band) == (7, 4, 1)
-    assert pilots.symbols.tolist() == [1 + 0j] * 3
-    assert user.next_deadline() == 20.5
-
-
-def test_the_downlink_is_answered_with_equal_uplink_and_ends_the_cycle(user):
-    grant(user)
-    (data,) = answers(user, m.Data(
-        cycle_id=7, user=4, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=123.0), 11.0)
-    assert (data.cycle_id, data.user, data.direction, data.stage) == (7, 4, UP, OFFERED)
-    assert (data.duration_s, data.bits) == (0.25, 123.0)
-    assert user.state is State.LISTENING
-    assert user.next_deadline() == math.inf
-
-
-@pytest.mark.parametrize(('direction', 'stage'), [(DOWN, OFFERED), (UP, OFFERED), (UP, DELIVERED)])
-def test_other_data_are_ignored(user, direction, stage):
-    grant(user)
-    assert user.handle(m.Data(
-        cycle_id=7, user=4, direction=direction, stage=stage, duration_s=0.25,
-        bits=123.0), 11.0) == []
-    assert user.state is State.GRANTED
-    assert user.counters == {}
-
-
-def test_a_late_beacon_of_the_granted_cycle_is_only_counted(user):
-    """Another beacon of a cycle may be in transit while the first ack is granted."""
-    grant(user)
-    assert user.handle(m.Beacon(cycle_id=7, attempt=1), 11.0) == []
-    assert user.state is State.GRANTED
-    assert user.next_deadline() == 18.0
-    assert user.counters == {'stale_beacon': 1}
-
-
-def test_a_beacon_of_another_cycle_ends_the_granted_one(user):
-    grant(user)
-    (ack,) = answers(user, m.Beacon(cycle_id=8, attempt=0), 11.0)
-    assert ack.cycle_id == 8
-    assert user.state is State.ACKNOWLEDGED
-    assert user.counters == {'abandoned': 1}
-
-
-def test_a_grant_to_another_user_ends_the_wait(user):
-    user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
-    assert user.handle(m.Grant(cycle_id=7, user=5), 10.5) == []
-    assert user.state is State.LISTENING
-    assert user.counters == {}
-
-
-@pytest.mark.parametrize('other', [
-    m.Grant(cycle_id=6, user=5), m.PilotRequest(
-        cycle_id=7, user=5, band=0, last_band=0, n_frames=2), m.Data(
-        cycle_id=6, user=5, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=1.0)],
-    ids=['grant of another cycle', 'request', 'data'])
-def test_other_messages_to_another_user_are_ignored(user, other):
-    for event, state in ((m.Beacon(
-        cycle_id=7, attempt=0), State.ACKNOWLEDGED), (m.Grant(cycle_id=7, user=4), State.GRANTED)):
-        user.handle(event, 10.0)
-        assert user.handle(other, 10.5) == []
-        assert user.state is state
-    assert user.counters == {}
-
-
-def test_a_pilot_request_that_overtakes_the_grant_implies_it(user):
-    user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
-    truth, pilots = answers(user, m.PilotRequest(
-        cycle_id=7, user=4, band=0, last_band=0, n_frames=2), 10.5)
-    assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
-    assert (type(pilots), len(pilots.symbols)) == (m.Pilot, 2)
-    assert user.state is State.GRANTED
-    assert user.handle(m.Grant(cycle_id=7, user=4), 11.0) == []
-    assert user.next_deadline() == 18.5
-    assert user.counters == {}
-
-
-@pytest.mark.parametrize(('granted', 'deadline_s', 'reason'), [
-    # A granted user waits through sounding of the last band, estimating and steering.
-    (False, 12.0, 'not_granted'), (True, 18.0, 'bs_silent')])
-def test_a_timeout_leads_back_to_listening(user, granted, deadline_s, reason):
-    user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
-    if granted:
-        user.handle(m.Grant(cycle_id=7, user=4), 10.0)
-    assert user.next_deadline() == deadline_s
-    assert user.handle(Timeout(), deadline_s) == []
-    assert user.state is State.LISTENING
-    assert user.counters == {reason: 1}
-    assert user.next_deadline() == math.inf
+    (pilots,) = answers(user, request(band=1, n_frames=3), 12.5)
+    assert (pilots.band, pilots.symbols.tolist()) == (1, [1 + 0j] * 3)
+    (uplink,) = answers(user, data(), 13.0)
+    assert (uplink.direction, uplink.stage) == (UP, OFFERED)
+    assert (uplink.duration_s, uplink.bits) == (0.25, 123.0)
+    # A late beacon of the cycle keeps its position.
+    user.handle(beacon(7, 1), 14.0)
+    again, *_ = answers(user, request(), 14.5)
+    assert again is truth
 
 
 @pytest.mark.parametrize('state', State)
 def test_a_disconnected_user_logs_it_and_sends_nothing(user, state):
     user.state = state
     assert user.handle(PeersChanged(('channel', 'bs')), 1.0) == [
-        LogMessage('waiting for channel, bs', warning=True)]
+        LogMessage('waiting for channel, bs', warning=True, key='peers', holds=True)]
     assert user.state is State.DISCONNECTED
-    assert user.handle(m.Beacon(cycle_id=7, attempt=0), 1.0) == []
-    assert user.handle(PeersChanged(()), 2.0) == [LogMessage('listening for beacons')]
+    assert user.handle(beacon(), 1.0) == []
+    assert user.handle(PeersChanged(()), 2.0) == [
+        LogMessage('listening for beacons', key='peers', holds=False)]
     assert user.state is State.LISTENING
 
 
@@ -191,14 +133,10 @@ def users():
     return made
 
 
-def invite(first, last, cycle_id=7, attempt=0):
-    return m.Beacon(cycle_id=cycle_id, attempt=attempt, first_user=first, last_user=last)
-
-
 @pytest.mark.parametrize(('first', 'last', 'invited'), [
     (1, 9, [4, 5, 6]), (5, 5, [5]), (5, 9, [5, 6]), (1, 4, [4])])
 def test_each_invited_user_of_a_node_answers(users, first, last, invited):
-    acks = answers(users, invite(first, last), 1.0)
+    acks = answers(users, beacon(first_user=first, last_user=last), 1.0)
     assert [(type(ack), ack.cycle_id, ack.user) for ack in acks] == [
         (m.Ack, 7, user) for user in invited]
     assert users.state is State.ACKNOWLEDGED
@@ -210,33 +148,26 @@ def test_each_invited_user_of_a_node_answers(users, first, last, invited):
 def test_a_beacon_to_other_users_is_not_answered_but_proves_an_active_base_station(
         users, state, counters):
     users.state = state
-    assert answers(users, invite(7, 9), 1.0) == []
+    assert answers(users, beacon(first_user=7, last_user=9), 1.0) == []
     assert users.state is State.LISTENING
     assert users.next_deadline() == 2.5
     assert users.counters == counters
-    assert answers(users, m.Grant(cycle_id=7, user=5), 1.5) == []
+    assert answers(users, grant(user=5), 1.5) == []
     assert users.counters == counters | {'wrong_cycle': 1}
 
 
 @pytest.mark.parametrize('user', [4, 6])
 def test_a_cycle_serves_the_user_of_the_node_that_is_granted_it(users, user):
-    users.handle(invite(1, 9), 1.0)
-    (truth,) = answers(users, m.Grant(cycle_id=7, user=user), 1.1)
+    users.handle(beacon(first_user=1, last_user=9), 1.0)
+    (truth,) = answers(users, grant(user=user), 1.1)
     assert (truth.user, *truth.position) == (user, user, 0, 0)
-    pilots = answers(users, m.PilotRequest(
-        cycle_id=7, user=user, band=0, last_band=0, n_frames=2), 1.2)
-    assert {pilot.user for pilot in pilots} == {user}
-    for other in ({4, 5, 6} - {user}):
-        assert answers(
-            users, m.PilotRequest(
-        cycle_id=7, user=other, band=1, last_band=1, n_frames=2), 1.2) == []
-        assert answers(users, m.Data(
-            cycle_id=7, user=other, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=1.0),
-            1.2) == []
+    assert {pilot.user for pilot in answers(users, request(user), 1.2)} == {user}
+    for other in {4, 5, 6} - {user}:
+        assert answers(users, request(other, band=1), 1.2) == []
+        assert answers(users, data(user=other), 1.2) == []
     assert users.counters == {'wrong_user': 2}
-    (data,) = answers(users, m.Data(
-        cycle_id=7, user=user, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=1.0), 1.3)
-    assert data.user == user
+    (uplink,) = answers(users, data(user=user), 1.3)
+    assert uplink.user == user
     assert users.state is State.LISTENING
 
 

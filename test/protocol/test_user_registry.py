@@ -35,34 +35,75 @@ def cycle(registry, *users):
     return registry.select()
 
 
-def test_there_are_three_policies():
-    assert set(POLICIES) == {'round_robin', 'first', 'random'}
+def after(registry, steps):
+    """Return the users served by steps.
+
+    A step is a cycle with users that answer, a user that is registered (+) or removed (-), or a
+    new policy.
+    """
+    served = []
+    for step in steps:
+        match step:
+            case tuple():
+                served.append(cycle(registry, *step))
+            case str():
+                registry.policy = step
+            case _ if step > 0:
+                registry.register(step)
+            case _:
+                registry.remove(-step)
+    return served
 
 
-def test_round_robin_serves_the_user_served_longest_ago(make):
-    registry = make()
-    assert [cycle(registry, 3, 1, 2) for _ in range(6)] == [1, 2, 3, 1, 2, 3]
-    assert cycle(registry, 2, 3) == 2
-    assert [cycle(registry, 1, 2, 3) for _ in range(4)] == [1, 3, 2, 1]
+@pytest.mark.parametrize(('policy', 'steps', 'served'), [
+    # The user served longest ago.
+    ('round_robin', [(3, 1, 2)] * 6 + [(2, 3)] + [(1, 2, 3)] * 4,
+     [1, 2, 3, 1, 2, 3, 2, 1, 3, 2, 1]),
+    # New users follow those that wait, the lower number first; user 2 was served last.
+    ('round_robin', [(2, 3)] * 5 + [(1, 2, 3, 9)] * 8, [2, 3, 2, 3, 2, 3, 1, 9, 2, 3, 1, 9, 2]),
+    # A returning user has no priority.
+    ('round_robin', [(2, 3, 9)] * 3 + [-9] + [(2, 3)] * 4 + [(2, 3, 9)] * 3,
+     [2, 3, 9, 2, 3, 2, 3, 2, 9, 3]),
+    # A registered user is waited for, but has not answered; registering again changes nothing.
+    ('round_robin', [(1,), 2, (1,), (1, 2)], [1, 1, 2]),
+    ('round_robin', [(1, 2), (1, 2), 1, 2, (2, 1)], [1, 2, 1]),
+    # The first to answer.
+    ('first', [(3, 1, 2), (2, 3), (2, 1)], [3, 2, 2]),
+    # A new policy keeps the turns.
+    ('round_robin', [(1, 2, 3), (1, 2, 3), 'first', (2, 1, 3), 'round_robin', (1, 2, 3)],
+     [1, 2, 2, 3])])
+def test_the_policy_selects_among_the_users_that_answered(make, policy, steps, served):
+    assert after(make(policy), steps) == served
 
 
-def test_round_robin_serves_a_new_user_after_those_that_wait(make):
-    registry = make()
-    assert [cycle(registry, 2, 3) for _ in range(5)] == [2, 3, 2, 3, 2]
-    # User 3 waits, user 2 was served last; of new users the lower number comes first.
-    assert [cycle(registry, 1, 2, 3, 9) for _ in range(8)] == [3, 1, 9, 2, 3, 1, 9, 2]
-
-
-def test_a_user_that_leaves_and_returns_is_not_served_more_often(make):
-    registry = make()
-    served = [cycle(registry, 1, 2, 3)]
-    for n in range(40):
-        if n % 2:
-            registry.remove(1)
-        served.append(cycle(registry, 1, 2, 3))
-    counts = [served.count(user) for user in (1, 2, 3)]
-    assert max(counts) <= 21
-    assert min(counts) >= 9
+@pytest.mark.parametrize(('policies', 'steps', 'answered', 'last', 'is_complete'), [
+    # Without registered users, one answer is enough.
+    (POLICIES, [], (), 5, True),
+    # Otherwise, those of all registered users are needed, except by the policy `first`.
+    (('round_robin', 'random'), [(1, 2, 3)], (), 1, False),
+    (('round_robin', 'random'), [(1, 2, 3)], (1,), 4, False),
+    (('round_robin', 'random'), [(1, 2, 3)], (1,), 2, False),
+    (('round_robin', 'random'), [(1, 2, 3)], (1, 2), 1, False),
+    (('round_robin', 'random'), [(1, 2, 3)], (1, 2), 3, True),
+    (('first',), [(1, 2, 3)], (), 2, True),
+    # A user is removed after three missed beacons in a row.
+    (('round_robin',), [(1, 2), (1,), (1,)], (), 1, False),
+    (('round_robin',), [(1, 2), (1,), (1,), (1,)], (), 1, True),
+    (('round_robin',), [(1, 2), (1,), (1,), (1, 2), (1,), (1,)], (), 1, False),
+    # A removed user is not waited for until it answers.
+    (('round_robin',), [(1, 2), -2], (), 1, True),
+    (('round_robin',), [(1, 2), -2, (1, 2)], (), 1, False),
+    (('round_robin',), [(1,), 2], (), 1, False)])
+def test_the_selection_waits_for_registered_users(
+        make, policies, steps, answered, last, is_complete):
+    for policy in policies:
+        registry = make(policy)
+        after(registry, steps)
+        registry.invite(0)
+        for user in answered:
+            registry.add_answer(user)
+        assert list(registry.answered) == list(answered)
+        assert registry.is_complete_with(last) == is_complete
 
 
 @pytest.mark.parametrize('order', [(1, 2, 3), (3, 2, 1)])
@@ -79,11 +120,6 @@ def test_a_user_lost_in_each_of_its_cycles_delays_the_others_by_at_most_one_turn
         assert max(np.diff([-1, *turns])) <= 3
 
 
-def test_first_serves_the_first_to_answer(make):
-    registry = make('first')
-    assert [cycle(registry, 3, 1, 2), cycle(registry, 2, 3), cycle(registry, 2, 1)] == [3, 2, 2]
-
-
 def test_random_is_uniform_and_reproducible(make):
     registry = make('random')
     served = [cycle(registry, 1, 2, 3) for _ in range(3000)]
@@ -98,122 +134,6 @@ def test_random_serves_only_users_that_answered(make):
     registry = make('random')
     cycle(registry, 1, 2, 3)
     assert {cycle(registry, 2, 3) for _ in range(50)} == {2, 3}
-
-
-def test_a_returning_user_has_no_priority(make):
-    registry = make()
-    assert [cycle(registry, 2, 3, 9) for _ in range(3)] == [2, 3, 9]
-    registry.remove(9)
-    assert [cycle(registry, 2, 3) for _ in range(4)] == [2, 3, 2, 3]
-    assert [cycle(registry, 2, 3, 9) for _ in range(3)] == [2, 9, 3]
-
-
-def test_a_cycle_begins_without_answers(make):
-    registry = make()
-    cycle(registry, 1, 2)
-    assert list(registry.answered) == [1, 2]
-    registry.invite(0)
-    assert not registry.answered
-
-
-def test_without_registered_users_one_answer_is_enough(make):
-    registry = make()
-    registry.invite(0)
-    assert registry.is_complete_with(5)
-
-
-@pytest.mark.parametrize('policy', ['round_robin', 'random'])
-def test_the_selection_waits_for_all_registered_users(make, policy):
-    registry = make(policy)
-    cycle(registry, 1, 2, 3)
-    registry.invite(0)
-    assert not registry.is_complete_with(1)
-    registry.add_answer(1)
-    assert not registry.is_complete_with(4)
-    assert not registry.is_complete_with(2)
-    registry.add_answer(2)
-    assert not registry.is_complete_with(1)
-    assert registry.is_complete_with(3)
-
-
-def test_first_needs_one_answer_only(make):
-    registry = make('first')
-    cycle(registry, 1, 2, 3)
-    registry.invite(0)
-    assert registry.is_complete_with(2)
-
-
-def test_a_user_is_removed_after_three_missed_beacons(make):
-    registry = make()
-    cycle(registry, 1, 2)
-    for _ in range(3):
-        registry.invite(0)
-        assert not registry.is_complete_with(1)
-        registry.add_answer(1)
-        registry.remove_absent()
-        registry.select()
-    registry.invite(0)
-    assert registry.is_complete_with(1)
-
-
-def test_an_answer_resets_the_count_of_missed_beacons(make):
-    registry = make()
-    cycle(registry, 1, 2)
-    for _ in range(2):
-        cycle(registry, 1)
-    cycle(registry, 1, 2)
-    for _ in range(3):
-        registry.invite(0)
-        assert not registry.is_complete_with(1)
-        registry.add_answer(1)
-        registry.remove_absent()
-        registry.select()
-
-
-def test_a_removed_user_is_not_waited_for_until_it_answers(make):
-    registry = make()
-    cycle(registry, 1, 2)
-    registry.remove(2)
-    registry.invite(0)
-    assert registry.is_complete_with(1)
-    registry.add_answer(1)
-    registry.add_answer(2)
-    registry.remove_absent()
-    registry.select()
-    registry.invite(0)
-    assert not registry.is_complete_with(1)
-
-
-def test_a_registered_user_is_waited_for_but_has_not_answered(make):
-    registry = make()
-    cycle(registry, 1)
-    registry.register(2)
-    assert list(registry.answered) == [1]
-    registry.invite(0)
-    assert not registry.is_complete_with(1)
-    registry.add_answer(1)
-    registry.remove_absent()
-    assert registry.select() == 1
-    assert cycle(registry, 1, 2) == 2
-
-
-def test_registering_again_does_not_change_the_turn(make):
-    registry = make()
-    cycle(registry, 1, 2)
-    cycle(registry, 1, 2)
-    registry.register(1)
-    registry.register(2)
-    assert cycle(registry, 2, 1) == 1
-
-
-def test_a_new_policy_keeps_the_turns(make):
-    registry = make()
-    cycle(registry, 1, 2, 3)
-    cycle(registry, 1, 2, 3)
-    registry.policy = 'first'
-    assert cycle(registry, 2, 1, 3) == 2
-    registry.policy = 'round_robin'
-    assert cycle(registry, 1, 2, 3) == 3
 
 
 def served_in_turn(registry, present, n):

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from in_memory_network import matches
 
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
@@ -14,11 +15,6 @@ POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
 DOWN = {'direction': m.Direction.DOWNLINK}
 UP = {'direction': m.Direction.UPLINK}
 OFFERED, DELIVERED = {'stage': m.Stage.OFFERED}, {'stage': m.Stage.DELIVERED}
-
-
-def matches(message, kind, fields):
-    return isinstance(message, kind) and all(
-        getattr(message, name) == value for name, value in fields.items())
 
 
 class Adds:
@@ -128,14 +124,6 @@ def test_altered_messages_are_dropped_and_counted(
             np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
     for kind in (m.Grant, m.RhsCommand, m.RhsConfiguration, m.Pilot, m.FeedSignals, m.Data):
         assert len(net.sent(kind)) == len(plain.sent(kind))
-
-
-def test_a_duplicate_beacon_is_answered_once(network):
-    net = network(transport=Adds(m.Beacon, {}, 'user1', replace()))
-    net.run_cycles(2)
-    assert net.served() == [1, 1]
-    assert net.counters() == {'user1': {'stale_beacon': 1}}
-    net.verify()
 
 
 @pytest.mark.parametrize(('late_s', 'counter'), [(2.5e-3, 'duplicate'), (0.05, 'stale_command')])

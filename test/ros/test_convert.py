@@ -85,19 +85,6 @@ def assert_same(one, other):
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_a_round_trip_preserves_every_bit(kind):
-    rng = np.random.default_rng(KINDS.index(kind))
-    for _ in range(20):
-        message = random_message(kind, rng)
-        sent = to_ros(message, STAMP)
-        assert type(sent) is getattr(ros, kind.__name__)
-        assert_same(message, from_ros(kind, sent))
-        received = deserialize_message(serialize_message(sent), type(sent))
-        back = from_ros(kind, received)
-        assert_same(message, back)
-
-
-@pytest.mark.parametrize('kind', KINDS)
 def test_rclpy_and_the_bytes_agree(kind):
     rng = np.random.default_rng(KINDS.index(kind))
     for _ in range(20):
@@ -116,14 +103,10 @@ def test_rclpy_and_the_bytes_agree(kind):
                 assert sent == value or sent != sent, name
 
 
-# Representation identifier, stamp, frame, cycle, sender, scenario, user.
-BIG_ENDIAN = b'\0\0\0\0' + struct.pack(
-    '>iII4sQQI4sI', 1, 2, 4, b'map\0', 3, 2**40, 4, b'sc2\0', 7)
-
-
-def test_a_message_in_the_other_byte_order_is_read():
-    message = m.Ack(cycle_id=3, sender=2**40, scenario_id='sc2', user=7)
-    assert_same(message, convert.from_bytes(m.Ack, BIG_ENDIAN))
+def test_another_encoding_is_named():
+    content = convert.to_bytes(m.Ack(cycle_id=3, user=7), 0)
+    with pytest.raises(m.MessageError, match='^Ack: .* representation 0000, expected 0001$'):
+        convert.from_bytes(m.Ack, b'\0\0' + content[2:])
 
 
 def test_a_stamp_with_a_second_or_more_of_nanoseconds_is_refused():
@@ -153,13 +136,6 @@ def test_arrays_of_other_numbers_are_converted(field, dtype, expected):
     received = getattr(convert.from_bytes(m.Beam, convert.to_bytes(message, 0)), field)
     assert received.dtype == expected
     assert np.array_equal(received, values)
-
-
-@pytest.mark.parametrize('kind', KINDS)
-def test_header_has_stamp_and_frame(kind):
-    sent = to_ros(random_message(kind, np.random.default_rng(0)), STAMP)
-    assert sent.header.stamp == STAMP
-    assert sent.header.frame_id == 'rhs_link'
 
 
 @pytest.mark.parametrize('kind', KINDS)
@@ -218,13 +194,6 @@ def test_a_type_of_a_field_without_a_codec_is_named():
         cdr.Codec(m.Ack, types)
 
 
-def test_an_encoding_of_rclpy_that_is_not_decoded_is_named(monkeypatch):
-    monkeypatch.setattr(
-        convert, 'serialize_message', lambda sent: b'\0\0' + serialize_message(sent)[2:])
-    with pytest.raises(RuntimeError, match='^Ack: serialized by rclpy .* 0000, expected 0001: '):
-        convert.from_bytes(m.Ack, BIG_ENDIAN)
-
-
 REAL = 'Beam.analog'
 COMPLEX = 'FeedSignals.signals'
 
@@ -266,7 +235,7 @@ def test_a_value_without_a_shape_is_not_a_vector():
     message = to_ros(random_message(m.Beam, np.random.default_rng(0)), STAMP)
     message.analog = ros.RealArray(data=[1.0])
     with pytest.raises(MessageError, match=r'^Beam.analog: shape \[\], expected \[N_E = 100\]'):
-        check(from_ros(m.Beam, message), SIZES)
+        check(from_ros(m.Beam, message), Scenario())
 
 
 @pytest.mark.parametrize(('kind', 'field', 'number'), [
@@ -286,7 +255,7 @@ def test_bytes_convert_to_the_message_or_an_error_that_names_it(kind):
     assert_same(message, convert.from_bytes(kind, serialized))
     for broken in (b'', serialized[:4], serialized[:-1], b'\xff' * len(serialized)):
         with pytest.raises(MessageError, match=f'{kind.__name__}'):
-            m.check(convert.from_bytes(kind, broken), SIZES)
+            m.check(convert.from_bytes(kind, broken), Scenario())
 
 
 def test_a_round_trip_preserves_every_bit_of_a_codebook(shipped):

@@ -2,7 +2,6 @@
 
 import importlib
 import threading
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ from geometry_msgs.msg import Point, Vector3
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import ReliabilityPolicy
 
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.nodes import bs
@@ -68,13 +68,6 @@ def refused(monkeypatch):
 
 
 @pytest.fixture
-def no_timers(monkeypatch):
-    def refuse(*_, **__):
-        raise rclpy_implementation.RCLError('no memory\n, at a.cpp:1')
-    monkeypatch.setattr(Node, 'create_timer', refuse)
-
-
-@pytest.fixture
 def make(bench):
     def make(executable):
         module = importlib.import_module(f'rhs_isac_ros.nodes.{executable}')
@@ -100,23 +93,10 @@ def test_a_role_runs_without_what_was_refused(bench, make, refused, capfd, role)
     texts = endpoints.refusals(node)
     assert {text.partition(' was refused: ')[2] for text in texts.values()} == {
         f'{name} not found in allow rule' for name in refused}
-    report = (node._report if role == topics.OPTIMIZER_NODE else node.report)()
+    report = node.report()
     assert report.fault
     assert {*texts.values()} <= {*report.values.values()}
     assert capfd.readouterr().err.count('was refused') == len(texts)
-
-
-@pytest.mark.parametrize('role', [*sorted(ROSTER), 'visualizer'])
-def test_a_role_runs_without_timers(bench, make, no_timers, role):
-    node = make(role)
-    if role in ROSTER and ROSTER[role].has_codebook:
-        node._on_codebook(Codebook.load(default_codebook_file()))
-    if role == 'user':
-        node.dispatch(m.Beacon(cycle_id=1, attempt=1, sender=1))
-    bench.spin_once()
-    texts = {*endpoints.refusals(node).values()}
-    assert texts
-    assert all(text.endswith(' s was refused: no memory') for text in texts)
 
 
 def test_a_simulation_whose_time_was_refused_is_not_used(bench, make, refused):
@@ -146,6 +126,26 @@ def test_a_refusal_is_logged_once(probe, refused, capfd):
     assert capfd.readouterr().err.count('publisher of ack was refused: ack not found') == 1
 
 
+OVERRIDES = [Parameter('qos_overrides./one.publisher.reliability', value='best_effort'),
+             Parameter('qos_overrides./one.publisher.depth', value=3),
+             Parameter('qos_overrides./one.subscription.reliability', value='best_effort'),
+             Parameter('qos_overrides./one.subscription.depth', value=3)]
+
+
+def test_an_override_changes_only_its_topic(bench):
+    node = bench.add(Node, 'overridden', parameter_overrides=OVERRIDES)
+    for name in ('one', 'two'):
+        endpoints.create_publisher(node, Point, name, endpoints.EXCHANGE, overridable=True)
+        endpoints.subscribe(node, Point, name, lambda message: None, endpoints.EXCHANGE,
+                            overridable=True)
+    for find in (node.get_publishers_info_by_topic, node.get_subscriptions_info_by_topic):
+        bench.until(lambda find=find: find('/one') and find('/two'), 'the endpoints')
+        one, two = (find(name)[0].qos_profile.reliability for name in ('/one', '/two'))
+        assert (one, two) == (ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE)
+    assert endpoints.EXCHANGE.reliability == ReliabilityPolicy.RELIABLE
+    assert endpoints.EXCHANGE.depth == 128
+
+
 @pytest.fixture
 def user_topics(probe):
     """Topics of the users up to number 7."""
@@ -173,7 +173,7 @@ def test_users_with_higher_numbers_have_none_and_one_is_logged(user_topics, capf
 def test_further_users_above_the_limit_do_not_reach_the_logger(user_topics, probe, monkeypatch):
     user_topics.publishers(8)
     # rclpy examines the stack at each call, which would take half a second for 1000 users.
-    monkeypatch.setattr(probe, 'get_logger', None)
+    monkeypatch.setattr(endpoints.journal(probe), '_logger', None)
 
     assert user_topics.publishers(8) == user_topics.publishers(9) == ()
 
@@ -222,14 +222,6 @@ def test_jobs_run_one_after_the_other(each_bench, background):
     each_bench.until(lambda: len(order) == 10)
     assert [n for kind, n in order if kind == 'begin'] == list(range(5))
     assert [n for kind, n in order if kind == 'end'] == list(range(5))
-
-
-def test_a_node_whose_jobs_have_no_thread_reports_that(each_bench, background, monkeypatch):
-    monkeypatch.setattr(threading.Thread, 'start', mock.Mock(side_effect=RuntimeError('no more')))
-    for _ in range(2):
-        background.run(lambda: 1, lambda result: None)
-    node = background._node
-    assert endpoints.refusals(node) == {'thread of jobs': 'thread of jobs was refused: no more'}
 
 
 def test_an_exception_of_a_job_is_raised_where_the_node_spins(each_bench, background):

@@ -4,17 +4,22 @@ import dataclasses
 import math
 
 import pytest
+import yaml
 from rclpy.parameter import Parameter
 
 from rhs_isac_ros.calibration import calibrate
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.bs import BsNode
 from rhs_isac_ros.nodes.channel import ChannelNode
+from rhs_isac_ros.nodes.fusion import FusionNode
 from rhs_isac_ros.nodes.positioner import PositionerNode
+from rhs_isac_ros.nodes.receiver import ReceiverNode
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.protocol.events import SettingsOffered
 from rhs_isac_ros.ros.parameters import NODES
 
-KINDS = {'bs': BsNode, 'channel': ChannelNode, 'positioner': PositionerNode,
+KINDS = {'bs': BsNode, 'channel': ChannelNode, 'fusion': FusionNode,
+         'positioner': PositionerNode, 'receiver': ReceiverNode,
          'transmission': TransmissionNode}
 DYNAMIC = [(executable, p) for executable, group in NODES.items() for p in group if p.dynamic]
 
@@ -26,6 +31,15 @@ def make(bench, bench_files, tmp_path, monkeypatch):
         values = {'scenario_file': str(bench_files / 'scenario.yaml')}
         if executable == 'positioner':
             values['table_folder'] = str(tmp_path)
+        if executable == 'fusion':
+            values = {'site_file': str(tmp_path / 'site.yaml')}
+            scenario = Scenario.from_yaml(bench_files / 'scenario.yaml')
+            (tmp_path / 'site.yaml').write_text(yaml.safe_dump({
+                'roi_center_m': list(scenario.roi_center_m),
+                'roi_size_m': list(scenario.roi_size_m),
+                'surfaces': {'front': {'scenario': str(bench_files / 'scenario.yaml'),
+                                       'codebook': str(bench_files / 'first.yaml')}}}),
+                encoding='utf-8')
         node = bench.add(KINDS[executable], parameter_overrides=[
             Parameter(name, value=value) for name, value in values.items()])
         node.offered = []

@@ -1,5 +1,6 @@
 """Declaration, checks and documentation of the parameters."""
 
+import argparse
 import dataclasses
 import math
 import types
@@ -10,17 +11,24 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.nodes.bs import BsNode
-from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
+    FusionSettings,
     Impairments,
     PositionerSettings,
+    ReceiverSettings,
     TransmissionSettings,
 )
-from rhs_isac_ros.ros.parameters import NODES, declare, settings_of
+from rhs_isac_ros.ros.parameters import (
+    CODEBOOK,
+    NODES,
+    check_arguments,
+    declare,
+    parameter_help,
+    settings_of,
+)
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.fields import ParameterError
 
@@ -39,7 +47,6 @@ def only(choose):
     return pytest.mark.parametrize(
         ('executable', 'parameter'), [pair for pair, _ in chosen],
         ids=[name for _, name in chosen])
-
 
 
 @pytest.fixture
@@ -74,16 +81,6 @@ def test_the_defaults_apply_with_their_types(make, executable):
     assert values == {p.name: p.default for p in NODES[executable]}
     assert [type(values[p.name]) for p in NODES[executable]] == [
         type(p.default) for p in NODES[executable]]
-
-
-@pytest.mark.parametrize('executable', NODES)
-def test_every_parameter_has_a_value(make, executable):
-    """Otherwise, `ros2 param dump` prints no parameter of the node."""
-    node = make()
-    declare(node, executable)
-    names = [p.name for p in NODES[executable]]
-    # rclpy raises ParameterUninitializedException for a parameter without value.
-    assert [p.name for p in node.get_parameters(names)] == names
 
 
 @pytest.mark.parametrize('executable', NODES)
@@ -165,7 +162,8 @@ def test_a_parameter_that_is_not_dynamic_is_read_only(make, executable, paramete
 
 @pytest.mark.parametrize(('executable', 'settings', 'fixed'), [
     ('bs', BaseStationSettings, {'step_timeout_s'}), ('channel', Impairments, set()),
-    ('positioner', PositionerSettings, set()), ('transmission', TransmissionSettings, set())])
+    ('positioner', PositionerSettings, set()), ('transmission', TransmissionSettings, set()),
+    ('receiver', ReceiverSettings, set()), ('fusion', FusionSettings, set())])
 def test_the_dynamic_parameters_are_the_settings_of_the_role(executable, settings, fixed):
     declared = {p.name: p for p in NODES[executable]}
     fields = {field.name for field in dataclasses.fields(settings)}
@@ -177,7 +175,8 @@ def test_the_dynamic_parameters_are_the_settings_of_the_role(executable, setting
 
 def test_other_nodes_have_no_dynamic_parameters():
     dynamic = {executable for executable, p in PAIRS if p.dynamic}
-    assert dynamic == {'bs', 'channel', 'positioner', 'transmission'}
+    assert dynamic == {
+        'bs', 'channel', 'fusion', 'positioner', 'receiver', 'transmission'}
 
 
 def test_nodes_share_declarations_of_equal_names():
@@ -261,16 +260,6 @@ def test_a_user_without_a_position_starts_in_the_region(bench):
     assert first != second
 
 
-def test_a_band_beyond_those_of_the_scenario_is_rejected(bench):
-    with pytest.raises(ParameterError, match='band: 2, expected 0 to 1 of the scenario'):
-        bench.add(TransmissionNode, parameter_overrides=[Parameter('band', value=2)])
-
-
-def test_a_node_reads_the_scenario_of_its_file(bench, small, bench_files):
-    overrides = [Parameter('scenario_file', value=str(bench_files / 'scenario.yaml'))]
-    assert bench.add(BsNode, parameter_overrides=overrides).scenario == small.scenario
-
-
 MOBILITIES = '''
 import numpy as np
 
@@ -309,3 +298,19 @@ def test_an_invalid_mobility_is_rejected(bench, install, name, words):
     install('moves', MOBILITIES, {plugins.MOBILITIES: {'climb': 'Climb', 'nothing': 'nothing'}})
     with pytest.raises(ParameterError, match=words):
         bench.add(UserNode, parameter_overrides=[Parameter('mobility', value=name)])
+
+
+@pytest.mark.parametrize('words', [
+    ['--ros-args', '-p', 'policy:=random', '-p', 'use_sim_time:=true'],
+    ['--ros-args', '-p', 'bs_2:polcy:=random'],
+    ['-p', 'polcy:=random', '--ros-args', '-r', 'polcy:=b', '--', '-p', 'polcy:=random'],
+], ids=['own parameters', 'of a single node', 'outside of the ROS arguments'])
+def test_other_arguments_are_accepted(words):
+    check_arguments(argparse.ArgumentParser(), 'bs', words)
+
+
+def test_only_the_optimizer_describes_the_parameters_of_a_codebook():
+    lines = {name: parameter_help(name).splitlines() for name in ('optimizer', 'bs', 'network')}
+    for parameter in CODEBOOK:
+        assert f'  {parameter}' in lines['optimizer']
+        assert f'  {parameter}' not in lines['bs'] + lines['network']

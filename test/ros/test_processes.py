@@ -1,21 +1,15 @@
 """Executables as child processes, and their end with their parent."""
 
-import gc
 import os
 import select
 import signal
 import subprocess
 import sys
-import warnings
-from multiprocessing.context import ForkProcess
 from pathlib import Path
 
-import pytest
 from ament_index_python.packages import get_package_prefix
 from system.trial_processes import TrialProcesses
 
-from rhs_isac_ros.executables import PARENT_ID
-from rhs_isac_ros.ros import processes
 from rhs_isac_ros.ros.roster import UNIQUE
 
 TIMEOUT_S = 60.0
@@ -29,28 +23,6 @@ with Processes(Path(sys.argv[1]), {'ROS_LOG_DIR': sys.argv[1]}) as children:
     children.start('rhs_controller')
     print(*(child.pid for child in children._running.values()), flush=True)
     signal.pause()
-"""
-# Forks a node, which it kills, and one that ends by itself; prints their exit codes.
-FORKS = """
-import os, sys
-from pathlib import Path
-from rhs_isac_ros.ros.processes import Processes
-with Processes(Path(sys.argv[1]), {'ROS_LOG_DIR': sys.argv[1]}, fork=True) as children:
-    children.start('visualizer', 'viewer')
-    viewer = children._running['viewer']
-    while 'serving' not in children.log('viewer'):
-        assert viewer.poll() is None, children.log('viewer')
-    print(Path(f'/proc/{viewer.pid}/comm').read_text().strip(),
-          os.getsid(viewer.pid) == viewer.pid)
-    viewer.send_signal(9)
-    children.start('bs', rest_s=-1.0)
-    children.start('user', unknown=1)
-    children.start('channel')
-    while len(children.ended()) < 3:
-        assert children.ended().get('channel') is None
-    print(children.ended())
-    channel = children._running['channel']
-print(channel.poll())
 """
 
 
@@ -84,46 +56,6 @@ def test_no_node_survives_a_demonstration_that_is_killed(tmp_path):
         assert len(children) == len(UNIQUE) + 2
         demo.send_signal(signal.SIGKILL)
         until_ended(children)
-
-
-def test_a_fork_is_a_process_with_its_own_name_session_log_and_exit_code(tmp_path):
-    done = subprocess.run([sys.executable, '-c', FORKS, tmp_path],
-                          capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
-    assert done.stdout.splitlines() == [
-        'visualizer True', "{'viewer': -9, 'bs': 2, 'user': 2}", '0'], done.stderr
-    assert (tmp_path / 'bs.log').read_text().startswith('bs: error: rest_s: ')
-    assert 'argument -p: unknown: unknown parameter' in (tmp_path / 'user.log').read_text()
-
-
-def test_a_fork_of_a_process_with_threads_causes_no_warning(tmp_path, monkeypatch):
-    """Python 3.12 and newer warn; here, a warning is an error."""
-    monkeypatch.setattr(ForkProcess, 'start', lambda self: warnings.warn(
-        'multi-threaded', DeprecationWarning, stacklevel=2))
-    processes._Fork(['bs'], tmp_path / 'bs.log', {})
-    gc.unfreeze()
-
-
-def test_a_child_whose_parent_has_already_died_ends_before_it_starts(tmp_path):
-    done = subprocess.run(
-        [sys.executable, '-c', 'from rhs_isac_ros import executables; executables.bs()'],
-        env={**os.environ, PARENT_ID: '1'}, capture_output=True, timeout=TIMEOUT_S, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, b'', b'')
-
-
-@pytest.mark.parametrize(('cores', 'available_kb', 'discovery', 'expected'), [
-    (2, 23_000_000, 'SUBNET', 80), (1, 23_000_000, 'SUBNET', 40), (64, 1_000_000, 'SUBNET', 15),
-    (2, 23_000_000, 'LOCALHOST', 31), (2, 23_000_000, None, 31), (1, 1_000_000, None, 15)])
-def test_cores_memory_and_discovery_limit_the_number_of_processes(
-        cores, available_kb, discovery, expected, monkeypatch, tmp_path):
-    (tmp_path / 'meminfo').write_text(
-        f'MemTotal:       99999999 kB\nMemAvailable:   {available_kb} kB\n', encoding='ascii')
-    monkeypatch.setattr(processes, '_MEMORY_FILE', tmp_path / 'meminfo')
-    monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: set(range(cores)))
-    if discovery:
-        monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', discovery)
-    else:
-        monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE', raising=False)
-    assert processes.max_processes() == expected
 
 
 def test_cpu_time_and_memory_are_those_of_the_running_processes(tmp_path):

@@ -98,8 +98,8 @@ def configuration(cycle_id, band=0):
         analog=np.array([[0.1, 0.2], [0.3, 0.4]]))
 
 
-def pilot(cycle_id, band=0):
-    return m.Pilot(cycle_id=cycle_id, user=1, band=band, symbols=np.ones(2, complex))
+def pilot(cycle_id, band=0, symbols=(1, 1)):
+    return m.Pilot(cycle_id=cycle_id, user=1, band=band, symbols=np.array(symbols, complex))
 
 
 def answers(radio, event):
@@ -115,6 +115,12 @@ def test_pilots_that_arrive_before_their_configuration_wait_for_it(radio):
     np.testing.assert_array_equal(sent.signals, [[0.1, 0.2], [0.3, 0.4]])
     assert answers(radio, pilot(5, band=1)) == []
     assert len(answers(radio, configuration(5, 1))) == 1
+
+
+def test_signals_are_divided_by_the_symbols(radio):
+    answers(radio, configuration(5))
+    sent, = answers(radio, pilot(5, symbols=(1j, -1)))
+    np.testing.assert_allclose(sent.signals, [[-0.1j, -0.2j], [-0.3, -0.4]])
 
 
 def test_an_old_configuration_does_not_answer_a_new_cycle(radio):

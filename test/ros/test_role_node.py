@@ -150,14 +150,12 @@ def test_messages_keep_their_order(each_bench, start):
         user for number in range(1, 51) for user in (number, 99)]
 
 
-def test_a_role_may_connect_to_its_topics_later_and_only_once(bench, probe):
+def test_a_role_may_subscribe_to_its_topics_later_and_only_once(bench, probe):
     role = Scripted(sends=[m.Grant], receives=[m.Ack])
     node = bench.add(RoleNode, 'channel', 'scripted')
     node.start(role, needs_codebook=True)
-    assert not node.count_publishers('grant')
     assert not node.count_subscribers('ack')
     for _ in range(2):
-        node.advertise()
         node.subscribe()
     publisher = bench.publisher(probe, m.Ack)
     assert node.count_publishers('grant') == publisher.get_subscription_count() == 1
@@ -300,7 +298,7 @@ def test_messages_carry_the_identity_of_their_sender(bench, start, probe):
     assert (received[0].sender, received[0].scenario_id) == (node.instance, node.scenario.id)
 
 
-def test_messages_of_another_scenario_are_dropped_counted_and_logged_once_per_sender(
+def test_messages_of_another_scenario_are_dropped_counted_and_logged_once(
         each_bench, start, capfd):
     role = Scripted(receives=[m.Ack])
     node = start(each_bench, role)
@@ -314,7 +312,7 @@ def test_messages_of_another_scenario_are_dropped_counted_and_logged_once_per_se
     assert {event.cycle_id for event, _ in role.events} == {2}
     assert role.counters == {'wrong_scenario': 43}
     log = capfd.readouterr().err
-    assert log.count('Ack dropped: sent with scenario other, expected sc') == 16
+    assert log.count('Ack dropped: sent with scenario other, expected sc') == 1
     assert '[WARN]' in log
 
 
@@ -322,19 +320,3 @@ def test_every_message_has_the_listed_topic(bench, start, probe):
     start(bench, Scripted(sends=topics.NAMES))
     for name in topics.NAMES.values():
         bench.until(lambda name=name: probe.count_publishers(f'/{name}'), name)
-
-
-def test_a_late_joiner_receives_the_latest_statistics(bench, start):
-    node = start(bench, Scripted(sends=[m.CapacityStatistics]))
-    for n in (1, 2):
-        quartiles = {name: factor * np.arange(3.0) for name, factor in (
-            ('expected_bps', 3), ('actual_bps', 2), ('perfect_bps', 4), ('loss_bps', 1),
-            ('loss_percent', 5))}
-        assert node.publish(m.CapacityStatistics(cycle_id=n, n_reports=n, **quartiles))
-    late, received, kind = bench.add(Node, 'late'), [], m.CapacityStatistics
-    late.create_subscription(
-        convert.ros_type(kind), topics.NAMES[kind], received.append, LATCHED)
-    bench.until(lambda: received, 'the statistics')
-    (message,) = received
-    assert message.n_reports == 2
-    assert list(message.loss_percent) == [0, 5, 10]

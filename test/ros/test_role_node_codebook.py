@@ -76,17 +76,6 @@ def test_a_client_waits_for_the_optimizer(bench, follow, shipped):
     assert ids(got) == [shipped.id]
 
 
-def test_each_change_is_fetched(bench, follow, optimizer_of, stored, small):
-    optimizer = optimizer_of('first')
-    got = follow(small.scenario)
-    bench.until(lambda: len(got) == 1, 'the first codebook')
-    change(optimizer, stored['second'])
-    bench.until(lambda: len(got) == 2, 'the second codebook')
-    change(optimizer, stored['first'])
-    bench.until(lambda: len(got) == 3, 'the first codebook again')
-    assert ids(got) == [stored[name].id for name in ('first', 'second', 'first')]
-
-
 def test_the_last_of_many_changes_is_fetched(bench, follow, optimizer_of, random_beams, small):
     optimizer = optimizer_of('first')
     got = follow(small.scenario)
@@ -134,19 +123,6 @@ def test_a_change_of_other_parameters_is_not_a_new_codebook(
     change(optimizer, stored['second'])
     bench.until(lambda: got[-1].id == stored['second'].id, 'the second codebook')
     assert ids(got) == [stored['first'].id, stored['second'].id]
-
-
-def test_optimizers_of_other_namespaces_are_ignored(
-        bench, follow, optimizer_of, stored, small):
-    here, there = optimizer_of('first'), optimizer_of('first', namespace='/there')
-    got = follow(small.scenario)
-    far = follow(small.scenario, 'far', namespace='/there')
-    bench.until(lambda: got and far, 'both first codebooks')
-    change(there, stored['second'])
-    bench.until(lambda: len(far) == 2, 'the second codebook there')
-    change(here, stored['second'])
-    bench.until(lambda: len(got) == 2, 'the second codebook here')
-    assert ids(got) == ids(far) == [stored['first'].id, stored['second'].id]
 
 
 def test_a_codebook_that_does_not_fit_is_rejected_with_one_error(

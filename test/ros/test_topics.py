@@ -3,10 +3,8 @@
 import re
 from pathlib import Path
 
-import pytest
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from rclpy.validate_topic_name import validate_topic_name
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
@@ -21,12 +19,6 @@ ALL = [*topics.NAMES.values(), topics.POSITION, topics.CODEBOOK]
 def test_every_message_has_its_own_topic():
     assert set(topics.NAMES) == set(m.Message.__subclasses__())
     assert len(set(ALL)) == len(ALL)
-
-
-@pytest.mark.parametrize('name', ALL)
-def test_names_are_valid_and_relative(name):
-    assert validate_topic_name(name)
-    assert not name.startswith(('/', '~'))
 
 
 def test_a_burst_of_messages_is_received_completely(bench, probe):

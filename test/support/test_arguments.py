@@ -10,10 +10,14 @@ from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
     input_file,
+    interval,
+    nonnegative_float,
     output_file,
     output_folder,
     picture_file,
+    positive_float,
     positive_int,
+    share,
 )
 
 
@@ -28,6 +32,21 @@ def test_positive_int_parses_integers_from_one(text, number):
 def test_anything_else_is_an_error_that_names_the_expectation(text, expected):
     with pytest.raises(argparse.ArgumentTypeError, match=f', expected {expected} 1000000000$'):
         positive_int(text)
+
+
+def test_ranges_of_numbers_contain_their_ends_unless_open():
+    assert nonnegative_float('0') == share('0') == 0
+    assert (share('1'), positive_float('1e-9')) == (1, 1e-9)
+    for kind, text in ((positive_float, '0'), (nonnegative_float, '-1e-9'), (share, '1.01')):
+        with pytest.raises(argparse.ArgumentTypeError, match=f'^{float(text)}, expected '):
+            kind(text)
+
+
+def test_an_interval_has_two_positive_ends_in_order():
+    assert (interval('2:3e9'), interval('2:2')) == ((2, 3e9), (2, 2))
+    for text in ('3:2', '2', '0:2', 'a:2', ':', ''):
+        with pytest.raises(argparse.ArgumentTypeError, match=f"^'{text}', expected LOW:HIGH"):
+            interval(text)
 
 
 def test_an_error_is_one_line_with_a_hint_and_exits_with_code_2(capsys):

@@ -9,7 +9,9 @@ import pytest
 from rhs_isac_ros.support.files import (
     ArchiveError,
     check_writable,
+    parse_yaml,
     read_archive,
+    read_yaml,
     write_archive,
     write_whole,
 )
@@ -86,3 +88,38 @@ def test_pickled_objects_are_refused(tmp_path):
     np.savez(tmp_path / 'file.npz', one=np.array([object()]), two=2, about='{"format": 4}')
     with pytest.raises(ArchiveError, match='cannot be read'):
         read_archive(tmp_path / 'file.npz', 'thing', 4, NAMES)
+
+
+@pytest.mark.parametrize(('text', 'value'), [
+    ('3', 3), ('-3', -3), ('+3', 3), ('0', 0), ('1.5', 1.5), ('-.5e-3', -0.5e-3), ('1.', 1.0),
+    ('2.5e9', 2.5e9), ('0.010', 0.01), ('.inf', float('inf')), ('true', True), ('~', None)])
+def test_numbers_in_yaml_are_decimal(text, value):
+    found = parse_yaml(f'[{text}, {{a: {text}}}]')
+    assert found == [value, {'a': value}]
+    assert type(found[0]) is type(value)
+
+
+@pytest.mark.parametrize('text', [
+    '010', '-010', '08', '0x1F', '0b11', '1_000', '1:30', '-1:30', '1:30.5', '00.5', '1_0.5',
+    '28e9'])
+def test_other_notations_in_yaml_are_text(text):
+    """YAML 1.1 reads 010 as 8, and -1:30 as -90."""
+    assert parse_yaml(f'[{text}]') == [text]
+
+
+@pytest.mark.parametrize(('text', 'error'), [
+    ('n: 1\nm: 2\nn: 3', 'n: repeated in line 3'), ('{n: 1, n: 1}', 'n: repeated in line 1'),
+    ('a:\n  b: {c: 1, c: 2}', 'c: repeated in line 2'), ('- {1: a, 1: b}', '1: repeated'),
+    ("'n': 1\nn: 2", 'n: repeated in line 2'), ('[1]: 2', 'unhashable key'),
+    ('? [1]\n: 2', 'unhashable key')])
+def test_a_key_that_yaml_repeats_is_an_error(tmp_path, text, error):
+    with pytest.raises(ValueError, match=error):
+        parse_yaml(text)
+    (tmp_path / 'a.yaml').write_text(text)
+    with pytest.raises(ValueError, match=f'a.yaml: cannot be read: .*{error}'):
+        read_yaml(tmp_path / 'a.yaml')
+
+
+def test_many_keys_are_read_in_linear_time():
+    content = parse_yaml('\n'.join(f'key{n}: {n}' for n in range(20_000)))
+    assert content['key19999'] == 19_999

@@ -49,12 +49,11 @@ def test_yaml(tmp_path, content, text):
     assert done.stdout.count('\n') == 2
 
 
-def test_a_file_without_end(monkeypatch, tmp_path):
-    monkeypatch.setattr('rhs_isac_ros.support.files._MAX_YAML_BYTES', 1000)
+def test_a_file_without_end(tmp_path):
     (tmp_path / 'longest').write_text(1000 * '1')
-    assert read_yaml(tmp_path / 'longest') == int(1000 * '1')
+    assert read_yaml(tmp_path / 'longest', max_bytes=1000) == int(1000 * '1')
     with pytest.raises(ValueError, match='/dev/zero: cannot be read: more than 1000 bytes'):
-        read_yaml('/dev/zero')
+        read_yaml('/dev/zero', max_bytes=1000)
 
 
 def npy(shape, kind='<f8'):

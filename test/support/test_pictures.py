@@ -2,7 +2,6 @@
 
 import itertools
 import os
-import re
 import subprocess
 import sys
 
@@ -80,20 +79,6 @@ def test_processes_write_equal_files_whatever_their_hash_seed(tmp_path, monkeypa
                    cwd=tmp_path / 'there', env=os.environ | {'PYTHONHASHSEED': '1'})
     for name in files:
         assert (tmp_path / 'here' / name).read_bytes() == (tmp_path / 'there' / name).read_bytes()
-
-
-def test_the_text_of_a_pdf_is_truetype_and_that_of_an_svg_is_outlines(figure, tmp_path):
-    write_picture(tmp_path / 'a.pdf', figure)
-    write_picture(tmp_path / 'a.svg', figure)
-    assert b'/Subtype /Type3' not in (tmp_path / 'a.pdf').read_bytes()
-    assert b'STIXGeneral' in (tmp_path / 'a.pdf').read_bytes()
-    assert '<text' not in (tmp_path / 'a.svg').read_text(encoding='utf-8')
-
-
-def test_the_size_is_that_of_the_figure(figure, tmp_path):
-    write_picture(tmp_path / 'a.svg', figure)
-    text = (tmp_path / 'a.svg').read_text(encoding='utf-8')
-    assert re.search(r'width="252pt" height="180pt"', text)
 
 
 def test_the_style_replaces_the_settings_of_the_user_inside_the_block_only():

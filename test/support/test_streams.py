@@ -50,21 +50,8 @@ def test_a_sequence_does_not_depend_on_what_was_drawn_before():
     assert first(key) == fresh
 
 
-def test_neighbouring_keys_are_not_correlated():
-    rows = np.array([streams.generator(0, streams.CHANNEL, 1, cycle, 0).normal(size=4000)
-                     for cycle in range(1, 9)])
-    correlation = np.corrcoef(rows) - np.eye(8)
-    assert np.abs(correlation).max() < 5 / np.sqrt(4000)
-
-
 def test_the_order_within_a_key_matters():
     assert first((0, streams.CHANNEL, 1, 2, 3)) != first((0, streams.CHANNEL, 2, 1, 3))
-
-
-def test_large_keys_are_distinct():
-    big = 2**31 - 1
-    keys = [(big, streams.CHANNEL, big, 2**63, 4000), (big, streams.CHANNEL, big, 2**63, 4001)]
-    assert first(keys[0]) != first(keys[1])
 
 
 def test_a_negative_key_is_an_error():

@@ -3,11 +3,9 @@
 import os
 import threading
 
-import numpy as np
 import pytest
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import threads
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
@@ -87,6 +85,35 @@ def test_the_last_of_several_callers_restores_the_setting():
     assert set(numbers()) == {3}
 
 
+def test_a_library_with_a_setting_for_each_thread_is_limited_in_the_calling_one():
+    class Library:
+        """Stands for a BLAS on OpenMP."""
+
+        def __init__(self):
+            self._own = threading.local()
+
+        def get_num_threads(self):
+            return getattr(self._own, 'number', 3)
+
+        def set_num_threads(self, number):
+            self._own.number = number
+
+    library = Library()
+
+    class Limit(type(one_blas_thread)):
+        def find_libraries(self):
+            self._per_thread = [library]
+
+    limit, elsewhere = Limit(), []
+    with limit, limit:
+        assert library.get_num_threads() == 1
+        thread = threading.Thread(target=lambda: elsewhere.append(library.get_num_threads()))
+        thread.start()
+        thread.join(TIMEOUT_S)
+    assert elsewhere == [3]
+    assert library.get_num_threads() == 3
+
+
 def test_a_setting_made_in_between_remains():
     with one_blas_thread:
         for library in BLAS:
@@ -120,8 +147,7 @@ def test_a_process_forked_in_a_block_can_leave_it():
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
-def test_blocks_run_side_by_side_with_one_blas_thread_each(monkeypatch):
-    monkeypatch.setattr(threads, '_n_cores', lambda: 2)
+def test_blocks_run_side_by_side_with_one_blas_thread_each():
     # Neither block returns before both have begun.
     barrier = threading.Barrier(2)
 
@@ -129,38 +155,25 @@ def test_blocks_run_side_by_side_with_one_blas_thread_each(monkeypatch):
         barrier.wait(TIMEOUT_S)
         return number, set(numbers())
 
-    assert map_blocks(block, [1, 2]) == [(1, {1}), (2, {1})]
+    assert map_blocks(block, [1, 2], n_cores=2) == [(1, {1}), (2, {1})]
 
 
 @pytest.mark.parametrize(('limit', 'cores'), [(1, 4), (3, 1)])
-def test_blocks_use_no_more_threads_than_blas_may_or_cores_exist(monkeypatch, limit, cores):
-    monkeypatch.setattr(threads, '_n_cores', lambda: cores)
+def test_blocks_use_no_more_threads_than_blas_may_or_cores_exist(limit, cores):
     with threadpool_limits(limit, user_api='blas'):
-        assert map_blocks(lambda _: threading.get_ident(), [1, 2, 3]) == [
+        assert map_blocks(lambda _: threading.get_ident(), [1, 2, 3], n_cores=cores) == [
             threading.get_ident()] * 3
 
 
-def test_blocks_start_no_threads_of_their_own(monkeypatch):
-    monkeypatch.setattr(threads, '_n_cores', lambda: 2)
-
+def test_blocks_start_no_threads_of_their_own():
     def outer(_):
-        return {threading.get_ident(), *map_blocks(lambda _: threading.get_ident(), [1, 2])}
+        inner = map_blocks(lambda _: threading.get_ident(), [1, 2], n_cores=2)
+        return {threading.get_ident(), *inner}
 
-    assert [len(identifiers) for identifiers in map_blocks(outer, [1, 2])] == [1, 1]
+    assert [len(identifiers) for identifiers in map_blocks(outer, [1, 2], n_cores=2)] == [1, 1]
 
 
-def test_an_error_in_a_block_propagates(monkeypatch):
-    monkeypatch.setattr(threads, '_n_cores', lambda: 2)
+def test_an_error_in_a_block_propagates():
     with pytest.raises(ZeroDivisionError):
-        map_blocks(lambda number: 1 / number, [1, 0])
+        map_blocks(lambda number: 1 / number, [1, 0], n_cores=2)
     assert set(numbers()) == {3}
-
-
-def test_results_do_not_depend_on_the_number_of_threads(monkeypatch, shipped):
-    from rhs_isac_ros.bounds import crlb
-    positions = Scenario().sample_positions(600, np.random.default_rng(0))
-    bounds = []
-    for cores in (1, 2):
-        monkeypatch.setattr(threads, '_n_cores', lambda cores=cores: cores)
-        bounds.append(crlb(Scenario(), shipped, positions))
-    assert np.array_equal(*bounds)

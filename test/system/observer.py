@@ -45,7 +45,7 @@ class NetworkObserver(CycleObserver):
     def __init__(self, scenario: Scenario, **node_options: Any) -> None:
         super().__init__(
             receives=dict.fromkeys((*cycle_log.RECEIVES, *invariants.RECEIVES)),
-            sizes=scenario.sizes, on_malformed=lambda error: None, **node_options)
+            scenario=scenario, on_malformed=lambda error: None, **node_options)
         # This executor takes messages in the order of their arrival. The standard executor takes
         # one message of each topic in turn, so under load the queue of feed signals overflows.
         self._executor = EventsExecutor()

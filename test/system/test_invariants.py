@@ -95,6 +95,9 @@ CASES = {
     'huge band': (of(m.FeedSignals, band=1), {'signals': 1e300}, 'do not match the feed signals'),
     'mutated configuration': (of(m.RhsConfiguration, band=0, **POSITIONING), {'analog': 0.5},
                                'not in the codebook'),
+    'two channels': (of(m.FeedSignals, band=1), {'sender': 77}, 'several channels'),
+    'another position': (of(m.GroundTruth), {'position': np.array([0.3, 0.0, 0.0])},
+                         'do not match the true position'),
 }
 
 

@@ -173,6 +173,14 @@ def test_arrays_are_a_survey_of_the_multipath(tmp_path):
     done = call(tmp_path / 'arrays.npz', *options)
     assert (done.code, done.err) == (0, '')
     assert 'warning: positions: 12, expected at least 20' in done.out
+    assert re.search(r'left-out pilots after: [\d.]+ m rms, 0 of 12 without a fix', done.out)
+    for values, error in (
+            (positions.astype(str), 'of type <U32, expected numbers'),
+            (1000 * positions, 'expected at most its longest side, 10 m, in metres')):
+        np.savez(tmp_path / 'arrays.npz', positions=values, received=received)
+        done = call(tmp_path / 'arrays.npz', *options)
+        assert done.code == 2 and error in done.err
+        assert len(done.err.splitlines()) == 1
     np.savez(tmp_path / 'arrays.npz', positions=positions)
     done = call(tmp_path / 'arrays.npz', *options)
     assert done.code == 2
@@ -191,3 +199,26 @@ def test_an_unusable_recording_is_named(recording, tmp_path, arguments, error):
     assert error in done.err
     assert len(done.err.splitlines()) == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_known_states_need_no_pilots(tmp_path):
+    file = tmp_path / 'states.npz'
+    done = call('--config', CONFIG / 'quick.yaml', '--states=0.5+0.5j,-1', '--output', file)
+    calibration = Calibration.load(file)
+    assert (done.code, done.out) == (0, f'{file}: calibration {calibration.id}\n')
+    assert calibration.surface.applied(np.array([0.0] + [1.0] * 35)).tolist() == [
+        0.5 + 0.5j, *[-1] * 35]
+
+
+@pytest.mark.parametrize('states', ['1', '1,2,3', '1,x', 'nan,1', ''])
+def test_states_are_two_numbers(states, capsys):
+    with pytest.raises(SystemExit):
+        main([f'--states={states}'])
+    assert f'--states: {states!r}, expected two numbers such as 1,-1' in capsys.readouterr().err
+
+
+def test_states_and_pilots_exclude_each_other(tmp_path):
+    (tmp_path / 'pilots.npz').touch()
+    done = call(tmp_path / 'pilots.npz', '--states=1,-1')
+    assert done.code == 2
+    assert 'pilots.npz: expected no file with --states' in done.err

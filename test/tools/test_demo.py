@@ -1,5 +1,7 @@
 """The command line of the demonstration, without a network."""
 
+import signal
+
 import pytest
 
 from rhs_isac_ros.tools import demo
@@ -23,15 +25,16 @@ def test_progress_is_printed_at_the_start_after_ten_cycles_and_at_the_end(monkey
         'cycle 10 of 12', 'cycle 12 of 12']
 
 
-def test_a_signal_during_the_start_completes_the_recording(tmp_path, monkeypatch):
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_during_the_start_completes_the_recording(
+        number, tmp_path, monkeypatch):
     pytest.importorskip('mcap', reason='mcap is not installed')
 
     def interrupted(*_, **__):
-        raise KeyboardInterrupt
+        signal.raise_signal(number)
     # The environment of this process remains as it is.
     for module, name, replacement in (
-            (demo, 'start_network', interrupted), (demo, 'private_domain', dict),
-            (demo.startup, 'use_discovery_profile', lambda: None)):
+            (demo, 'start_network', interrupted), (demo, 'private_domain', dict)):
         monkeypatch.setattr(module, name, replacement)
     assert main(['--record', str(tmp_path / 'run.mcap'),
                  '--picture', str(tmp_path / 'demo.png')]) == 0

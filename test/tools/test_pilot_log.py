@@ -17,7 +17,7 @@ def codebook(random_beams):
 
 @pytest.fixture
 def log(codebook):
-    log = PilotLog()
+    log = PilotLog(Scenario())
     log.add(codebook)
     return log
 
@@ -43,6 +43,15 @@ def test_signals_are_paired_with_the_position_of_their_cycle(log, codebook):
     np.testing.assert_array_equal(pilots.received[:, 0, 0], [2 + 1j, 1 + 1j])
 
 
+def test_positions_are_converted_to_the_frame_of_the_surface(codebook):
+    log = PilotLog(Scenario(pose={'position_m': [1, 2, 3], 'quaternion': [0, 0, 1, 1]}))
+    for message in (codebook, truth(9), signals(9, codebook.id)):
+        log.add(message)
+    (pilots,) = log.pilots()
+    # The truth is 7 m in front of the surface, which faces along y, and 7 m to its right.
+    np.testing.assert_allclose(pilots.positions, [[7.0, -7.0, -3.0]], atol=1e-12)
+
+
 @pytest.mark.parametrize('message', [
     truth(0), truth(3, user=2), truth(3, sender=8)], ids=['no cycle', 'user', 'instance'])
 def test_positions_of_others_do_not_count(log, codebook, message):
@@ -59,7 +68,7 @@ def test_repeated_signals_count_once(log, codebook):
 
 
 def test_signals_of_one_user_may_be_selected(codebook):
-    log = PilotLog(user=2)
+    log = PilotLog(Scenario(), user=2)
     log.add(codebook)
     for user in (1, 2):
         log.add(truth(user, user))

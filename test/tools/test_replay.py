@@ -1,5 +1,6 @@
 """``scripts/record`` and ``scripts/replay`` on a network in another process."""
 
+import dataclasses
 import os
 import re
 import signal
@@ -12,19 +13,27 @@ import pytest
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from ros_messages import from_ros
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert
-from rhs_isac_ros.ros.endpoints import EXCHANGE
-from rhs_isac_ros.ros.recording import CycleObserver, Recorder, read
+from rhs_isac_ros.ros.endpoints import EXCHANGE, OBSERVATION
+from rhs_isac_ros.ros.recording import (
+    CycleObserver,
+    Recorder,
+    read,
+    recorded_topics,
+    schema,
+    type_name,
+)
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.tools import replay
-from rhs_isac_ros.tools.replay import errors_m, load, main
+from rhs_isac_ros.tools.replay import Recording, errors_m, load, main
 
 pytest.importorskip('mcap', reason='mcap is not installed')
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -80,15 +89,16 @@ def test_the_same_estimator_has_the_same_errors(run, run_script):
         f'{np.median(live):.6f}', 'm', f'{np.sqrt(np.mean(live**2)):.6f}', 'm', '0']
 
 
-def test_errors_match_those_of_the_estimator(run):
+def test_errors_do_not_depend_on_the_pose_of_the_surface(run):
     recording = load(run.path)
-    estimators = {key: make_estimator('ml', recording.scenario, codebook)
-            for key, codebook in recording.codebooks.items()}
-    expected = []
-    for cycle in run.cycles:
-        fix = estimators[cycle.signals.codebook_id].estimate(cycle.signals.signals.reshape(2, -1))
-        expected.append(np.sqrt(np.sum((fix.mean - cycle.truth.position)**2)))
-    np.testing.assert_allclose(errors_m(recording.cycles, estimators), expected, rtol=1e-9)
+    placed = dataclasses.replace(recording.scenario, pose=Pose((1, 2, 3), (0, 0, 1, 1)))
+    moved = [dataclasses.replace(cycle, truth=dataclasses.replace(
+        cycle.truth, position=placed.pose.to_site(cycle.truth.position)))
+        for cycle in recording.cycles]
+    errors = [errors_m(one, {key: make_estimator('ml', one.scenario, codebook)
+                             for key, codebook in one.codebooks.items()})
+              for one in (recording, Recording(placed, moved, recording.codebooks))]
+    np.testing.assert_allclose(*errors, rtol=1e-9)
 
 
 def test_users_are_tracked_beside_single_cycles(run, run_script):
@@ -96,8 +106,8 @@ def test_users_are_tracked_beside_single_cycles(run, run_script):
     recording = load(run.path)
     estimators = {key: make_estimator('bayes', recording.scenario, codebook)
                   for key, codebook in recording.codebooks.items()}
-    alone = errors_m(recording.cycles, estimators)
-    tracked = errors_m(recording.cycles, estimators, 1.0)
+    alone = errors_m(recording, estimators)
+    tracked = errors_m(recording, estimators, 1.0)
     users = [cycle.user for cycle in recording.cycles]
     first = [users.index(user) for user in set(users)]
     assert len(first) < CYCLES
@@ -106,12 +116,6 @@ def test_users_are_tracked_beside_single_cycles(run, run_script):
     found = rows(run_script(f'{SCRIPTS}/replay {run.path} --track'))
     assert found['track'] == [
         f'{np.median(tracked):.6f}', 'm', f'{np.sqrt(np.mean(tracked**2)):.6f}', 'm', '0']
-
-
-def test_only_bayes_tracks(run, capsys):
-    with pytest.raises(SystemExit):
-        main([str(run.path), '--estimator', 'ml', '--track'])
-    assert 'argument --track: expected together with' in capsys.readouterr().err
 
 
 def test_an_estimator_of_a_plugin_is_available(run, install, capsys):
@@ -193,6 +197,89 @@ def test_a_running_positioner_reproduces_the_recorded_estimates(run, shared_sess
     assert {cycle: received[cycle] for cycle in both} == {cycle: recorded[cycle] for cycle in both}
 
 
+@pytest.fixture
+def many(run, tmp_path):
+    """A recording with more signals than a queue holds, whose clock is set forward and back."""
+    from mcap.writer import Writer
+    kinds = recorded_topics()
+    path = tmp_path / 'many.mcap'
+    writer = Writer(str(path))
+    writer.start()
+    writer.add_metadata('scenario', {'yaml': (CONFIG / 'quick.yaml').read_text(encoding='utf-8')})
+    channels = {name: writer.register_channel(f'/{name}', 'cdr', writer.register_schema(
+        type_name(kinds[name][0]), 'ros2msg', schema(kinds[name][0]).encode()))
+        for name in ('codebook', 'received_signals')}
+    codebook = next(found for _, found, _ in read(run.path, ['/codebook']))
+    writer.add_message(channels['codebook'], 0, codebook, 0)
+    signals = convert.from_bytes(m.ReceivedSignals, next(
+        found for _, found, _ in read(run.path, ['/received_signals'])))
+    for number in range(1, 301):
+        time_ns = number * 10**8 + (3600 * 10**9 if 100 < number <= 200 else 0)
+        writer.add_message(channels['received_signals'], time_ns, convert.to_bytes(
+            dataclasses.replace(signals, cycle_id=number), time_ns,
+            (signals.sender, signals.scenario_id), 'rhs_link'), time_ns)
+    writer.finish()
+    return path
+
+
+def test_no_signals_are_lost_at_any_rate_and_gaps_are_shortened(
+        many, shared_session, positioner):
+    received = set()
+    subscription = shared_session.node.create_subscription(
+        convert.ros_type(m.PositionEstimate), '/again/position_estimate',
+        lambda message: received.add(message.cycle_id), OBSERVATION)
+    # The replay awaits the positioner, but not this observer.
+    assert shared_session.spin_until(lambda: subscription.get_publisher_count() > 0, 60)
+    with subprocess.Popen(
+            [SCRIPTS / 'replay', many, '--publish', '--rate', '100000', '--ros-args', '-r',
+             '__ns:=/again'], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True) as process:
+        complete = shared_session.spin_until(lambda: len(received) == 300, 60)
+        out, err = process.communicate(timeout=30)
+    shared_session.node.destroy_subscription(subscription)
+    assert (process.returncode, out) == (0, '300 messages published\n'), err
+    assert complete
+    assert [line for line in err.splitlines() if line.startswith('replay: ')] == [
+        'replay: a pause of 3600 s in the recording is shortened to 1 s',
+        'replay: a clock that was set back by 3600 s in the recording is shortened to 1 s']
+
+
+def test_signals_that_nobody_answers_are_counted(many, bench):
+    """A subscriber that publishes no estimates has the place of the positioner."""
+    probe = bench.add(Node, 'probe', namespace='/silent')
+    signals = []
+    probe.create_subscription(
+        convert.ros_type(m.ReceivedSignals), 'received_signals', signals.append, OBSERVATION)
+    probe.create_publisher(convert.ros_type(m.PositionEstimate), 'position_estimate', EXCHANGE)
+    with subprocess.Popen(
+            [SCRIPTS / 'replay', many, '--publish', '--rate', '100000', '--timeout', '5',
+             '--ros-args', '-r', '__ns:=/silent'], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True) as process:
+        # The rest would take a minute.
+        bench.until(lambda: len({message.cycle_id for message in signals}) > 4, 'the signals')
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=30)
+    assert process.returncode == 1, err
+    assert re.fullmatch(r'replay: error: [0-9]+ signals without position_estimate or no_fix',
+                        err.splitlines()[-1])
+
+
+@pytest.mark.parametrize(('times_s', 'due_s', 'lines'), [
+    ([5, 6, 8.5], [0, 1, 3.5], []),
+    ([5, 3605, 3606], [0, 1, 2], ['a pause of 3600 s']),
+    ([3600, 0, 1], [0, 1, 2], ['a clock that was set back by 3600 s']),
+    ([0, 100, 101, 201, 1], [0, 1, 2, 3, 4], [
+        'a pause of 100 s', 'a pause of 100 s', 'a clock that was set back by 200 s']),
+    # Messages in almost the right order.
+    ([0, 2, 1.5, 3], [0, 2, 1.5, 3], [])])
+def test_gaps_of_a_recording_are_shortened_and_printed(times_s, due_s, lines, capsys):
+    messages = [('codebook', b'', -1e6), *(('ack', b'', time_s) for time_s in times_s)]
+    found = list(replay._without_gaps(messages))
+    assert [time_s for _, _, time_s in found] == [0, *due_s]
+    assert [line.removeprefix('replay: ').partition(' in the')[0]
+            for line in capsys.readouterr().err.splitlines()] == lines
+
+
 def test_topics_of_a_running_network_are_not_published(built_scripts, run, shared_session):
     """The low rate leaves time to discover the other publisher however slow discovery is."""
     done = subprocess.run(
@@ -211,35 +298,6 @@ def test_topics_of_a_running_network_are_not_published(built_scripts, run, share
 def test_unusable_recordings_are_named(run, capsys, arguments, error):
     assert main([str(run.path), '--publish', *map(str, arguments)]) == 2
     assert error in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(('enabled', 'least_s'), [('true', 6.0), ('false', 2.0)])
-def test_an_optimizer_is_awaited_as_long_as_discovery_takes(monkeypatch, enabled, least_s):
-    monkeypatch.setenv('ROS_SECURITY_ENABLE', enabled)
-    monkeypatch.setattr(replay, 'AsyncParameterClient', lambda *_: types.SimpleNamespace(
-        wait_for_services=lambda timeout_s: timeout_s >= least_s))
-    assert replay._optimizer_present(None)
-
-
-def test_endpoints_settle_some_time_after_the_last_change(monkeypatch):
-    node = types.SimpleNamespace(
-        _message_publishers=['received_signals'], _endpoints=None, _unchanged_since_s=0.0,
-        count_subscribers=lambda name: 1)
-    for now_s, count, settled in ((9.0, 1, False), (9.9, 1, False), (10.1, 2, False),
-                                  (11.0, 2, False), (11.2, 2, True), (11.3, 1, False)):
-        node.count_publishers = lambda name, count=count: count
-        clock = types.SimpleNamespace(monotonic=lambda now_s=now_s: now_s)
-        monkeypatch.setattr(replay, 'time', clock)
-        assert replay.RepublisherNode._endpoints_settled(node) == settled
-
-
-@pytest.mark.parametrize('arguments', [['--estimator', 'ml'], ['--rate', '0'],
-                                       ['--topic', 'codebook']])
-def test_options_that_exclude_publishing_are_named(run, capsys, arguments):
-    with pytest.raises(SystemExit):
-        main([str(run.path), '--publish', *arguments])
-    text = capsys.readouterr().err
-    assert any(reason in text for reason in ('not allowed', 'expected', 'invalid choice'))
 
 
 def test_record_writes_all_topics_until_it_is_interrupted(

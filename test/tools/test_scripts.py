@@ -37,8 +37,8 @@ def test_setup_rejects_an_unknown_group():
     done = subprocess.run([SCRIPTS / 'setup', 'recordin'], capture_output=True, text=True,
                           check=False)
     assert (done.returncode, done.stdout) == (2, '')
-    assert done.stderr == ("scripts/setup: 'recordin', expected recording, experiments, docs, "
-                           'test, view or peers\n')
+    assert done.stderr == ("scripts/setup: 'recordin', expected recording, samples, "
+                           'experiments, docs, test, view or peers\n')
 
 
 @pytest.mark.parametrize(('script', 'built', 'distribution', 'line'), [

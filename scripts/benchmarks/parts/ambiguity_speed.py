@@ -6,12 +6,11 @@ same run. With the two bands of Table I, the final value of the reference is tha
 codebook, the result of 3000 steps; with four bands, it is assumed to need as many evaluations.
 """
 
-import math
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from parts.frame import CONFIG, Table, shown
 
 from rhs_isac_ros.bounds import PairwiseErrorCost
 from rhs_isac_ros.bounds.rows import Evaluation
@@ -22,7 +21,7 @@ from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.support import streams
 
-SHIPPED = Path(__file__).parents[3] / 'config' / 'codebook_ambiguity.yaml'
+SHIPPED = CONFIG / 'codebook_ambiguity.yaml'
 HELD_OUT_PAIRS = 32_768
 # Evaluations of all pairs that are timed.
 N_STEPS = 8
@@ -50,16 +49,16 @@ def ambiguity_speed() -> dict:
     shipped = Codebook.load(SHIPPED)
     evaluations = Provenance.parse(shipped.provenance).evaluations
     print('(d) objective ambiguity: time of the default run and value on held-out pairs\n')
-    print('| bands | search | s | held-out value [m^2] |\n|---|---|---|---|')
+    table = Table('bands', 'search', 's', 'held-out value [m²]')
     figures = {}
     for name, scenario in {
             '2': Scenario(), '4': Scenario.from_yaml(SHIPPED.with_name('bandplan.yaml'))}.items():
         figures[name] = row = compare(
             scenario, shipped if scenario == Scenario() else None, evaluations)
-        print(f'| {name} | all pairs, {evaluations} evaluations of {1e3 * row["step_s"]:.0f} ms | '
-              f'{row["reference_s"]:.0f} | {row["values"].get("all", math.nan):.6f} |')
-        print(f'| {name} | samples of the pairs | {row["ours_s"]:.1f} | '
-              f'{row["values"]["samples"]:.6f} |', flush=True)
+        table.row(name, f'all pairs, {evaluations} evaluations of {1e3 * row["step_s"]:.0f} ms',
+                  shown(row['reference_s'], 0), shown(row['values'].get('all'), 6))
+        table.row(name, 'samples of the pairs', shown(row['ours_s'], 1),
+                  shown(row['values']['samples'], 6))
     speedups = {name: row['reference_s'] / row['ours_s'] for name, row in figures.items()}
     print('\nspeed-up: ' + ', '.join(
         f'{speedup:.1f} with {name} bands' for name, speedup in speedups.items()) + '\n')

@@ -19,11 +19,12 @@ from rhs_isac_ros.model.multipath import (
     multipath_covariance,
 )
 from rhs_isac_ros.model.surface import AppliedBeams
-from rhs_isac_ros.positioning.grid import TemplateTable, tabulate
+from rhs_isac_ros.positioning.grid import TemplateTable
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood, NuisancePrior, Signals
 from rhs_isac_ros.positioning.posterior import WeightedSamples, draw_samples
 from rhs_isac_ros.positioning.search import find_modes
+from rhs_isac_ros.positioning.templates import tabulate
 
 # Positions whose mean signals determine the subspace of all mean signals, and its accuracy: the
 # largest whitened amplitude outside of it.

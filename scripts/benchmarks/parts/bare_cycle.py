@@ -140,4 +140,4 @@ def bare_cycles(rest_s: float) -> np.ndarray:
 
 
 if __name__ == '__main__':
-    sys.exit(run(lambda: [BareNode(sys.argv[1], 0.0)], []))
+    sys.exit(run(lambda: [BareNode(sys.argv[1], 0.0)], ['bare_cycle']))

@@ -7,18 +7,17 @@ likelihood at these points is divided by the probability of the draw, so that su
 expectation, and integrated over the parameters numerically where it matters.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import ElementErrors
-from rhs_isac_ros.positioning.coordinates import select, to_polar
+from rhs_isac_ros.model.geometry import to_polar
 from rhs_isac_ros.positioning.estimate import Estimate, checked_received
 from rhs_isac_ros.positioning.estimators import BayesEstimator
 from rhs_isac_ros.positioning.failures import FailedElements, FailureSearch, can_enumerate
-from rhs_isac_ros.positioning.grid import tabulate
 from rhs_isac_ros.positioning.likelihood import (
     Alignment,
     Conditional,
@@ -29,6 +28,8 @@ from rhs_isac_ros.positioning.likelihood import (
 from rhs_isac_ros.positioning.neural import stack_parts
 from rhs_isac_ros.positioning.posterior import BandPhases
 from rhs_isac_ros.positioning.search import Modes, marginal_at
+from rhs_isac_ros.positioning.segments import select
+from rhs_isac_ros.positioning.templates import tabulate
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Points evaluated at a time.
@@ -48,15 +49,13 @@ _SPREAD = 1.2
 
 @one_blas_thread
 def exhaustive_posterior(
-        scenario: Scenario, codebook: Codebook, received: np.ndarray, log2_points: int = 22,
-        progress: Callable[[float], None] | None = None, *,
+        scenario: Scenario, codebook: Codebook, received: np.ndarray, log2_points: int = 22, *,
         surface: ElementErrors | None = None, seed: int = 0) -> Estimate:
     """Compute mean and covariance of the posterior from points all over the region of interest.
 
     The prior is uniform on the region. All phases share the 2^log2_points points of a Sobol
-    sequence, scrambled with the seed; the default number takes minutes. `progress` is called with
-    the completed share of the points. Signals are complex128 [N, N_B, N_SB F] for an estimate of
-    N positions.
+    sequence, scrambled with the seed; the default number takes minutes. Signals are complex128
+    [N, N_B, N_SB F] for an estimate of N positions.
 
     Impairments that the scenario declares are integrated out at every point. Element errors and
     failures are treated as Gaussian, with their covariance at every point, unless `surface`
@@ -80,8 +79,6 @@ def exhaustive_posterior(
         block = slice(done, min(done + _BLOCK, total))
         points[block] = sequence.random(block.stop - done) * (high - low) + low
         profile[:, block] = posterior.profile(points[block])
-        if progress:
-            progress(block.stop / total)
     moments = [posterior.moments(phase, points, profile[phase]) for phase in range(len(batch))]
     means, covariances = map(np.stack, zip(*moments, strict=True))
     return Estimate(means, covariances)
@@ -237,7 +234,8 @@ class _InformedEstimator(BayesEstimator):
 
     def __init__(self, scenario: Scenario, codebook: Codebook) -> None:
         super().__init__(scenario, codebook)
-        self._failures = self._informed = _InformedFailures(self._likelihood, self._grid)
+        self._informed = _InformedFailures(self._likelihood, self._region.table)
+        self._region = self._region._replace(failures=self._informed)
 
     def estimate_with(self, received: np.ndarray, surface: ElementErrors,
                       position: np.ndarray) -> Estimate:

@@ -1,6 +1,6 @@
 """Parts (c) and (e) of the benchmark of the optimizer: time and memory by the size of the problem.
 
-As a script, it measures the sizes in its argument, a JSON object, on the cores assigned to it.
+As a program, it measures the sizes in its argument, a JSON object, on the cores assigned to it.
 """
 
 import json
@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from parts.frame import Table, shown
 
 from rhs_isac_ros.bounds import AverageCrlb
 from rhs_isac_ros.codebook import Progress, optimize, random_codebook
@@ -32,17 +33,15 @@ STEPS = 10
 def growth() -> dict:
     """Run part (c), each size in a new process so that its peak memory can be measured."""
     print('(c) growth: set-up, value with gradient, peak memory of the process\n')
-    print('| size | set-up [s] | evaluation [ms] | peak [MiB] | ranks |\n|---|---|---|---|---|')
+    table = Table('size', 'set-up [s]', 'evaluation [ms]', 'peak [MiB]', 'ranks')
     base = {'N_sam': POSITIONS, 'N_E': 100, 'N_B': 2}
-    rows = {}
-    for symbol, values in GROWTH.items():
-        for value in values:
-            rows[f'{symbol} = {value}'] = measure(base | {symbol: value})
+    sizes = {f'{symbol} = {value}': base | {symbol: value}
+             for symbol, values in GROWTH.items() for value in values}
     large = ', '.join(f'{symbol} = {value}' for symbol, value in LARGE.items())
-    rows[large] = measure(LARGE)
+    rows = {name: measure(one) for name, one in (sizes | {large: LARGE}).items()}
     for name, row in rows.items():
-        print(f'| {name} | {row["setup_s"]:.2f} | {row["evaluation_ms"]:.1f} | '
-              f'{row["peak_mib"]:.0f} | {", ".join(map(str, row["ranks"]))} |')
+        table.row(name, shown(row['setup_s'], 2), shown(row['evaluation_ms'], 1),
+                  shown(row['peak_mib'], 0), ', '.join(map(str, row['ranks'])))
 
     def relative_to_linear(symbol: str, a: int, b: int) -> float:
         first, second = (rows[f'{symbol} = {n}']['evaluation_ms'] for n in (a, b))
@@ -62,10 +61,11 @@ def growth() -> dict:
 def surfaces() -> dict:
     """Run part (e), each size in a new process so that its peak memory can be measured."""
     print(f'(e) large surfaces: optimize(max_steps={STEPS}), four bands, default positions\n')
-    print('| N_E | set-up, CPU [s] | step, CPU [s] | peak [MiB] |\n|---|---|---|---|')
+    table = Table('N_E', 'set-up, CPU [s]', 'step, CPU [s]', 'peak [MiB]')
     rows = {n: measure({'N_E': n, 'N_B': 4, 'steps': STEPS}) for n in SURFACES}
     for n, row in rows.items():
-        print(f'| {n} | {row["setup_s"]:.2f} | {row["step_s"]:.3f} | {row["peak_mib"]:.0f} |')
+        table.row(str(n), shown(row['setup_s'], 2), shown(row['step_s'], 3),
+                  shown(row['peak_mib'], 0))
     powers = {}
     for name in ('setup_s', 'step_s', 'peak_mib'):
         values = np.log([row[name] for row in rows.values()])
@@ -79,8 +79,8 @@ def surfaces() -> dict:
 def measure(sizes: dict[str, int]) -> dict:
     """Measure one size in a new process."""
     done = subprocess.run(
-        [sys.executable, __file__, json.dumps(sizes)], stdout=subprocess.PIPE, text=True,
-        check=True)
+        [sys.executable, '-m', 'parts.optimizer_growth', json.dumps(sizes)],
+        cwd=Path(__file__).parents[1], stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout)
 
 

@@ -6,16 +6,10 @@ from typing import Any
 import numpy as np
 from parts import fig4_claims
 from parts.fig4_results import Condition, Results
+from parts.options import write_results
 
 from rhs_isac_ros.experiments import markdown_table
-from rhs_isac_ros.support.files import write_whole
-from rhs_isac_ros.support.pictures import (
-    PAGE_IN,
-    look,
-    new_panels,
-    paper_style,
-    write_picture,
-)
+from rhs_isac_ros.support.pictures import PAGE_IN, look, new_panels, paper_style
 
 # Whiskers of the box plots [%].
 WHISKERS = (5, 95)
@@ -34,12 +28,7 @@ def write(results: Results, options: argparse.Namespace) -> None:
             f'## {condition}', table(results, condition),
             'Reduction relative to each benchmark:',
             fig4_claims.condition_table(results, condition)))])
-    for name, text in csv_files(results).items():
-        write_whole(options.output / name, text)
-    name = f'fig4.{options.format}'
-    write_picture(options.output / name, picture(results))
-    write_whole(options.output / 'fig4.md', f'# Fig. 4\n\n![Fig. 4]({name})\n\n{report}\n')
-    print(f'{report}\n\nwritten: {options.output}/{name}, fig4.md, fig4a.csv and fig4b.csv')
+    write_results(options, 'fig4', 'Fig. 4', report, picture(results), csv_files(results))
 
 
 def table(results: Results, condition: Condition) -> str:

@@ -2,7 +2,7 @@
 
 import sys
 
-from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.support.exits import exit_code_of
 from system.chaos.command import main
 
 sys.exit(exit_code_of(main))

@@ -15,12 +15,9 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 
 from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros.processes import private_domain
-from rhs_isac_ros.ros.run import check_domain
-from rhs_isac_ros.ros.startup import use_discovery_profile
+from rhs_isac_ros.ros.environment import check_environment, private_domain, use_discovery_profile
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
@@ -28,6 +25,7 @@ from rhs_isac_ros.support.arguments import (
     positive_float,
     positive_int,
 )
+from rhs_isac_ros.support.exits import print_error
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.tools.demo import add_network_options, load_files, start_network
 from system.chaos import crashes, fuzzing, intruders, report, soaking
@@ -57,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options = parser.parse_args(arguments)
-    check_domain(parser)
+    check_environment(parser)
     check_distinct(parser, options)
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
@@ -94,10 +92,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(
         observer: NetworkObserver, processes: TrialProcesses, scenario: Scenario,
         options: argparse.Namespace, folder: Path, codebook_file: Path) -> dict[str, Any]:
-    if options.soak:
-        return _soak(observer, processes, options)
-    if options.fuzz:
-        return _fuzz(observer, processes, scenario, options)
+    if options.soak or options.fuzz:
+        figures = (_soak(observer, processes, options) if options.soak
+                   else _fuzz(observer, processes, scenario, options))
+        print(json.dumps(figures, indent=2))
+        return figures
     trials: list[Trial] = []
     crashes_chosen = options.nodes is not None or options.phases is not None
     if crashes_chosen or options.intruders is None:
@@ -110,6 +109,9 @@ def _run(
     observer.spin_for(CHECK_DELAY_S)
     figures = report.trial_figures(trials, observer.invariants)
     print(report.publication_summary(figures))
+    for name, code in processes.ended().items():
+        last = '\n  '.join(processes.log(name).splitlines()[-12:])
+        print(f'ENDED: {name}, exit code {code}\n  {last}')
     return figures
 
 
@@ -121,9 +123,7 @@ def _soak(
             f'{minutes:.1f} of {options.soak:g} minutes, {cycles} cycles'))
     # The last results are checked after the settling time.
     observer.spin_for(CHECK_DELAY_S)
-    figures = report.soak_figures(result, observer.invariants)
-    print(report.soak_text(result, figures))
-    return figures
+    return report.soak_figures(result, observer.invariants)
 
 
 def _fuzz(
@@ -132,7 +132,6 @@ def _fuzz(
     result = fuzzing.fuzz(
         observer, processes, scenario, options.fuzz, np.random.default_rng(options.seed),
         lambda sent: _show_progress(f'{sent} of {options.fuzz} mutations'))
-    print(report.fuzz_text(result))
     return report.fuzz_figures(result)
 
 

@@ -201,7 +201,7 @@ def _is_malformed(kind: type[m.Message], content: bytes, scenario: Scenario) -> 
     try:
         message = convert.from_bytes(kind, content)
         if message.scenario_id in ('', scenario.id):
-            m.check(message, scenario.sizes)
+            m.check(message, scenario)
     except m.MessageError:
         return True
     return False

@@ -1,4 +1,4 @@
-"""Results of the chaos trials as text and as JSON figures."""
+"""Results of the chaos trials as lines and as JSON figures."""
 
 import dataclasses
 import math
@@ -91,42 +91,7 @@ def soak_figures(result: SoakResult, invariants: InvariantChecker) -> dict[str, 
     }
 
 
-def soak_text(result: SoakResult, figures: Mapping[str, Any]) -> str:
-    """Return a soak test and its figures, as returned by `soak_figures`, as lines."""
-    lines = [
-        f'{result.minutes:.1f} minutes, {result.cycles} cycles, '
-        f'{100 * result.estimate_share:.2f} % of which led to an estimate',
-        f'impaired: {_counts(result.impaired)}',
-        f'cycles: {_counts(result.outcomes)}',
-        f'repeated requests: {_counts(result.retries)}',
-        f'{figures["wrong_publications"]} wrong publications among '
-        f'{figures["checked_publications"]}',
-        'memory after the warm-up and at the end [MiB]:']
-    lines += [f'  {name:15s} {first / 2**20:7.1f} {last / 2**20:7.1f}   '
-              f'{100 * result.memory_growth[name]:+5.2f} %'
-              for name, (first, last) in result.memory_bytes.items()]
-    lines += [f'ENDED: {name}' for name in result.ended]
-    return '\n'.join([*lines, *(f'VIOLATION: {text}' for text in figures['violations'])])
-
-
 def fuzz_figures(result: FuzzResult) -> dict[str, Any]:
     """Return the figures of fuzzing, for JSON."""
     return {**dataclasses.asdict(result), 'mutations': sum(result.sent.values()),
             'recovery_s': finite(result.recovery_s), 'passed': result.passed}
-
-
-def fuzz_text(result: FuzzResult) -> str:
-    """Return the results of fuzzing as lines."""
-    lines = [f'{sum(result.sent.values())} mutations on {len(result.sent)} topics; '
-             f'{len(result.ended)} processes ended, {len(result.traces)} error traces',
-             'malformed messages by node, sent and counted:']
-    lines += [f'  {node:15s} {count:7d} {result.counted[node]:7d}'
-              for node, count in sorted(result.malformed.items())]
-    lines += [f'dropped by reason: {_counts(result.dropped)}',
-              f'both users served {result.recovery_s:.1f} s after the last mutation']
-    return '\n'.join([*lines, *(f'ENDED: {name}' for name in result.ended),
-                      *(f'TRACE: {line}' for line in result.traces)])
-
-
-def _counts(counts: Mapping[str, int]) -> str:
-    return ', '.join(f'{name} {n}' for name, n in sorted(counts.items()) if n) or 'none'

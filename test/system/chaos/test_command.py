@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rhs_isac_ros.ros import topics
-from rhs_isac_ros.ros.processes import claim_domain
+from rhs_isac_ros.ros.environment import claim_domain
 from rhs_isac_ros.ros.roster import UNIQUE
 from system.chaos.command import main
 

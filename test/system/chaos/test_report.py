@@ -69,13 +69,6 @@ def test_violations_fail_and_are_printed():
     assert '  VIOLATION: x' in report.crash_line(crash_trial(violations=('x',)))
 
 
-def test_an_infinite_recovery_is_none_in_json():
-    trial = crash_trial(recovery_s=math.inf)
-    assert figures_of(trial)['worst_recovery_s'] is None
-    assert report.trial_summary('crashes', [trial]).endswith(
-        '0 of 1 recovered within the limit, slowest: never')
-
-
 def soak_result(**fields):
     given = {'minutes': 10.0, 'outcomes': {'served': 995, 'user_gone': 5}, 'estimates': 996,
              'retries': {'retry_band': 40}, 'impaired': {'loss': 80},
@@ -90,9 +83,7 @@ def test_a_soak_test_passes_within_its_limits():
     assert not soak_result(estimates=989).passed
     assert not soak_result(memory_bytes={'bs': (100, 106)}).passed
     assert not soak_result(ended=('bs',)).passed
-    figures = report.soak_figures(result, InvariantChecker(Scenario()))
-    assert figures['passed']
-    assert '99.60 %' in report.soak_text(result, figures)
+    assert report.soak_figures(result, InvariantChecker(Scenario()))['passed']
 
 
 def test_fuzzing_passes_if_all_malformed_messages_were_counted():
@@ -101,5 +92,5 @@ def test_fuzzing_passes_if_all_malformed_messages_were_counted():
     assert FuzzResult(**given).passed
     for failed in ({'counted': {'bs': 2}}, {'ended': ('bs',)}, {'traces': ('bs: Traceback',)}):
         assert not FuzzResult(**given | failed).passed
-    assert '5 mutations on 1 topics' in report.fuzz_text(FuzzResult(**given))
-    assert report.fuzz_figures(FuzzResult(**given))['passed']
+    figures = report.fuzz_figures(FuzzResult(**given))
+    assert (figures['mutations'], figures['passed']) == (5, True)

@@ -1,1 +1,1 @@
-"""Test of the network on several hosts: network namespaces whose links are taken down."""
+"""Trial of a network on several hosts: network namespaces whose links are taken down."""

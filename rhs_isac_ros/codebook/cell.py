@@ -1,0 +1,82 @@
+"""Priors of the position for which a codebook is optimised: the region, or a cell of it."""
+
+import dataclasses
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from rhs_isac_ros.model import Scenario
+
+# Pairs of positions are drawn from a box of this many standard deviations around a cell.
+_REACH = 3.0
+# Smallest probability beside a position, so that its quantile is finite.
+_TINY = 1e-9
+
+
+class Prior(Protocol):
+    """Where the user may be."""
+
+    def positions(self, scenario: Scenario, uniform: np.ndarray) -> np.ndarray:
+        """Map positions that are uniform in the region, float64 [N, 3] [m], to the prior."""
+        ...
+
+    def box(self, scenario: Scenario) -> Scenario:
+        """Return a scenario whose region contains the prior; only the region is changed."""
+        ...
+
+    def ratios(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Return by how much more probable second positions are than first ones, at most 1."""
+        ...
+
+
+class Region:
+    """A uniform density in the region of interest."""
+
+    def positions(self, scenario: Scenario, uniform: np.ndarray) -> np.ndarray:
+        """Return the positions."""
+        return uniform
+
+    def box(self, scenario: Scenario) -> Scenario:
+        """Return the scenario."""
+        return scenario
+
+    def ratios(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Return ones, float64 [N]."""
+        return np.ones(len(first))
+
+
+REGION = Region()
+
+
+class Cell(NamedTuple):
+    """A Gaussian with the same variance in all directions, cut off at the border of the region."""
+
+    centre_m: tuple[float, float, float]  #: In the frame of the surface [m].
+    std_m: float  #: Standard deviation of each coordinate [m].
+
+    def positions(self, scenario: Scenario, uniform: np.ndarray) -> np.ndarray:
+        """Map positions that are uniform in the region, float64 [N, 3] [m], to the cell."""
+        # A slow import, which loading a codebook does not need.
+        from scipy.special import ndtr, ndtri
+
+        bounds = scenario.roi_bounds_m
+        low, high = ndtr((bounds - np.array(self.centre_m)) / self.std_m)
+        extent = np.ptp(bounds, axis=0)
+        share = (uniform - bounds[0]) / np.where(extent > 0, extent, 1.0)
+        quantiles = ndtri(np.clip(low + (high - low) * share, _TINY, 1 - _TINY))
+        return np.clip(np.array(self.centre_m) + self.std_m * quantiles, *bounds)
+
+    def box(self, scenario: Scenario) -> Scenario:
+        """Return the scenario with the part of its region that is near the cell."""
+        centre, bounds = np.array(self.centre_m), scenario.roi_bounds_m
+        low, high = np.clip([centre - _REACH * self.std_m, centre + _REACH * self.std_m], *bounds)
+        return dataclasses.replace(
+            scenario, roi_center_m=tuple((low + high) / 2), roi_size_m=tuple(high - low))
+
+    def ratios(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Return ratios of the roots of the densities, at most 1, float64 [N]."""
+        # The probability of confusing two positions with different priors is, in either direction,
+        # bounded by the root of the product of these priors.
+        squares = [np.sum((points - np.array(self.centre_m))**2, axis=1)
+                   for points in (first, second)]
+        return np.exp(np.minimum(squares[0] - squares[1], 0.0) / (4 * self.std_m**2))

@@ -1,0 +1,225 @@
+"""A library of codebooks: one for each cell of the region and each uncertainty of the position.
+
+The codebook of a cell is optimised for a user whose position is known to a standard deviation, the
+spread. Cells form a lattice in the region, with a pitch for each spread. The pitch follows from a
+loss: by how much the objective of a codebook exceeds that of one optimised for the very position,
+on average over the positions in its cell.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rhs_isac_ros.codebook.cell import Cell
+from rhs_isac_ros.codebook.codebook import Codebook, CodebookError
+from rhs_isac_ros.codebook.objective import OBJECTIVES, sobol
+from rhs_isac_ros.codebook.optimize import optimize
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.files import read_archive, write_archive
+
+# Default spreads [m], and the loss from which the pitch of their cells follows.
+SPREADS_M = (0.2, 0.5)
+LOSS = 0.05
+# Pitches that are tried [spreads], and number of positions at which their loss is measured.
+_PITCHES = (8.0, 6.25, 5.0, 4.0, 3.0, 2.0)
+_N_TRIALS = 12
+# Positions and steps of an optimisation; few suffice, because it starts from a good codebook.
+_N_POSITIONS = 32
+_STEPS = 60
+_FORMAT = 1
+_ARRAYS = {'centres_m', 'spreads_m', 'analog', 'digital'}
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Everything that determines the codebooks of a library."""
+
+    scenario: str  #: Id of the scenario.
+    start: str  #: Id of the codebook from which the optimisations start.
+    objective: str  #: Name of the objective.
+    spreads_m: tuple[float, ...]  #: Standard deviations of each coordinate [m].
+    pitches_m: tuple[float, ...]  #: Distance of the cells' centres for each spread [m].
+
+    def cells(self, scenario: Scenario) -> list[Cell]:
+        """Return all cells, in the frame of the surface."""
+        cells = []
+        for spread_m, pitch_m in zip(self.spreads_m, self.pitches_m, strict=True):
+            lines = [low + (np.arange(n) + 0.5) * (high - low) / n for low, high, n in zip(
+                *scenario.roi_bounds_m, _numbers(scenario, pitch_m), strict=True)]
+            cells += [Cell((float(x), float(y), float(z)), spread_m)
+                      for x, y, z in itertools.product(*lines)]
+        return cells
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Library:
+    """Codebooks of the first L cells of a plan; all of them if the library is complete.
+
+    Raises CodebookError if a codebook is malformed.
+    """
+
+    plan: Plan
+    centres_m: np.ndarray  #: Centres of the cells in the frame of the surface, float64 [L, 3] [m].
+    spreads_m: np.ndarray  #: Float64 [L] [m].
+    analog: np.ndarray  #: Of `Codebook`, float64 [L, N_B, F, N_E].
+    digital: np.ndarray  #: Of `Codebook`, complex128 [L, N_B, N_SB, F, K].
+
+    @classmethod
+    def of(cls, plan: Plan, cells: Sequence[Cell], codebooks: Sequence[Codebook]) -> 'Library':
+        """Return the library of some cells and their codebooks, at least one."""
+        return cls(plan, np.array([cell.centre_m for cell in cells]),
+                   np.array([cell.std_m for cell in cells]),
+                   np.stack([one.analog for one in codebooks]),
+                   np.stack([one.digital for one in codebooks]))
+
+    @functools.cached_property
+    def codebooks(self) -> tuple[Codebook, ...]:
+        """The codebooks of the cells."""
+        return tuple(map(Codebook, self.analog, self.digital))
+
+    @functools.cached_property
+    def by_id(self) -> Mapping[str, Codebook]:
+        """The codebooks by their ids."""
+        return {one.id: one for one in self.codebooks}
+
+    @functools.cached_property
+    def id(self) -> str:
+        """Hash of the codebooks' ids: ``lib`` and 16 hex digits."""
+        return f'lib{hashlib.sha256(" ".join(self.by_id).encode()).hexdigest()[:16]}'
+
+    def codebook_at(self, position_m: np.ndarray, std_m: float) -> Codebook | None:
+        """Return the codebook for a predicted position, float64 [3] [m], in the surface's frame.
+
+        `std_m` is the root of the mean variance of its coordinates. The spread of the cell is the
+        smallest one that is not smaller. If there is none, the result is None: the position is not
+        known well enough.
+        """
+        wider = self.spreads_m[self.spreads_m >= std_m]
+        if not wider.size:
+            return None
+        (rows,) = np.nonzero(self.spreads_m == wider.min())
+        distances = np.sum((self.centres_m[rows] - position_m)**2, axis=1)
+        return self.codebooks[rows[np.argmin(distances)]]
+
+    def check(self, scenario: Scenario) -> None:
+        """Raise CodebookError if the library is incomplete, or for another scenario."""
+        expected = scenario.unplaced.id
+        if self.plan.scenario != expected:
+            raise CodebookError(f'scenario: {self.plan.scenario}, expected {expected}')
+        n_cells = len(self.plan.cells(scenario))
+        if len(self.codebooks) != n_cells:
+            raise CodebookError(f'codebooks: {len(self.codebooks)}, expected {n_cells}')
+        for one in self.codebooks:
+            one.check(scenario)
+
+    def save(self, path: str | Path) -> None:
+        """Write one file atomically; raise OSError if it cannot be written."""
+        write_archive(path, {name: getattr(self, name) for name in _ARRAYS},
+                      {'format': _FORMAT, **dataclasses.asdict(self.plan)})
+
+    @classmethod
+    def load(cls, path: str | Path) -> 'Library':
+        """Read a file; raise CodebookError if it is no library, or damaged."""
+        with translated((ValueError, TypeError), CodebookError, path):
+            arrays, about = read_archive(path, 'library of codebooks', _FORMAT, _ARRAYS)
+            lengths = {len(array) for array in arrays.values()}
+            if len(lengths) != 1 or arrays['centres_m'].shape[1:] != (3,):
+                raise CodebookError(f'lengths {sorted(lengths)}, expected one for all arrays')
+            fields: dict[str, Any] = {
+                name: tuple(value) if isinstance(value, list) else value
+                for name, value in about.items()}
+            plan = Plan(**fields)
+            library = cls(plan, **arrays)
+            _ = library.codebooks
+        return library
+
+
+def plan_library(
+        scenario: Scenario, start: Codebook, objective: str,
+        spreads_m: Sequence[float] = SPREADS_M, loss: float = LOSS,
+        report: Callable[[float, float, float], None] | None = None) -> Plan:
+    """Choose the pitch of the cells: the largest one tried with a small enough loss.
+
+    `report` is called with each spread [m], pitch [m] and loss. Raises ValueError if the objective
+    is unknown, or a number is not positive.
+    """
+    if objective not in OBJECTIVES:
+        raise ValueError(f'objective: {objective!r}, expected one of {sorted(OBJECTIVES)}')
+    pitches_m = []
+    for spread_m in spreads_m:
+        rng = streams.generator(0, streams.SAMPLES)
+        places = scenario.sample_positions(_N_TRIALS, rng)
+        own = [improve(scenario, Cell(_tuple(place), spread_m), start, objective)
+               for place in places]
+        for pitch_m in spread_m * np.array(_PITCHES):
+            # A codebook is used at most half a pitch from the centre of its cell.
+            offsets = pitch_m * (rng.random(places.shape) - 0.5)
+            found = loss_at(scenario, spread_m, objective, places,
+                            np.clip(places - offsets, *scenario.roi_bounds_m), own, start)
+            if report:
+                report(spread_m, float(pitch_m), found)
+            if found <= loss:
+                break
+        pitches_m.append(float(pitch_m))
+    return Plan(scenario.unplaced.id, start.id, objective, tuple(spreads_m), tuple(pitches_m))
+
+
+def loss_at(scenario: Scenario, spread_m: float, objective: str, places: np.ndarray,
+            centres: np.ndarray, best: Sequence[Codebook], start: Codebook) -> float:
+    """Return the relative loss at places [N, 3] with codebooks for other centres [N, 3] [m].
+
+    `best` are the codebooks for the very places.
+    """
+    totals = np.zeros(2)
+    for place, centre, own in zip(places, centres, best, strict=True):
+        cell, rng = Cell(_tuple(place), spread_m), streams.generator(0, streams.HELD_OUT)
+        average = OBJECTIVES[objective](
+            scenario, cell.positions(scenario, sobol(scenario, 2 * _N_POSITIONS, rng)), rng,
+            prior=cell)
+        other = improve(scenario, Cell(_tuple(centre), spread_m), start, objective)
+        totals += average.value(other), average.value(own)
+    return float(totals[0] / totals[1] - 1)
+
+
+def build(scenario: Scenario, plan: Plan, start: Codebook, done: Sequence[Codebook] = (),
+          keep: Callable[[Library], None] | None = None) -> Library:
+    """Optimise the codebooks of all cells of a plan, after those that are `done`.
+
+    `keep` is called with the library so far after each codebook.
+    """
+    cells, codebooks = plan.cells(scenario), list(done)
+    for cell in cells[len(codebooks):]:
+        codebooks.append(improve(scenario, cell, start, plan.objective))
+        if keep:
+            keep(Library.of(plan, cells[:len(codebooks)], codebooks))
+    return Library.of(plan, cells, codebooks)
+
+
+def improve(scenario: Scenario, cell: Cell, start: Codebook, objective: str) -> Codebook:
+    """Optimise a codebook for a cell, from a codebook for the whole region."""
+    return optimize(scenario, objective=objective, n_positions=_N_POSITIONS, start=start,
+                    max_steps=_STEPS, prior=cell).codebook
+
+
+def _numbers(scenario: Scenario, pitch_m: float) -> list[int]:
+    """Return the numbers of cells along each axis."""
+    return [max(int(np.ceil(size / pitch_m - 1e-9)), 1) for size in scenario.roi_size_m]
+
+
+def _tuple(position: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = position.tolist()
+    return x, y, z
+
+
+def describe(plan: Plan, scenario: Scenario) -> dict[str, Any]:
+    """Return the numbers of cells for each spread."""
+    return {f'{spread_m:g} m': int(np.prod(_numbers(scenario, pitch_m)))
+            for spread_m, pitch_m in zip(plan.spreads_m, plan.pitches_m, strict=True)}

@@ -1,0 +1,170 @@
+"""The pose of a surface in the frame of its site, and what its uncertainty adds to positions.
+
+The model, and all signals of a surface, are in the frame of the surface: x outward, y left, z up.
+Several surfaces of one site share the frame of the site. A pose converts between the two.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rhs_isac_ros.model.arrays import numbers, read_only
+
+# Smallest eigenvalue of a covariance relative to the largest one, up to rounding.
+_MIN_EIGENVALUE = -1e-9
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """Position and orientation of a surface in the frame of its site, with their uncertainty.
+
+    The position x in the frame of the surface is the position R x + p of the site. The errors of
+    the pose are a shift t of the surface and a turn of the surface about itself, by a small
+    rotation vector a. Both are in the frame of the site and have the given covariance.
+
+    Raises ValueError if a value does not have the expected shape, is not finite, or is no
+    orientation or covariance.
+    """
+
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: p, x, y, z [m].
+    #: Quaternion x, y, z, w of any length but 0: the rotation R from the surface to the site.
+    quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    #: Standard deviations of each coordinate of t [m] and of a [deg], or the covariance [6, 6] of
+    #: t [m] and a [rad]. 0 for a pose that is known exactly.
+    uncertainty: tuple[float, ...] | tuple[tuple[float, ...], ...] = (0.02, 0.2)
+
+    def __post_init__(self) -> None:
+        """Convert every field to tuples of floats, and check it."""
+        position, quaternion, uncertainty = (
+            numbers(field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
+        for name, array, size in (('position_m', position, 3), ('quaternion', quaternion, 4)):
+            if array.shape != (size,):
+                raise ValueError(f'{name}: shape {array.shape}, expected [{size}]')
+        if not quaternion.any():
+            raise ValueError('quaternion: zeros, expected a length other than 0')
+        if uncertainty.shape not in ((2,), (6, 6)):
+            raise ValueError(f'uncertainty: shape {uncertainty.shape}, expected two standard '
+                             'deviations [m, deg] or a covariance [6, 6]')
+        if uncertainty.ndim == 1 and uncertainty.min() < 0:
+            raise ValueError(f'uncertainty: {uncertainty.min():g}, expected at least 0')
+        if uncertainty.ndim == 2:
+            _check_covariance('uncertainty', uncertainty)
+        for name, array in (('position_m', position), ('quaternion', quaternion),
+                            ('uncertainty', uncertainty)):
+            object.__setattr__(self, name, _nested(array))
+
+    @functools.cached_property
+    def origin(self) -> np.ndarray:
+        """The position p, float64 [3] [m], read-only."""
+        return read_only(np.array(self.position_m))
+
+    @functools.cached_property
+    def unit_quaternion(self) -> np.ndarray:
+        """The quaternion x, y, z, w of length 1, float64 [4], read-only."""
+        return read_only(np.array(self.quaternion) / np.linalg.norm(self.quaternion))
+
+    @functools.cached_property
+    def rotation(self) -> np.ndarray:
+        """The matrix R, float64 [3, 3], read-only."""
+        return read_only(rotation_matrix(np.array(self.quaternion)))
+
+    @functools.cached_property
+    def covariance(self) -> np.ndarray:
+        """Covariance of the shift [m] and the rotation vector [rad], float64 [6, 6], read-only."""
+        values = np.array(self.uncertainty)
+        if values.ndim == 1:
+            values = np.diag(np.repeat([values[0], math.radians(values[1])], 3)**2)
+        return read_only(values)
+
+    def to_site(self, positions: np.ndarray) -> np.ndarray:
+        """Convert positions, [..., 3] [m], from the frame of the surface to that of the site."""
+        return self.vectors_to_site(positions) + self.origin
+
+    def to_surface(self, positions: np.ndarray) -> np.ndarray:
+        """Convert positions, [..., 3] [m], from the frame of the site to that of the surface."""
+        return self.vectors_to_surface(positions - self.origin)
+
+    def vectors_to_site(self, vectors: np.ndarray) -> np.ndarray:
+        """Rotate vectors, such as velocities, [..., 3], into the frame of the site."""
+        return vectors @ self.rotation.T
+
+    def vectors_to_surface(self, vectors: np.ndarray) -> np.ndarray:
+        """Rotate vectors, such as velocities, [..., 3], into the frame of the surface."""
+        return vectors @ self.rotation
+
+    def covariances_to_site(self, covariances: np.ndarray) -> np.ndarray:
+        """Rotate covariances of vectors, [..., 3, 3], into the frame of the site."""
+        return self.rotation @ covariances @ self.rotation.T
+
+    def covariances_to_surface(self, covariances: np.ndarray) -> np.ndarray:
+        """Rotate covariances of vectors, [..., 3, 3], into the frame of the surface."""
+        return self.rotation.T @ covariances @ self.rotation
+
+    def spread(self, positions: np.ndarray) -> np.ndarray:
+        """Return the covariances that the pose adds to positions, float64 [N, 3, 3] [m^2].
+
+        The positions, float64 [N, 3] [m], and the covariances are in the frame of the site.
+        """
+        by_error = np.concatenate(
+            [np.broadcast_to(np.eye(3), (len(positions), 3, 3)),
+             -_cross_matrices(positions - self.origin)], axis=2)
+        return by_error @ self.covariance @ np.swapaxes(by_error, 1, 2)
+
+    def displaced(self, error: ArrayLike) -> 'Pose':
+        """Return the pose after an error: a shift [m] and a rotation vector [rad], [6]."""
+        shift, turn = np.split(numbers('error', error), 2)
+        angle = float(np.linalg.norm(turn))
+        half = np.append(turn * np.sinc(angle / (2 * math.pi)) / 2, math.cos(angle / 2))
+        moved = _nested(self.origin + shift)
+        turned = _nested(quaternion_product(half, np.array(self.quaternion)))
+        return dataclasses.replace(self, position_m=moved, quaternion=turned)
+
+
+    def error_of(self, other: 'Pose') -> np.ndarray:
+        """Return the error that displaces this pose to another one, float64 [6]; see `displaced`.
+
+        The rotation vector has a length of at most pi.
+        """
+        shift = other.origin - self.origin
+        turn = quaternion_product(other.unit_quaternion, self.unit_quaternion * [-1, -1, -1, 1])
+        turn = turn if turn[3] >= 0 else -turn
+        sine = float(np.linalg.norm(turn[:3]))
+        angle = 2 * math.atan2(sine, turn[3])
+        return np.append(shift, turn[:3] * (angle / sine if sine else 2.0))
+
+
+def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Return the rotation matrix [3, 3] of a quaternion x, y, z, w of any length except 0."""
+    x, y, z, w = quaternion / np.linalg.norm(quaternion)
+    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                     [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                     [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
+
+
+def quaternion_product(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the quaternion of two successive rotations: first `other`, then `one`."""
+    (u, a), (v, b) = (one[:3], one[3]), (other[:3], other[3])
+    return np.append(a * v + b * u + np.cross(u, v), a * b - u @ v)
+
+
+def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
+    """Return the matrices [N, 3, 3] whose products with a vector are cross products."""
+    return np.cross(vectors[:, None], np.eye(3)).swapaxes(1, 2)
+
+
+def _check_covariance(name: str, matrix: np.ndarray) -> None:
+    """Raise ValueError unless a matrix is symmetric and has no negative eigenvalues."""
+    scale = np.abs(matrix).max()
+    values = np.linalg.eigvalsh(matrix)
+    if (np.abs(matrix - matrix.T) > 1e-9 * scale).any() or values[0] < _MIN_EIGENVALUE * scale:
+        raise ValueError(f'{name}: smallest eigenvalue {values[0]:g}, expected a symmetric matrix '
+                         'without negative eigenvalues')
+
+
+def _nested(array: np.ndarray) -> Any:
+    """Return an array as tuples, which are hashable."""
+    return tuple(map(_nested, array)) if array.ndim else float(array)

@@ -1,0 +1,19 @@
+"""The executable ``receiver``: receives pilots with a surface that follows another one."""
+
+from typing import Any
+
+from rhs_isac_ros.protocol.receiver import Receiver, combiner
+from rhs_isac_ros.ros.role_node import RoleNode
+from rhs_isac_ros.ros.run import entry
+
+
+class ReceiverNode(RoleNode[Receiver]):
+    """The receiver of a surface without a base station, which serves once it has a codebook."""
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__('receiver', **node_options)
+        self.start(Receiver(self.scenario, combiner(self.scenario, self.values.seed),
+                            self.make_settings(self.values)), needs_codebook=True)
+
+
+main = entry('receiver', lambda: [ReceiverNode()])

@@ -1,0 +1,164 @@
+"""Mixtures of Gaussians over the position of a user, in the frame of the site.
+
+A mixture represents the posterior of one cycle, from one or several surfaces. It is Gaussian in
+Cartesian coordinates. Where a component is a curved sheet around a surface, `fusion` bends it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.model.arrays import log_sum, mixture_weights
+from rhs_isac_ros.model.gaussian import likelihood_loss, moments, symmetric
+from rhs_isac_ros.positioning.segments import concatenate, select
+
+# Components whose squared Mahalanobis distance is below this are merged.
+_MERGE_DISTANCE = 1.0
+# Components whose log-weight is below the heaviest by more than this are discarded.
+_WEIGHT_MARGIN = 18.0
+
+
+class Mixture(NamedTuple):
+    """A mixture of C Gaussians over D = 3 coordinates of a position, or 6 with the velocity.
+
+    Lengths are in metres, velocities in metres per second. Every method returns a new mixture.
+    """
+
+    log_weights: np.ndarray  #: Float64 [C]; the sum of the weights is the mass of the mixture.
+    means: np.ndarray  #: Float64 [C, D].
+    covariances: np.ndarray  #: Float64 [C, D, D].
+
+    @property
+    def log_mass(self) -> float:
+        """Logarithm of the integral of the density."""
+        return log_sum(self.log_weights)
+
+    @property
+    def probabilities(self) -> np.ndarray:
+        """Weights of the components with the sum 1, float64 [C]."""
+        return mixture_weights(self.log_weights)[0]
+
+    def normalised(self) -> 'Mixture':
+        """Return the mixture with a mass of 1."""
+        return self.weighted(-self.log_mass)
+
+    def weighted(self, log_factor: float | np.ndarray) -> 'Mixture':
+        """Return the mixture with its weights multiplied by a factor, given as its logarithm."""
+        return self._replace(log_weights=self.log_weights + log_factor)
+
+    def powered(self, exponent: float) -> 'Mixture':
+        """Return the mixture with the density of each component raised to a power."""
+        powered = self._replace(covariances=self.covariances / exponent)
+        return powered.weighted(exponent * self._log_peaks() - powered._log_peaks())
+
+    def widened(self, covariance: np.ndarray) -> 'Mixture':
+        """Return the mixture after independent errors, [D, D] or [C, D, D]; the mass stays."""
+        return self._replace(covariances=self.covariances + covariance)
+
+    def position(self) -> 'Mixture':
+        """Return the mixture of the position alone, D = 3."""
+        return self._replace(
+            means=self.means[:, :3], covariances=self.covariances[:, :3, :3])
+
+    def or_within(self, centre_m: np.ndarray, covariance: np.ndarray, probability: float
+                  ) -> 'Mixture':
+        """Add a component, wider than a region, for users who may be anywhere in the region.
+
+        The density is that of a uniform one with the given probability in a box whose squared
+        edges are the variances, [3, 3] [m^2]. Velocities have the same mean square as in the
+        mixture, the same in all directions.
+        """
+        size = self.means.shape[1]
+        mean, joint = np.zeros(size), np.zeros((size, size))
+        mean[:3], joint[:3, :3] = centre_m, covariance
+        if size > 3:
+            average, spread = (one[3:] for one in self.moments())
+            square = (average @ average + np.trace(spread[:, 3:])) / 3
+            joint[3:, 3:] = square * np.eye(size - 3)
+        # The peak of a Gaussian is lower than a uniform density of the same extent.
+        log_weight = np.log(probability) + 1.5 * np.log(2 * np.pi)
+        rest = self.weighted(np.log1p(-probability) - self.log_mass)
+        return concatenate(rest, Mixture(np.array([log_weight]), mean[None], joint[None]))
+
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean, float64 [D], and the covariance, float64 [D, D]."""
+        weights = self.probabilities
+        mean, between = moments(weights, self.means)
+        return mean, symmetric(np.tensordot(weights, self.covariances, axes=1) + between)
+
+    def log_density(self, points: np.ndarray) -> np.ndarray:
+        """Evaluate the logarithm of the density at points [..., D], float64 [...]."""
+        precision = np.linalg.inv(self.covariances)
+        offsets = points[..., None, :] - self.means
+        squares = np.einsum('...cp,cpq,...cq->...c', offsets, precision, offsets)
+        logs = self._log_peaks() - squares / 2
+        highest = logs.max(axis=-1, keepdims=True)
+        density: np.ndarray = highest[..., 0] + np.log(np.exp(logs - highest).sum(axis=-1))
+        return density
+
+    def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Draw n independent points, float64 [n, D]."""
+        chosen = rng.choice(len(self.means), size=n, p=self.probabilities)
+        roots = np.linalg.cholesky(self.covariances)[chosen]
+        normal = rng.standard_normal((n, self.means.shape[1], 1))
+        return self.means[chosen] + np.matmul(roots, normal)[..., 0]
+
+    def reduce(self, max_components: int, distance: float = _MERGE_DISTANCE) -> 'Mixture':
+        """Merge components close to a heavier one; discard light ones and any beyond the maximum.
+
+        A component is close to another one if its squared Mahalanobis distance from it, with the
+        covariance of the heavier one, is less than `distance`. Merging preserves the mass, the
+        mean and the covariance.
+        """
+        order = np.argsort(-self.log_weights, kind='stable')
+        order = order[self.log_weights[order] >= self.log_weights[order[0]] - _WEIGHT_MARGIN]
+        mixture = select(self, order)
+        precisions = np.linalg.inv(mixture.covariances)
+        group = np.full(len(order), -1)
+        for number in range(max_components):
+            free = group < 0
+            if not free.any():
+                break
+            leader = int(np.argmax(free))
+            offsets = mixture.means - mixture.means[leader]
+            squares = np.einsum('cp,cp->c', offsets @ precisions[leader], offsets)
+            squares[leader] = -1.0
+            group[free & (squares < distance)] = number
+        return mixture._merged(group)
+
+    def product(self, other: 'Mixture') -> 'Mixture':
+        """Return the product of two densities: one component for each pair, not normalised.
+
+        The other mixture may have fewer coordinates, which are the first ones of this mixture; it
+        then is a likelihood of these. The mass is the integral of the product.
+        """
+        n, size = len(self.means), other.means.shape[1]
+        first, second = np.divmod(np.arange(n * len(other.means)), len(other.means))
+        pairs = select(self, first)
+        offsets = other.means[second] - pairs.means[:, :size]
+        precision = np.linalg.inv(
+            pairs.covariances[:, :size, :size] + other.covariances[second])
+        gain = np.matmul(pairs.covariances[:, :, :size], precision)
+        log_weights = pairs.log_weights + other.log_weights[second] + (
+            np.linalg.slogdet(precision)[1] - size * np.log(2 * np.pi)) / 2
+        return Mixture(
+            log_weights - likelihood_loss(offsets, precision),
+            pairs.means + np.matmul(gain, offsets[..., None])[..., 0],
+            symmetric(pairs.covariances - np.matmul(gain, pairs.covariances[:, :size])))
+
+    def _log_peaks(self) -> np.ndarray:
+        """Return the logarithms of the densities of the components at their means, [C]."""
+        size = self.means.shape[1]
+        return self.log_weights - (
+            np.linalg.slogdet(self.covariances)[1] + size * np.log(2 * np.pi)) / 2
+
+    def _merged(self, group: np.ndarray) -> 'Mixture':
+        """Merge the components of each group; discard group -1."""
+        members = np.equal.outer(np.arange(group.max() + 1), group)
+        shares, log_weights = mixture_weights(np.where(members, self.log_weights, -np.inf))
+        means = shares @ self.means
+        offsets = self.means - means[group]
+        spread = self.covariances + offsets[:, :, None] * offsets[:, None, :]
+        size = means.shape[1]
+        covariances = (shares @ spread.reshape(len(group), -1)).reshape(-1, size, size)
+        return Mixture(log_weights, means, covariances)

@@ -1,0 +1,143 @@
+"""Peaks of the log-likelihood along the range, in windows that resolve the carriers of the bands.
+
+A maximum is located as if delays and amplitudes in its window were those of the centre, so that
+only the phases of the bands turn along the range. Its value takes the amplitude into account.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.positioning.lattice import Grid
+from rhs_isac_ros.positioning.segments import Segments
+from rhs_isac_ros.positioning.templates import Query, turns_at
+
+# Fine range steps per shortest wavelength; at least four are needed to resolve the posterior.
+_STEPS_PER_WAVELENGTH = 8
+
+
+class RangeWindows:
+    """Windows of similar widths that divide the range cells of a grid.
+
+    `range_m` and `width_m`, float64 [R], are their centres and widths; `turns`, complex64 [N_B,
+    N_SB, R], are the factors of `turns_at` in their centres.
+    """
+
+    def __init__(self, grid: Grid, wavenumbers: np.ndarray) -> None:
+        self._cell = grid.cell
+        counts = np.ceil(grid.widths_m / grid.widths_m.min() - 1e-9).astype(int)
+        self._of_cell = of_cell = Segments.of_counts(counts)
+        self.width_m = of_cell.repeat(grid.widths_m / counts)
+        low_m = of_cell.repeat(grid.ranges_m - grid.widths_m / 2)
+        self.range_m = low_m + (of_cell.places + 0.5) * self.width_m
+        self.turns = turns_at(wavenumbers, self.range_m).astype(np.complex64)
+
+    def of(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """List the W windows of (template, cell) pairs [K].
+
+        Returns the index from 0 to K - 1 of each window's pair, and of the window, int [W].
+        """
+        ranges = self._cell[cells]
+        of_pair = Segments.of_counts(self._of_cell.counts[ranges])
+        pair = of_pair.repeat(np.arange(len(cells)))
+        return pair, of_pair.repeat(self._of_cell.starts[ranges]) + of_pair.places
+
+
+class Candidates(NamedTuple):
+    """W windows of (template, cell) pairs in which peaks are possible, in order of the shots."""
+
+    shots: np.ndarray  # Shot of each, int [W], ascending.
+    cell: np.ndarray  # Index of the (template, cell) pair, int [W].
+    range_m: np.ndarray  # Centre, float64 [W] [m].
+    outputs: np.ndarray  # Matched-filter outputs of the bands at the centre, complex64 [N_B, W].
+    energy: np.ndarray  # Energy of the template at the centre, float32 [W].
+
+
+class Peaks(NamedTuple):
+    """P peaks along the range."""
+
+    shots: np.ndarray  # Shot of each, int [P].
+    cell: np.ndarray  # Index of the (template, cell) pair, int [P].
+    window_m: np.ndarray  # Centre of the window of range, float64 [P] [m].
+    range_m: np.ndarray  # Float64 [P] [m].
+    value: np.ndarray  # Log-likelihood, as if delays were those at `window_m`, float32 [P].
+    gain: np.ndarray  # Most likely gain [nepers], float64 [P].
+    outputs: np.ndarray  # Matched-filter outputs of the bands, complex64 [P, N_B].
+
+
+class PeakFinder:
+    """Search for peaks in windows, with known or with uniform phases of the bands.
+
+    Known phases: the log-likelihood is evaluated at fine steps across a window, in which the
+    carriers, float64 [N_B] [1/m], rotate. Uniform phases: it hardly changes within a window.
+    """
+
+    def __init__(self, width_m: float, wavelength_m: float, carriers: np.ndarray) -> None:
+        n_steps = int(np.ceil(width_m / wavelength_m * _STEPS_PER_WAVELENGTH))
+        # One more step at either end keeps every maximum inside some window.
+        self._step_m, self._carriers = width_m / n_steps, carriers
+        self._offsets_m = (np.arange(n_steps + 2) - (n_steps + 1) / 2) * self._step_m
+        turns = np.exp(1j * carriers * self._offsets_m[:, None])
+        self._turns = np.ascontiguousarray(turns.T.astype(np.complex64))
+        self._rotation = (2 * np.hstack([turns.real, -turns.imag])).astype(np.float32)
+
+    def find(self, windows: Candidates, query: Query) -> Peaks:
+        """Find all peaks in windows; their order follows the steps, not the shots."""
+        if query.prior.is_coarse:
+            return self._centres(windows, query)
+        return self._maxima(windows, query)
+
+    def _centres(self, windows: Candidates, query: Query) -> Peaks:
+        """Return the centre of every window."""
+        turns = np.ones_like(self._turns[:, :1])
+        (value,), (gain,) = _over_gain(_amplified(turns, windows, query), windows, query)
+        return Peaks(windows.shots, windows.cell, windows.range_m, windows.range_m, value, gain,
+                     windows.outputs.T.astype(complex))
+
+    def _maxima(self, windows: Candidates, query: Query) -> Peaks:
+        """Return the local maxima along the range, but not those at the ends of a window."""
+        if query.prior.phase_covariance.any():
+            along = _amplified(self._turns, windows, query)
+        else:
+            outputs = windows.outputs
+            along = self._rotation @ np.concatenate([outputs.real, outputs.imag])
+        along, gain = _over_gain(along, windows, query)
+        is_peak = along[1:-1] >= along[:-2]
+        is_peak &= along[1:-1] > along[2:]
+        step, window = np.nonzero(is_peak)
+        step += 1
+        # The vertex of a parabola through a maximum and the steps beside it.
+        before, highest, after = (along[step + side, window] for side in (-1, 0, 1))
+        slope, bend = (after - before) / 2, 2 * highest - after - before
+        offset = slope / np.maximum(bend, np.abs(slope) + 1e-9)
+        centre_m, energy = windows.range_m[window], windows.energy[window]
+        range_m = centre_m + self._offsets_m[step] + offset * self._step_m
+        # Within a window, amplitudes decrease with the range.
+        scale = centre_m / range_m
+        value = scale * (highest + slope * offset / 2 + energy) - scale**2 * energy
+        outputs = windows.outputs[:, window].T * np.exp(
+            1j * self._carriers * (range_m - centre_m)[:, None])
+        return Peaks(windows.shots[window], windows.cell[window], centre_m, range_m, value,
+                     gain[step, window], outputs)
+
+
+def _amplified(turns: np.ndarray, windows: Candidates, query: Query) -> np.ndarray:
+    """Return twice the amplitudes after the best rotation of the phases; `turns` are [N_B, S]."""
+    return 2 * query.prior.amplitude(turns[..., None] * windows.outputs[:, None])
+
+
+def _over_gain(doubled: np.ndarray, windows: Candidates, query: Query
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Maximise the log-likelihood over the gain, for twice the amplitude [S, W].
+
+    Returns the log-likelihood and the gain [nepers], [S, W]; the former overwrites `doubled`.
+    """
+    gain = np.broadcast_to(0.0, doubled.shape)
+    if query.prior.gain_std:
+        gain, n_rows = np.zeros_like(doubled), query.signals[0].size
+        for part in Segments.of_keys(windows.shots).slices:
+            energy = float(query.energies[windows.shots[part.start]])
+            doubled[:, part], gain[:, part] = query.prior.over_gain(
+                doubled[:, part] / 2, energy, n_rows)
+    doubled -= windows.energy
+    return doubled, gain

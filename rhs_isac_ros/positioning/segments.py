@@ -1,0 +1,70 @@
+"""Arrays whose rows belong together: rows of several arrays, and consecutive rows of a segment."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+# A named tuple of arrays with equal first dimensions.
+_Rows = TypeVar('_Rows', bound=tuple[np.ndarray, ...])
+
+
+def select(rows: _Rows, chosen: Any) -> _Rows:
+    """Select rows of a named tuple of arrays by their indices or by a mask."""
+    kind: Any = type(rows)
+    return kind(*(field[chosen] for field in rows))
+
+
+def concatenate(*parts: _Rows) -> _Rows:
+    """Concatenate the fields of named tuples of arrays."""
+    kind: Any = type(parts[0])
+    return kind(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+
+
+class Segments(NamedTuple):
+    """A division of M rows into N segments of consecutive rows, such as the points of each shot.
+
+    `sum`, `max` and `first` require that no segment is empty.
+    """
+
+    starts: np.ndarray  # Index of the first row of each segment, int [N].
+    counts: np.ndarray  # Number of rows in each segment, int [N].
+
+    @classmethod
+    def of_counts(cls, counts: np.ndarray) -> 'Segments':
+        """Return segments with these numbers of rows, int [N]."""
+        return cls(np.cumsum(counts) - counts, counts)
+
+    @classmethod
+    def of_keys(cls, keys: np.ndarray) -> 'Segments':
+        """Return the segments of rows with equal keys [M], which are in ascending order."""
+        changes = np.ones(len(keys), bool)
+        np.not_equal(keys[1:], keys[:-1], out=changes[1:])
+        starts = np.flatnonzero(changes)
+        return cls(starts, np.diff(starts, append=len(keys)))
+
+    @property
+    def slices(self) -> Iterator[slice]:
+        """The rows of each segment."""
+        return map(slice, self.starts.tolist(), (self.starts + self.counts).tolist())
+
+    @property
+    def places(self) -> np.ndarray:
+        """Number of rows before each row in its segment, int [M]."""
+        return np.arange(self.counts.sum()) - self.repeat(self.starts)
+
+    def sum(self, values: np.ndarray) -> np.ndarray:
+        """Add up values of the rows, [M, ...], in each segment, [N, ...]."""
+        return np.add.reduceat(values, self.starts)
+
+    def max(self, values: np.ndarray) -> np.ndarray:
+        """Return the largest value [M] in each segment, [N]."""
+        return np.maximum.reduceat(values, self.starts)
+
+    def first(self, values: np.ndarray) -> np.ndarray:
+        """Return the value of the first row of each segment, [N, ...]."""
+        return values[self.starts]
+
+    def repeat(self, values: np.ndarray) -> np.ndarray:
+        """Repeat a value of each segment, [N, ...], for each of its rows, [M, ...]."""
+        return np.repeat(values, self.counts, axis=0)

@@ -1,0 +1,189 @@
+"""A site: several surfaces around one region, and the position of a user from all of them."""
+
+import dataclasses
+import json
+import os
+import re
+from collections.abc import Mapping, Set
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
+from rhs_isac_ros.positioning.agreement import Pair, pair_agreements
+from rhs_isac_ros.positioning.estimators import BayesEstimator
+from rhs_isac_ros.positioning.fusion import Fused, Sighting, fuse
+from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.files import read_yaml
+
+# Number of decimals of regions [m], and tolerance of their comparisons [m].
+_DECIMALS, _TOLERANCE_M = 6, 2e-6
+
+
+class SiteError(ValueError):
+    """A site file is invalid, or the surfaces of a site contradict each other."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SiteSurface:
+    """One surface of a site; its pose is that of the scenario."""
+
+    scenario: Scenario
+    codebook: Codebook
+
+    @property
+    def pose(self) -> Pose:
+        """Pose of the surface in the frame of the site."""
+        return self.scenario.pose
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Site:
+    """Surfaces by their names, and the region of interest in the frame of the site.
+
+    Raises SiteError without surfaces, if a name is no name of a ROS namespace, if a codebook does
+    not fit, or if the region of a scenario does not contain that of the site.
+    """
+
+    surfaces: Mapping[str, SiteSurface]
+    bounds_m: np.ndarray  #: Lower and upper corner of the region, float64 [2, 3] [m].
+
+    def __post_init__(self) -> None:
+        """Check the surfaces."""
+        if not self.surfaces:
+            raise SiteError('surfaces: none, expected at least one')
+        for name, one in self.surfaces.items():
+            if not re.fullmatch('[a-z][a-z0-9_]*', name):
+                raise SiteError(f'surfaces: {name!r}, expected a name of small letters, digits '
+                                'and underscores')
+            with translated(ValueError, SiteError, name):
+                one.codebook.check(one.scenario)
+            low, high = one.scenario.roi_bounds_m
+            places = one.pose.to_surface(_corners(self.bounds_m))
+            if (places < low - _TOLERANCE_M).any() or (places > high + _TOLERANCE_M).any():
+                raise SiteError(
+                    f'{name}: roi_center_m {one.scenario.roi_center_m}, roi_size_m '
+                    f'{one.scenario.roi_size_m}, expected a region that contains that of the '
+                    f'site, from {places.min(axis=0).tolist()} to '
+                    f'{places.max(axis=0).tolist()} m in the frame of the surface')
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> 'Site':
+        """Read a site file; raise SiteError if it cannot be read or is invalid.
+
+        Paths in the file are relative to its folder. The region of a surface is the smallest box
+        in its own frame that contains the region of the site.
+        """
+        with translated(ValueError, SiteError):
+            content = read_yaml(path)
+        with translated((ValueError, TypeError, KeyError), SiteError, path):
+            content = _mapping('the file', content, {'roi_center_m', 'roi_size_m', 'surfaces'})
+            region = Scenario(
+                roi_center_m=content['roi_center_m'], roi_size_m=content['roi_size_m'])
+            if not isinstance(content['surfaces'], dict):
+                raise SiteError('surfaces: expected a mapping of names to surfaces')
+            bounds_m = region.roi_bounds_m
+            return cls({str(name): _surface(str(name), value, Path(path).parent, bounds_m)
+                        for name, value in content['surfaces'].items()}, bounds_m)
+
+    @property
+    def leader(self) -> str:
+        """Name of the surface whose base station leads: the first one."""
+        return next(iter(self.surfaces))
+
+    def simulate(self, positions: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Draw signals for users at positions [N, 3] [m], complex128 [N, N_B, N_SB F] by name.
+
+        Multipath, noise and impairments of different surfaces are independent.
+        """
+        return {name: MeasurementModel(one.scenario, one.codebook).sample(
+            one.pose.to_surface(positions), rng) for name, one in self.surfaces.items()}
+
+
+class SiteEstimator:
+    """The position of a user of a site, from the signals of one cycle."""
+
+    def __init__(self, site: Site, table_folder: Path | None = None) -> None:
+        self._site = site
+        self._estimators = {name: BayesEstimator(one.scenario, one.codebook, table_folder)
+                            for name, one in site.surfaces.items()}
+
+    def sightings(self, received: Mapping[str, np.ndarray]) -> dict[str, Sighting]:
+        """Return the likelihoods of the surfaces that have a position, by name.
+
+        `received` contains signals, complex128 [N_B, N_SB F], of some or all surfaces.
+        """
+        found = ((name, Sighting.of(self._estimators[name].posterior(signals),
+                                    self._site.surfaces[name].pose))
+                 for name, signals in received.items())
+        return {name: one for name, one in found if one is not None}
+
+    def draw_agreements(self, n: int, rng: np.random.Generator
+                        ) -> tuple[list[dict[Pair, float]], np.ndarray]:
+        """Draw `n` users, and return references and places for a `PoseTest`.
+
+        Users without a position are left out.
+        """
+        low, high = self._site.bounds_m
+        received = self._site.simulate(rng.uniform(low, high, size=(n, 3)), rng)
+        agreements, places = [], []
+        for cycle in range(n):
+            sightings = self.sightings(
+                {name: of_surface[cycle] for name, of_surface in received.items()})
+            if sightings:
+                agreements.append(pair_agreements(sightings, self._site.bounds_m))
+                fused = fuse(list(sightings.values()), self._site.bounds_m)
+                places.append(fused.mixture.moments()[0])
+        return agreements, np.array(places).reshape(-1, 3)
+
+    def estimate(self, received: Mapping[str, np.ndarray]) -> Fused | None:
+        """Return the posterior in the frame of the site; None if no surface has a position."""
+        sightings = self.sightings(received)
+        return fuse(list(sightings.values()), self._site.bounds_m) if sightings else None
+
+
+def site_text(path: str | Path, poses: Mapping[str, Pose], folder: Path) -> str:
+    """Return the content of a site file with other poses of some surfaces, by name.
+
+    Paths in the result are relative to `folder`.
+    """
+    content = read_yaml(path)
+    for name, surface in content['surfaces'].items():
+        surface.update({key: os.path.relpath(Path(path).parent / surface[key], folder)
+                        for key in ('scenario', 'codebook')})
+        if name in poses:
+            # Of JSON, because YAML would refer to values that occur twice.
+            surface['pose'] = json.loads(json.dumps(dataclasses.asdict(poses[name])))
+    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+
+
+def _corners(bounds_m: np.ndarray) -> np.ndarray:
+    """Return the corners of a box with bounds [2, 3] [m], float64 [8, 3] [m]."""
+    return np.stack(np.meshgrid(*bounds_m.T), axis=-1).reshape(-1, 3)
+
+
+def _surface(name: str, value: Any, folder: Path, bounds_m: np.ndarray) -> SiteSurface:
+    content = _mapping(name, value, {'scenario', 'codebook'}, {'pose'})
+    with translated(ValueError, SiteError, name):
+        scenario = Scenario.from_yaml(folder / content['scenario'])
+        if 'pose' in content:
+            scenario = dataclasses.replace(scenario, pose=content['pose'])
+        # Rounded, so that errors of the rotation do not change the identifier of the scenario.
+        places = np.round(scenario.pose.to_surface(_corners(bounds_m)), _DECIMALS) + 0.0
+        low, high = places.min(axis=0), places.max(axis=0)
+        scenario = dataclasses.replace(
+            scenario, roi_center_m=(low + high) / 2, roi_size_m=high - low)
+        return SiteSurface(scenario, Codebook.load(folder / content['codebook']))
+
+
+def _mapping(place: str, content: Any, required: Set[str], optional: Set[str] = frozenset()
+             ) -> dict[str, Any]:
+    """Return a mapping with the required keys and none beyond the optional ones."""
+    if not isinstance(content, dict) or not required <= content.keys() <= required | optional:
+        keys = sorted(map(str, content)) if isinstance(content, dict) else content
+        raise SiteError(f'{place}: {keys}, expected the keys {sorted(required)}'
+                        + (f' and, if needed, {sorted(optional)}' if optional else ''))
+    return content

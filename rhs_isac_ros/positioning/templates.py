@@ -1,0 +1,249 @@
+"""Templates of the mean signals, and their energies and derivatives in the cells of the grid.
+
+A template is a mean signal times the range, without the carriers of its sub-bands: exp(i k_n r) r
+mu_n(p). It changes with the direction at the resolution of the aperture, but with the range only
+through the curvature of the wavefront, so many ranges share one template.
+"""
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import read_only
+from rhs_isac_ros.model.gaussian import quadratic_form
+from rhs_isac_ros.model.geometry import to_positions
+from rhs_isac_ros.positioning.lattice import (
+    PHASE_ERROR,
+    Expansion,
+    Grid,
+    Resolution,
+    lay_grid,
+    subband_wavenumbers,
+    whiten,
+)
+from rhs_isac_ros.positioning.likelihood import NuisancePrior
+from rhs_isac_ros.positioning.segments import Segments
+from rhs_isac_ros.support.threads import map_blocks
+
+# Number of points that represent a standard Gaussian.
+N_NORMAL = 128
+# Number of templates computed at a time.
+_BLOCK = 128
+# Number of positions in the second moments of the means, in the region and in a part of it.
+_N_MOMENTS = 1024
+_N_PART_MOMENTS = 32
+# Largest mean energy of a component of the whitened signals. The error of a template is about
+# `PHASE_ERROR` times its amplitude, so it does not exceed the noise.
+_MAX_ENERGY = 1 / PHASE_ERROR**2
+# Error within a range cell, as a share of the energy of the template.
+_CELL_ERROR = 0.015
+
+
+def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None = None,
+             grid: Grid | None = None) -> dict[str, np.ndarray]:
+    """Compute the arrays of a `TemplateTable`, for G templates and C pairs of template and cell.
+
+    The table covers a grid, by default that of the region. The arrays are ``filters``, the
+    conjugate templates, complex64 [N_B, N_SB, G, F]; ``slope_filters``, their derivatives with
+    respect to (r [m], u, v), complex64 [N_B, N_SB, G, 3, F]; ``energy`` of the whitened means,
+    float32 [C]; ``energy_slope``, its derivative, float32 [C, 3]; ``template_energy`` and
+    ``error``, energies of the whitened templates and of their differences from the means,
+    float32 [C]; ``curvature`` of the log-likelihood, float64 [C, 3, 3]; ``spread``, the mean
+    of the outer products of the whitened means, ``limiter``, which multiplies whitened
+    signals, and ``whitener``, which whitens and limits signals, complex128 [N_B, N_SB F, N_SB
+    F]; and ``normal``, points that represent a standard Gaussian, float64 [128, 3]. Energies
+    and derivatives are those of limited means.
+    """
+    part, grid = grid, grid or lay_grid(model.scenario)
+    n_bands, n_rows = model.shape
+    points = grid.points
+    n_subbands = subband_wavenumbers(model.scenario).shape[1]
+    shape = n_bands, n_subbands, len(grid.nodes)
+    n_frames, n_cells = n_rows // n_subbands, len(grid.cell)
+    table = {
+        'filters': np.empty((*shape, n_frames), np.complex64),
+        'slope_filters': np.empty((*shape, 3, n_frames), np.complex64),
+        'energy': np.empty(n_cells, np.float32),
+        'energy_slope': np.empty((n_cells, 3), np.float32),
+        'template_energy': np.empty(n_cells, np.float32),
+        'error': np.empty(n_cells, np.float32),
+        'curvature': np.empty((n_cells, 3, 3)),
+        'normal': standard_normal(N_NORMAL),
+    }
+    table['spread'], table['limiter'] = _moments(model, _positions_in(model.scenario, part))
+    table['whitener'] = np.matmul(table['limiter'], model.whitener)
+    by_node = np.argsort(grid.node, kind='stable')
+    of_node = Segments.of_counts(np.bincount(grid.node, minlength=len(grid.nodes)))
+
+    def fill(start: int) -> None:
+        nodes = slice(start, min(start + _BLOCK, len(grid.nodes)))
+        expansion = Expansion.of(model, grid.nodes[nodes])
+        by_frame = expansion.mean.conj().reshape(-1, n_bands, n_subbands, n_frames)
+        table['filters'][:, :, nodes] = np.moveaxis(by_frame, 0, 2)
+        by_frame = expansion.slopes.conj().reshape(-1, 3, n_bands, n_subbands, n_frames)
+        table['slope_filters'][:, :, nodes] = np.moveaxis(by_frame, (0, 1), (2, 3))
+        first, n = of_node.starts[start], of_node.counts[nodes].sum()
+        for cells in np.array_split(by_node[first:first + n], -(-n // _BLOCK)):
+            index = grid.node[cells] - start
+            white = whiten(table['whitener'], *expansion.at(index, points[cells]))
+            template = whiten(table['whitener'], expansion.template_at(index, points[cells, 0]))
+            table['template_energy'][cells] = np.sum(np.abs(template)**2, axis=(1, 2, 3))
+            table['error'][cells] = np.sum(np.abs(template - white[:, :1])**2, axis=(1, 2, 3))
+            form = quadratic_form(white.reshape(len(cells), 4, -1))
+            table['energy'][cells] = form[:, 0, 0] / 2
+            table['energy_slope'][cells] = form[:, 0, 1:]
+            table['curvature'][cells] = form[:, 1:, 1:]
+
+    map_blocks(fill, range(0, len(grid.nodes), _BLOCK), progress)
+    return table
+
+
+def _positions_in(scenario: Scenario, part: Grid | None) -> np.ndarray:
+    """Return evenly spread positions in the region, or in the box of a part of its grid."""
+    low, high = scenario.roi_bounds_m
+    if part is None:
+        return low + (high - low) * _unit_points()
+    centres = to_positions(part.points)
+    low, high = (np.clip(edge, low, high) for edge in (centres.min(axis=0), centres.max(axis=0)))
+    return low + (high - low) * _unit_points()[:_N_PART_MOMENTS]
+
+
+@functools.cache
+def _unit_points() -> np.ndarray:
+    """Return quasi-random points in the unit cube, read-only."""
+    from scipy.stats import qmc
+
+    return read_only(qmc.Sobol(3, seed=0).random(_N_MOMENTS))
+
+
+def _moments(model: MeasurementModel, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return `spread` and `limiter` of `tabulate`.
+
+    Where sub-bands fade alike, the energy of some components of whitened signals is so large that
+    errors of templates in them outweigh all else. The limiter scales such a component to the mean
+    energy `_MAX_ENERGY`. For the limiter, stronger signals are scaled down to the median energy.
+    """
+    white = np.matmul(
+        np.moveaxis(model.mean(positions), 1, 0), np.swapaxes(model.whitener, 1, 2))
+    energy = np.sum(np.abs(white)**2, axis=(0, 2))
+    shares = np.minimum(np.median(energy) / np.maximum(energy, np.finfo(float).tiny), 1.0)
+    spread, typical = (np.matmul(np.swapaxes(white * weights[:, None], 1, 2), white.conj())
+                       / len(positions) for weights in (np.ones(len(positions)), shares))
+    energies, components = np.linalg.eigh(typical)
+    scale = 1 / np.sqrt(np.maximum(energies / _MAX_ENERGY, 1.0)) - 1
+    limiter = np.eye(spread.shape[1]) + np.matmul(
+        components * scale[:, None], np.conj(np.swapaxes(components, 1, 2)))
+    return spread, limiter
+
+
+@functools.cache
+def standard_normal(n: int, size: int = 3) -> np.ndarray:
+    """Return points that represent a Gaussian, float64 [n, size]; n is a power of two.
+
+    The array is read-only.
+    """
+    # The points are kept with the table because these imports take longer than loading a table.
+    from scipy.special import ndtri
+    from scipy.stats import qmc
+
+    return read_only(ndtri(np.clip(qmc.Sobol(size, seed=0).random(n), 1e-6, 1 - 1e-6)))
+
+
+class Filters(NamedTuple):
+    """Matched filters for the G templates; the fields are arrays of `tabulate`."""
+
+    templates: np.ndarray
+    slopes: np.ndarray
+    limiter: np.ndarray
+    whitener: np.ndarray
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, np.ndarray]) -> 'Filters':
+        """Take the filters from the result of `tabulate`."""
+        return cls(*(arrays[name] for name in ('filters', 'slope_filters', 'limiter', 'whitener')))
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the likelihood is exact, apart from the errors of the templates."""
+        return bool((self.limiter == np.eye(self.limiter.shape[1])).all())
+
+    def apply(self, whitened: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Filter the whitened signals of N shots, complex128 [N, N_B, N_SB F].
+
+        Returns signals weighted with the inverse covariance, complex64 [N, N_B, N_SB, F]; filter
+        outputs, complex64 [N, N_B, N_SB, G]; and energies of limited signals, float64 [N].
+        """
+        limited = np.matmul(np.swapaxes(whitened, 0, 1), np.swapaxes(self.limiter, 1, 2))
+        weighted = np.swapaxes(np.matmul(limited, self.whitener.conj()), 0, 1)
+        n, n_bands = weighted.shape[:2]
+        signals = weighted.reshape(n, n_bands, -1, self.templates.shape[3]).astype(np.complex64)
+        outputs = np.matmul(self.templates, np.moveaxis(signals, 0, 3))
+        return (signals, np.ascontiguousarray(np.moveaxis(outputs, 3, 0)),
+                np.sum(np.abs(limited)**2, axis=(0, 2)))
+
+
+class Cells(NamedTuple):
+    """Energies of the means and curvatures of the log-likelihood in the C (template, cell) pairs.
+
+    Energies are those at the centre of the cell.
+    """
+
+    range_m: np.ndarray  # Centre of the range cell, float64 [C] [m].
+    energy: np.ndarray  # Energy of the whitened template, float32 [C].
+    mean_energy: np.ndarray  # Energy of the whitened mean, float32 [C].
+    energy_slope: np.ndarray  # Derivative of `mean_energy`, float32 [C, 3].
+    # Derivative with respect to the range of `mean_energy` times the squared range, divided by the
+    # squared range, float64 [C].
+    along: np.ndarray
+    curvature: np.ndarray  # Float64 [C, 3, 3].
+    inverse: np.ndarray  # Inverse of `curvature`, float32 [C, 3, 3].
+    # Largest loss of log-likelihood between the directions of the grid, and due to the curvature
+    # of the wavefront, float64 [C].
+    loss: np.ndarray
+
+    @classmethod
+    def of(cls, grid: Grid, resolution: Resolution, arrays: Mapping[str, np.ndarray]) -> 'Cells':
+        """Take the energies and curvatures from the result of `tabulate`."""
+        energy, slope, range_m = arrays['energy'], arrays['energy_slope'], grid.ranges_m[grid.cell]
+        curvature = arrays['curvature'] + np.diag(resolution.curvature_floor)
+        half = PHASE_ERROR * resolution.direction
+        across = np.abs(arrays['curvature'][:, 1:, 1:])
+        loss = np.einsum('a,cab,b->c', half, across, half) / 2 + (
+            arrays['error'] + _CELL_ERROR * energy)
+        return cls(
+            range_m, arrays['template_energy'], energy, slope, slope[:, 0] + 2 * energy / range_m,
+            curvature, np.linalg.inv(curvature).astype(np.float32), loss)
+
+    def energy_at(self, cells: np.ndarray, range_m: np.ndarray) -> np.ndarray:
+        """Return the energies of templates [K] at ranges in their cells, float32 [K]."""
+        return self._at(self.energy[cells], cells, range_m)
+
+    def mean_energy_at(self, cells: np.ndarray, range_m: np.ndarray) -> np.ndarray:
+        """Return the energies of means [K] at ranges in their cells, float32 [K]."""
+        return self._at(self.mean_energy[cells], cells, range_m)
+
+    def _at(self, energy: np.ndarray, cells: np.ndarray, range_m: np.ndarray) -> np.ndarray:
+        # Apart from its decrease with the squared range, the energy is linear within a cell.
+        cell_m = self.range_m[cells]
+        change = self.along[cells] * (range_m - cell_m)
+        return ((cell_m / range_m)**2 * (energy + change)).astype(np.float32)
+
+
+class Query(NamedTuple):
+    """Signals of N shots, prepared for comparison with the templates of the grid."""
+
+    signals: np.ndarray  # Weighted with the inverse covariance, complex64 [N, N_B, N_SB, F].
+    outputs: np.ndarray  # Filter outputs for all templates, complex64 [N, N_B, N_SB, G].
+    energies: np.ndarray  # Energies of the whitened signals, float64 [N].
+    bound: np.ndarray  # Bound of the log-likelihood in each cell, [N, C].
+    prior: NuisancePrior
+    # Negative logarithm of the share of the posterior that may be left out, [1] or for each cell.
+    margin: np.ndarray
+
+
+def turns_at(wavenumbers: np.ndarray, ranges_m: np.ndarray) -> np.ndarray:
+    """Return ratios of conjugate means to conjugate templates at ranges, [N_B, N_SB, R]."""
+    return np.exp(1j * wavenumbers[..., None] * ranges_m) / ranges_m

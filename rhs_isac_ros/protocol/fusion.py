@@ -1,0 +1,245 @@
+"""The fusion of a site, which multiplies the posteriors of its surfaces, and tests their poses."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from rhs_isac_ros.positioning.agreement import PoseTest, pair_agreements
+from rhs_isac_ros.positioning.fusion import Fused, Sighting, fuse
+from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.site import Site
+from rhs_isac_ros.positioning.tracking import MixtureTracker, Motion
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import (
+    AgreementsDrawn,
+    Event,
+    Outcome,
+    PublishTrack,
+    SettingsOffered,
+)
+from rhs_isac_ros.protocol.role import NewestDict, Role
+from rhs_isac_ros.protocol.settings import FusionSettings, PendingSettings
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
+
+# Limits of the probability that a mixture does not contain the position of the user.
+_LEAST_MISSING, _MOST_MISSING = 1e-9, 0.999
+# This probability, at least, for a surface whose pose may be wrong.
+_SUSPECT_MISSING = 0.5
+# Number of successive cycles without an answer after which a surface is silent.
+_MAX_MISSED = 3
+# Number of cycles that are remembered, and of those that wait for answers.
+_MAX_CLOSED, _MAX_OPEN = 256, 64
+
+
+def posterior_of(source: object, sighting: Sighting, **fields: float | int) -> m.Posterior:
+    """Return the message about a likelihood, with the cycle, user and codebook of a source."""
+    mixture, pose = sighting.mixture.normalised(), sighting.pose
+    return m.derive(
+        m.Posterior, source, log_weights=mixture.log_weights, means=mixture.means,
+        covariances_m2=mixture.covariances, log_evidence=sighting.mixture.log_mass,
+        missing_probability=float(np.clip(sighting.missing, _LEAST_MISSING, _MOST_MISSING)),
+        surface_position_m=pose.origin, surface_quaternion=pose.unit_quaternion,
+        surface_uncertainty=pose.covariance, **fields)
+
+
+def sighting_of(message: m.Posterior) -> Sighting:
+    """Return the likelihood in a message."""
+    mixture = Mixture(message.log_weights, message.means, message.covariances_m2)
+    return Sighting(message.surface_pose, mixture.weighted(message.log_evidence),
+                    message.missing_probability)
+
+
+@dataclasses.dataclass
+class _Fix:
+    """The answers of the surfaces about one user in one cycle, by the names of the surfaces."""
+
+    due_s: float
+    answers: dict[str, m.Posterior | m.NoFix]
+
+    @property
+    def posteriors(self) -> dict[str, m.Posterior]:
+        """The answers that contain a position."""
+        return {name: answer for name, answer in sorted(self.answers.items())
+                if isinstance(answer, m.Posterior)}
+
+
+class Fusion(Role):
+    """The role that locates users from the posteriors of all surfaces of a site.
+
+    The scenario of an answer identifies its surface. A cycle is complete when all surfaces have
+    answered, or some time after the first answer. A surface that misses several cycles is silent,
+    and no cycle waits for it until it answers again. Fewer answers make a position less certain.
+    `stopwatch` returns a time [s], to measure latencies.
+    """
+
+    SENDS = (m.PositionEstimate, m.Posterior, m.NoFix)
+    RECEIVES = (m.Posterior, m.NoFix)
+
+    def __init__(self, site: Site, stopwatch: Callable[[], float],
+                 settings: FusionSettings | None = None) -> None:
+        super().__init__()
+        self._bounds_m, self._stopwatch = site.bounds_m, stopwatch
+        self._scenario = site.surfaces[site.leader].scenario
+        # Positions of the site are in front of the surface that leads.
+        self._pose = dataclasses.replace(self._scenario.pose, uncertainty=(0.0, 0.0))
+        self._names = {one.scenario.id: name for name, one in site.surfaces.items()}
+        self._settings = PendingSettings(settings or FusionSettings())
+        self._test: PoseTest | None = None
+        self._suspects: tuple[str, ...] = ()
+        # By user: the latest instance, and its track.
+        self._tracks: NewestDict[int, tuple[int, MixtureTracker]] = NewestDict(MAX_USERS)
+        # Number of successive cycles without an answer of each surface.
+        self._missed = dict.fromkeys(site.surfaces, 0)
+        # By cycle and user.
+        self._open: NewestDict[tuple[int, int], _Fix] = NewestDict(_MAX_OPEN)
+        self._closed: NewestDict[tuple[int, int], None] = NewestDict(_MAX_CLOSED)
+
+    def next_deadline(self) -> float | None:
+        """Return the time at which the wait for answers ends [s], or None."""
+        return min((fix.due_s for fix in self._open.values()), default=None)
+
+    def status(self) -> Mapping[str, str]:
+        """Return the settings, silent surfaces, wrong poses, and deviations of agreements.
+
+        ``agreement.<one>.<other>`` is how far two surfaces are from agreeing, in standard
+        deviations.
+        """
+        deviations = self._test.deviations() if self._test else {}
+        return self._settings.describe() | {
+            f'agreement.{one}.{other}': f'{value:.2f}'
+            for (one, other), value in deviations.items()} | {
+            f'warning.silent.{name}': _silent(name) for name in self._missed
+            if self._is_silent(name)} | (
+            {'warning.poses': _wrong_poses(self._suspects)} if self._suspects else {})
+
+    def react(self, event: Event) -> None:
+        """Process an event, then locate the users of the cycles that are complete or due."""
+        match event:
+            case SettingsOffered(settings):
+                self._settings.latest = settings
+                self.log(self._settings.apply())
+            case AgreementsDrawn(references, places) if references:
+                self._test = PoseTest(references, places)
+            case m.Posterior() | m.NoFix():
+                self._receive(event)
+        for key in [key for key, fix in self._open.items() if self._is_ready(fix)]:
+            self._close(key, self._open.pop(key))
+
+    def _is_silent(self, name: str) -> bool:
+        return self._missed[name] >= _MAX_MISSED
+
+    def _is_ready(self, fix: _Fix) -> bool:
+        return self.now_s >= fix.due_s or all(
+            name in fix.answers or self._is_silent(name) for name in self._missed)
+
+    def _receive(self, message: m.Posterior | m.NoFix) -> None:
+        name, key = self._names.get(message.scenario_id), (message.cycle_id, message.user)
+        if name is None:
+            self.count(Outcome.WRONG_SCENARIO)
+            return
+        if self._is_silent(name):
+            self.log_state(f'surface {name}', f'surface {name} answers again', False)
+        self._missed[name] = 0
+        fix = self._open.get(key)
+        if key in self._closed:
+            self.count(Outcome.STALE)
+        elif fix is None:
+            due_s = self.now_s + self._settings.in_use.wait_s
+            self.count(Outcome.OVERFLOW, self._open.put(key, _Fix(due_s, {name: message})))
+        elif name in fix.answers:
+            self.count(Outcome.DUPLICATE)
+        else:
+            fix.answers[name] = message
+
+    def _close(self, key: tuple[int, int], fix: _Fix) -> None:
+        self._closed.put(key, None)
+        for name in self._missed.keys() - fix.answers.keys():
+            self._missed[name] += 1
+            if self._missed[name] == _MAX_MISSED:
+                self.log_state(f'surface {name}', _silent(name), True)
+        if not fix.posteriors:
+            self._no_fix(fix)
+            return
+        begin = self._stopwatch()
+        sightings = {name: sighting_of(one) for name, one in fix.posteriors.items()}
+        # Anything may be published on the topic, such as a mixture inside the surface.
+        try:
+            fused = fuse([self._trusted(name, one) for name, one in sightings.items()],
+                         self._bounds_m)
+            agreements = pair_agreements(sightings, self._bounds_m) if self._test else {}
+        except ValueError as error:
+            self.counters['malformed'] += 1
+            self.log(f'cycle {key[0]} of user {key[1]}: {error}', warning=True, key='malformed')
+            return
+        self._publish(fix, sightings, fused, self._stopwatch() - begin)
+        if self._test:
+            self._test.add(agreements, fused.mixture.moments()[0])
+            self._examine(self._test.suspects())
+
+    def _trusted(self, name: str, sighting: Sighting) -> Sighting:
+        """Return a sighting with less weight if the pose of its surface may be wrong."""
+        if name not in self._suspects:
+            return sighting
+        return sighting._replace(missing=max(sighting.missing, _SUSPECT_MISSING))
+
+    def _publish(self, fix: _Fix, sightings: Mapping[str, Sighting], fused: Fused,
+                 latency_s: float) -> None:
+        answers = fix.posteriors
+        source = next(iter(answers.values()))
+        mean, covariance = fused.mixture.moments()
+        common = {
+            'stamp_ns': source.stamp_ns,
+            'outside_probability': max(one.outside_probability for one in answers.values()),
+            # From all surfaces.
+            'blocked_probability': math.prod(
+                one.blocked_probability for one in answers.values())}
+        self.send(m.derive(
+            m.PositionEstimate, source, position=mean, covariance_m2=covariance,
+            crlb_m2=math.nan, estimator=f'fusion of {", ".join(answers)}', latency_s=latency_s,
+            **common))
+        # The agreement is relative to a different user at each surface.
+        volume = (len(answers) - 1) * float(np.log(np.ptp(self._bounds_m, axis=0)).sum())
+        log_evidence = fused.log_agreement - volume + sum(
+            one.log_evidence for one in answers.values())
+        missing = math.prod(one.missing for one in sightings.values())
+        self.send(posterior_of(source, Sighting(
+            self._pose, fused.mixture.weighted(log_evidence), missing), **common))
+        self._track(source, fused.mixture, missing)
+
+    def _track(self, source: m.Posterior, mixture: Mixture, missing: float) -> None:
+        """Update the track of a user and publish it, unless the cycle is late."""
+        instance, tracker = self._tracks.get(source.user, (0, None))
+        if tracker is None or not m.same_instance(instance, source.user_instance):
+            tracker = MixtureTracker(
+                self._scenario, self._bounds_m, Motion(self._settings.in_use.track_speed_mps))
+        self._tracks.put(source.user, (source.user_instance, tracker))
+        estimate = tracker.update(source.time_s(self.now_s), mixture, missing)
+        if estimate:
+            self.act(PublishTrack(source.user, estimate, source.stamp_ns))
+
+    def _no_fix(self, fix: _Fix) -> None:
+        source = next(iter(fix.answers.values()))
+        self.count(Outcome.NO_FIX)
+        self.send(m.derive(m.NoFix, source, stamp_ns=source.stamp_ns, reason='; '.join(
+            f'{name}: {answer.reason}' for name, answer in sorted(fix.answers.items())
+            if isinstance(answer, m.NoFix))))
+
+    def _examine(self, suspects: tuple[str, ...]) -> None:
+        """Log when poses begin or cease to be suspect."""
+        if suspects != self._suspects:
+            self._suspects = suspects
+            self.log_state(
+                'poses', _wrong_poses(suspects) if suspects else 'the surfaces agree again',
+                bool(suspects))
+
+
+def _silent(name: str) -> str:
+    return f'surface {name} is silent; positions are less certain without it'
+
+
+def _wrong_poses(suspects: tuple[str, ...]) -> str:
+    if len(suspects) == 1:
+        return f'surface {suspects[0]} disagrees with the others: its pose is wrong'
+    return f'surfaces {", ".join(suspects)} disagree: a pose is wrong'

@@ -1,0 +1,168 @@
+"""The receiver of a surface that follows the cycles of another surface's base station."""
+
+import dataclasses
+import enum
+from collections.abc import Callable
+
+import numpy as np
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.measurement import receive_feeds
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import CodebookOffered, Outcome, SettingsOffered
+from rhs_isac_ros.protocol.role import ANY, Row, StateMachine, on
+from rhs_isac_ros.protocol.settings import PendingSettings, ReceiverSettings
+from rhs_isac_ros.support import streams
+
+# Combines the signals at the feeds: (codebook, feeds [N_B, F, N_SB, K], user, cycle_id, whether to
+# add noise) to complex128 [N_B, N_SB, F].
+Combine = Callable[[Codebook, np.ndarray, int, int, bool], np.ndarray]
+
+
+def combiner(scenario: Scenario, seed: int) -> Combine:
+    """Return the combination of a receiver whose noise depends on the seed, user and cycle."""
+    def combine(codebook: Codebook, feeds: np.ndarray, user: int, cycle_id: int, noise: bool
+                ) -> np.ndarray:
+        rng = streams.generator(seed, streams.RECEIVER, user, cycle_id) if noise else None
+        return receive_feeds(scenario, codebook, feeds, rng)
+    return combine
+
+
+@dataclasses.dataclass
+class Reception:
+    """The signals of one cycle, as they arrive from a channel."""
+
+    cycle_id: int
+    codebook: Codebook | None = None  # latest codebook at the begin of the cycle
+    user: int = 0  # user of the cycle; 0 if there is none yet
+    # Instance of the user, from its acks or else from the first feed signals; 0 if unknown.
+    user_instance: int = 0
+    # Instance of the channel that sent the first signals; 0 if unknown.
+    channel: int = 0
+    # Feed signals by band, complex128 [F, N_SB, K].
+    signals: dict[int, np.ndarray] = dataclasses.field(default_factory=dict)
+    stamp_ns: int = 0  # time of the first feed signals [ns]; 0 if unknown
+
+    @property
+    def codebook_id(self) -> str:
+        """Id of the codebook; empty if there is none."""
+        return self.codebook.id if self.codebook else ''
+
+    def store(self, event: m.FeedSignals) -> None:
+        """Store the signals of a band, and the instances of user and channel if still unknown."""
+        self.user_instance = self.user_instance or event.user_instance
+        self.channel = self.channel or event.sender
+        self.stamp_ns = self.stamp_ns or event.stamp_ns
+        self.signals[event.band] = event.signals
+
+    def combined(self, combine: Combine, noise: bool) -> m.ReceivedSignals:
+        """Combine the signals of all bands, which must be complete; `noise` adds noise."""
+        assert self.codebook
+        feeds = np.stack([signals for _, signals in sorted(self.signals.items())])
+        return m.derive(
+            m.ReceivedSignals, self, stamp_ns=self.stamp_ns, signals=combine(
+                self.codebook, feeds, self.user, self.cycle_id, noise))
+
+
+class State(enum.Enum):
+    """States of the receiver."""
+
+    LISTENING = 'listening'  # waits for a grant
+    SOUNDING = 'sounding'    # waits for the feed signals of all bands
+
+
+class Receiver(StateMachine):
+    """The role that receives the pilots of each granted cycle with a surface of its own.
+
+    Pilots are uplink, so all surfaces receive the same ones. The receiver commands its surface
+    when another surface's base station grants a cycle. It requests no repetition: signals that
+    are incomplete when the next cycle begins are discarded.
+    """
+
+    SENDS = (m.RhsCommand, m.ReceivedSignals)
+
+    STATES = State
+
+    def __init__(self, scenario: Scenario, combine: Combine,
+                 settings: ReceiverSettings | None = None) -> None:
+        super().__init__(State.LISTENING)
+        self._combine = combine
+        self._bands = frozenset(range(scenario.n_bands))
+        self._settings = PendingSettings(settings or ReceiverSettings())
+        self._codebook: Codebook | None = None
+        self._cycle = Reception(0)
+
+    def status(self) -> dict[str, str]:
+        """Return the settings and the codebook in use."""
+        return self._settings.describe() | {'codebook_id': self._cycle.codebook_id}
+
+    # Guards
+
+    def _without_codebook(self, event: m.Grant) -> bool:
+        return self._codebook is None
+
+    def _same_cycle(self, event: m.Grant) -> bool:
+        return event.cycle_id == self._cycle.cycle_id and event.user == self._cycle.user
+
+    def _wrong_cycle(self, event: m.FeedSignals) -> bool:
+        return event.cycle_id != self._cycle.cycle_id
+
+    def _wrong_user(self, event: m.FeedSignals) -> bool:
+        return event.user != self._cycle.user
+
+    def _wrong_instance(self, event: m.FeedSignals) -> bool:
+        return not (m.same_instance(event.user_instance, self._cycle.user_instance)
+                    and m.same_instance(event.sender, self._cycle.channel))
+
+    def _duplicate_signals(self, event: m.FeedSignals) -> bool:
+        return event.band in self._cycle.signals
+
+    def _last_signals(self, event: m.FeedSignals) -> bool:
+        return self._cycle.signals.keys() | {event.band} == self._bands
+
+    # Steps
+
+    def _store_codebook(self, event: CodebookOffered) -> None:
+        self._codebook = event.codebook
+
+    def _apply_settings(self, event: SettingsOffered) -> None:
+        self._settings.latest = event.settings
+        self.log(self._settings.apply())
+
+    def _give_up(self, event: m.Grant) -> None:
+        user, missing = self._cycle.user, sorted(self._bands - self._cycle.signals.keys())
+        self.log_state(f'signals of user {user}', f'cycle {self._cycle.cycle_id}: no signals of '
+                       f'user {user} in the bands {missing}', True)
+
+    def _begin(self, event: m.Grant) -> None:
+        """Begin a cycle, and command the configurations of all bands."""
+        self._cycle = Reception(event.cycle_id, self._codebook, event.user,
+                                event.user_instance)
+        for band in sorted(self._bands):
+            self.send(m.derive(m.RhsCommand, self._cycle, band=band))
+
+    def _store_signals(self, event: m.FeedSignals) -> None:
+        self._cycle.store(event)
+
+    def _send_signals(self, event: m.FeedSignals) -> None:
+        cycle = self._cycle
+        self.send(cycle.combined(self._combine, self._settings.in_use.receiver_noise))
+        self.log_state(f'signals of user {cycle.user}', f'cycle {cycle.cycle_id}: signals of '
+                       f'user {cycle.user} in all bands', False)
+
+    TABLE = (
+        *on(CodebookOffered, 'codebook')(Row(ANY, (_store_codebook,))),
+        *on(SettingsOffered, 'settings')(Row(ANY, (_apply_settings,))),
+        *on(m.Grant, 'grant', {_without_codebook: Outcome.WRONG_CODEBOOK,
+                               _same_cycle: Outcome.DUPLICATE})(
+            Row((State.SOUNDING,), (_give_up, _begin), State.SOUNDING,
+                outcome=Outcome.INCOMPLETE),
+            Row((State.LISTENING,), (_begin,), State.SOUNDING)),
+        *on(m.FeedSignals, 'signals', {
+            _wrong_cycle: Outcome.WRONG_CYCLE, _wrong_user: Outcome.WRONG_USER,
+            _wrong_instance: Outcome.WRONG_INSTANCE, _duplicate_signals: Outcome.DUPLICATE})(
+            Row((State.SOUNDING,), (_store_signals, _send_signals), State.LISTENING,
+                guard=_last_signals),
+            Row((State.SOUNDING,), (_store_signals,))),
+    )

@@ -1,0 +1,68 @@
+"""Ends of commands: signals, errors of one line, exit codes, and streams that are closed."""
+
+import io
+import os
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+
+def on_end_signals(handler: Callable[[int, Any], Any] | signal.Handlers) -> None:
+    """Install a handler for SIGINT, SIGTERM and SIGHUP, which end a command.
+
+    SIGHUP, which a closed terminal sends, remains ignored under ``nohup``.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
+
+
+def print_error(error: object, program: str = '') -> None:
+    """Print an error to stderr after the prefix `program`, by default the name of this command."""
+    if not program:
+        spec = getattr(sys.modules['__main__'], '__spec__', None)
+        program = (f'python3 -m {spec.name.removesuffix(".__main__")}' if spec
+                   else os.path.basename(sys.argv[0]))
+    print(f'{program}: error: {error}', file=sys.stderr)
+
+
+def exit_code_of(
+        main: Callable[[], int | None], errors: tuple[type[Exception], ...] = (),
+        program: str = '') -> int:
+    """Run a main function and return the exit code, even if a standard stream is closed or fails.
+
+    The code is the result of `main` (0 for None); 0 if the reader of the output closes it early,
+    as ``head`` does; 1 if the output cannot be written; or 2 if `main` raises one of the `errors`.
+    In the last two cases, the error is printed. Other exceptions propagate.
+    """
+    # If a standard stream is closed, the next file to be opened would take its descriptor.
+    for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding='utf-8'))
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # The encoding of a locale may lack characters of a table.
+        sys.stdout.reconfigure(errors='backslashreplace')
+    try:
+        try:
+            return main() or 0
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        discard_stdout()
+        return 0
+    except errors as error:
+        print_error(error, program)
+        return 2
+    except OSError as error:
+        # Errors about a file have a file name; errors about the output do not.
+        if error.filename is not None:
+            raise
+        discard_stdout()
+        print_error(error, program)
+        return 1
+
+
+def discard_stdout() -> None:
+    """Redirect the standard output to `os.devnull`, so that Python can flush it at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,109 @@
+"""Limits on log lines about states that begin and end, and about events that repeat."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import NamedTuple
+
+# Time in which repeated changes of a state, or repetitions of an event, are only counted [s].
+PERIOD_S = 60.0
+# Maximum number of states and events, which bounds the memory.
+_MAX_RECORDS = 1024
+
+
+class Line(NamedTuple):
+    """A line of a log, which is a warning, an error or, by default, information."""
+
+    text: str
+    warning: bool
+    error: bool = False
+
+
+@dataclasses.dataclass
+class _Record:
+    """What was logged about a state or an event in a period."""
+
+    until_s: float  # end of the period [s]
+    holds: bool | None = None  # whether the state holds; None for an event
+    logged: set[bool | None] = dataclasses.field(default_factory=set)  # kinds of logged lines
+    suppressed: Line | None = None  # latest line, if it was not logged
+    n: int = 0  # number of changes or repetitions that were not logged
+
+
+class StateLog:
+    """Decides which lines about states and events a log contains.
+
+    The log contains the first begin and the first end of a state, and the first occurrence of an
+    event. Within a minute after that, further changes and occurrences are only counted. At the end
+    of the minute, if there were any, one line contains the latest text and their number, and the
+    next minute begins. After a minute without any, the state or event counts as new.
+
+    Each method returns the lines to log. Times `now_s` [s] are on a steady clock.
+    """
+
+    def __init__(self) -> None:
+        self._records: dict[str, _Record] = {}
+        # Texts of the states passed to `update`, by key.
+        self._states: dict[str, str] = {}
+
+    def state(self, key: str, line: Line, now_s: float, *, holds: bool = True) -> list[Line]:
+        """Log that a state begins or has another text (`holds`), or that it ends."""
+        return self._add(key, line, now_s, holds)
+
+    def event(self, key: str, line: Line, now_s: float) -> list[Line]:
+        """Log an event."""
+        return self._add(key, line, now_s, None)
+
+    def update(self, states: Mapping[str, str], now_s: float) -> list[Line]:
+        """Log the changes of a group of states; `states` contains the texts of those that hold."""
+        before, self._states = self._states, dict(states)
+        lines = []
+        for key, text in before.items() - states.items():
+            if key not in states:
+                lines += self.state(key, Line(f'no longer: {text}', False), now_s, holds=False)
+        for key, text in states.items() - before.items():
+            lines += self.state(key, Line(text, True), now_s)
+        return [*self.due(now_s), *sorted(lines)]
+
+    def due(self, now_s: float) -> list[Line]:
+        """Return the lines about what was not logged in the periods that have ended."""
+        lines = []
+        for key, record in list(self._records.items()):
+            if now_s < record.until_s:
+                continue
+            if record.suppressed is None:
+                del self._records[key]
+                continue
+            text, *severity = record.suppressed
+            what = 'time' if record.holds is None else 'change'
+            times = (f' ({record.n} {what}{"s"[:record.n != 1]} in {PERIOD_S:.0f} s)'
+                     if record.n else '')
+            lines.append(Line(text + times, *severity))
+            record.until_s, record.suppressed, record.n = now_s + PERIOD_S, None, 0
+        return lines
+
+    def renew(self) -> None:
+        """Treat states and events as new, because their cause is new.
+
+        States of the group that hold are older than the cause, and remain known.
+        """
+        self._records = {key: record for key, record in self._records.items()
+                         if record.holds and key in self._states}
+
+    def _add(self, key: str, line: Line, now_s: float, holds: bool | None) -> list[Line]:
+        lines = self.due(now_s)
+        record = self._records.get(key)
+        if record is None:
+            while len(self._records) >= _MAX_RECORDS:
+                del self._records[next(iter(self._records))]
+            record = self._records[key] = _Record(now_s + PERIOD_S)
+        is_change = holds is None or holds != record.holds
+        record.holds = holds
+        if holds not in record.logged:
+            record.logged.add(holds)
+            # The line also shows the current state, so nothing else remains to be logged.
+            if not record.n:
+                record.suppressed = None
+            return [*lines, line]
+        record.suppressed = line
+        record.n += is_change
+        return lines

@@ -1,0 +1,248 @@
+"""Codebooks that follow what is known about the position of a user.
+
+Problem: before a cycle, the position of a user is known to a standard deviation of 0.2 m in each
+coordinate. By how much does a codebook for this cell of the region, from a library, reduce the
+error, compared with the codebook for the whole region and the same prior? What happens if the
+prediction is wrong? How large are the errors of tracks whose codebook follows the prediction?
+
+True positions are drawn from the prior, whose centres are uniform in the region. Each position has
+a new estimator, which has not seen the codebook. A wrong prediction is 1, 2 or 3 m away from the
+position, in a random horizontal direction. The codebook is that of the wrong cell, and the
+position is estimated with the region as prior, or with the wrong prediction as prior.
+
+Tracks are those of walks between random positions, with a cycle each 0.1 s; multipath and noise
+are independent in each cycle. Cycles within the first two seconds are not counted.
+
+The intervals of ratios are from resampling positions or walks. The 95 % region is the ellipsoid of
+the covariance that contains 95 % of a Gaussian.
+"""
+
+import os
+
+# One thread, as in the positioner node. This must be set before NumPy is imported.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import argparse
+import functools
+import time
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from parts import frame
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.codebook.cell import Cell
+from rhs_isac_ros.codebook.library import Library
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.mobility import RandomWalk
+from rhs_isac_ros.positioning import BayesEstimator, Mixture, Motion, Tracker
+from rhs_isac_ros.support.arguments import input_file, integer
+
+PLANS = {'table1': ('table1.yaml', 'codebook.yaml'),
+         'bandplan': ('bandplan.yaml', 'codebook_bandplan.yaml')}
+STD_M = 0.2
+WRONG_M = (1.0, 2.0, 3.0)
+PERIOD_S, N_CYCLES, WARM_UP_S = 0.1, 40, 2.0
+
+
+class World(NamedTuple):
+    """One plan with its library."""
+
+    scenario: Scenario
+    fixed: Codebook
+    library: Library
+
+    def codebook_at(self, place: np.ndarray, std_m: float = STD_M) -> Codebook:
+        """Return the codebook for a predicted position, or the one for the whole region."""
+        return self.library.codebook_at(place, std_m) or self.fixed
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = frame.benchmark_parser('adaptive', __doc__, positions=2000)
+    parser.add_argument('--library', nargs=2, action='append', required=True,
+                        metavar=('PLAN', 'FILE'), help=f'one of {", ".join(PLANS)}, and a file of '
+                        'python3 -m rhs_isac_ros.codebook library')
+    parser.add_argument('--walks', type=integer(0, 10**5), default=200,
+                        help='number of walks')
+    options = parser.parse_args()
+    results = {}
+    for name, file in options.library:
+        if name not in PLANS:
+            parser.error(f'argument --library: {name}, expected one of {sorted(PLANS)}')
+        config, codebook = PLANS[name]
+        world = World(Scenario.from_yaml(frame.CONFIG / config),
+                      Codebook.load(frame.CONFIG / codebook), Library.load(input_file(file)))
+        world.library.check(world.scenario)
+        print(f'\n{name}: {len(world.library.codebooks)} codebooks, {options.positions} '
+              f'positions, {options.walks} walks, seed {options.seed}\n')
+        results[name] = measure(world, options)
+    frame.write_results(options.json, results)
+
+
+def measure(world: World, options: argparse.Namespace) -> dict:
+    """Measure one plan."""
+    table = frame.Table('codebook', 'mean squared error [m^2]', 'median [m]',
+                        'in the 95 % region [%]', 'CPU time of an estimate [ms]')
+    draw, noise, wrong, walks = map(
+        np.random.default_rng, np.random.SeedSequence(options.seed).spawn(4))
+    scenario, n = world.scenario, options.positions
+    centres = scenario.sample_positions(n, draw)
+    positions = np.concatenate([
+        Cell(tuple(centre), STD_M).positions(scenario, scenario.sample_positions(1, draw))
+        for centre in centres])
+    fixes = {}
+    for name, codebook_at in (('whole region', lambda _: world.fixed),
+                              ('cell', world.codebook_at)):
+        fixes[name], time_s = locate(
+            world, positions, centres, codebook_at, noise, new_estimator)
+        row(table, name, fixes[name], time_s)
+    found, reference = fixes['cell'], fixes['whole region']
+    ratio, *interval = ratio_interval(found.squared, reference.squared)
+    results = {
+        'ratio': ratio, 'ratio_interval': interval,
+        'median_m': np.median(found.squared)**0.5,
+        'median_fixed_m': np.median(reference.squared)**0.5,
+        'in_region': found.covered, 'in_region_fixed': reference.covered,
+        'normalised_error': found.normalised.mean(),
+        'wrong': wrong_predictions(world, table, n // 6, wrong)}
+    print(f'\nratio {ratio:.3f} [{interval[0]:.3f}, {interval[1]:.3f}]\n')
+    if options.walks:
+        results['tracked'] = tracked(world, options.walks, walks)
+    return results
+
+
+def locate(world: World, positions: np.ndarray, centres: np.ndarray,
+           codebook_at: Callable[[np.ndarray], Codebook], rng: np.random.Generator,
+           estimator_of: Callable[[Scenario, Codebook], BayesEstimator], knows: bool = True
+           ) -> tuple[frame.Fixes, float]:
+    """Locate users at positions; return the fixes, and the median CPU time [s].
+
+    The codebook is that for the predicted position, a row of `centres`. The prior is this
+    prediction or, unless `knows`, the region.
+    """
+    estimates, times_s = [], []
+    for position, centre in zip(positions, centres, strict=True):
+        codebook = codebook_at(centre)
+        received = model_of(world.scenario, codebook).sample(position[None], rng)[0]
+        begin = time.process_time()
+        estimator = estimator_of(world.scenario, codebook)
+        estimates.append(estimator.posterior(received, around(centre) if knows else None).estimate)
+        times_s.append(time.process_time() - begin)
+    return frame.Fixes.of(frame.stacked(estimates), positions), float(np.median(times_s))
+
+
+def wrong_predictions(world: World, table: frame.Table, n: int, rng: np.random.Generator
+                      ) -> dict:
+    """Measure wrong predictions, n for each distance."""
+    positions, centres = map(np.concatenate, zip(*(
+        displaced(world.scenario, n, distance_m, rng) for distance_m in WRONG_M), strict=True))
+    results = {}
+    for key, name, knows in (('region', 'wrong cell, prior: region', False),
+                             ('prediction', 'wrong cell, prior: prediction', True)):
+        fixes, time_s = locate(
+            world, positions, centres, world.codebook_at, rng, known_estimator, knows)
+        row(table, name, fixes, time_s)
+        results[key] = {
+            'mse_m2': frame.mean_interval(fixes.squared), 'in_region': fixes.covered,
+            'without_fix': fixes.without_fix,
+            'in_region_by_distance': [
+                100 * float(part.mean()) for part in np.array_split(fixes.inside, len(WRONG_M))]}
+    return results
+
+
+def displaced(scenario: Scenario, n: int, distance_m: float, rng: np.random.Generator
+              ) -> tuple[np.ndarray, np.ndarray]:
+    """Draw n positions and predictions at a horizontal distance, all in the region."""
+    low, high = scenario.roi_bounds_m
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
+    while len(pairs) < n:
+        position, angle = scenario.sample_positions(1, rng)[0], rng.uniform(0, 2 * np.pi)
+        centre = position + distance_m * np.array([np.cos(angle), np.sin(angle), 0.0])
+        if (centre >= low).all() and (centre <= high).all():
+            pairs.append((position, centre))
+    positions, centres = map(np.stack, zip(*pairs, strict=True))
+    return positions, centres
+
+
+def tracked(world: World, n: int, rng: np.random.Generator) -> dict:
+    """Measure the tracks of n walks with the fixed codebook, and with those of the library."""
+    times_s = PERIOD_S * np.arange(N_CYCLES)
+    paths = []
+    for _ in range(n):
+        walk = RandomWalk(world.scenario, 1.0, rng)
+        paths.append(np.array([walk.state(time_s)[0] for time_s in times_s]))
+    table = frame.Table('tracks', 'rms error [m]', 'in the 95 % region [%]', 'normalised error')
+    counted = times_s >= WARM_UP_S
+    walk_of = np.repeat(np.arange(n), counted.sum())
+    results, squared = {}, {}
+    for name, follows in (('fixed', False), ('following', True)):
+        estimates = [one for path in paths for one in np.array(
+            list(track(world, path, times_s, follows, rng)), object)[counted]]
+        fixes = frame.Fixes.of(
+            frame.stacked(estimates), np.concatenate([path[counted] for path in paths]))
+        squared[name] = fixes.squared
+        rms = [value**0.5 for value in frame.mean_interval(fixes.squared, walk_of)]
+        covered = frame.mean_interval(100.0 * fixes.inside, walk_of)
+        table.row(name, frame.shown(rms, 3), frame.shown(covered, 1),
+                  frame.shown(fixes.normalised.mean(), 2))
+        results |= {'rms_m' if follows else 'rms_fixed_m': rms,
+                    'in_region' if follows else 'in_region_fixed': covered}
+    return results | {'ratio': np.sqrt(ratio_interval(*(
+        squared[name].reshape(n, -1).mean(axis=1) for name in ('following', 'fixed')))).tolist()}
+
+
+def track(world: World, path: np.ndarray, times_s: np.ndarray, follows: bool,
+          rng: np.random.Generator) -> Iterator:
+    """Yield the estimates of a walk."""
+    tracker = Tracker(known_estimator(world.scenario, world.fixed), Motion())
+    for time_s, position in zip(times_s, path, strict=True):
+        codebook, predicted = world.fixed, tracker.predict(float(time_s))
+        if follows and predicted:
+            mean, covariance = predicted
+            codebook = world.codebook_at(mean, float(np.sqrt(np.trace(covariance) / 3)))
+        tracker.estimator = known_estimator(world.scenario, codebook)
+        yield tracker.update(float(time_s), model_of(world.scenario, codebook).sample(
+            position[None], rng)[0])
+
+
+def new_estimator(scenario: Scenario, codebook: Codebook) -> BayesEstimator:
+    """Return an estimator that has not seen the codebook."""
+    return BayesEstimator(scenario, codebook, lazy=True)
+
+
+@functools.lru_cache(maxsize=512)
+def known_estimator(scenario: Scenario, codebook: Codebook) -> BayesEstimator:
+    """Return an estimator with the table of the region, which it keeps."""
+    return BayesEstimator(scenario, codebook)
+
+
+@functools.lru_cache(maxsize=1024)
+def model_of(scenario: Scenario, codebook: Codebook) -> MeasurementModel:
+    """Return the model of the signals."""
+    return MeasurementModel(scenario, codebook).prepare()
+
+
+def around(centre: np.ndarray) -> Mixture:
+    """Return the prior of a prediction; the pose of the surface is that of the site."""
+    return Mixture(np.zeros(1), centre[None], STD_M**2 * np.eye(3)[None])
+
+
+def row(table: frame.Table, name: str, fixes: frame.Fixes, time_s: float) -> None:
+    """Print a row of the table."""
+    table.row(name, frame.shown(frame.mean_interval(fixes.squared), 4),
+              frame.shown(np.median(fixes.squared)**0.5, 3), frame.shown(fixes.covered, 1),
+              frame.shown(1e3 * time_s, 1))
+
+
+def ratio_interval(first: np.ndarray, second: np.ndarray) -> frame.Interval:
+    """Return the ratio of two means of N samples, which are resampled together."""
+    picks = np.random.default_rng(0).integers(len(first), size=(2000, len(first)))
+    ratios = first[picks].mean(axis=1) / second[picks].mean(axis=1)
+    low, high = np.percentile(ratios, (2.5, 97.5))
+    return float(first.mean() / second.mean()), float(low), float(high)
+
+
+if __name__ == '__main__':
+    frame.run(main)

@@ -1,0 +1,243 @@
+"""Positioning with several surfaces of one site.
+
+Problem: one surface determines directions well and the range badly. How much do a second surface
+at a right angle to the first one, or opposite of it, and a third one reduce the error? Do the
+covariances contain the errors, also if the poses of the surfaces are slightly wrong? How soon is a
+wrong pose noticed?
+
+The surfaces are at (0, 0, 0), (10, -10, 0) and (20, 0, 0) m and face the centre of the region, so
+that all of them see the same region. All surfaces receive the same pilots. The signals of each are
+simulated independently: multipath and noise of different surfaces have no common part. Case
+front_side_pose shifts and turns both surfaces by random errors of 2 cm in each coordinate and 0.2
+degrees about each axis, new ones for each position, which the poses declare; all other poses are
+exact. In case half_frames, two surfaces have half as many frames and a codebook that is optimised
+for these, so the number of pilots of both together is that of one surface with all frames.
+
+A wrong pose of the second surface, by 0.3 m or 5 degrees, is tested with poses that declare 2 cm
+and 0.2 degrees. The share of detections is for random windows of 50 of the positions. From each 50
+positions in turn, the pose of the second surface is estimated; the search begins at a pose with
+random errors of 0.3 m in each coordinate and 5 degrees about each axis.
+
+The intervals of the mean squared error are 1.96 standard errors wide on both sides. The 95 %
+region is the ellipsoid of the covariance that contains 95 % of a Gaussian. The normalised error
+(NEES) is 3 for a Gaussian with the right covariance.
+"""
+
+import os
+
+# One thread, as in the positioner node. This must be set before NumPy is imported.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import argparse
+import dataclasses
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from parts.frame import benchmark_parser, run, write_results
+from scipy.stats import chi2
+
+from rhs_isac_ros.bounds import site_crlb
+from rhs_isac_ros.codebook import Codebook, optimize
+from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
+from rhs_isac_ros.positioning import BayesEstimator, Sighting, fuse
+from rhs_isac_ros.positioning.agreement import WINDOW, PoseTest, pair_agreements
+from rhs_isac_ros.positioning.alignment import estimate_pose
+from rhs_isac_ros.positioning.posterior import Posterior
+
+CONFIG = Path(__file__).parents[2] / 'config'
+PLANS = {'table1': ('table1.yaml', 'codebook_ambiguity.yaml'),
+         'bandplan': ('bandplan.yaml', 'codebook_bandplan.yaml')}
+EXACT, DECLARED = (0.0, 0.0), (0.02, 0.2)
+POSES = {'front': Pose(uncertainty=EXACT),
+         'side': Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.0, 1.0), EXACT),
+         'opposite': Pose((20.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), EXACT)}
+SITES = {'front': ['front'], 'front_side': ['front', 'side'],
+         'front_opposite': ['front', 'opposite'], 'three': ['front', 'side', 'opposite']}
+CASES = (*SITES, 'front_side_pose', 'half_frames', 'wrong_pose',
+         'estimated_pose')
+PAIR = ('front', 'side')
+# Errors of the pose of the side surface: shifts [m] and turns [rad] in the frame of the site.
+WRONG = {'x_0.3m': (0.3, 0, 0, 0, 0, 0), 'y_0.3m': (0, 0.3, 0, 0, 0, 0),
+         'z_0.3m': (0, 0, 0.3, 0, 0, 0), 'roll_5deg': (0, 0, 0, np.radians(5), 0, 0),
+         'pitch_5deg': (0, 0, 0, 0, np.radians(5), 0), 'yaw_5deg': (0, 0, 0, 0, 0, np.radians(5))}
+# Number of positions from which a pose is estimated; errors of the pose where the search begins.
+GROUP, START = 50, np.repeat([0.3, np.radians(5)], 3)
+# Number of random windows, and of positions for each wrong pose.
+WINDOWS, WRONG_POSITIONS = 400, 500
+
+
+class World(NamedTuple):
+    """One plan, its positions, and the estimator of a surface."""
+
+    scenario: Scenario
+    model: MeasurementModel
+    estimator: BayesEstimator
+    positions: np.ndarray  # Float64 [N, 3] [m], in the frame of the site.
+
+    def posteriors(self, poses: list[Pose], rng: np.random.Generator) -> list[Posterior]:
+        """Return the posteriors of one surface, which has another pose for each position."""
+        places = np.array([pose.to_surface(place) for pose, place in zip(
+            poses, self.positions, strict=True)])
+        return [self.estimator.posterior(signals)
+                for signals in self.model.sample(places, rng)]
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = benchmark_parser('surfaces', __doc__, positions=3000)
+    parser.add_argument('--plan', choices=PLANS, action='append', help='leave out other plans')
+    parser.add_argument('--case', choices=CASES, action='append', help='leave out other cases')
+    options = parser.parse_args()
+    results = {}
+    for name in options.plan or PLANS:
+        print(f'\n{name}: {options.positions} positions, seed {options.seed}\n\n'
+              '| surfaces | mean squared error [m^2] | median error [m] | 95 % region | NEES | '
+              'average CRLB [m^2] | fusion [ms] |\n|---|---|---|---|---|---|---|', flush=True)
+        results[name] = measure(*PLANS[name], options)
+    write_results(options.json, results)
+
+
+def measure(config: str, codebook_file: str, options: argparse.Namespace) -> dict:
+    """Measure all cases with one plan."""
+    scenario = Scenario.from_yaml(CONFIG / config)
+    # The random numbers of a case do not depend on the other cases.
+    draw, *of_surface, pose_errors, windows, half_frames, starts = map(
+        np.random.default_rng, np.random.SeedSequence(options.seed).spawn(5 + len(POSES)))
+    positions = scenario.sample_positions(options.positions, draw)
+    n, pair = len(positions), [POSES[name] for name in SITES['front_side']]
+    cases, results = options.case or CASES, {}
+    world = make_world(scenario, Codebook.load(CONFIG / codebook_file), positions)
+    needed = {name for case in cases for name in SITES.get(case, POSES)
+              if case in (*SITES, 'wrong_pose', 'estimated_pose')}
+    found = {name: world.posteriors([POSES[name]] * n, rng)
+             for name, rng in zip(POSES, of_surface, strict=True) if name in needed}
+    for case, names in SITES.items():
+        if case not in cases:
+            continue
+        results[case] = compare(
+            case, positions, [found[name] for name in names],
+            [POSES[name] for name in names], [world.model] * len(names), scenario)
+    if 'front_side_pose' in cases:
+        poses = [dataclasses.replace(pose, uncertainty=DECLARED) for pose in pair]
+        displaced = [world.posteriors([pose.displaced(pose_errors.multivariate_normal(
+            np.zeros(6), pose.covariance)) for _ in range(n)], pose_errors) for pose in poses]
+        results['front_side_pose'] = compare(
+            'front_side_pose', positions, displaced, poses, [world.model] * 2, scenario)
+    if 'half_frames' in cases:
+        half = dataclasses.replace(scenario, n_frames=scenario.n_frames // 2)
+        world = make_world(half, optimize(half, objective='error').codebook, positions)
+        shared = [world.posteriors([pose] * n, half_frames) for pose in pair]
+        results['half_frames'] = compare(
+            'half_frames', positions, shared, pair, [world.model] * 2, half)
+    if 'wrong_pose' in cases:
+        results['wrong_pose'] = wrong_poses(found, scenario, windows)
+    if 'estimated_pose' in cases:
+        results['estimated_pose'] = estimated_poses(found, scenario, starts)
+    return results
+
+
+def make_world(scenario: Scenario, codebook: Codebook, positions: np.ndarray) -> World:
+    """Return the model and the estimator of a surface."""
+    return World(scenario, MeasurementModel(scenario, codebook),
+                 BayesEstimator(scenario, codebook), positions)
+
+
+def sightings_of(found: list[list[Posterior]], poses: list[Pose], position: int
+                 ) -> list[Sighting]:
+    """Return the sightings of the surfaces with a position."""
+    both = (Sighting.of(posteriors[position], pose)
+            for posteriors, pose in zip(found, poses, strict=True))
+    return [one for one in both if one is not None]
+
+
+def compare(case: str, positions: np.ndarray, found: list[list[Posterior]], poses: list[Pose],
+            models: list[MeasurementModel], scenario: Scenario) -> dict:
+    """Fuse the posteriors of all positions, and print and return the statistics."""
+    squares, distances, times_s = np.empty((3, len(positions)))
+    for number, place in enumerate(positions):
+        sightings = sightings_of(found, poses, number)
+        begin = time.process_time()
+        mean, covariance = fuse(sightings, scenario.roi_bounds_m).mixture.moments()
+        times_s[number] = time.process_time() - begin
+        error = mean - place
+        squares[number] = error @ error
+        distances[number] = error @ np.linalg.solve(covariance, error)
+    margin = 1.96 * squares.std() / np.sqrt(len(squares))
+    result = {
+        'mse_m2': squares.mean(), 'low_m2': squares.mean() - margin,
+        'high_m2': squares.mean() + margin, 'median_m': np.median(squares)**0.5,
+        'in_region': np.mean(distances <= chi2.ppf(0.95, 3)), 'nees': distances.mean(),
+        'crlb_m2': site_crlb(zip(models, poses, strict=True), positions).mean(),
+        'time_ms': 1e3 * np.median(times_s)}
+    print('| {} | {mse_m2:.4f} [{low_m2:.4f}, {high_m2:.4f}] | {median_m:.3f} | {in_region:.3f} | '
+          '{nees:.2f} | {crlb_m2:.4f} | {time_ms:.1f} |'.format(case, **result), flush=True)
+    return result
+
+
+def wrong_poses(found: dict[str, list[Posterior]], scenario: Scenario,
+                rng: np.random.Generator) -> dict:
+    """Measure how often wrong poses of the side surface are noticed, and named, in a window."""
+    n = min(WRONG_POSITIONS, len(found['front']) // 2)
+    poses = {name: dataclasses.replace(pose, uncertainty=DECLARED)
+             for name, pose in POSES.items()}
+
+    def cycles(error: tuple[float, ...], numbers: range) -> list[dict]:
+        declared = poses | {'side': poses['side'].displaced(error)}
+        return [pair_agreements({
+            name: one for name in declared
+            if (one := Sighting.of(found[name][number], declared[name]))},
+            scenario.roi_bounds_m) for number in numbers]
+    right = cycles((0.0,) * 6, range(2 * n))
+    # The references are for other positions than those of the windows.
+    references = right[n:]
+    of_pair = [{PAIR: cycle[PAIR]} for cycle in references if PAIR in cycle]
+    print(f'\n| error of the pose | noticed by two surfaces in {WINDOW} cycles | '
+          'named by three |\n|---|---|---|')
+    results = {}
+    for name, error in {'none': (0.0,) * 6, **WRONG}.items():
+        pool = right[:n] if name == 'none' else cycles(error, range(n))
+        noticed = named = 0
+        for _ in range(WINDOWS):
+            window = [pool[number] for number in rng.integers(n, size=WINDOW)]
+            two, three = PoseTest(of_pair), PoseTest(references)
+            for cycle in window:
+                two.add(cycle)
+                three.add(cycle)
+            noticed += bool(two.suspects())
+            named += three.suspects() == (('side',) if name != 'none' else ())
+        results[name] = {'noticed': noticed / WINDOWS, 'named': named / WINDOWS}
+        print(f'| {name} | {noticed / WINDOWS:.3f} | {named / WINDOWS:.3f} |', flush=True)
+    return results
+
+
+def estimated_poses(found: dict[str, list[Posterior]], scenario: Scenario,
+                    rng: np.random.Generator) -> dict:
+    """Estimate the pose of the side surface from groups of positions; measure the errors."""
+    truth, errors, squares = POSES['side'], [], []
+    for begin in range(0, len(found['side']) - GROUP + 1, GROUP):
+        poses = {'front': POSES['front'], 'side': truth.displaced(START * rng.normal(size=6))}
+        both = [pair for number in range(begin, begin + GROUP) if len(pair := sightings_of(
+            [found[name] for name in PAIR], list(poses.values()), number)) == len(PAIR)]
+        pose = estimate_pose(*zip(*both, strict=True), scenario.roi_bounds_m)
+        errors.append(pose.error_of(truth))
+        squares.append(errors[-1] @ np.linalg.solve(pose.covariance, errors[-1]))
+    shifts_m, turns_deg = (np.linalg.norm(part, axis=1) for part in np.split(
+        np.array(errors) * [1, 1, 1, *np.degrees([1, 1, 1])], 2, axis=1))
+    result = {
+        'groups': len(errors), 'median_shift_m': np.median(shifts_m),
+        'p90_shift_m': np.quantile(shifts_m, 0.9), 'median_turn_deg': np.median(turns_deg),
+        'p90_turn_deg': np.quantile(turns_deg, 0.9), 'nees': np.mean(squares),
+        'median_nees': np.median(squares),
+        'in_region': np.mean(np.array(squares) <= chi2.ppf(0.95, 6))}
+    print('\npose estimated from {} positions, {groups} times: median error {median_shift_m:.3f} '
+          'm and {median_turn_deg:.2f} deg, 90 % below {p90_shift_m:.3f} m and '
+          '{p90_turn_deg:.2f} deg; {in_region:.3f} in the 95 % region; normalised error '
+          '{nees:.1f} on average, median {median_nees:.1f}, expected 6 and 5.3'.format(
+              GROUP, **result), flush=True)
+    return result
+
+
+if __name__ == '__main__':
+    run(main)

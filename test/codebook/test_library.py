@@ -1,0 +1,142 @@
+"""Libraries of codebooks: cells, files, and their construction."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook import CodebookError, library, library_command
+from rhs_isac_ros.codebook.cell import Cell
+from rhs_isac_ros.codebook.library import Library, Plan
+from rhs_isac_ros.codebook.objective import OBJECTIVES, sobol
+from rhs_isac_ros.model import Scenario
+
+SCENARIO = Scenario(
+    center_frequencies_hz=(2.5e9, 2.6e9), n_subbands=2, n_frames=2, elements_per_side=4,
+    roi_center_m=(4, 0, 0), roi_size_m=(2, 1, 0.5))
+
+
+@pytest.fixture(scope='module')
+def start(random_beams):
+    return random_beams(SCENARIO, np.random.default_rng(1))
+
+
+@pytest.fixture(scope='module')
+def plan(start):
+    return Plan(SCENARIO.unplaced.id, start.id, 'ambiguity', (0.1, 0.4), (0.8, 2.0))
+
+
+@pytest.fixture(scope='module')
+def built(plan, start):
+    return library.build(SCENARIO, plan, start)
+
+
+def test_every_position_is_within_half_a_pitch_of_a_cell(plan):
+    centres = np.array([cell.centre_m for cell in plan.cells(SCENARIO) if cell.std_m == 0.1])
+    places = SCENARIO.sample_positions(300, np.random.default_rng(2))
+    apart = np.abs(places[:, None] - centres).max(axis=2).min(axis=1)
+    assert apart.max() <= 0.4
+    assert len(centres) == 3 * 2 * 1
+
+
+def test_the_codebook_is_that_of_the_nearest_cell_with_the_next_wider_spread(built):
+    cells = built.plan.cells(SCENARIO)
+    place = np.array(cells[3].centre_m) + 0.05
+    assert built.codebook_at(place, 0.07) is built.codebooks[3]
+    assert built.codebook_at(place, 0.1) is built.codebooks[3]
+    assert built.codebook_at(place, 0.2) is built.codebooks[-1]
+    assert built.codebook_at(place, 0.5) is None
+
+
+def test_a_codebook_has_a_lower_objective_in_its_cell(built, start):
+    for number in (0, 6):
+        cell = built.plan.cells(SCENARIO)[number]
+        rng = np.random.default_rng(3)
+        places = cell.positions(SCENARIO, sobol(SCENARIO, 64, rng))
+        average = OBJECTIVES['ambiguity'](SCENARIO, places, rng, prior=cell)
+        assert average.value(built.codebooks[number]) < 0.9 * average.value(start)
+
+
+def test_a_resumed_library_equals_one_built_at_once(built, start):
+    kept = []
+    again = library.build(SCENARIO, built.plan, start, built.codebooks[:5], kept.append)
+    assert [len(one.codebooks) for one in kept] == [6, 7]
+    assert again.id == built.id
+    assert list(again.by_id) == [one.id for one in built.codebooks]
+
+
+def test_a_file_has_all_content(built, tmp_path):
+    built.save(tmp_path / 'library.npz')
+    found = Library.load(tmp_path / 'library.npz')
+    found.check(SCENARIO)
+    assert found.plan == built.plan
+    assert found.id == built.id
+    np.testing.assert_array_equal(found.centres_m, built.centres_m)
+
+
+def test_a_damaged_file_is_an_error(built, tmp_path):
+    path = tmp_path / 'library.npz'
+    built.save(path)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(CodebookError, match=r'library\.npz'):
+        Library.load(path)
+
+
+def test_a_library_for_another_scenario_or_an_incomplete_one_is_an_error(built):
+    other = dataclasses.replace(SCENARIO, roi_size_m=(2.0, 1.0, 0.4))
+    with pytest.raises(CodebookError, match='^scenario: '):
+        built.check(other)
+    part = Library.of(built.plan, built.plan.cells(SCENARIO)[:3], built.codebooks[:3])
+    with pytest.raises(CodebookError, match='^codebooks: 3, expected 7'):
+        part.check(SCENARIO)
+
+
+def test_the_pitch_is_the_largest_with_a_small_loss(start, monkeypatch):
+    losses = dict(zip(
+        (0.8, 0.625, 0.5, 0.4, 0.3, 0.2), (0.3, 0.1, 0.04, 0.01, 0.0, 0.0), strict=True))
+    tried = []
+
+    def loss_at(scenario, spread_m, objective, places, centres, best, start):
+        reach = 2 * np.abs(places - centres).max()
+        pitch = min(one for one in losses if one >= reach - 1e-9)
+        tried.append(pitch)
+        return losses[pitch]
+
+    monkeypatch.setattr(library, 'loss_at', loss_at)
+    monkeypatch.setattr(library, 'improve', lambda *_: start)
+    wide = dataclasses.replace(SCENARIO, roi_size_m=(4.0, 4.0, 4.0), roi_center_m=(4, 0, 0))
+    reports = []
+    plan = library.plan_library(
+        wide, start, 'error', (0.1,), 0.05, lambda *report: reports.append(report))
+    assert plan.pitches_m == (pytest.approx(0.5),)
+    assert [pitch for _, pitch, _ in reports] == pytest.approx([0.8, 0.625, 0.5])
+
+
+def test_the_loss_at_the_centre_of_a_cell_is_zero(start):
+    places = SCENARIO.sample_positions(2, np.random.default_rng(5))
+    own = [library.improve(SCENARIO, Cell(tuple(place), 0.1), start, 'ambiguity')
+           for place in places.tolist()]
+    assert library.loss_at(
+        SCENARIO, 0.1, 'ambiguity', places, places, own, start) == pytest.approx(0.0)
+
+
+def test_the_command_resumes_an_unfinished_library(built, start, tmp_path, capsys):
+    scenario_file = tmp_path / 'scenario.yaml'
+    scenario_file.write_text(
+        'center_frequencies_hz: [2.5e+9, 2.6e+9]\nn_subbands: 2\nn_frames: 2\n'
+        'elements_per_side: 4\nroi_center_m: [4, 0, 0]\nroi_size_m: [2, 1, 0.5]\n',
+        encoding='utf-8')
+    start.save(tmp_path / 'start.yaml')
+    output = tmp_path / 'library.npz'
+    part = Library.of(built.plan, built.plan.cells(SCENARIO)[:5], built.codebooks[:5])
+    part.save(tmp_path / 'library.npz.part')
+    arguments = ['--scenario', str(scenario_file), '--start', str(tmp_path / 'start.yaml'),
+                 '--objective', 'ambiguity', '--output', str(output), '--quiet', '--spreads']
+    assert library_command.main([*arguments, '0.3']) == 2
+    assert 'made with other arguments' in capsys.readouterr().err
+    assert library_command.main([*arguments, '0.4', '0.1']) == 0
+    assert '7 codebooks: 6 for 0.1 m, 1 for 0.4 m' in capsys.readouterr().out
+    assert Library.load(output).id == built.id
+    assert not (tmp_path / 'library.npz.part').exists()

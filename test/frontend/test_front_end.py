@@ -1,0 +1,92 @@
+"""A surface and a radio that are stepped together."""
+
+import types
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.frontend import (
+    Air,
+    EmulatedRadio,
+    EmulatedSurface,
+    FrontEnd,
+    RadioFault,
+    Sounding,
+    SurfaceFault,
+)
+from rhs_isac_ros.model import Scenario
+
+SCENARIO = Scenario(n_subbands=2, n_frames=3, n_feeds=1, elements_per_side=2)
+CONFIGURATIONS = np.eye(4)[:3]
+
+
+class Recording:
+    """A surface and a radio that record the order of their calls; `fails` is the failing one."""
+
+    n_elements, waits, modem = 4, True, types.SimpleNamespace(
+        pilot=lambda symbol: symbol, receive=lambda cycle_id, captures, symbols: captures)
+
+    def __init__(self, fails=None, capture=((1.0,), (1.0,))):
+        self.calls, self._fails, self._capture = [], fails, np.array(capture)
+
+    def apply(self, configuration):
+        self._call(f'show {np.argmax(configuration)}', SurfaceFault('silence', 'none'))
+
+    def capture(self, band, pilot):
+        self._call(f'capture {band} {pilot:g}', OSError('gone'))
+        return self._capture
+
+    def close(self):
+        self._call('close', OSError('gone'))
+
+    def _call(self, name, error):
+        self.calls.append(name)
+        if name == self._fails:
+            raise error
+
+
+def sounding():
+    return Sounding(1, 0, np.arange(3), np.ones((3, 2, 1)), 1, np.zeros(3))
+
+
+def test_each_frame_is_measured_while_its_configuration_is_shown():
+    parts = Recording()
+    front_end = FrontEnd(parts, parts, Air(SCENARIO, np.random.default_rng(0)))
+    assert front_end.sound(CONFIGURATIONS, sounding()).shape == (3, 2, 1)
+    # The last confirmation covers the last capture.
+    assert parts.calls == ['show 0', 'capture 0 0', 'show 1', 'capture 0 1', 'show 2',
+                           'capture 0 2', 'show 2']
+
+
+@pytest.mark.parametrize(('fails', 'kind', 'n'), [
+    ('show 1', SurfaceFault, 3), ('capture 0 1', RadioFault, 4), ('show 2', SurfaceFault, 5)])
+def test_nothing_is_measured_after_a_fault(fails, kind, n):
+    parts = Recording(fails)
+    with pytest.raises(kind):
+        FrontEnd(parts, parts, Air(SCENARIO, np.random.default_rng(0))).sound(
+            CONFIGURATIONS, sounding())
+    assert len(parts.calls) == n
+
+
+@pytest.mark.parametrize('capture', [
+    np.ones((1, 1)), np.full((2, 1), np.nan), np.ones((0, 1))])
+def test_captures_of_another_size_are_a_fault_of_the_radio(capture):
+    parts = Recording(capture=capture)
+    with pytest.raises(RadioFault, match='expected finite'):
+        FrontEnd(parts, parts, Air(SCENARIO, np.random.default_rng(0))).sound(
+            CONFIGURATIONS, sounding())
+
+
+def test_both_parts_are_released_even_if_one_fails():
+    surface, radio = Recording('close'), Recording()
+    with pytest.raises(OSError, match='gone'):
+        FrontEnd(surface, radio, Air(SCENARIO, np.random.default_rng(0))).close()
+    assert radio.calls == ['close']
+
+
+def test_only_parts_of_hardware_need_a_thread():
+    air = Air(SCENARIO, np.random.default_rng(0))
+    emulated = EmulatedSurface(4), EmulatedRadio(SCENARIO, air)
+    assert not FrontEnd(*emulated, air).waits
+    assert FrontEnd(Recording(), emulated[1], air).waits
+    assert FrontEnd(emulated[0], Recording(), air).waits

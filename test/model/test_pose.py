@@ -1,0 +1,131 @@
+"""Poses of surfaces: frames, and the uncertainty that they add to positions."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rhs_isac_ros.model import Pose
+from rhs_isac_ros.model.pose import quaternion_product, rotation_matrix
+
+# The surface is at (10, -10, 0) and looks along y of the site.
+SIDE = Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.0, 1.0))
+TILTED = Pose((1.0, -2.0, 3.0), tuple(Rotation.from_euler('xyz', [0.3, -0.5, 1.2]).as_quat()))
+PLACES = np.array([[10.0, 2.0, -0.5], [7.0, -3.0, 1.0]])
+
+
+def test_a_pose_is_the_frame_of_the_site_by_default():
+    np.testing.assert_array_equal(Pose().to_site(PLACES), PLACES)
+    np.testing.assert_array_equal(Pose().covariances_to_site(np.diag([1.0, 2.0, 3.0])),
+                                  np.diag([1.0, 2.0, 3.0]))
+
+
+def test_positions_turn_and_move():
+    np.testing.assert_allclose(
+        SIDE.to_site(PLACES), [[8.0, 0.0, -0.5], [13.0, -3.0, 1.0]], atol=1e-12)
+
+
+def test_vectors_turn_only():
+    np.testing.assert_allclose(SIDE.vectors_to_site(np.array([1.0, 2.0, 3.0])),
+                               [-2.0, 1.0, 3.0], atol=1e-12)
+
+
+@pytest.mark.parametrize('pose', [SIDE, TILTED])
+def test_both_directions_are_inverse(pose):
+    np.testing.assert_allclose(pose.to_surface(pose.to_site(PLACES)), PLACES, atol=1e-12)
+    np.testing.assert_allclose(
+        pose.vectors_to_surface(pose.vectors_to_site(PLACES)), PLACES, atol=1e-12)
+    covariance = np.cov(np.random.default_rng(1).standard_normal((3, 9)))
+    np.testing.assert_allclose(
+        pose.covariances_to_surface(pose.covariances_to_site(covariance)), covariance)
+
+
+def test_covariances_turn_with_their_vectors():
+    vectors = np.random.default_rng(1).standard_normal((50, 3))
+    np.testing.assert_allclose(
+        TILTED.covariances_to_site(np.cov(vectors.T)), np.cov(TILTED.vectors_to_site(vectors).T))
+
+
+def test_a_quaternion_is_that_of_scipy():
+    np.testing.assert_allclose(
+        TILTED.rotation, Rotation.from_quat(TILTED.quaternion).as_matrix(), atol=1e-12)
+
+
+def test_a_product_of_quaternions_rotates_by_the_second_one_first():
+    one, other = Rotation.from_euler('xyz', [[0.3, 0.1, 0.0], [0.0, 0.7, -0.4]]).as_quat()
+    np.testing.assert_allclose(rotation_matrix(quaternion_product(one, other)),
+                               rotation_matrix(one) @ rotation_matrix(other), atol=1e-12)
+
+
+@pytest.mark.parametrize('turn', [
+    (0.0, 0.0, 0.0), (0.1, -0.2, 0.3), (1.0, 2.0, -1.5), (0.0, 0.0, -3.0)])
+def test_the_error_of_a_displaced_pose_is_its_displacement(turn):
+    error = np.array([0.3, -0.2, 0.1, *turn])
+    np.testing.assert_allclose(TILTED.error_of(TILTED.displaced(error)), error, atol=1e-12)
+
+
+def test_the_length_of_the_quaternion_does_not_matter():
+    half = Pose(SIDE.position_m, (0.0, 0.0, 0.5, 0.5))
+    np.testing.assert_allclose(half.to_site(PLACES), SIDE.to_site(PLACES), atol=1e-12)
+
+
+def test_the_default_uncertainty_is_2_cm_and_a_fifth_of_a_degree():
+    np.testing.assert_allclose(np.sqrt(np.diag(Pose().covariance)),
+                               [0.02] * 3 + [np.radians(0.2)] * 3)
+
+
+def test_an_exact_pose_adds_nothing():
+    np.testing.assert_array_equal(Pose(uncertainty=(0.0, 0.0)).spread(PLACES), 0.0)
+
+
+def test_a_shift_adds_its_covariance_everywhere():
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = np.diag([1e-4, 4e-4, 9e-4])
+    spread = Pose((3.0, 0.0, 0.0), uncertainty=covariance).spread(PLACES)
+    np.testing.assert_allclose(spread, [covariance[:3, :3]] * 2)
+
+
+def test_a_turn_acts_across_the_line_of_sight_in_proportion_to_the_range():
+    spread = Pose(uncertainty=(0.0, 1.0)).spread(np.array([[10.0, 0.0, 0.0]]))
+    variance = (10 * np.radians(1.0))**2
+    np.testing.assert_allclose(spread[0], np.diag([0.0, variance, variance]), atol=1e-15)
+
+
+def test_the_spread_is_the_covariance_of_displaced_positions():
+    rng = np.random.default_rng(3)
+    root = 1e-3 * rng.standard_normal((6, 6))
+    pose = Pose(TILTED.position_m, TILTED.quaternion, root @ root.T)
+    errors = rng.standard_normal((20_000, 6)) @ root.T
+    site = pose.to_site(PLACES[:1])
+    moved = np.concatenate([pose.displaced(error).to_site(PLACES[:1]) for error in errors])
+    np.testing.assert_allclose(
+        np.cov(moved.T), pose.spread(site)[0], atol=0.05 * np.trace(pose.spread(site)[0]))
+
+
+def test_a_displaced_surface_turns_about_itself():
+    error = np.array([0.1, 0.2, -0.3, 0.0, 0.0, np.pi / 2])
+    moved = TILTED.displaced(error)
+    np.testing.assert_allclose(moved.origin, TILTED.origin + error[:3])
+    np.testing.assert_allclose(
+        moved.rotation, [[0, -1, 0], [1, 0, 0], [0, 0, 1]] @ TILTED.rotation, atol=1e-12)
+    assert moved.uncertainty == TILTED.uncertainty
+
+
+def test_equal_poses_have_equal_hashes():
+    again = Pose(np.array(SIDE.position_m), [0, 0, 1, 1], np.array([0.02, 0.2]))
+    assert again == SIDE and hash(again) == hash(SIDE)
+    assert Pose(uncertainty=(0.0, 0.0)) != Pose()
+
+
+@pytest.mark.parametrize(('field', 'value', 'message'), [
+    ('position_m', (1.0, 2.0), r'position_m: shape \(2,\), expected \[3\]'),
+    ('position_m', (1.0, np.nan, 2.0), 'position_m: not finite'),
+    ('quaternion', (0.0, 0.0, 1.0), r'quaternion: shape \(3,\), expected \[4\]'),
+    ('quaternion', (0.0, 0.0, 0.0, 0.0), 'quaternion: zeros, expected a length other than 0'),
+    ('uncertainty', (0.1, -1.0), 'uncertainty: -1, expected at least 0'),
+    ('uncertainty', (0.1, 0.1, 0.1), r'uncertainty: shape \(3,\), expected two standard'),
+    ('uncertainty', np.diag([1.0, 1, 1, 1, 1, -1]), 'uncertainty: smallest eigenvalue -1'),
+    ('uncertainty', np.triu(np.ones((6, 6))), 'uncertainty: .* expected a symmetric matrix'),
+])
+def test_invalid_poses_are_refused(field, value, message):
+    with pytest.raises(ValueError, match=message):
+        Pose(**{field: value})

@@ -1,0 +1,239 @@
+"""A site of two surfaces, as processes: fusion, faults of a surface, and wrong poses."""
+
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+
+import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.codebook import default_codebook_file
+from rhs_isac_ros.positioning import Site, fuse
+from rhs_isac_ros.positioning.agreement import WINDOW
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.fusion import sighting_of
+from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.diagnostics import subscribe_reports
+from rhs_isac_ros.ros.endpoints import EXCHANGE
+from rhs_isac_ros.ros.roster import FOLLOWING, ROSTER
+
+ROOT = Path(__file__).parents[2]
+BOTH, FRONT = 'fusion of front, side', 'fusion of front'
+# Users who walk slowly: with more of them, the positions of a window differ more.
+N_USERS = 8
+# Time within which the other surface and the fusion continue [s].
+OUTAGE_S = 3.0
+
+
+@pytest.fixture(scope='module')
+def site_file(tmp_path_factory):
+    """Two surfaces of Table I at a right angle, as in config/site.yaml."""
+    config = Path(__file__).parents[2] / 'config'
+    content = yaml.safe_load((config / 'site.yaml').read_text(encoding='utf-8'))
+    for surface in content['surfaces'].values():
+        surface |= {'scenario': str(config / 'table1.yaml'),
+                    'codebook': str(default_codebook_file())}
+    file = tmp_path_factory.mktemp('site') / 'site.yaml'
+    file.write_text(yaml.safe_dump(content, sort_keys=False), encoding='utf-8')
+    return file
+
+
+class Running:
+    """The processes of a site with walking users, and observers of its three namespaces."""
+
+    def __init__(self, processes, make_watch, site_file):
+        self._processes, self.site_file = processes, site_file
+        self.site = Site.from_yaml(site_file)
+        self.fused, self.front, self.side = (
+            make_watch(namespace) for namespace in ('/', '/front', '/side'))
+        self.running = {}
+        for role in FOLLOWING:
+            self.start('/side', role)
+        self.start('/', 'fusion')
+        for role, member in ROSTER.items():
+            if member.is_unique:
+                self.start('/front', role, **({'rest_s': 0.02} if role == 'bs' else {}))
+        self.start('/front', 'user', user_count=N_USERS, mobility='random_walk', speed_mps=1.0)
+
+    def start(self, namespace, role, **parameters):
+        self.running[namespace, role] = self._processes.start(
+            role, namespace=namespace, site_file=self.site_file, **parameters)
+
+    def until_fused(self, estimator, n=1, since_s=None):
+        """Wait for `n` more positions of the given surfaces, and return them."""
+        before = len(self.fused.received[m.PositionEstimate])
+
+        def found():
+            self.front._spin()
+            self.side._spin()
+            new = [one for one in self.fused.received[m.PositionEstimate][before:]
+                   if one.estimator == estimator]
+            return new if len(new) >= n else None
+        return self.fused.until(found, estimator, self.running.values())
+
+    def of_front(self, kind, estimate):
+        """Wait for the messages of a kind about the user and cycle of a fused position."""
+        return self.fused.until(lambda: (self.front._spin(), [
+            one for one in self.front.of_cycle(kind, estimate.cycle_id)
+            if one.user == estimate.user])[-1], kind.__name__)
+
+    def verify(self, estimate):
+        """Check that a position is the fusion of what the surfaces have published about it."""
+        def published(watch):
+            return [one for one in watch.of_cycle(m.Posterior, estimate.cycle_id)
+                    if one.user == estimate.user]
+        names = estimate.estimator.removeprefix('fusion of ').split(', ')
+        watches = {'front': self.front, 'side': self.side}
+        self.fused.until(lambda: (self.front._spin(), self.side._spin(), all(
+            published(watches[name]) for name in names))[-1], 'the posteriors')
+        expected = fuse([sighting_of(published(watches[name])[0]) for name in names],
+                        self.site.bounds_m)
+        mean, covariance = expected.mixture.moments()
+        np.testing.assert_allclose(estimate.position, mean, atol=1e-9)
+        np.testing.assert_allclose(estimate.covariance_m2, covariance, atol=1e-9)
+
+
+@pytest.fixture(scope='module')
+def running(module_processes, make_watch, site_file):
+    return Running(module_processes, make_watch, site_file)
+
+
+def test_two_surfaces_locate_users_together(running):
+    estimates = running.until_fused(BOTH, 4 * N_USERS)
+    assert {estimate.user for estimate in estimates} == set(range(1, N_USERS + 1))
+    errors_m, alone_m = [], []
+    for estimate in estimates:
+        running.verify(estimate)
+        (truth,), (alone,) = (running.of_front(kind, estimate) for kind in (
+            m.GroundTruth, m.PositionEstimate))
+        errors_m.append(np.linalg.norm(estimate.position - truth.position))
+        alone_m.append(np.linalg.norm(alone.position - truth.position))
+    assert np.mean(np.square(errors_m)) < np.mean(np.square(alone_m))
+
+
+def test_the_surfaces_receive_the_same_pilots_with_noise_of_their_own(running):
+    (estimate,) = running.until_fused(BOTH)[:1]
+    front, side = (
+        running.fused.until(lambda watch=watch: (watch._spin(), watch.of_cycle(
+            m.ReceivedSignals, estimate.cycle_id))[-1], 'the signals')[0]
+        for watch in (running.front, running.side))
+    assert (front.user, front.user_instance) == (side.user, side.user_instance)
+    assert not np.isclose(front.signals, side.signals).any()
+    assert not running.side.received[m.Grant]
+
+
+def test_any_program_can_read_posteriors_poses_and_odometry(running):
+    posteriors, poses, tracks = [], [], []
+    for kind, topic, store in ((ros.Posterior, 'posterior', posteriors),
+                               (PoseWithCovarianceStamped, topics.POSE.format(user=1), poses),
+                               (Odometry, topics.ODOMETRY.format(user=1), tracks)):
+        running.fused.node.create_subscription(kind, topic, store.append, EXCHANGE)
+    running.fused.until(lambda: posteriors and poses and tracks, 'a message on each topic')
+    assert {one[0].header.frame_id for one in (posteriors, poses, tracks)} == {'map'}
+    assert tracks[0].child_frame_id == 'user_1'
+    weights = np.exp(posteriors[0].log_weights.data)
+    assert weights.sum() == pytest.approx(1)
+    assert posteriors[0].means.shape.tolist() == [len(weights), 3]
+
+
+@pytest.mark.parametrize('role', FOLLOWING)
+def test_the_others_continue_without_a_node_of_one_surface(running, role):
+    running.until_fused(BOTH, 2)
+    process = running.running.pop(('/side', role))
+    process.signal(signal.SIGKILL)
+    killed_s = time.monotonic()
+    running.front._spin()
+    # Observers may have missed the last messages of the process, and the latest grant.
+    latest = max(grant.cycle_id for grant in running.front.received[m.Grant]) + 1
+
+    def continued():
+        running.front._spin()
+        running.side._spin()
+        return [end for end in running.front.served if end.cycle_id > latest] and [
+            one for one in running.fused.received[m.PositionEstimate] if one.cycle_id > latest]
+    estimates = running.fused.until(continued, 'a position', running.running.values())
+    assert time.monotonic() - killed_s < OUTAGE_S
+    # Without its optimizer, a surface keeps its codebook.
+    rest = running.until_fused(BOTH if role == topics.OPTIMIZER_NODE else FRONT, 5)
+    for estimate in [*estimates, *rest]:
+        running.verify(estimate)
+    running.start('/side', role)
+    n_posteriors = len(running.side.received[m.Posterior])
+    running.fused.until(
+        lambda: (running.side._spin(), len(running.side.received[m.Posterior]) > n_posteriors)[-1],
+        'the second surface', running.running.values())
+    running.verify(running.until_fused(BOTH, 2)[-1])
+    assert not running.front.given_up
+
+
+def set_channel(running, **values):
+    """Set parameters of the channel of the second surface."""
+    client = AsyncParameterClient(running.side.node, 'channel')
+    result = running.side.call(client, lambda client: client.set_parameters(
+        [Parameter(name, value=value) for name, value in values.items()]))
+    assert [one.successful for one in result.results] == [True] * len(values)
+
+
+@pytest.mark.slow
+def test_a_wrong_pose_is_named_and_a_right_one_is_not(running):
+    reports = []
+    subscribe_reports(running.fused.node, lambda name, report: reports.append(report.values))
+
+    def cycles_until(named):
+        """Return the number of positions until a report names the surfaces, or no longer does."""
+        before = len(running.fused.received[m.PositionEstimate])
+
+        def found():
+            running.front._spin()
+            running.side._spin()
+            return ('warning.poses' in reports[-1]) is named
+        running.fused.until(found, f'{values}: {named}', running.running.values())
+        return len(running.fused.received[m.PositionEstimate]) - before
+    values = {}
+    running.fused.until(
+        lambda: reports and 'agreement.front.side' in reports[-1], 'the references')
+    running.until_fused(BOTH, 4 * WINDOW)
+    assert not [report for report in reports if 'warning.poses' in report]
+    for values in ({'surface_shift_m': 0.3}, {'surface_turn_deg': 5.0}):
+        set_channel(running, **values)
+        assert cycles_until(True) <= 2 * WINDOW
+        assert reports[-1]['warning.poses'] == 'surfaces front, side disagree: a pose is wrong'
+        set_channel(running, **dict.fromkeys(values, 0.0))
+        assert cycles_until(False) <= 2 * WINDOW
+    assert 'surfaces front, side disagree' in running.running['/', 'fusion'].log
+
+
+def test_the_pose_of_a_surface_that_has_moved_is_found(running, built_scripts, tmp_path):
+    set_channel(running, surface_shift_m=0.3)
+    running.until_fused(BOTH, 2)
+    done = subprocess.run(
+        [ROOT / 'scripts' / 'calibrate', '--site', running.site_file, '--cycles', '60',
+         '--output', tmp_path / 'found.yaml'], capture_output=True, text=True, timeout=120,
+        check=False)
+    set_channel(running, surface_shift_m=0.0)
+    assert (done.returncode, done.stderr) == (0, '')
+    declared, found = (site.surfaces['side'].pose for site in (
+        running.site, Site.from_yaml(tmp_path / 'found.yaml')))
+    # The left of the surface is the negative x of the site.
+    error = found.error_of(declared.displaced([-0.3, 0, 0, 0, 0, 0]))
+    assert error @ np.linalg.solve(found.covariance, error) < 25
+    assert declared.error_of(found)[0] < -0.05
+    assert 'side: moved by [-0.' in done.stdout
+
+
+@pytest.mark.parametrize('prior', ['region', 'track'])
+def test_the_demonstration_compares_each_surface_with_the_fusion(
+        prior, built_scripts, site_file, tmp_path):
+    done = subprocess.run(
+        [ROOT / 'scripts' / 'demo', '--site', site_file, '--cycles', '4', '--prior', prior],
+        cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    for text in ('front: ', 'side: ', 'fused: 4 positions, root mean square error'):
+        assert text in done.stdout

@@ -1,0 +1,98 @@
+"""A network with an emulated board, whose faults end cycles but not the service."""
+
+import time
+
+import numpy as np
+import pytest
+import yaml
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.nodes.bs import BsNode
+from rhs_isac_ros.nodes.channel import ChannelNode
+from rhs_isac_ros.nodes.optimizer import OptimizerNode
+from rhs_isac_ros.nodes.positioner import PositionerNode
+from rhs_isac_ros.nodes.rhs_controller import RhsControllerNode
+from rhs_isac_ros.nodes.transmission import TransmissionNode
+from rhs_isac_ros.nodes.user import UserNode
+from rhs_isac_ros.protocol import messages as m
+
+SCENARIO = Scenario(
+    n_subbands=2, n_frames=3, n_feeds=1, elements_per_side=16, amplitude_levels=2,
+    roi_center_m=(3, 0, 0), roi_size_m=(1, 1, 1))
+# The patterns of a cycle: those of two bands, the last one twice, of the downlink and the uplink.
+N_PATTERNS = 2 * (SCENARIO.n_frames + 1) + 2
+RECOVERY_S = 3.0
+
+
+@pytest.fixture(scope='module')
+def board():
+    with EmulatedBoard() as board:
+        yield board
+
+
+@pytest.fixture(scope='module')
+def observed(module_bench, board, tmp_path_factory):
+    """The states and the estimates of a network that serves a user."""
+    bench, folder = module_bench, tmp_path_factory.mktemp('network')
+    (folder / 'scenario.yaml').write_text(yaml.safe_dump(SCENARIO.changes()), encoding='utf-8')
+    random_codebook(SCENARIO, np.random.default_rng(0)).save(folder / 'codebook.yaml')
+
+    def add(kind, **values):
+        values = {'scenario_file': str(folder / 'scenario.yaml'), **values}
+        bench.add(kind, parameter_overrides=[
+            Parameter(name, value=value) for name, value in values.items()])
+    add(OptimizerNode, codebook_file=str(folder / 'codebook.yaml'))
+    add(RhsControllerNode)
+    add(PositionerNode, table_folder=str(folder))
+    add(TransmissionNode)
+    add(ChannelNode, surface='opensourceris', surface_options=f'port={board.port}')
+    add(UserNode, position_m=[3.0, 0.1, 0.2])
+    add(BsNode, rest_s=0.02)
+    receiver = bench.add(Node, 'receiver')
+    return bench.collect(receiver, m.ProtocolState), bench.collect(receiver, m.PositionEstimate)
+
+
+@pytest.fixture
+def served(module_bench, observed):
+    """Return a function that awaits the end of a cycle with service."""
+    states, _ = observed
+
+    def wait():
+        n = len(states)
+        module_bench.until(lambda: any(state.outcome == 'served' for state in states[n:]),
+                           'a served cycle')
+        return next(state.cycle_id for state in states[n:] if state.outcome == 'served')
+    return wait
+
+
+@pytest.mark.parametrize('pattern', [0, SCENARIO.n_frames, N_PATTERNS - 1])
+@pytest.mark.parametrize(
+    'fault', ['silence', 'flipped bit', 'restart', 'late', 'closed', 'occupied'])
+def test_users_are_served_again_soon_after_a_fault(module_bench, board, served, fault, pattern):
+    served()
+    occurs = board.n_patterns + pattern
+    board.faults = {occurs: fault}
+    module_bench.until(lambda: board.n_patterns > occurs, 'the fault')
+    if fault in ('closed', 'occupied'):
+        board.plug()
+    begin_s = time.monotonic()
+    served()
+    assert time.monotonic() - begin_s < RECOVERY_S
+
+
+def test_without_a_board_there_are_no_estimates(module_bench, board, observed, served):
+    states, estimates = observed
+    served()
+    board.unplug()
+    n = len(states)
+    # The cycle in progress ends, and the next one is given up.
+    module_bench.until(lambda: [state.outcome for state in states[n:]].count('user_gone') == 1,
+                       'a cycle that is given up')
+    cycle_id = next(state.cycle_id for state in states[n:] if state.outcome == 'user_gone')
+    board.plug()
+    assert served() > cycle_id
+    assert cycle_id not in [estimate.cycle_id for estimate in estimates]

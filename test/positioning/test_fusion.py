@@ -1,0 +1,268 @@
+"""Positions from the signals of several surfaces."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
+from rhs_isac_ros.model.geometry import polar_derivative, to_polar
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning.fusion import MAX_MODES, Fused, Sighting, fuse
+from rhs_isac_ros.positioning.mixture import Mixture
+
+BOUNDS = np.array([[5.0, -5.0, -1.0], [15.0, 5.0, 1.0]])
+EXACT = (0.0, 0.0)
+FRONT = Pose(uncertainty=EXACT)
+SIDE = Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.0, 1.0), EXACT)
+OPPOSITE = Pose((20.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), EXACT)
+PLACE = np.array([8.0, 1.0, 0.2])
+# Standard deviations of range [m] and direction cosines of a mode.
+STD = np.array([0.01, 0.05, 0.02])
+
+
+def sheets(pose, places, log_weights=(0.0,), std=STD, missing=1e-12):
+    """Return modes at positions of the site that are Gaussian around the surface."""
+    means = np.array(places, float).reshape(-1, 3)
+    by_site = polar_derivative(to_polar(pose.to_surface(means))) @ pose.rotation.T
+    precision = np.swapaxes(by_site, 1, 2) @ np.diag(1 / std**2) @ by_site
+    return Sighting(pose, Mixture(np.array(log_weights, float), means, np.linalg.inv(precision)),
+                    missing)
+
+
+def log_likelihood(sighting, positions):
+    """Evaluate modes with weight 1 at positions [N, 3], by their definition around the surface."""
+    points = to_polar(sighting.pose.to_surface(positions))
+    centres = to_polar(sighting.pose.to_surface(sighting.mixture.means))
+    squares = np.sum(((points[:, None] - centres) / STD)**2, axis=2)
+    volumes = np.linalg.slogdet(sighting.mixture.covariances)[1] / 2
+    return np.logaddexp.reduce(sighting.mixture.log_weights - volumes - squares / 2, axis=1)
+
+
+def integrated(sightings, bounds=BOUNDS, n=400_000):
+    """Return mean and covariance of the product by importance sampling in the region."""
+    rng = np.random.default_rng(0)
+    # Positions in the region of each mode of the first surface.
+    first = sightings[0]
+    means = to_polar(first.pose.to_surface(first.mixture.means))
+    chosen = rng.integers(len(means), size=n)
+    points = means[chosen] + STD * rng.standard_normal((n, 3))
+    r, u, v = points.T
+    local = r[:, None] * np.stack([np.sqrt(1 - u**2 - v**2), u, v], axis=1)
+    positions = first.pose.to_site(local)
+    squares = np.sum(((points[:, None] - means) / STD)**2, axis=2)
+    log_proposal = np.logaddexp.reduce(-squares / 2, axis=1)
+    # The density of a position is that of (r, u, v) divided by the volume element.
+    log_weights = sum(log_likelihood(one, positions) for one in sightings) - log_proposal
+    log_weights += 2 * np.log(r) - np.log(np.sqrt(1 - u**2 - v**2))
+    log_weights[~((positions >= bounds[0]) & (positions <= bounds[1])).all(axis=1)] = -np.inf
+    weights = np.exp(log_weights - log_weights.max())
+    weights /= weights.sum()
+    mean = weights @ positions
+    return mean, (positions - mean).T @ ((positions - mean) * weights[:, None])
+
+
+def assert_moments(fused, mean, covariance, tolerance=0.05):
+    found, spread = fused.mixture.moments()
+    std = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(found / std, mean / std, atol=tolerance)
+    np.testing.assert_allclose(spread / np.outer(std, std), covariance / np.outer(std, std),
+                               atol=2 * tolerance)
+
+
+@pytest.mark.parametrize('others', [[], [SIDE], [OPPOSITE], [SIDE, OPPOSITE]],
+                         ids=['alone', 'side', 'opposite', 'three'])
+def test_the_posterior_is_the_integral_of_the_product(others):
+    # The modes of each surface are not exactly at the same place.
+    places = [PLACE + [0.005, 0.1, 0.02], PLACE + [0.1, -0.004, 0.0], PLACE + [0.0, 0.06, 0.05]]
+    sightings = [sheets(pose, place)
+                 for pose, place in zip([FRONT, *others], places, strict=False)]
+    assert_moments(fuse(sightings, BOUNDS), *integrated(sightings))
+
+
+def test_a_sheet_is_bent_around_its_surface():
+    # A metre away from the mean of the first mode, its sheet is 5 cm from the tangent plane.
+    aside = PLACE + [-0.05, 1.0, 0.0]
+    sightings = [sheets(FRONT, PLACE), sheets(SIDE, aside)]
+    mean = fuse(sightings, BOUNDS).mixture.moments()[0]
+    assert abs(np.linalg.norm(mean) - np.linalg.norm(PLACE)) < STD[0]
+    range_m = np.linalg.norm(aside - SIDE.origin)
+    assert abs(np.linalg.norm(mean - SIDE.origin) - range_m) < STD[0]
+
+
+def test_only_modes_that_agree_remain():
+    # The wrong modes of one surface are at other places than those of the other one.
+    front = sheets(FRONT, [PLACE, PLACE + [0.6, 0.0, 0.0]], [0.0, 1.0])
+    side = sheets(SIDE, [PLACE, PLACE + [0.0, 0.6, 0.0]], [0.0, 1.0])
+    sightings = [front, side]
+    assert_moments(fuse(sightings, BOUNDS), *integrated(sightings))
+
+
+def test_the_order_of_the_surfaces_does_not_matter():
+    sightings = [sheets(pose, [PLACE, PLACE + offset], [0.0, 0.3]) for pose, offset in (
+        (FRONT, [0.6, 0.1, 0.0]), (SIDE, [0.0, 0.5, 0.1]), (OPPOSITE, [0.3, 0.1, 0.1]))]
+    one, other = fuse(sightings, BOUNDS), fuse(sightings[::-1], BOUNDS)
+    assert_moments(one, *other.mixture.moments(), tolerance=0.02)
+    np.testing.assert_allclose(one.log_agreement, other.log_agreement, atol=0.02)
+
+
+def test_the_site_may_have_any_frame():
+    # Everything moves and turns together.
+    frame = Pose((3.0, -2.0, 1.0), (0.0, 0.0, 1.0, 1.0))
+    sightings = [sheets(FRONT, PLACE), sheets(SIDE, PLACE + [0.1, 0.0, 0.0])]
+    moved = []
+    for one in sightings:
+        rotation = frame.rotation @ one.pose.rotation
+        yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+        pose = Pose(frame.to_site(one.pose.origin),
+                    (0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)), EXACT)
+        mixture = one.mixture._replace(
+            means=frame.to_site(one.mixture.means),
+            covariances=frame.covariances_to_site(one.mixture.covariances))
+        moved.append(Sighting(pose, mixture, one.missing))
+    corners = np.sort(frame.to_site(BOUNDS), axis=0)
+    mean, covariance = fuse(sightings, BOUNDS).mixture.moments()
+    assert_moments(fuse(moved, corners), frame.to_site(mean),
+                   frame.covariances_to_site(covariance))
+
+
+def test_positions_are_inside_the_region():
+    # The mode has its maximum 0.3 m above the region.
+    sightings = [sheets(FRONT, [8.0, 1.0, 1.3])]
+    fused = fuse(sightings, BOUNDS)
+    assert (fused.mixture.means <= BOUNDS[1]).all()
+    assert_moments(fused, *integrated(sightings), tolerance=0.15)
+
+
+def test_a_region_without_height_keeps_its_height():
+    flat = np.array([[5.0, -5.0, 0.0], [15.0, 5.0, 0.0]])
+    fused = fuse([sheets(FRONT, PLACE), sheets(SIDE, PLACE)], flat)
+    mean, covariance = fused.mixture.moments()
+    np.testing.assert_allclose(mean[2], 0.0, atol=0.005)
+    assert covariance[2, 2] < 0.005**2
+
+
+def test_an_uncertain_pose_widens_the_posterior_by_its_covariance():
+    place = np.array([10.0, 0.0, 0.0])
+    uncertain = Pose(uncertainty=(0.3, 0.0))
+    alone = fuse([sheets(FRONT, place, std=STD / 100)], BOUNDS).mixture.moments()[1]
+    found = fuse([sheets(FRONT, place, std=STD / 100)._replace(pose=uncertain)], BOUNDS)
+    np.testing.assert_allclose(found.mixture.moments()[1] - alone, 0.09 * np.eye(3), atol=0.01)
+
+
+def test_a_pose_with_little_uncertainty_is_exact():
+    sightings = [sheets(FRONT, PLACE), sheets(SIDE, PLACE + [0.1, 0.0, 0.0])]
+    nearly = [one._replace(pose=Pose(one.pose.position_m, one.pose.quaternion, (1e-6, 1e-6)))
+              for one in sightings]
+    assert_moments(fuse(nearly, BOUNDS), *fuse(sightings, BOUNDS).mixture.moments(),
+                   tolerance=1e-4)
+
+
+def test_widening_keeps_the_weights_of_the_modes():
+    # The modes are so far apart that they do not overlap. One is much narrower.
+    front = sheets(FRONT, [PLACE, PLACE + [4.0, 0.0, 0.0]], np.log([0.3, 0.7]))
+    front.mixture.covariances[1] *= 1e-2
+    wide = front._replace(pose=Pose(uncertainty=(0.02, 0.0)))
+    found = fuse([wide], BOUNDS).mixture
+    np.testing.assert_allclose(np.sort(np.exp(found.log_weights)), [0.3, 0.7], rtol=0.03)
+
+
+def test_surfaces_that_disagree_make_the_posterior_broad():
+    far = PLACE + [3.0, -2.0, 0.0]
+    fused = fuse([sheets(FRONT, PLACE, missing=1e-3), sheets(SIDE, far, missing=1e-3)], BOUNDS)
+    mean, covariance = fused.mixture.moments()
+    np.testing.assert_allclose(fused.mixture.probabilities, [0.5, 0.5], atol=0.1)
+    for place in (PLACE, far):
+        offset = place - mean
+        assert offset @ np.linalg.solve(covariance, offset) < 2
+
+
+def test_a_surface_that_is_probably_blocked_has_little_weight():
+    far = PLACE + [3.0, -2.0, 0.0]
+    fused = fuse([sheets(FRONT, PLACE, missing=1e-3), sheets(SIDE, far, missing=0.9)], BOUNDS)
+    np.testing.assert_allclose(fused.mixture.moments()[0], PLACE, atol=0.05)
+
+
+def test_agreement_is_the_density_of_the_signals_relative_to_separate_users():
+    # With narrow Gaussians of equal width, the integral of the product is that of Gaussians.
+    std_m, volume_m3 = 0.01, 200.0
+    place, pose = np.array([10.0, 0.0, 0.0]), Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.0, 1.0), EXACT)
+    offset = np.array([0.015, -0.01, 0.0])
+    first = Sighting(FRONT, Mixture(np.zeros(1), place[None], std_m**2 * np.eye(3)[None]), 1e-12)
+    second = Sighting(pose, first.mixture._replace(means=place[None] + offset), 1e-12)
+    expected = (np.log(volume_m3) - 1.5 * np.log(4 * np.pi * std_m**2)
+                - offset @ offset / (4 * std_m**2))
+    np.testing.assert_allclose(fuse([first, second], BOUNDS).log_agreement, expected, atol=0.01)
+    np.testing.assert_allclose(fuse([first], BOUNDS).log_agreement, 0.0, atol=0.01)
+
+
+def test_agreement_does_not_depend_on_the_level_of_the_likelihood():
+    front, side = sheets(FRONT, PLACE), sheets(SIDE, PLACE)
+    louder = front._replace(mixture=front.mixture.weighted(300.0))
+    np.testing.assert_allclose(fuse([louder, side], BOUNDS).log_agreement,
+                               fuse([front, side], BOUNDS).log_agreement)
+
+
+def test_fusion_needs_a_surface():
+    with pytest.raises(ValueError, match='sightings: none, expected at least one'):
+        fuse([], BOUNDS)
+
+
+@pytest.fixture(scope='module')
+def world():
+    scenario = Scenario(
+        center_frequencies_hz=(2.5e9, 2.56e9, 2.6e9), n_frames=2, elements_per_side=6)
+    codebook = random_codebook(scenario, np.random.default_rng(1))
+    return scenario, codebook, make_estimator('bayes', scenario, codebook)
+
+
+def drawn(world, pose, positions, seed):
+    scenario, codebook, _ = world
+    model = MeasurementModel(scenario, codebook)
+    return model.sample(pose.to_surface(positions), np.random.default_rng(seed))
+
+
+def test_one_surface_has_the_estimate_of_its_estimator(world):
+    scenario, _, estimator = world
+    positions = scenario.sample_positions(20, np.random.default_rng(2))
+    for signals in drawn(world, SIDE, positions, 3):
+        posterior = estimator.posterior(signals)
+        fused = fuse([Sighting.of(posterior, SIDE)], BOUNDS)
+        estimate = posterior.estimate
+        assert_moments(fused, SIDE.to_site(estimate.mean),
+                       SIDE.covariances_to_site(estimate.covariance), tolerance=0.12)
+
+
+def test_two_surfaces_are_more_accurate_than_one(world):
+    scenario, _, estimator = world
+    positions = scenario.sample_positions(40, np.random.default_rng(4))
+    both = [[Sighting.of(estimator.posterior(one), pose)
+             for one in drawn(world, pose, positions, seed)]
+            for seed, pose in enumerate((FRONT, SIDE))]
+    fused = [fuse(pair, BOUNDS) for pair in zip(*both, strict=True)]
+    errors = np.array([one.mixture.moments()[0] for one in fused]) - positions
+    alone = np.array([fuse([one], BOUNDS).mixture.moments()[0] for one in both[0]]) - positions
+    assert np.mean(errors**2) < 0.4 * np.mean(alone**2)
+
+
+def test_a_phase_without_a_position_has_no_likelihood(world):
+    _, codebook, estimator = world
+    silence = np.zeros((3, codebook.shape[1] * codebook.shape[2]), complex)
+    posterior = estimator.posterior(silence)
+    assert posterior.estimate.reason
+    assert Sighting.of(posterior, FRONT) is None
+
+
+def test_the_number_of_modes_is_limited(world):
+    scenario, _, estimator = world
+    (signals,) = drawn(world, FRONT, scenario.sample_positions(1, np.random.default_rng(5)), 6)
+    posterior = estimator.posterior(signals)
+    many = posterior.modes._replace(
+        **{name: np.repeat(field, MAX_MODES + 1, axis=0)
+           for name, field in posterior.modes._asdict().items()})
+    assert len(Sighting.of(posterior._replace(modes=many), FRONT).mixture.means) == MAX_MODES
+
+
+def test_a_result_is_normalised():
+    fused = fuse([sheets(FRONT, PLACE), sheets(SIDE, PLACE)], BOUNDS)
+    assert isinstance(fused, Fused)
+    np.testing.assert_allclose(fused.mixture.log_mass, 0.0, atol=1e-12)

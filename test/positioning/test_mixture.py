@@ -1,0 +1,160 @@
+"""Mixtures of Gaussians in the frame of the site."""
+
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+from scipy.stats import multivariate_normal
+
+from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.segments import select
+
+
+def mixture(seed, n=3, size=3, spread=1.0):
+    rng = np.random.default_rng(seed)
+    roots = spread * rng.standard_normal((n, size, size)) + np.eye(size)
+    return Mixture(
+        rng.normal(size=n), rng.standard_normal((n, size)), roots @ roots.swapaxes(1, 2))
+
+
+def one(mean, covariance, log_weight=0.0):
+    return Mixture(np.array([log_weight]), np.array([mean], float), np.array([covariance], float))
+
+
+def test_the_moments_are_those_of_the_density():
+    both = Mixture(np.log([0.2, 0.6]), np.array([[0.0, 0, 0], [4.0, 0, 0]]),
+                   np.array([np.eye(3), 2 * np.eye(3)]))
+    mean, covariance = both.moments()
+    np.testing.assert_allclose(mean, [3.0, 0.0, 0.0])
+    np.testing.assert_allclose(covariance, np.diag([1.75 + 3.0, 1.75, 1.75]))
+
+
+def test_the_mass_is_the_sum_of_the_weights():
+    both = mixture(1)
+    np.testing.assert_allclose(np.exp(both.log_mass), np.exp(both.log_weights).sum())
+    np.testing.assert_allclose(both.normalised().log_mass, 0.0, atol=1e-12)
+    np.testing.assert_allclose(both.weighted(2.0).log_mass, both.log_mass + 2.0)
+
+
+@pytest.mark.parametrize('size', [3, 6])
+def test_the_density_is_a_sum_of_gaussians(size):
+    both, points = mixture(2, size=size), np.random.default_rng(3).normal(size=(4, 5, size))
+    expected = sum(np.exp(weight) * multivariate_normal(mean, covariance).pdf(points)
+                   for weight, mean, covariance in zip(*both, strict=True))
+    np.testing.assert_allclose(both.log_density(points), np.log(expected))
+
+
+def test_samples_have_the_moments_of_the_mixture():
+    both = mixture(4)
+    samples = both.sample(200_000, np.random.default_rng(5))
+    mean, covariance = both.moments()
+    scale = np.trace(covariance)
+    np.testing.assert_allclose(samples.mean(axis=0), mean, atol=0.01 * np.sqrt(scale))
+    np.testing.assert_allclose(np.cov(samples.T), covariance, atol=0.02 * scale)
+
+
+def test_a_product_is_the_product_of_the_densities():
+    first, second = mixture(6), mixture(7, n=2)
+    points = np.random.default_rng(8).normal(size=(20, 3))
+    np.testing.assert_allclose(first.product(second).log_density(points),
+                               first.log_density(points) + second.log_density(points))
+
+
+def test_the_mass_of_a_product_is_its_integral():
+    # With independent axes, the integral over y and z is known.
+    covariances = np.array([np.diag([1.0, 1.0, 1.0]), np.diag([0.25, 1.0, 1.0])])
+    first = Mixture(np.log([0.3, 0.7]), np.array([[0.0, 0, 0], [2.0, 0, 0]]), covariances)
+    second = one([0.7, 0.0, 0.0], np.diag([0.5, 1.0, 1.0]))
+    x = np.linspace(-8.0, 10.0, 20_001)
+    points = np.stack([x, 0 * x, 0 * x], axis=1)
+    # Over y and over z, the product of two unit Gaussians integrates to 1 / sqrt(4 pi), and its
+    # value at 0 is 1 / (2 pi).
+    integral = trapezoid(np.exp(first.log_density(points) + second.log_density(points)), x)
+    np.testing.assert_allclose(
+        np.exp(first.product(second).log_mass), integral * (2 * np.pi)**2 / (4 * np.pi))
+
+
+def test_a_likelihood_of_positions_also_updates_velocities():
+    joint = mixture(9, n=2, size=6)
+    likelihood = mixture(10, n=2)
+    points = np.random.default_rng(11).normal(size=(20, 6))
+    np.testing.assert_allclose(
+        joint.product(likelihood).log_density(points),
+        joint.log_density(points) + likelihood.log_density(points[:, :3]))
+
+
+def test_a_wide_likelihood_changes_nothing():
+    both = mixture(12)
+    product = both.product(one([0.0, 0, 0], 1e12 * np.eye(3)))
+    np.testing.assert_allclose(product.means, both.means, atol=1e-9)
+    np.testing.assert_allclose(product.normalised().log_weights, both.normalised().log_weights)
+
+
+def test_widening_keeps_the_mass_and_the_mean():
+    both = mixture(13)
+    wide = both.widened(0.5 * np.eye(3))
+    np.testing.assert_allclose(wide.log_mass, both.log_mass)
+    (mean, covariance), (wide_mean, wide_covariance) = both.moments(), wide.moments()
+    np.testing.assert_allclose(wide_mean, mean)
+    np.testing.assert_allclose(wide_covariance, covariance + 0.5 * np.eye(3))
+
+
+def test_the_position_is_a_marginal():
+    both = mixture(14, size=6)
+    mean, covariance = both.moments()
+    np.testing.assert_allclose(both.position().moments()[0], mean[:3])
+    np.testing.assert_allclose(both.position().moments()[1], covariance[:3, :3])
+
+
+def test_a_component_for_the_whole_region_is_nearly_uniform_in_it():
+    narrow, size_m = one(np.zeros(3), 0.01 * np.eye(3), 7.0), np.array([4.0, 6.0, 2.0])
+    both = narrow.or_within(np.ones(3), np.diag(size_m**2), 0.02)
+    assert both.log_weights[0] == pytest.approx(np.log(0.98))
+    inside = 1 + size_m * (np.random.default_rng(13).random((4000, 3)) - 0.5)
+    wide = select(both, slice(1, None))
+    assert np.exp(wide.log_density(inside)).mean() * size_m.prod() == pytest.approx(
+        0.02, rel=0.15)
+
+
+def test_a_user_elsewhere_moves_as_fast_in_any_direction():
+    both = mixture(3, size=6).or_within(np.zeros(3), np.eye(3), 0.1)
+    mean, covariance = mixture(3, size=6).moments()
+    np.testing.assert_array_equal(both.means[-1, 3:], 0.0)
+    square = np.trace(covariance[3:, 3:]) + mean[3:] @ mean[3:]
+    np.testing.assert_allclose(both.covariances[-1, 3:, 3:], square / 3 * np.eye(3))
+
+
+def test_merging_preserves_mass_mean_and_covariance():
+    both = mixture(15, n=8)
+    merged = both.reduce(1, distance=np.inf)
+    assert len(merged.means) == 1
+    np.testing.assert_allclose(merged.log_mass, both.log_mass)
+    np.testing.assert_allclose(merged.means[0], both.moments()[0])
+    np.testing.assert_allclose(merged.covariances[0], both.moments()[1])
+
+
+def test_components_merge_by_their_distance_relative_to_their_covariance():
+    # The second component is 0.5 m from the first one along a wide axis, the third one 0.1 m
+    # along a narrow one.
+    thin = np.diag([1e-4, 1.0, 1.0])
+    far = Mixture(np.log([0.5, 0.3, 0.2]), np.array([[0.0, 0, 0], [0.0, 0.5, 0], [0.1, 0, 0]]),
+                  np.array([thin] * 3))
+    reduced = far.reduce(8)
+    np.testing.assert_allclose(np.exp(reduced.log_weights), [0.8, 0.2])
+    np.testing.assert_allclose(reduced.means[1], [0.1, 0.0, 0.0])
+
+
+def test_the_lightest_components_are_discarded():
+    separate = Mixture(np.log([0.1, 0.6, 0.3, 1e-9]), 100.0 * np.eye(4, 3),
+                       np.array([np.eye(3)] * 4))
+    np.testing.assert_allclose(np.exp(separate.reduce(2).log_weights), [0.6, 0.3])
+    assert len(separate.reduce(8).means) == 3
+
+
+def test_the_product_of_two_square_roots_is_the_mixture():
+    covariance = np.diag([0.04, 1.0, 0.25])
+    mixture = Mixture(np.array([-0.7]), np.array([[9.0, 1.0, 0.0]]), covariance[None])
+    root = mixture.powered(0.5)
+    points = np.array([[9.1, 0.5, 0.2], [8.7, 1.5, -0.3]])
+    np.testing.assert_allclose(root.log_density(points), mixture.log_density(points) / 2)
+    np.testing.assert_allclose(
+        root.product(root).log_density(points), mixture.log_density(points))

@@ -1,0 +1,191 @@
+"""Posteriors with a mixture as prior."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.special import chdtri
+
+from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
+from rhs_isac_ros.model.geometry import to_polar
+from rhs_isac_ros.positioning import BayesEstimator, Mixture
+from rhs_isac_ros.positioning.lattice import Resolution, lay_grid
+from rhs_isac_ros.positioning.prior import bend, cells_of, flatten
+
+PLACE = np.array([8.5, -1.5, 0.2])
+STD_M = 0.15
+POSE = Pose((1.0, -2.0, 0.5), (0.1, -0.2, 0.6, 0.8))
+REGION_RADIUS = float(chdtri(3, 0.05))
+
+
+def around(place, std_m=STD_M):
+    return Mixture(np.zeros(1), np.asarray(place, float)[None], std_m**2 * np.eye(3)[None])
+
+
+@pytest.fixture(scope='module')
+def model(shipped):
+    return MeasurementModel(Scenario(), shipped)
+
+
+@pytest.fixture
+def lazy(shipped):
+    """An estimator that has not seen the codebook."""
+    return BayesEstimator(Scenario(), shipped, lazy=True)
+
+
+def has_searched_the_region(estimator):
+    return '_region' in vars(estimator)
+
+
+@pytest.mark.parametrize('pose', [Pose(), POSE], ids=['at the origin', 'elsewhere'])
+def test_a_bent_mixture_has_the_moments_of_range_and_directions(pose):
+    rng, std_m = np.random.default_rng(1), np.array([0.03, 0.5, 0.3])
+    mixture = around(pose.to_site(PLACE))._replace(
+        covariances=pose.covariances_to_site(np.diag(std_m**2))[None])
+    points = to_polar(pose.to_surface(mixture.sample(200_000, rng)))
+    bent = bend(mixture, pose)
+    stds = np.sqrt(np.diagonal(bent.covariances[0]))
+    np.testing.assert_allclose(
+        (points.mean(axis=0) - bent.means[0]) / stds, 0.0, atol=0.03)
+    np.testing.assert_allclose(
+        np.cov(points.T) / np.outer(stds, stds), bent.covariances[0] / np.outer(stds, stds),
+        atol=0.03)
+
+
+def test_a_flattened_mixture_has_the_moments_of_the_position():
+    """A sheet, 5 mm thick and half a metre wide, around a surface."""
+    rng = np.random.default_rng(2)
+    point = to_polar(PLACE)
+    covariance = np.diag([0.005, 0.06, 0.04])**2
+    points = rng.multivariate_normal(point, covariance, 200_000)
+    w = np.sqrt(1 - np.sum(points[:, 1:]**2, axis=1))
+    positions = POSE.to_site(points[:, :1] * np.column_stack([w, points[:, 1:]]))
+    flat = flatten(Mixture(np.zeros(1), point[None], covariance[None]), POSE)
+    np.testing.assert_allclose(flat.means[0], positions.mean(axis=0), atol=5e-3)
+    np.testing.assert_allclose(flat.covariances[0], np.cov(positions.T), atol=2e-3)
+    # The mean is beside the sheet, by much more than it is thick.
+    assert np.linalg.norm(POSE.to_surface(flat.means[0])) < point[0] - 0.015
+
+
+def test_bending_leaves_velocities_and_their_correlation():
+    covariance = np.eye(6) + 0.3
+    mixture = Mixture(np.zeros(1), np.array([[*PLACE, 1.0, 2.0, 3.0]]), 1e-4 * covariance[None])
+    again = flatten(bend(mixture, POSE), POSE)
+    np.testing.assert_allclose(again.means, mixture.means, atol=1e-4)
+    np.testing.assert_allclose(again.covariances, mixture.covariances, rtol=1e-3, atol=1e-8)
+
+
+def test_bent_components_are_in_front_of_the_surface():
+    bent = bend(around([-2.0, 0.3, 0.1]), Pose())
+    assert np.isfinite(bent.means).all()
+    assert np.isfinite(bent.covariances).all()
+
+
+def test_the_search_covers_four_standard_deviations():
+    scenario, rng = Scenario(), np.random.default_rng(3)
+    grid, resolution = lay_grid(scenario), Resolution.of(scenario)
+    chosen = cells_of(bend(around(PLACE), Pose()), grid, resolution)
+    offsets = rng.standard_normal((500, 3))
+    offsets *= 3.9 * STD_M / np.linalg.norm(offsets, axis=1)[:, None]
+    points, part = to_polar(PLACE + offsets), grid.within(chosen)
+    apart = np.abs(points[:, None] - part.points)
+    half = np.column_stack([
+        part.widths_m[part.cell] / 2, np.tile(0.2 * resolution.direction, (len(part.cell), 1))])
+    assert (apart <= 1.01 * half).all(axis=2).any(axis=1).all()
+    assert np.count_nonzero(chosen) < 0.1 * len(chosen)
+
+
+def test_the_posterior_is_the_prior_times_the_likelihood(table1_estimator, model):
+    """The reference weighs points drawn from the prior with the exact likelihood."""
+    rng, errors = np.random.default_rng(5), []
+    for place in ([8.5, -1.5, 0.2], [6.0, 2.0, -0.3], [11.0, 0.5, 0.1]):
+        # A second mode, 0.6 m away, is improbable.
+        prior = around(place + 0.1 * rng.standard_normal(3), 0.1)
+        signals = model.sample(np.array([place]), rng)[0]
+        found = table1_estimator.posterior(signals, prior, wrong=1e-9)
+        points = prior.sample(60_000, rng)
+        residual = model.whiten(signals - model.mean(points))
+        logs = -np.sum(np.abs(residual)**2, axis=(1, 2))
+        weights = np.exp(logs - logs.max())
+        weights /= weights.sum()
+        mean = weights @ points
+        spread = np.cov(points.T, aweights=weights, ddof=0)
+        error = found.estimate.mean - mean
+        errors.append(error @ np.linalg.solve(spread, error))
+        np.testing.assert_allclose(
+            np.linalg.slogdet(found.estimate.covariance)[1], np.linalg.slogdet(spread)[1],
+            atol=0.5)
+        mean_of_mixture, _ = found.mixture.moments()
+        np.testing.assert_allclose(mean_of_mixture, found.estimate.mean, atol=0.02)
+    # The reference has an effective number of about a hundred points.
+    assert np.mean(errors) < 0.1
+
+
+def test_a_codebook_that_has_not_been_seen_gives_the_same_posterior(
+        lazy, table1_estimator, model):
+    rng = np.random.default_rng(7)
+    for _ in range(5):
+        prior = around(PLACE + STD_M * rng.standard_normal(3))
+        signals = model.sample(PLACE[None], rng)[0]
+        found, expected = (
+            one.posterior(signals, prior).estimate for one in (lazy, table1_estimator))
+        error = found.mean - expected.mean
+        assert error @ np.linalg.solve(expected.covariance, error) < 0.05
+        np.testing.assert_allclose(found.covariance, expected.covariance, atol=3e-3)
+    assert not has_searched_the_region(lazy)
+
+
+def test_the_region_is_searched_if_the_signals_disagree_with_the_prior(
+        lazy, table1_estimator, model):
+    place = np.array([13.0, 3.5, -0.4])
+    signals = model.sample(place[None], np.random.default_rng(8))[0]
+    found = lazy.posterior(signals, around(PLACE)).estimate
+    assert has_searched_the_region(lazy)
+    alone = table1_estimator.estimate(signals)
+    assert np.linalg.norm(found.mean - alone.mean) < 0.2
+    offset = found.mean - place
+    assert offset @ np.linalg.solve(found.covariance, offset) < REGION_RADIUS
+
+
+def test_positions_are_in_the_frame_of_the_surface_and_mixtures_in_that_of_the_site(
+        shipped, table1_estimator, model):
+    placed = BayesEstimator(dataclasses.replace(Scenario(), pose=POSE), shipped)
+    signals = model.sample(PLACE[None], np.random.default_rng(9))[0]
+    expected = table1_estimator.posterior(signals, around(PLACE))
+    found = placed.posterior(signals, around(POSE.to_site(PLACE)))
+    np.testing.assert_allclose(found.estimate.mean, expected.estimate.mean, atol=1e-6)
+    np.testing.assert_allclose(
+        found.mixture.moments()[0], POSE.to_site(expected.mixture.moments()[0]), atol=1e-6)
+
+
+def test_without_a_prior_the_mixture_is_that_of_the_region(table1_estimator, model):
+    signals = model.sample(PLACE[None], np.random.default_rng(10))[0]
+    found = table1_estimator.posterior(signals)
+    mean, covariance = found.mixture.moments()
+    np.testing.assert_allclose(mean, found.estimate.mean, atol=0.05)
+    np.testing.assert_allclose(covariance, found.estimate.covariance, atol=0.03)
+    assert found.mixture.log_mass == pytest.approx(0.0, abs=1e-9)
+
+
+def test_signals_without_a_position_have_no_mixture(table1_estimator, model):
+    signals = 1e3 * model.sample(PLACE[None], np.random.default_rng(11))[0]
+    found = table1_estimator.posterior(signals, around(PLACE))
+    assert found.mixture is None
+    assert 'residual' in found.estimate.reason
+
+
+@pytest.mark.slow
+def test_errors_have_the_stated_covariance(shipped, model):
+    """Positions drawn from the prior, with a table of the prior's cells alone."""
+    rng, normalised = np.random.default_rng(12), []
+    centres = Scenario(roi_size_m=(8, 8, 1)).sample_positions(300, rng)
+    places = centres + 0.2 * rng.standard_normal(centres.shape)
+    for centre, place in zip(centres, places, strict=True):
+        estimator = BayesEstimator(Scenario(), shipped, lazy=True)
+        found = estimator.posterior(
+            model.sample(place[None], rng)[0], around(centre, 0.2)).estimate
+        offset = found.mean - place
+        normalised.append(offset @ np.linalg.solve(found.covariance, offset))
+    # The standard errors are 1.3 % and 0.14.
+    assert 0.91 < np.mean(np.array(normalised) <= REGION_RADIUS) < 0.99
+    assert np.mean(normalised) == pytest.approx(3.0, abs=0.6)

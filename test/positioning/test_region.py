@@ -1,0 +1,113 @@
+"""Gaussians in range and direction, restricted to regions of three, two and one dimensions."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.stats import qmc
+
+from rhs_isac_ros.model.gaussian import likelihood_loss
+from rhs_isac_ros.model.geometry import to_polar, to_positions
+from rhs_isac_ros.positioning.region import Restricted, move_inside
+from rhs_isac_ros.positioning.templates import standard_normal
+
+CENTRE, SIZE = np.array([10.0, 4.5, -2.5]), np.array([8.0, 6.0, 2.0])
+# Extents relative to SIZE: boxes, planes and lines, and two that are thin but not flat.
+EXTENTS = [*itertools.product((0, 1), repeat=3)][1:] + [(1, 1, 1e-3), (1, 1e-3, 1e-3)]
+# The range is known to a centimetre, the direction to a few degrees.
+CURVATURE = np.array([[1e4, 2e2, -1e2], [2e2, 3e2, 0.0], [-1e2, 0.0, 4e2]])
+NORMAL = standard_normal(1024)
+
+
+def bounds_of(extents, centre=CENTRE):
+    half = np.array(extents) * SIZE / 2
+    return np.stack([centre - half, centre + half])
+
+
+def grid(bounds):
+    free = bounds[1] > bounds[0]
+    # The modes are thin sheets.
+    log2_points = 13 + 2 * int(free.sum())
+    points = np.tile(bounds.mean(axis=0), (2**log2_points, 1))
+    sobol = qmc.Sobol(int(free.sum()), seed=0).random_base2(log2_points)
+    points[:, free] = bounds[0, free] + sobol * (bounds[1] - bounds[0])[free]
+    return points
+
+
+def log_density(positions, centre):
+    offset = (to_polar(positions) - centre).reshape(-1, 3)
+    return -likelihood_loss(offset, CURVATURE[None]).reshape(positions.shape[:-1])
+
+
+def restricted(centre, bounds):
+    """The Gaussian around a centre, expanded at its most likely point inside."""
+    point = to_polar(np.clip(to_positions(centre), *bounds))
+    for _ in range(4):
+        gaussian = Restricted.of(
+            point[None], (CURVATURE @ (centre - point))[None], CURVATURE[None], bounds)
+        point = to_polar(gaussian.nearest()[0])
+    return gaussian
+
+
+@pytest.mark.parametrize('extents', EXTENTS, ids=str)
+@pytest.mark.parametrize('shift', [
+    (0.0, 0.0, 0.0), (0.01, 0.05, -0.03), (-0.02, -0.1, 0.12)], ids=str)
+def test_samples_have_the_moments_and_the_mass_of_the_gaussian_in_the_region(extents, shift):
+    """Some modes have their unrestricted maxima outside, on other sides of the border."""
+    bounds, reference = bounds_of(extents), grid(bounds_of(extents))
+    rng = np.random.default_rng(3)
+    for inside in rng.uniform(*bounds, (4, 3)):
+        centre = to_polar(inside) + shift
+        positions, log_weights = restricted(centre, bounds).sample(NORMAL)
+        weights = np.exp(log_weights[0] + log_density(positions[0], centre))
+        expected = np.exp(log_density(reference, centre))
+        assert ((positions >= bounds[0]) & (positions <= bounds[1])).all()
+        assert weights.mean() == pytest.approx(expected.mean(), rel=0.1)
+        mean = np.average(reference, axis=0, weights=expected)
+        std = np.sqrt(np.average((reference - mean)**2, axis=0, weights=expected))
+        np.testing.assert_allclose(
+            np.average(positions[0], axis=0, weights=weights), mean, atol=0.15 * std.max() + 1e-9)
+
+
+@pytest.mark.parametrize('extents', EXTENTS, ids=str)
+def test_steps_inside_the_region_reach_the_most_likely_position(extents):
+    bounds = bounds_of(extents)
+    reference, rng = grid(bounds), np.random.default_rng(4)
+    for inside in rng.uniform(*bounds, (4, 3)):
+        centre = to_polar(inside) + [0.01, 0.1, -0.2]
+        found = restricted(centre, bounds).nearest()[0]
+        # Points of the grid miss the maximum by a few centimetres.
+        assert log_density(found, centre) >= log_density(reference, centre).max() - 0.3
+        once = move_inside(centre[None], CURVATURE[None], bounds)[0]
+        assert log_density(to_positions(once), centre) >= log_density(
+            reference, centre).max() - 10
+
+
+def test_points_inside_do_not_move():
+    bounds = bounds_of((1, 1, 1))
+    points = to_polar(np.random.default_rng(0).uniform(*bounds, (50, 3)))
+    np.testing.assert_array_equal(
+        move_inside(points, np.tile(CURVATURE, (50, 1, 1)), bounds), points)
+
+
+def test_a_grazing_direction_determines_the_range_along_the_wall():
+    """A corridor along the surface: x is far shorter than y, and directions are near the rim."""
+    bounds = np.array([[0.05, 15.0, -1.0], [1.5, 25.0, 1.0]])
+    point = to_polar(np.array([0.4, 20.0, 0.3]))
+    positions, log_weights = Restricted.of(
+        point[None], np.zeros((1, 3)), CURVATURE[None], bounds).sample(NORMAL)
+    weights = np.exp(log_weights[0] + log_density(positions[0], point))
+    expected = np.exp(log_density(grid(bounds), point)).mean()
+    assert weights.mean() == pytest.approx(expected, rel=0.03)
+    assert weights.sum()**2 / (weights**2).sum() > 0.5 * len(weights)
+
+
+def test_a_distant_gaussian_is_sampled_on_the_border():
+    bounds = bounds_of((1, 1, 1))
+    centre = to_polar(np.array([10.0, 4.0, 9.0]))
+    point = to_polar(np.array([10.0, 4.0, -1.5]))
+    positions, log_weights = Restricted.of(
+        point[None], (CURVATURE @ (centre - point))[None], CURVATURE[None], bounds).sample(NORMAL)
+    assert np.isfinite(log_weights).all()
+    assert (positions[0, :, 2] > -1.8).mean() > 0.8
+    assert np.isfinite(to_positions(to_polar(positions))).all()

@@ -1,0 +1,177 @@
+"""Sites with several surfaces, their files and positions from all surfaces."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Pose, Scenario
+from rhs_isac_ros.positioning import Site, SiteError, SiteEstimator, SiteSurface, make_estimator
+from rhs_isac_ros.positioning.agreement import PoseTest
+from rhs_isac_ros.positioning.site import site_text
+
+CONFIG = Path(__file__).parents[2] / 'config'
+BOUNDS = np.array([[5.0, -5.0, -1.0], [15.0, 5.0, 1.0]])
+EXACT = (0.0, 0.0)
+SCENARIO = Scenario.from_yaml(CONFIG / 'bandplan.yaml')
+CODEBOOK = Codebook.load(CONFIG / 'codebook_bandplan.yaml')
+FRONT, SIDE = (
+    SiteSurface(dataclasses.replace(SCENARIO, pose=pose), CODEBOOK)
+    for pose in (Pose(uncertainty=EXACT), Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.0, 1.0), EXACT)))
+SITE = Site({'front': FRONT, 'side': SIDE}, BOUNDS)
+
+
+@pytest.fixture(scope='module')
+def estimator():
+    return SiteEstimator(SITE)
+
+
+@pytest.fixture(scope='module')
+def cycles():
+    """Positions, and the signals of each cycle by the name of the surface."""
+    rng = np.random.default_rng(2)
+    positions = rng.uniform(*BOUNDS, size=(30, 3))
+    received = SITE.simulate(positions, rng)
+    return positions, [{name: signals[number] for name, signals in received.items()}
+                       for number in range(len(positions))]
+
+
+def test_all_surfaces_locate_better_than_one(estimator, cycles):
+    def error_m2(names):
+        means = [estimator.estimate({name: one[name] for name in names}).mixture.moments()[0]
+                 for one in cycles[1]]
+        return np.mean(np.sum((means - cycles[0])**2, axis=1))
+    both = error_m2(['front', 'side'])
+    assert both < 0.7 * min(error_m2(['front']), error_m2(['side']))
+
+
+def test_one_surface_locates_like_its_estimator(estimator, cycles):
+    alone = make_estimator('bayes', SCENARIO, CODEBOOK)
+    for cycle in cycles[1][:5]:
+        mean = estimator.estimate({'side': cycle['side']}).mixture.moments()[0]
+        expected = alone.posterior(cycle['side']).estimate
+        offset = SIDE.pose.to_surface(mean) - expected.mean
+        assert offset @ np.linalg.solve(expected.covariance, offset) < 0.05
+
+
+def test_a_surface_without_a_signal_is_left_out(estimator, cycles):
+    cycle = cycles[1][0]
+    silent = np.zeros_like(cycle['side'])
+    assert set(estimator.sightings({**cycle, 'side': silent})) == {'front'}
+    mixtures = [estimator.estimate(received).mixture for received in (
+        {**cycle, 'side': silent}, {'front': cycle['front']})]
+    np.testing.assert_array_equal(mixtures[0].means, mixtures[1].means)
+    assert estimator.estimate({'side': silent}) is None
+    assert estimator.estimate({}) is None
+
+
+def test_surfaces_receive_independent_signals_of_the_same_users():
+    places = np.array([[10.0, 0.0, 0.0]])
+    # This place is the same in the frames of both surfaces.
+    received = SITE.simulate(places, np.random.default_rng(3))
+    assert not np.allclose(received['front'], received['side'])
+
+
+def test_the_example_is_two_surfaces_at_a_right_angle():
+    site = Site.from_yaml(CONFIG / 'site.yaml')
+    assert list(site.surfaces) == ['front', 'side']
+    np.testing.assert_array_equal(site.bounds_m, BOUNDS)
+    front, side = (one.pose.vectors_to_site(np.array([1.0, 0.0, 0.0]))
+                   for one in site.surfaces.values())
+    assert front @ side == pytest.approx(0.0)
+    assert site.surfaces['side'].pose.uncertainty == Pose().uncertainty
+
+
+def written(folder, change=lambda content: None):
+    """Write the example with a change, and return its path."""
+    content = yaml.safe_load((CONFIG / 'site.yaml').read_text(encoding='utf-8'))
+    for one in content['surfaces'].values():
+        one |= {name: str(CONFIG / one[name]) for name in ('scenario', 'codebook')}
+    change(content)
+    path = folder / 'site.yaml'
+    path.write_text(yaml.safe_dump(content), encoding='utf-8')
+    return path
+
+
+def test_a_pose_is_by_default_that_of_the_scenario(tmp_path):
+    def change(content):
+        del content['surfaces']['front']['pose']
+    assert Site.from_yaml(written(tmp_path, change)).surfaces['front'].pose == Pose()
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    (lambda site: site.pop('roi_size_m'), r"the file: \[.*\], expected the keys \['roi_center_m'"),
+    (lambda site: site.update(extra=1), r"the file: \['extra', .*\], expected the keys"),
+    (lambda site: site.update(surfaces={}), 'surfaces: none, expected at least one'),
+    (lambda site: site.update(surfaces=[1]), 'surfaces: expected a mapping of names to surfaces'),
+    (lambda site: site.update(roi_size_m=[1, 2]), 'roi_size_m'),
+    (lambda site: site['surfaces'].update({'Top/1': site['surfaces'].pop('side')}),
+     "surfaces: 'Top/1', expected a name of small letters"),
+    (lambda site: site['surfaces']['side'].pop('codebook'), 'side: .* expected the keys'),
+    (lambda site: site['surfaces']['side'].update(place=1), 'side: .*place.* expected the keys'),
+    (lambda site: site['surfaces']['side'].update(pose=1), 'side: pose: 1, expected a mapping'),
+    (lambda site: site['surfaces'].update(side=3), 'side: 3, expected the keys'),
+    (lambda site: site['surfaces']['side'].update(scenario=3), 'unsupported operand'),
+    (lambda site: site['surfaces']['side'].update(scenario='none.yaml'), 'none.yaml: cannot be'),
+    (lambda site: site['surfaces']['side']['pose'].update(quaternion=[0, 0, 0, 0]),
+     'side: pose: quaternion: zeros'),
+    (lambda site: site['surfaces']['side'].update(codebook=str(CONFIG / 'codebook.yaml')),
+     'side: analog'),
+    (lambda site: site['surfaces']['side']['pose'].update(position_m=[10.0, 0.0, 0.0]),
+     'side: roi_center_m'),
+])
+def test_invalid_files_are_refused(tmp_path, change, message):
+    with pytest.raises(SiteError, match=message) as error:
+        Site.from_yaml(written(tmp_path, change))
+    assert 'site.yaml' in str(error.value)
+
+
+def test_a_file_that_does_not_exist_is_refused(tmp_path):
+    with pytest.raises(SiteError, match=r'none\.yaml: cannot be read'):
+        Site.from_yaml(tmp_path / 'none.yaml')
+
+
+def test_the_region_of_a_surface_in_a_file_is_that_of_the_site(tmp_path):
+    def change(content):
+        content['surfaces']['side']['pose'].update(position_m=[10.0, -9.0, 0.5])
+    scenario = Site.from_yaml(written(tmp_path, change)).surfaces['side'].scenario
+    np.testing.assert_array_equal(scenario.roi_bounds_m, [[4.0, -5.0, -1.5], [14.0, 5.0, 0.5]])
+    # As long as it is the same, estimators use the same tables.
+    example = Site.from_yaml(CONFIG / 'site.yaml').surfaces['side'].scenario
+    assert example.id == dataclasses.replace(SCENARIO, pose=example.pose).id
+
+
+def test_a_file_with_other_poses_is_the_same_site(tmp_path):
+    pose = Pose((10.1, -10.2, 0.1), (0.0, 0.1, 1.0, 1.0), tuple(map(tuple, 1e-4 * np.eye(6))))
+    (tmp_path / 'below').mkdir()
+    path = tmp_path / 'below' / 'moved.yaml'
+    path.write_text(site_text(written(tmp_path), {'side': pose}, path.parent), encoding='utf-8')
+    before, after = (Site.from_yaml(file) for file in (written(tmp_path), path))
+    assert after.surfaces['side'].pose == pose
+    assert after.surfaces['front'].scenario == before.surfaces['front'].scenario
+    assert after.surfaces['side'].codebook.id == before.surfaces['side'].codebook.id
+
+
+def test_the_region_of_a_turned_surface_may_be_larger():
+    turned = dataclasses.replace(
+        SCENARIO, pose=Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.1, 1.0), EXACT))
+    with pytest.raises(SiteError, match='side: roi_center_m'):
+        Site({'side': SiteSurface(turned, CODEBOOK)}, BOUNDS)
+    large = dataclasses.replace(turned, roi_size_m=(14.0, 14.0, 2.0))
+    assert Site({'side': SiteSurface(large, CODEBOOK)}, BOUNDS).surfaces
+
+
+def test_drawn_agreements_are_references_for_their_places(estimator):
+    agreements, places = estimator.draw_agreements(5, np.random.default_rng(2))
+    assert [*agreements[0]] == [('front', 'side')]
+    assert len(agreements) == len(places) <= 5
+    assert ((places >= BOUNDS[0]) & (places <= BOUNDS[1])).all()
+    PoseTest(agreements, places).add(agreements[0], places[0])
+
+
+def test_the_base_station_of_the_first_surface_leads():
+    assert SITE.leader == 'front'
+    assert Site({'side': SIDE, 'front': FRONT}, BOUNDS).leader == 'side'

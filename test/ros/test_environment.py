@@ -1,0 +1,71 @@
+"""Environment variables that ROS reads: their checks and defaults."""
+
+import argparse
+
+import pytest
+
+from rhs_isac_ros.ros.environment import check_environment, discovery_range, log_arguments
+
+
+@pytest.mark.parametrize(('name', 'value', 'expected'), [
+    # rcl would read 8, 16, 5, 5 and 0.
+    ('ROS_DOMAIN_ID', '010', 'an integer from 0 to 232'),
+    ('ROS_DOMAIN_ID', '0x10', 'an integer from 0 to 232'),
+    ('ROS_DOMAIN_ID', ' 5', 'an integer from 0 to 232'),
+    ('ROS_DOMAIN_ID', '5x', 'an integer from 0 to 232'),
+    ('ROS_DOMAIN_ID', '-1', 'an integer from 0 to 232'),
+    ('ROS_DOMAIN_ID', '233', 'an integer from 0 to 232'),
+    ('ROS_DOMAIN_ID', '٣', 'an integer from 0 to 232'),
+    ('ROS_AUTOMATIC_DISCOVERY_RANGE', 'localhost', 'OFF, LOCALHOST, SUBNET or SYSTEM_DEFAULT'),
+    ('ROS_STATIC_PEERS', '127.0.0.1,127.0.0.2', 'addresses or host names with ; between them'),
+    ('ROS_STATIC_PEERS', '127.0.0.1 127.0.0.2', 'addresses or host names with ; between them'),
+    ('ROS_SECURITY_ENABLE', 'True', 'true or false'),
+    ('ROS_SECURITY_STRATEGY', 'enforce', 'Enforce or Permissive')])
+def test_an_invalid_environment_variable_is_named(name, value, expected, monkeypatch, capsys):
+    monkeypatch.setenv(name, value)
+    with pytest.raises(SystemExit, match='2'):
+        check_environment(argparse.ArgumentParser(prog='bs'))
+    assert (f'bs: error: environment variable {name}: {value!r}, expected {expected}'
+            in capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(('name', 'value'), [
+    *(('ROS_DOMAIN_ID', value) for value in ('', '0', '9', '10', '99', '199', '232')),
+    ('ROS_STATIC_PEERS', '127.0.0.1;localhost'), ('ROS_AUTOMATIC_DISCOVERY_RANGE', 'OFF'),
+    ('ROS_SECURITY_ENABLE', 'false')])
+def test_a_valid_environment_variable_is_accepted(name, value, monkeypatch):
+    monkeypatch.setenv(name, value)
+    check_environment(argparse.ArgumentParser())
+
+
+@pytest.mark.parametrize(('only', 'given', 'expected'), [
+    (None, None, 'LOCALHOST'), (None, 'SUBNET', 'SUBNET'), ('0', 'SUBNET', 'SUBNET'),
+    ('1', 'SUBNET', 'LOCALHOST')])
+def test_the_older_variable_for_the_discovery_range_takes_precedence(
+        only, given, expected, monkeypatch):
+    for name, value in (('ROS_LOCALHOST_ONLY', only), ('ROS_AUTOMATIC_DISCOVERY_RANGE', given)):
+        monkeypatch.delenv(name, raising=False)
+        if value:
+            monkeypatch.setenv(name, value)
+    assert discovery_range() == expected
+
+
+WITHOUT_LOG_FILES = ['--ros-args', '--disable-external-lib-logs']
+
+
+@pytest.mark.parametrize(('variable', 'value', 'expected'), [
+    ('HOME', '{folder}', []), ('HOME', '{folder}/file', WITHOUT_LOG_FILES),
+    ('HOME', '', WITHOUT_LOG_FILES), ('HOME', None, WITHOUT_LOG_FILES),
+    # rcl reports an error for a folder that the user chose.
+    ('ROS_LOG_DIR', '/proc/none', []), ('ROS_HOME', '/proc/none', [])])
+def test_a_user_without_a_home_directory_has_no_log_files(
+        variable, value, expected, monkeypatch, tmp_path, capsys):
+    (tmp_path / 'file').touch()
+    for name in ('HOME', 'ROS_LOG_DIR', 'ROS_HOME'):
+        monkeypatch.delenv(name, raising=False)
+    if value is not None:
+        monkeypatch.setenv(variable, value.format(folder=tmp_path))
+    assert log_arguments() == expected
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == bool(expected)
+    assert all(line.startswith('no log files: ') and 'ROS_LOG_DIR' in line for line in lines)

@@ -1,0 +1,48 @@
+"""Signals, errors and exit codes at the end of a command."""
+
+import subprocess
+import sys
+import types
+
+import pytest
+
+from rhs_isac_ros.support import exits
+
+
+@pytest.mark.parametrize(('spec', 'expected'), [
+    (None, 'fig4.py: error: x\n'),
+    (types.SimpleNamespace(name='lab.__main__'), 'python3 -m lab: error: x\n'),
+    (types.SimpleNamespace(name='lab.tool'), 'python3 -m lab.tool: error: x\n')])
+def test_an_error_names_the_program_of_the_process_by_default(spec, expected, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, '__main__', types.SimpleNamespace(__spec__=spec))
+    monkeypatch.setattr(sys, 'argv', ['/lab/fig4.py', 'x'])
+    exits.print_error('x')
+    assert capsys.readouterr().err == expected
+
+
+def test_an_error_of_the_user_names_the_program(capsys):
+    def fail():
+        raise LookupError('no such place')
+    assert exits.exit_code_of(fail, (LookupError,), 'lab') == 2
+    assert capsys.readouterr().err == 'lab: error: no such place\n'
+
+
+@pytest.mark.parametrize(('setup', 'ends'), [
+    ('', 'True True True'),
+    # As under nohup.
+    ('signal.signal(signal.SIGHUP, signal.SIG_IGN)', 'True True False')])
+def test_a_handler_of_all_signals_that_end_a_command_respects_nohup(setup, ends):
+    code = f"""
+import signal
+from rhs_isac_ros.support.exits import on_end_signals
+{setup}
+received = []
+on_end_signals(lambda number, _: received.append(number))
+numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+for number in numbers:
+    signal.raise_signal(number)
+print(*(number in received for number in numbers))
+"""
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          check=True, timeout=60)
+    assert done.stdout.strip() == ends
