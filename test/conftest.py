@@ -1,6 +1,7 @@
 """Fixtures that all tests share, and the paper's equations written out index by index."""
 
 import contextlib
+import gc
 import importlib.util
 import signal
 import subprocess
@@ -44,6 +45,12 @@ def pytest_addoption(parser):
 def pytest_configure(config):
     thorough = config.getoption('thorough')
     hypothesis.settings.load_profile('thorough' if thorough else 'quick')
+
+
+def pytest_collection_finish():
+    # Later collections then ignore the modules and tests, so they are fast.
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_report_header():

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import gc
 import time
 import warnings
 
@@ -91,6 +92,9 @@ class Bench:
             self.remove(node)
         self._executor.shutdown()
         rclpy.shutdown(context=self.context)
+        # A node whose constructor failed is part of a reference cycle. If it were destroyed in the
+        # middle of a later test, its participant could block the process.
+        gc.collect()
 
 
 @pytest.fixture

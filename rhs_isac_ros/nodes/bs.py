@@ -1,5 +1,6 @@
 """The executable ``bs``: the base station."""
 
+import collections
 import dataclasses
 import functools
 import time
@@ -43,17 +44,34 @@ class _Turns:
     def __init__(self, node: Node) -> None:
         self._node, self._next_s = node, 0.0
         self._feedback = f'{node.resolve_topic_name(topics.LOCATE)}/_action/feedback'
+        self._waiting: collections.deque[Future] = collections.deque()
 
     async def wait(self) -> None:
         """Return at the next turn; at once if there is none before."""
-        now_s = time.monotonic()
-        delay_s = self._next_s - now_s
-        self._next_s = max(self._next_s, now_s) + max(
-            _ANSWER_S, _ANSWER_PER_CLIENT_S * self._node.count_subscribers(self._feedback))
-        if delay_s > 0:
+        delay_s = self._next_s - time.monotonic()
+        if self._waiting or delay_s > 0:
             future: Future = Future()
-            _later(self._node, delay_s, lambda: future.set_result(None))
+            self._waiting.append(future)
+            if len(self._waiting) == 1:
+                _later(self._node, delay_s, self._end_turn)
             await future
+        else:
+            self._begin_turn()
+
+    def _begin_turn(self) -> float:
+        """Set the time of the next turn, and return the time until then [s]."""
+        length_s = max(_ANSWER_S,
+                       _ANSWER_PER_CLIENT_S * self._node.count_subscribers(self._feedback))
+        self._next_s = time.monotonic() + length_s
+        return length_s
+
+    def _end_turn(self) -> None:
+        # The next turn begins when this one really ends. With times that are fixed in advance, a
+        # delayed process would send all overdue answers at once.
+        length_s = self._begin_turn()
+        self._waiting.popleft().set_result(None)
+        if self._waiting:
+            _later(self._node, length_s, self._end_turn)
 
 
 def _later(node: Node, delay_s: float, callback: Callable[[], None]) -> Timer:
@@ -121,10 +139,14 @@ class LocateServer:
         """Abort all goals; withdraw the action `delay_s` [s] later, once the results are sent."""
         for goal in list(self._goals):
             self._end(goal, 'the base station ends or stands by')
+        if delay_s:
+            _later(self._node, delay_s, self._withdraw)
+        else:
+            self._withdraw()
+
+    def _withdraw(self) -> None:
         server, self._server = self._server, None
-        if server and delay_s:
-            _later(self._node, delay_s, server.destroy)
-        elif server:
+        if server:
             server.destroy()
 
     async def _accept(self, request: Locate.Goal) -> GoalResponse:
@@ -192,12 +214,8 @@ class BsNode(RoleNode[BaseStation]):
         self.start(BaseStation(
             self.scenario, self.make_settings(values), rng, combiner(self.scenario, values.seed),
             values.first_cycle or _cycle_from_clock()))
-        self._make_locate = functools.partial(
-            LocateServer, self, lambda user: self.dispatch(events.LocateRequested(user)),
-            lambda found: convert.pose(found, convert.stamp_of(found, self), self.frame),
-            values.max_users)
-        self._locate: LocateServer | None = self._make_locate()
-        self.endings.callback(self._end_locate)
+        self._locate: LocateServer | None = None
+        self._begin_locate()
         self._reply = events.Reply(False, '')
         for name, request in ((topics.PAUSE, events.PauseRequested()),
                               (topics.RESUME, events.ResumeRequested()),
@@ -208,13 +226,15 @@ class BsNode(RoleNode[BaseStation]):
 
     def stand_by(self) -> None:
         """Withdraw the action ``locate``, and abandon the cycle."""
-        self._end_locate(_FAREWELL_S)
+        if self._locate:
+            self._locate.destroy(_FAREWELL_S)
+        self._locate = None
         self.dispatch(events.StoodBy())
 
     def resume(self) -> None:
         """Offer the action again, and begin cycles once the other nodes are present."""
         self.dispatch(events.Resumed(_cycle_from_clock()))
-        self._locate = self._make_locate()
+        self._begin_locate()
 
     def dispatch(self, event: events.Event) -> None:
         """Pass an event to the role, and a `PositionEstimate` or `NoFix` also to ``locate``."""
@@ -229,10 +249,14 @@ class BsNode(RoleNode[BaseStation]):
             self._locate.observe(message)
         return is_published
 
-    def _end_locate(self, delay_s: float = 0.0) -> None:
-        if self._locate:
-            self._locate.destroy(delay_s)
-        self._locate = None
+    def _begin_locate(self) -> None:
+        self._locate = LocateServer(
+            self, lambda user: self.dispatch(events.LocateRequested(user)),
+            lambda found: convert.pose(found, convert.stamp_of(found, self), self.frame),
+            self.values.max_users)
+        # An action that is still to be withdrawn would outlive its node.
+        self.endings.callback(self._locate.destroy)
+
 
     def execute(self, action: events.Action) -> None:
         """Store a reply for the service call that caused it."""

@@ -54,7 +54,7 @@ def action(bench, request):
             goal.result = goal.handle.get_result_async()
             bench.until(lambda: user in requested and goal.feedback, 'the begin of the goal')
         return goal
-    yield types.SimpleNamespace(server=server, requested=requested, send=send)
+    yield types.SimpleNamespace(server=server, client=client, requested=requested, send=send)
     client.destroy()
     server.destroy()
 
@@ -188,6 +188,13 @@ def test_a_goal_ends_with_the_action(bench, action):
     goal = action.send(1)
     action.server.destroy(0.5)
     assert 'stands by' in finish(bench, goal, GoalStatus.STATUS_ABORTED).reason
+
+
+def test_an_action_that_is_to_be_withdrawn_later_ends_with_its_node(bench, action):
+    action.server.destroy(3600.0)
+    assert action.client.server_is_ready()
+    action.server.destroy()
+    bench.until(lambda: not action.client.server_is_ready(), 'the end of the action')
 
 
 @pytest.mark.parametrize(('user', 'timeout_s'), [(0, 1.0), (9, 1.0), (1, -1.0), (1, np.nan)])
