@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rhs_isac_ros.positioning.fusion import Sighting, fuse
+from rhs_isac_ros.positioning.fusion import Fuser, Sighting
 
 # Number of latest cycles that count.
 WINDOW = 50
@@ -30,12 +30,13 @@ _FAILING, _DOUBTFUL = 3.09, 2.05
 Pair = tuple[str, str]
 
 
-def pair_agreements(sightings: Mapping[str, Sighting], bounds_m: np.ndarray) -> dict[Pair, float]:
+def pair_agreements(sightings: Mapping[str, Sighting], fuser: Fuser) -> dict[Pair, float]:
     """Return the logarithm of the agreement of each pair of surfaces in one cycle.
 
-    Takes the sightings by the name of their surface, and the bounds [2, 3] [m] of the region.
+    Takes the sightings by the name of their surface. `fuser` multiplies them, unless it already
+    has.
     """
-    return {(one, other): fuse([sightings[one], sightings[other]], bounds_m).log_agreement
+    return {(one, other): fuser.fuse([sightings[one], sightings[other]]).log_agreement
             for one, other in itertools.combinations(sorted(sightings), 2)}
 
 

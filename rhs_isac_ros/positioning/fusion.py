@@ -15,6 +15,7 @@ missed a mode, or the surface may be elsewhere. A surface that disagrees with th
 the posterior broader.
 """
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -64,7 +65,8 @@ _TIE = 1e-6
 _MIN_COSINE = 0.05
 
 
-class Sighting(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sighting:
     """The likelihood of positions for the signals of one surface."""
 
     pose: Pose
@@ -106,26 +108,50 @@ class Fused(NamedTuple):
     log_agreement: float
 
 
-@one_blas_thread
 def fuse(sightings: Sequence[Sighting], bounds_m: np.ndarray) -> Fused:
     """Multiply the likelihoods of the surfaces, for a user between the bounds of the region.
 
     The bounds, float64 [2, 3] [m], are in the frame of the site. Raises ValueError without
     sightings, or if a mixture has no finite density.
     """
-    if not sightings:
-        raise ValueError('sightings: none, expected at least one')
-    centre, extent = bounds_m.mean(axis=0), np.maximum(np.ptp(bounds_m, axis=0), _MIN_EXTENT_M)
-    bounds_m = centre + np.outer([-0.5, 0.5], extent)
-    sheets = [_Sheets.of(one, bounds_m) for one in sightings]
-    products = _Products.of(sheets[0]).climb(sheets[:1], bounds_m, 1)
-    for number in range(1, len(sheets)):
-        products = products.extended(sheets[:number + 1], bounds_m)
-    # At least one surface sees the user.
-    products = select(products, ~products.are_constant(sheets))
-    mixture = products.restricted(sheets, bounds_m)
-    log_agreement = mixture.log_mass + (len(sheets) - 1) * float(np.log(extent).sum())
-    return Fused(mixture.normalised().reduce(MAX_COMPONENTS), log_agreement)
+    return Fuser(bounds_m).fuse(sightings)
+
+
+class Fuser:
+    """Products of the sightings of one user, each of which is computed once.
+
+    The products of sightings that begin in the same way share their first factors.
+    """
+
+    def __init__(self, bounds_m: np.ndarray) -> None:
+        """Take the bounds of the region in the frame of the site, float64 [2, 3] [m]."""
+        extent = np.maximum(np.ptp(bounds_m, axis=0), _MIN_EXTENT_M)
+        self._bounds_m = bounds_m.mean(axis=0) + np.outer([-0.5, 0.5], extent)
+        self._log_volume = float(np.log(extent).sum())
+        self._sheets = functools.cache(lambda one: _Sheets.of(one, self._bounds_m))
+        self._product = functools.cache(self._multiply)
+        self._fused = functools.cache(self._locate)
+
+    @one_blas_thread
+    def fuse(self, sightings: Sequence[Sighting]) -> Fused:
+        """Multiply likelihoods; see the function `fuse`."""
+        if not sightings:
+            raise ValueError('sightings: none, expected at least one')
+        return self._fused(tuple(sightings))
+
+    def _multiply(self, sightings: tuple[Sighting, ...]) -> '_Products':
+        sheets = [self._sheets(one) for one in sightings]
+        if len(sheets) == 1:
+            return _Products.of(sheets[0]).climb(sheets, self._bounds_m, 1)
+        return self._product(sightings[:-1]).extended(sheets, self._bounds_m)
+
+    def _locate(self, sightings: tuple[Sighting, ...]) -> Fused:
+        sheets, products = [self._sheets(one) for one in sightings], self._product(sightings)
+        # At least one surface sees the user.
+        products = select(products, ~products.are_constant(sheets))
+        mixture = products.restricted(sheets, self._bounds_m)
+        return Fused(mixture.normalised().reduce(MAX_COMPONENTS),
+                     mixture.log_mass + (len(sheets) - 1) * self._log_volume)
 
 
 class _Sheets(NamedTuple):

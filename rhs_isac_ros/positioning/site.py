@@ -15,7 +15,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
 from rhs_isac_ros.positioning.agreement import Pair, pair_agreements
 from rhs_isac_ros.positioning.estimators import BayesEstimator
-from rhs_isac_ros.positioning.fusion import Fused, Sighting, fuse
+from rhs_isac_ros.positioning.fusion import Fused, Fuser, Sighting, fuse
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import read_yaml
 
@@ -134,8 +134,9 @@ class SiteEstimator:
             sightings = self.sightings(
                 {name: of_surface[cycle] for name, of_surface in received.items()})
             if sightings:
-                agreements.append(pair_agreements(sightings, self._site.bounds_m))
-                fused = fuse(list(sightings.values()), self._site.bounds_m)
+                fuser = Fuser(self._site.bounds_m)
+                agreements.append(pair_agreements(sightings, fuser))
+                fused = fuser.fuse([one for _, one in sorted(sightings.items())])
                 places.append(fused.mixture.moments()[0])
         return agreements, np.array(places).reshape(-1, 3)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from rhs_isac_ros.positioning.agreement import PoseTest, pair_agreements
-from rhs_isac_ros.positioning.fusion import Fused, Sighting, fuse
+from rhs_isac_ros.positioning.fusion import Fused, Fuser, Sighting
 from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.positioning.site import Site
 from rhs_isac_ros.positioning.tracking import MixtureTracker, Motion
@@ -165,10 +165,10 @@ class Fusion(Role):
         begin = self._stopwatch()
         sightings = {name: sighting_of(one) for name, one in fix.posteriors.items()}
         # Anything may be published on the topic, such as a mixture inside the surface.
+        fuser = Fuser(self._bounds_m)
         try:
-            fused = fuse([self._trusted(name, one) for name, one in sightings.items()],
-                         self._bounds_m)
-            agreements = pair_agreements(sightings, self._bounds_m) if self._test else {}
+            fused = fuser.fuse([self._trusted(name, one) for name, one in sightings.items()])
+            agreements = pair_agreements(sightings, fuser) if self._test else {}
         except ValueError as error:
             self.counters['malformed'] += 1
             self.log(f'cycle {key[0]} of user {key[1]}: {error}', warning=True, key='malformed')
@@ -182,7 +182,7 @@ class Fusion(Role):
         """Return a sighting with less weight if the pose of its surface may be wrong."""
         if name not in self._suspects:
             return sighting
-        return sighting._replace(missing=max(sighting.missing, _SUSPECT_MISSING))
+        return dataclasses.replace(sighting, missing=max(sighting.missing, _SUSPECT_MISSING))
 
     def _publish(self, fix: _Fix, sightings: Mapping[str, Sighting], fused: Fused,
                  latency_s: float) -> None:

@@ -44,6 +44,7 @@ from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
 from rhs_isac_ros.positioning import BayesEstimator, Sighting, fuse
 from rhs_isac_ros.positioning.agreement import WINDOW, PoseTest, pair_agreements
 from rhs_isac_ros.positioning.alignment import estimate_pose
+from rhs_isac_ros.positioning.fusion import Fuser
 from rhs_isac_ros.positioning.posterior import Posterior
 
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -188,7 +189,7 @@ def wrong_poses(found: dict[str, list[Posterior]], scenario: Scenario,
         return [pair_agreements({
             name: one for name in declared
             if (one := Sighting.of(found[name][number], declared[name]))},
-            scenario.roi_bounds_m) for number in numbers]
+            Fuser(scenario.roi_bounds_m)) for number in numbers]
     right = cycles((0.0,) * 6, range(2 * n))
     # The references are for other positions than those of the windows.
     references = right[n:]

@@ -8,6 +8,7 @@ import pytest
 from rhs_isac_ros.model import Pose
 from rhs_isac_ros.positioning import Mixture, Sighting, fuse
 from rhs_isac_ros.positioning.agreement import WINDOW, PoseTest, pair_agreements
+from rhs_isac_ros.positioning.fusion import Fuser
 
 BOUNDS = np.array([[5.0, -5.0, -1.0], [15.0, 5.0, 1.0]])
 NAMES = ('front', 'opposite', 'side')
@@ -92,7 +93,7 @@ def test_agreements_are_those_of_each_pair():
     covariances = 0.01 * np.eye(3)[None]
     sightings = {name: Sighting(POSES[name], Mixture(
         np.zeros(1), far if name == 'side' else place, covariances)) for name in POSES}
-    found = pair_agreements(sightings, BOUNDS)
+    found = pair_agreements(sightings, Fuser(BOUNDS))
     assert tuple(found) == PAIRS
     assert found['front', 'opposite'] == fuse(
         [sightings['front'], sightings['opposite']], BOUNDS).log_agreement
@@ -111,7 +112,7 @@ def test_a_surface_at_another_place_lowers_its_agreements():
             seen[0] += shift_m if name == 'side' else 0.0
             sightings[name] = Sighting(pose, Mixture(
                 np.zeros(1), seen[None], std_m**2 * np.eye(3)[None]))
-        return pair_agreements(sightings, BOUNDS)
+        return pair_agreements(sightings, Fuser(BOUNDS))
     test = PoseTest([cycle(0.0) for _ in range(100)])
     for _ in range(WINDOW):
         test.add(cycle(0.3))

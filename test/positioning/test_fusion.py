@@ -1,13 +1,15 @@
 """Positions from the signals of several surfaces."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
 from rhs_isac_ros.model.geometry import polar_derivative, to_polar
-from rhs_isac_ros.positioning import make_estimator
-from rhs_isac_ros.positioning.fusion import MAX_MODES, Fused, Sighting, fuse
+from rhs_isac_ros.positioning import make_estimator, weighted_modes
+from rhs_isac_ros.positioning.fusion import MAX_MODES, Fused, Fuser, Sighting, fuse
 from rhs_isac_ros.positioning.mixture import Mixture
 
 BOUNDS = np.array([[5.0, -5.0, -1.0], [15.0, 5.0, 1.0]])
@@ -145,14 +147,16 @@ def test_an_uncertain_pose_widens_the_posterior_by_its_covariance():
     place = np.array([10.0, 0.0, 0.0])
     uncertain = Pose(uncertainty=(0.3, 0.0))
     alone = fuse([sheets(FRONT, place, std=STD / 100)], BOUNDS).mixture.moments()[1]
-    found = fuse([sheets(FRONT, place, std=STD / 100)._replace(pose=uncertain)], BOUNDS)
+    found = fuse([dataclasses.replace(sheets(FRONT, place, std=STD / 100), pose=uncertain)],
+                 BOUNDS)
     np.testing.assert_allclose(found.mixture.moments()[1] - alone, 0.09 * np.eye(3), atol=0.01)
 
 
 def test_a_pose_with_little_uncertainty_is_exact():
     sightings = [sheets(FRONT, PLACE), sheets(SIDE, PLACE + [0.1, 0.0, 0.0])]
-    nearly = [one._replace(pose=Pose(one.pose.position_m, one.pose.quaternion, (1e-6, 1e-6)))
-              for one in sightings]
+    nearly = [dataclasses.replace(
+        one, pose=Pose(one.pose.position_m, one.pose.quaternion, (1e-6, 1e-6)))
+        for one in sightings]
     assert_moments(fuse(nearly, BOUNDS), *fuse(sightings, BOUNDS).mixture.moments(),
                    tolerance=1e-4)
 
@@ -161,7 +165,7 @@ def test_widening_keeps_the_weights_of_the_modes():
     # The modes are so far apart that they do not overlap. One is much narrower.
     front = sheets(FRONT, [PLACE, PLACE + [4.0, 0.0, 0.0]], np.log([0.3, 0.7]))
     front.mixture.covariances[1] *= 1e-2
-    wide = front._replace(pose=Pose(uncertainty=(0.02, 0.0)))
+    wide = dataclasses.replace(front, pose=Pose(uncertainty=(0.02, 0.0)))
     found = fuse([wide], BOUNDS).mixture
     np.testing.assert_allclose(np.sort(np.exp(found.log_weights)), [0.3, 0.7], rtol=0.03)
 
@@ -197,7 +201,7 @@ def test_agreement_is_the_density_of_the_signals_relative_to_separate_users():
 
 def test_agreement_does_not_depend_on_the_level_of_the_likelihood():
     front, side = sheets(FRONT, PLACE), sheets(SIDE, PLACE)
-    louder = front._replace(mixture=front.mixture.weighted(300.0))
+    louder = dataclasses.replace(front, mixture=front.mixture.weighted(300.0))
     np.testing.assert_allclose(fuse([louder, side], BOUNDS).log_agreement,
                                fuse([front, side], BOUNDS).log_agreement)
 
@@ -221,15 +225,16 @@ def drawn(world, pose, positions, seed):
     return model.sample(pose.to_surface(positions), np.random.default_rng(seed))
 
 
-def test_one_surface_has_the_estimate_of_its_estimator(world):
+def test_one_surface_has_the_moments_of_its_modes(world):
     scenario, _, estimator = world
     positions = scenario.sample_positions(20, np.random.default_rng(2))
     for signals in drawn(world, SIDE, positions, 3):
-        posterior = estimator.posterior(signals)
-        fused = fuse([Sighting.of(posterior, SIDE)], BOUNDS)
-        estimate = posterior.estimate
-        assert_moments(fused, SIDE.to_site(estimate.mean),
-                       SIDE.covariances_to_site(estimate.covariance), tolerance=0.12)
+        fused = fuse([Sighting.of(estimator.posterior(signals), SIDE)], BOUNDS)
+        modes = weighted_modes(estimator, signals)
+        mean, covariance = Mixture(
+            np.log(modes.probabilities), modes.positions, modes.covariances).moments()
+        assert_moments(fused, SIDE.to_site(mean), SIDE.covariances_to_site(covariance),
+                       tolerance=0.12)
 
 
 def test_two_surfaces_are_more_accurate_than_one(world):
@@ -266,3 +271,17 @@ def test_a_result_is_normalised():
     fused = fuse([sheets(FRONT, PLACE), sheets(SIDE, PLACE)], BOUNDS)
     assert isinstance(fused, Fused)
     np.testing.assert_allclose(fused.mixture.log_mass, 0.0, atol=1e-12)
+
+
+def test_products_of_the_same_sightings_are_computed_once():
+    fuser, one, two, three = Fuser(BOUNDS), *(
+        sheets(pose, PLACE) for pose in (FRONT, SIDE, OPPOSITE))
+    pair = fuser.fuse([one, two])
+    assert fuser.fuse((one, two)) is pair
+    # The same numbers as without the others, to the last bit.
+    for group in ([one, two], [one, two, three], [two, three]):
+        found, expected = fuser.fuse(group), fuse(group, BOUNDS)
+        assert found.log_agreement == expected.log_agreement
+        assert np.array_equal(found.mixture.means, expected.mixture.means)
+    # The surface is the same, but may be elsewhere with a higher probability.
+    assert fuser.fuse([one, dataclasses.replace(two, missing=0.5)]) is not pair
