@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from rhs_isac_ros.bounds import site_crlb
+from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.positioning.agreement import PoseTest, pair_agreements
 from rhs_isac_ros.positioning.fusion import Fused, Fuser, Sighting
 from rhs_isac_ros.positioning.mixture import Mixture
@@ -81,7 +83,9 @@ class Fusion(Role):
                  settings: FusionSettings | None = None) -> None:
         super().__init__()
         self._bounds_m, self._stopwatch = site.bounds_m, stopwatch
-        self._scenario = site.surfaces[site.leader].scenario
+        self._surfaces, self._scenario = site.surfaces, site.surfaces[site.leader].scenario
+        self._models = {name: MeasurementModel(one.scenario, one.codebook).prepare()
+                        for name, one in site.surfaces.items()}
         # Positions of the site are in front of the surface that leads.
         self._pose = dataclasses.replace(self._scenario.pose, uncertainty=(0.0, 0.0))
         self._names = {one.scenario.id: name for name, one in site.surfaces.items()}
@@ -197,8 +201,8 @@ class Fusion(Role):
                 one.blocked_probability for one in answers.values())}
         self.send(m.derive(
             m.PositionEstimate, source, position=mean, covariance_m2=covariance,
-            crlb_m2=math.nan, estimator=f'fusion of {", ".join(answers)}', latency_s=latency_s,
-            **common))
+            crlb_m2=self._bound_m2(answers, mean), estimator=f'fusion of {", ".join(answers)}',
+            latency_s=latency_s, **common))
         # The agreement is relative to a different user at each surface.
         volume = (len(answers) - 1) * float(np.log(np.ptp(self._bounds_m, axis=0)).sum())
         log_evidence = fused.log_agreement - volume + sum(
@@ -207,6 +211,16 @@ class Fusion(Role):
         self.send(posterior_of(source, Sighting(
             self._pose, fused.mixture.weighted(log_evidence), missing), **common))
         self._track(source, fused.mixture, missing)
+
+    def _bound_m2(self, answers: Mapping[str, m.Posterior], position: np.ndarray) -> float:
+        """Return the bound of the surfaces with a position; NaN without one of their codebooks."""
+        surfaces = {name: self._surfaces[name] for name in answers}
+        if any(answers[name].codebook_id != one.codebook.id for name, one in surfaces.items()):
+            return math.nan
+        # A thin region is widened, perhaps to positions behind a surface.
+        place = np.clip(position, *self._bounds_m)[None]
+        return float(site_crlb(
+            [(self._models[name], one.pose) for name, one in surfaces.items()], place)[0])
 
     def _track(self, source: m.Posterior, mixture: Mixture, missing: float) -> None:
         """Update the track of a user and publish it, unless the cycle is late."""

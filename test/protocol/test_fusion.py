@@ -6,7 +6,8 @@ import itertools
 import numpy as np
 import pytest
 
-from rhs_isac_ros.model import Pose
+from rhs_isac_ros.bounds import site_crlb
+from rhs_isac_ros.model import MeasurementModel, Pose
 from rhs_isac_ros.positioning import Mixture, Sighting, Site, fuse
 from rhs_isac_ros.positioning.agreement import WINDOW
 from rhs_isac_ros.positioning.site import SiteSurface
@@ -47,7 +48,8 @@ def answer(site):
         covariance = pose.covariances_to_site(np.diag([0.01, 4.0, 0.04])[None])
         sighting = Sighting(pose, Mixture(np.array([-3.0]), place[None], covariance))
         source = m.ReceivedSignals(
-            cycle_id=cycle_id, user=user, user_instance=7, codebook_id='x', signals=None)
+            cycle_id=cycle_id, user=user, user_instance=7,
+            codebook_id=site.surfaces[name].codebook.id, signals=None)
         return posterior_of(source, sighting, **{
             'scenario_id': site.surfaces[name].scenario.id, 'stamp_ns': 9,
             'outside_probability': 0.1} | fields)
@@ -97,6 +99,22 @@ def test_a_cycle_with_all_surfaces_is_fused_at_once(fusion, site, answer):
     assert np.linalg.norm(mean - PLACE) < 0.1
     for message in (estimate, posterior):
         m.check(message, site.surfaces['front'].scenario)
+
+
+def test_the_bound_is_that_of_the_surfaces_with_a_position(fusion, site, answer, no_fix):
+    models = {name: (MeasurementModel(one.scenario, one.codebook), one.pose)
+              for name, one in site.surfaces.items()}
+    *_, (both, _), _, (alone, _) = at_once(fusion, [
+        answer('side'), answer('front'), no_fix('front', 2), answer('side', 2)])
+    for estimate, names in ((both, ('front', 'side')), (alone, ('side',))):
+        expected = site_crlb([models[name] for name in names], estimate.position[None])
+        assert estimate.crlb_m2 == pytest.approx(expected[0])
+    assert both.crlb_m2 < 0.7 * alone.crlb_m2
+
+
+def test_signals_with_a_codebook_of_which_the_site_does_not_know_have_no_bound(fusion, answer):
+    *_, (estimate, _) = at_once(fusion, [answer('front'), answer('side', codebook_id='other')])
+    assert np.isnan(estimate.crlb_m2)
 
 
 def tracks(fusion, events):
