@@ -224,7 +224,10 @@ class SearchEstimator(abc.ABC):
         batch = checked_received(self._likelihood.codebook, received)
         signals = self._likelihood.signals(batch)
         if prior is None:
-            ((located, modes),) = self._locate_block(self._region, signals, draws=False)
+            ((located, modes),) = self._locate_block(self._region, signals, draws=True)
+            if modes is None and not located[2]:
+                # The position is an average over draws, as in `estimate`; a search yields modes.
+                ((_, modes),) = self._locate_block(self._region, signals, draws=False)
             found = uniform(modes, self._bounds).normalised() if modes else None
         else:
             located, modes, found = self._update(signals, prior, wrong, share)

@@ -41,7 +41,7 @@ _MAX_STD_RAD = 3.0
 class Posterior(NamedTuple):
     """The posterior of one shot, for a uniform prior on the region of interest or a mixture."""
 
-    estimate: Estimate
+    estimate: Estimate  # Without a prior, that of `Estimator.estimate`.
     modes: Modes | None  # Of the likelihood; None without a position.
     signals: Signals  # Signals of the shot, N = 1.
     mixture: Mixture | None = None  # Normalised, in the frame of the site; None without one.

@@ -103,12 +103,21 @@ def test_estimates_from_draws_agree_with_those_from_modes(codebook):
     """Laplace's method is rough below the noise, but the modes are at the right places."""
     estimator, rng = make_estimator('bayes', WEAK, codebook), np.random.default_rng(2)
     received = simulate_received(WEAK, codebook, WEAK.sample_positions(N, rng), rng)
-    drawn, by_modes = estimator.estimate(received), [
-        estimator.posterior(one) for one in received]
-    assert all(one.modes is not None for one in by_modes)
-    errors = [np.sum((mean - one.estimate.mean)**2) / np.trace(one.estimate.covariance)
-              for mean, one in zip(drawn.mean, by_modes, strict=True)]
+    drawn = estimator.estimate(received)
+    by_modes = [estimator.posterior(one).mixture.moments() for one in received]
+    errors = [np.sum((one - mean)**2) / np.trace(covariance)
+              for one, (mean, covariance) in zip(drawn.mean, by_modes, strict=True)]
     assert 1e-6 < np.mean(errors) < 0.5**2
     single = estimator.estimate(received[3])
     np.testing.assert_allclose(single.mean, drawn.mean[3], atol=0.02)
     np.testing.assert_allclose(single.residual, drawn.residual[3], rtol=1e-3)
+
+
+def test_the_estimate_of_a_posterior_is_that_of_the_estimator(codebook):
+    estimator, rng = make_estimator('bayes', WEAK, codebook), np.random.default_rng(4)
+    for signals in simulate_received(WEAK, codebook, WEAK.sample_positions(5, rng), rng):
+        expected, posterior = estimator.estimate(signals), estimator.posterior(signals)
+        for found, field in zip(
+                vars(posterior.estimate).values(), vars(expected).values(), strict=True):
+            np.testing.assert_array_equal(found, field)
+        assert posterior.modes is not None

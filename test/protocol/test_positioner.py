@@ -9,7 +9,7 @@ from in_memory_network import FIXED_PLACE as PLACE
 from in_memory_network import Fixed, feed
 
 from rhs_isac_ros.bounds import crlb
-from rhs_isac_ros.model import Pose, simulate_received
+from rhs_isac_ros.model import Pose, Scenario, simulate_received
 from rhs_isac_ros.positioning import BayesEstimator, Estimate, SignalError
 from rhs_isac_ros.positioning.fusion import fuse
 from rhs_isac_ros.protocol import messages as m
@@ -86,17 +86,16 @@ def beside(scenario):
 @pytest.fixture(scope='module')
 def located(beside, codebooks):
     """Function that locates signals of a user, with or without observers of the posterior."""
-    estimator = BayesEstimator(beside, codebooks[0])
-    received = simulate_received(beside, codebooks[0], PLACE[None], np.random.default_rng(1))
-
-    def locate(observed, **settings):
+    def locate(observed, scenario=beside, codebook=codebooks[0], **settings):
+        received = simulate_received(scenario, codebook, PLACE[None], np.random.default_rng(1))
         observers = Observers()
-        role = Positioner(beside, lambda: 0.0, PositionerSettings(**settings), observers)
-        feed(role, [CodebookOffered(codebooks[0]), ready(codebooks[0], estimator)])
+        role = Positioner(scenario, lambda: 0.0, PositionerSettings(**settings), observers)
+        feed(role, [CodebookOffered(codebook),
+                    ready(codebook, BayesEstimator(scenario, codebook))])
         observers.present = observed
         message = m.ReceivedSignals(
-            cycle_id=3, user=2, user_instance=7, codebook_id=codebooks[0].id, stamp_ns=5,
-            signals=received[0].reshape(codebooks[0].shape[:3]))
+            cycle_id=3, user=2, user_instance=7, codebook_id=codebook.id, stamp_ns=5,
+            signals=received[0].reshape(codebook.shape[:3]))
         return feed(role, [message])[0]
     return locate
 
@@ -109,6 +108,18 @@ def test_a_posterior_is_sent_only_to_observers(located, prior):
     assert isinstance(posterior, m.Posterior)
     assert (posterior.cycle_id, posterior.user, posterior.user_instance, posterior.stamp_ns,
             posterior.codebook_id) == (3, 2, 7, 5, estimate.codebook_id)
+
+
+def test_observers_do_not_change_estimates_of_signals_below_the_noise(located, random_beams):
+    """The estimate is an average over draws, but the posterior consists of modes."""
+    weak = Scenario(elements_per_side=6, multipath_to_los_db=-30.0, noise_psd_dbm_hz=-95.0,
+                    roi_center_m=(6, 0, 0), roi_size_m=(6, 6, 1))
+    codebook = random_beams(weak, np.random.default_rng(0))
+    (estimate,) = located(False, weak, codebook)
+    again, posterior = located(True, weak, codebook)
+    assert m.same(again, estimate)
+    assert np.linalg.norm(
+        sighting_of(posterior).mixture.moments()[0] - estimate.position) > 1e-3
 
 
 def test_a_posterior_contains_all_that_the_fusion_needs(located, beside):
