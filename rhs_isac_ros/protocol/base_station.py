@@ -47,6 +47,8 @@ class Cycle(Reception):
     attempt: int = 0  # number of earlier beacons in this cycle
     # Bands whose configurations the RHS has reported.
     configured: set[int] = dataclasses.field(default_factory=set)
+    # Bands whose pilots the user has sent.
+    piloted: set[int] = dataclasses.field(default_factory=set)
     # Signals that were sent to the positioner once all bands were complete.
     received: m.ReceivedSignals | None = None
     beam: m.Beam | None = None
@@ -251,6 +253,11 @@ class BaseStation(StateMachine):
     def _last_ack(self, event: m.Ack) -> bool:
         return self._users.is_complete_with(event.user)
 
+    def _signals_due(self, event: Timeout) -> bool:
+        """Return whether the channel is missing, or has not answered all pilots of the user."""
+        return ('channel' in (self._missing or ())
+                or not self._cycle.piloted <= self._cycle.signals.keys())
+
     def _last_signals(self, event: m.FeedSignals) -> bool:
         return self._cycle.signals.keys() | {event.band} == self._bands
 
@@ -384,6 +391,9 @@ class BaseStation(StateMachine):
         first = min(self._bands - self._cycle.signals.keys())
         self._send(m.PilotRequest, band=first, last_band=max(self._bands),
                    n_frames=self._scenario.n_frames)
+
+    def _store_piloted(self, event: m.Pilot) -> None:
+        self._cycle.piloted.add(event.band)
 
     def _store_signals(self, event: m.FeedSignals) -> None:
         self._cycle.store(event)
@@ -522,6 +532,8 @@ class BaseStation(StateMachine):
             # Repeat the command too, because the channel may have missed the report of the RHS.
             Row((State.SOUNDING,), (_command_silent_bands, _request_pilots), guard=_may_retry,
                 outcome=Outcome.RETRY_BAND, restart_timeout=True),
+            Row((State.SOUNDING,), (_abandon, _apply_settings), State.RESTING,
+                guard=_signals_due, outcome=Outcome.CHANNEL_SILENT),
             Row((State.SOUNDING,), (_remove_user, _abandon, _apply_settings), State.RESTING,
                 outcome=Outcome.USER_GONE),
             Row((State.ESTIMATING,), (_resend_signals,), guard=_may_retry,
@@ -551,6 +563,8 @@ class BaseStation(StateMachine):
             Row((State.STEERING,), (_store_beam_applied,)),
             # A repeated request may be answered twice.
             Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
+        # Only who is silent, the user or the channel, depends on the pilots.
+        *on(m.Pilot, 'pilot', _OF_USER)(Row(ANY, (_store_piloted,))),
         *on(m.FeedSignals, 'signals', _OF_USER | {_wrong_instance: Outcome.WRONG_INSTANCE,
                                         _duplicate_signals: Outcome.DUPLICATE})(
             Row((State.SOUNDING,), (_store_signals, _send_signals), State.ESTIMATING,

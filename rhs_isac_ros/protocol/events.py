@@ -247,6 +247,7 @@ class Outcome(enum.Enum):
     # A cycle that ended without service, as counted by the base station.
     RHS_SILENT = 'rhs_silent', Kind.LOST
     USER_GONE = 'user_gone', Kind.LOST
+    CHANNEL_SILENT = 'channel_silent', Kind.LOST
     NO_FIX = 'no_fix', Kind.LOST
     POSITIONER_SILENT = 'positioner_silent', Kind.LOST
     TRANSMISSION_SILENT = 'transmission_silent', Kind.LOST

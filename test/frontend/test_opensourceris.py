@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -152,14 +153,26 @@ def malformed(rng):
         b'\r\n', b'#SerNo:\n', b'#READY!\n', b'#0X' + b'G' * 64 + b'\n'], object))
 
 
-def test_20_000_malformed_lines_confirm_nothing_and_do_not_end_the_service(board, driver):
+@pytest.fixture
+def traced():
+    tracemalloc.start()
+    yield
+    tracemalloc.stop()
+
+
+def test_malformed_lines_confirm_nothing_and_neither_end_the_service_nor_fill_the_memory(
+        board, driver, traced):
     rng = np.random.default_rng(0)
-    for pattern in patterns(200):
+    for index, pattern in enumerate(patterns(20)):
         driver.apply(pattern)
         board.send(b''.join(malformed(rng) for _ in range(100)))
         assert fault_of(driver.apply, 1 - pattern).kind in ('stray', 'garbled', 'restart')
         driver.apply(1 - pattern)
         assert (board.configuration == 1 - pattern).all()
+        if index == 9:
+            before, _ = tracemalloc.get_traced_memory()
+    # The lines in between have about 45 kB.
+    assert tracemalloc.get_traced_memory()[0] - before < 20_000
 
 
 def test_characters_without_a_line_break_are_no_answer(board):

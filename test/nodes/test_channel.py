@@ -99,6 +99,19 @@ def test_a_fault_at_any_pattern_sends_no_signals_and_ends(
     assert [one.cycle_id for one in cycle.answers] == [2]
 
 
+def test_malformed_lines_are_one_line_in_the_log_for_each_kind(bench, node, board, capfd):
+    cycle = Cycle(bench)
+    for cycle_id in range(1, 21, 2):
+        cycle.ask(cycle_id, random_analog(cycle_id))
+        cycle.answer(cycle_id)
+        board.send(b'#0X0\n#OK\n' * 50)
+        cycle.ask(cycle_id + 1, random_analog(cycle_id))
+        bench.until(lambda n=cycle_id // 2 + 1: node.role.counters.total() == n, 'a fault')
+    log = capfd.readouterr().err
+    assert log.count('surface: ') == len(node.role.counters)
+    assert log.count('surface and radio work again') == 1
+
+
 def test_a_configuration_that_the_board_cannot_show_is_a_fault(bench, node):
     cycle = Cycle(bench)
     cycle.ask(1, random_analog(1) / 2)

@@ -90,9 +90,9 @@ def test_without_a_board_there_are_no_estimates(module_bench, board, observed, s
     board.unplug()
     n = len(states)
     # The cycle in progress ends, and the next one is given up.
-    module_bench.until(lambda: [state.outcome for state in states[n:]].count('user_gone') == 1,
+    module_bench.until(lambda: [state.outcome for state in states[n:]].count('channel_silent') == 1,
                        'a cycle that is given up')
-    cycle_id = next(state.cycle_id for state in states[n:] if state.outcome == 'user_gone')
+    cycle_id = next(state.cycle_id for state in states[n:] if state.outcome == 'channel_silent')
     board.plug()
     assert served() > cycle_id
     assert cycle_id not in [estimate.cycle_id for estimate in estimates]

@@ -313,7 +313,7 @@ def test_a_cycle_is_served_in_spite_of_a_fault_or_given_up(network):
     net.front_end = emulated_front_end(
         net.scenario, Faulty(net.scenario.n_elements, {2, *range(14, 18)}))
     net.run_cycles(3)
-    assert [outcome for _, _, outcome in net.outcomes()] == ['served', 'user_gone', 'served']
+    assert [outcome for _, _, outcome in net.outcomes()] == ['served', 'channel_silent', 'served']
     assert net['channel'].counters['surface_silence'] == 5
     assert len(net.sent(m.PositionEstimate)) == 2
     assert net.logged('channel').count('surface: no answer') == 5

@@ -23,18 +23,19 @@ LOST = [
     (m.Ack, {}, 'bs', 'served', {'bs': {'unanswered': 1}}),
     (m.Grant, {}, 'user1', 'served', {}),
     (m.Grant, {}, 'rhs_controller', 'served', {}),
-    (m.GroundTruth, {}, 'channel', 'user_gone', {}),
+    (m.GroundTruth, {}, 'channel', 'channel_silent', {}),
     (m.GroundTruth, {}, 'transmission', 'served', {}),
     (m.RhsCommand, {}, 'rhs_controller', 'rhs_silent', {}),
     (m.RhsCommand, {'band': 1}, 'rhs_controller', 'rhs_silent', {}),
     (m.RhsConfiguration, {'mode': POSITIONING}, 'bs', 'rhs_silent', {}),
-    (m.RhsConfiguration, {'mode': POSITIONING}, 'channel', 'user_gone', {}),
+    (m.RhsConfiguration, {'mode': POSITIONING}, 'channel', 'channel_silent', {}),
     (m.RhsConfiguration, {'mode': POSITIONING, 'band': 1}, 'bs', 'rhs_silent', {}),
     (m.PilotRequest, {}, 'user1', 'user_gone', {}),
-    (m.Pilot, {}, 'channel', 'user_gone', {}),
-    (m.Pilot, {'band': 1}, 'channel', 'user_gone', {}),
-    (m.FeedSignals, {}, 'bs', 'user_gone', {}),
-    (m.FeedSignals, {'band': 1}, 'bs', 'user_gone', {}),
+    (m.Pilot, {}, 'channel', 'channel_silent', {}),
+    (m.Pilot, {'band': 1}, 'channel', 'channel_silent', {}),
+    (m.Pilot, {}, 'bs', 'served', {}),
+    (m.FeedSignals, {}, 'bs', 'channel_silent', {}),
+    (m.FeedSignals, {'band': 1}, 'bs', 'channel_silent', {}),
     (m.ReceivedSignals, {}, 'positioner', 'positioner_silent', {}),
     (m.PositionEstimate, {}, 'bs', 'served', {}),
     (m.PositionEstimate, {}, 'transmission', 'transmission_silent', {}),
@@ -205,8 +206,8 @@ def test_users_are_served_while_messages_are_lost_at_random(network, noisy, loss
         assert len(net.served()) > before, half
     assert {user for _, user, _ in net.outcomes()} == {1, 2}
     reasons = collections.Counter(outcome for _, _, outcome in net.outcomes())
-    assert reasons.keys() == {'served', 'rhs_silent', 'user_gone', 'positioner_silent',
-                              'transmission_silent', 'data_lost'}
+    assert reasons.keys() == {'served', 'rhs_silent', 'user_gone', 'channel_silent',
+                              'positioner_silent', 'transmission_silent', 'data_lost'}
     assert {r: n for r, n in reasons.items() if r != 'served'} == {
         r: n for r, n in net['bs'].counters.items() if r in reasons}
     ends = [0.0, *(s.time_s for s in net.log

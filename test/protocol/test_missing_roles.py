@@ -11,8 +11,8 @@ pytestmark = pytest.mark.usefixtures('plain_beams')
 ROLE_FAULTS = [
     ('rhs_controller', State.CONFIGURING, 'rhs_silent'),
     ('rhs_controller', State.ESTIMATING, 'transmission_silent'),
-    ('channel', State.CONFIGURING, 'user_gone'),
-    ('channel', State.SOUNDING, 'user_gone'),
+    ('channel', State.CONFIGURING, 'channel_silent'),
+    ('channel', State.SOUNDING, 'channel_silent'),
     ('channel', State.ESTIMATING, 'data_lost'),
     ('positioner', State.SOUNDING, 'positioner_silent'),
     ('transmission', State.SOUNDING, 'transmission_silent'),

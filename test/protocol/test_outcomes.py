@@ -7,8 +7,8 @@ from rhs_isac_ros.protocol.events import Kind, Outcome, kind_of
 COUNTERS = {
     'retries': {'retry_rhs', 'retry_band', 'retry_position', 'retry_beam', 'retry_data',
                 'asked_again'},
-    'cycles': {'rhs_silent', 'user_gone', 'no_fix', 'positioner_silent', 'transmission_silent',
-               'data_lost', 'incomplete', 'not_granted', 'abandoned', 'bs_silent'},
+    'cycles': {'rhs_silent', 'user_gone', 'channel_silent', 'no_fix', 'positioner_silent',
+               'transmission_silent', 'data_lost', 'incomplete', 'not_granted', 'abandoned', 'bs_silent'},
     'beacons': {'unanswered', 'no_beacon', 'user_lost'},
     'dropped': {'wrong_cycle', 'wrong_user', 'wrong_instance', 'wrong_scenario', 'number_taken',
                 'wrong_band', 'wrong_codebook', 'duplicate',

@@ -236,7 +236,7 @@ def test_impairments_change_when_a_cycle_begins(network):
     assert net.served() == [1, 1, 1]
     net.change('channel', loss_probability=1.0, delay_s=0.0)
     net.run_cycles(2)
-    assert net.outcomes()[3:] == [(4, 1, 'user_gone'), (5, 1, 'user_gone')]
+    assert net.outcomes()[3:] == [(4, 1, 'channel_silent'), (5, 1, 'channel_silent')]
     net.change('channel', loss_probability=0.0)
     net.run_cycles(2)
     assert net.served()[3:] == [1, 1]
