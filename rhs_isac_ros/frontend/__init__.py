@@ -92,7 +92,7 @@ def make_radio(name: str, scenario: Scenario, air: Air, **options: Any) -> Radio
     """
     radio = _make(RADIOS, plugins.RADIOS, name, scenario, air, **options)
     if not isinstance(radio, Radio):
-        raise _misfit(plugins.RADIOS, name, radio, 'waits, modem, capture and close')
+        raise _misfit(plugins.RADIOS, name, radio, 'waits, modem, time_s, capture and close')
     return radio
 
 

@@ -41,17 +41,18 @@ class FrontEnd:
         Returns the signals at the feeds for unit symbols, complex128 [F, N_SB, K]. Raises
         RadioFault for an exception of the radio; others are those of the surface.
         """
-        captures = []
+        captures, times_s = [], []
         self._air.cycle_id = sounding.cycle_id
         for self._air.frame, (configuration, symbol, self._air.signals) in enumerate(zip(
                 configurations, sounding.symbols, sounding.arriving, strict=True)):
             self._surface.apply(configuration)
             captures.append(self._capture(sounding.band, symbol))
+            times_s.append(self._radio.time_s)
         # A fault during the last measurement would be noticed only with the next band.
         self._surface.apply(configurations[-1])
-        feeds = self._receive(sounding, captures)
+        feeds = self._receive(sounding, captures, np.array(times_s))
         if self._recorder:
-            self._recorder.add(configurations, sounding, np.stack(captures))
+            self._recorder.add(configurations, sounding, np.stack(captures), times_s)
         return feeds
 
     def status(self) -> Mapping[str, str]:
@@ -73,11 +74,12 @@ class FrontEnd:
         except Exception as error:
             raise RadioFault(f'{type(error).__name__}: {error}') from error
 
-    def _receive(self, sounding: Sounding, captures: list[np.ndarray]) -> np.ndarray:
+    def _receive(self, sounding: Sounding, captures: list[np.ndarray], times_s: np.ndarray
+                 ) -> np.ndarray:
         # The captures may have any size.
         try:
             feeds = self._radio.modem.receive(
-                sounding.cycle_id, np.stack(captures), sounding.symbols)
+                sounding.cycle_id, np.stack(captures), sounding.symbols, sounding.band, times_s)
         except ValueError as error:
             raise RadioFault(str(error)) from error
         if feeds.shape != sounding.arriving.shape or not np.isfinite(feeds).all():

@@ -65,18 +65,26 @@ class OpenSourceRis:
         self._port = _Port(str(port))
         self._timeout_s = finite('timeout_s', timeout_s, 0.0)
         self._read_back = read_back
+        # The digits that were read back last; empty if the board may show others.
+        self._shown = b''
         # Whether every line from the board so far belongs to a known command.
         self._is_synchronised = False
 
     def apply(self, configuration: ArrayLike) -> None:
         """Set a pattern: 0 or 1 for each element, [256]."""
         digits = to_digits(checked(configuration, self.n_elements, is_binary=True))
-        self._ask(b'!0x' + digits, _OK)
-        if self._read_back and (shown := self._ask(b'?Pattern', _PATTERN)) != digits:
+        # A pattern that is shown already is only read back, which also finds that it was lost.
+        before, self._shown = self._shown, b''
+        if digits != before:
+            self._ask(b'!0x' + digits, _OK)
+        if not self._read_back:
+            return
+        if (shown := self._ask(b'?Pattern', _PATTERN)) != digits:
             different = np.flatnonzero(to_configuration(shown) != to_configuration(digits))
             self._is_synchronised = False
             raise self._fault('mismatch', f'{different.size} of {self.n_elements} elements differ '
                               f'from the pattern that was set, first element {different[0]}')
+        self._shown = digits
 
     def read(self) -> np.ndarray:
         """Return the last pattern that the board has accepted, float64 [256] of 0 and 1.
@@ -95,7 +103,7 @@ class OpenSourceRis:
 
     def close(self) -> None:
         """Close the port, which another process may then open."""
-        self._is_synchronised = False
+        self._is_synchronised, self._shown = False, b''
         self._port.close()
 
     def _ask(self, command: bytes, expected: re.Pattern[bytes]) -> bytes:

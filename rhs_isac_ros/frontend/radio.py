@@ -54,10 +54,12 @@ class Modem(Protocol):
         """Return the samples of the pilot of a frame, complex128 [n]."""
         ...
 
-    def receive(self, cycle_id: int, captures: np.ndarray, symbols: np.ndarray) -> np.ndarray:
+    def receive(self, cycle_id: int, captures: np.ndarray, symbols: np.ndarray, band: int,
+                times_s: np.ndarray) -> np.ndarray:
         """Return the signals of a band for unit symbols, complex128 [F, N_SB, K].
 
-        Takes one capture of each frame, complex128 [F, K, n], and the symbols of the pilots, [F].
+        Takes one capture of each frame, complex128 [F, K, n], the symbols of the pilots, [F], and
+        `Radio.time_s` of each capture, [F].
         """
         ...
 
@@ -78,6 +80,15 @@ class Radio(Protocol):
     @property
     def modem(self) -> Modem:
         """The modem for the samples of this radio, usually a `Waveform`."""
+        ...
+
+    @property
+    def time_s(self) -> float:
+        """Time of the latest capture by the clock of its samples [s].
+
+        It must be exact to a small part of the period of the carrier's offset. With one clock for
+        transmitter and receiver it is always 0: there is no drift to correct.
+        """
         ...
 
     def capture(self, band: int, pilot: np.ndarray) -> np.ndarray:
@@ -101,7 +112,7 @@ class EmulatedRadio:
     The base station adds the noise. Each sub-band is one sample, so the radio is its own modem.
     """
 
-    waits = False
+    waits, time_s = False, 0.0
 
     def __init__(self, scenario: Scenario, air: Air) -> None:
         self._air = air
@@ -115,7 +126,8 @@ class EmulatedRadio:
         """Return the symbol."""
         return np.array([symbol])
 
-    def receive(self, cycle_id: int, captures: np.ndarray, symbols: np.ndarray) -> np.ndarray:
+    def receive(self, cycle_id: int, captures: np.ndarray, symbols: np.ndarray, band: int,
+                times_s: np.ndarray) -> np.ndarray:
         """Divide the sub-bands by the symbols."""
         return np.swapaxes(captures, 1, 2) / symbols[:, None, None]
 
@@ -135,8 +147,8 @@ class WaveformRadio:
     """A radio that receives OFDM pilots from the emulated air as samples with noise.
 
     The delay of the samples and the offset of the carrier are unknown to the modem. They are drawn
-    when the radio opens. The phase at the start of a frame does not change from frame to frame, as
-    with one clock for both ends.
+    when the radio opens. With one clock for both ends, the phase at the start of a frame does not
+    change from frame to frame.
 
     Parameters
     ----------
@@ -145,14 +157,19 @@ class WaveformRadio:
         combined signals have the noise of the scenario.
     carrier_std_hz : float
         Standard deviation of the offset of the carrier.
+    clock_ppm : float
+        Excess of the user's clock over that of the receiver; 0 for one clock. It changes phase and
+        delay from frame to frame.
     """
 
-    waits = False
+    waits, time_s = False, 0.0
 
     def __init__(self, scenario: Scenario, air: Air, *, noise_psd_dbm_hz: float | None = None,
-                 carrier_std_hz: float = 300.0) -> None:
+                 carrier_std_hz: float = 300.0, clock_ppm: float = 0.0) -> None:
         self.modem = Waveform(scenario)
         self._air, self._carrier_std_hz = air, carrier_std_hz
+        self._n_frames, self._frame_s = scenario.n_frames, scenario.frame_duration_s
+        self._drift, self._centers_hz = 1e-6 * clock_ppm, scenario.center_frequencies_hz
         excess_db = 0.0 if noise_psd_dbm_hz is None else (
             noise_psd_dbm_hz - scenario.noise_psd_dbm_hz)
         # The mean over the samples of the symbols has the noise of a feed.
@@ -167,11 +184,16 @@ class WaveformRadio:
         if self._offsets is None:
             self._offsets = n * air.rng.uniform(0, 2), self._carrier_std_hz * air.rng.normal()
         delay, carrier_hz = self._offsets
+        if self._drift:
+            self.time_s = (band * self._n_frames + air.frame) * self._frame_s
+        drift_hz = self._drift * self._centers_hz[band]
+        delay, carrier_hz = delay - self._drift * self.time_s * rate_hz, carrier_hz + drift_hz
         sent = np.arange(-modem.n_prefix, len(pilot) - modem.n_prefix)
         amplitudes = np.conj(modem.tones(sent[-n:])) @ pilot[-n:] / n
         times = np.arange(len(pilot) + 3 * n) - modem.n_prefix - delay
         is_frame = (times >= sent[0]) & (times <= sent[-1])
-        carrier = np.exp(2j * np.pi * carrier_hz / rate_hz * times) * is_frame
+        carrier = is_frame * np.exp(2j * np.pi * (
+            carrier_hz / rate_hz * times + drift_hz * self.time_s))
         signals = (air.signals * amplitudes[:, None]).T @ modem.tones(times) * carrier
         return signals + np.sqrt(self._noise_w) * complex_normal(signals.shape, air.rng)
 

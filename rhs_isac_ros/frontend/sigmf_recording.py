@@ -11,7 +11,7 @@ import datetime
 import itertools
 import json
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,8 +74,9 @@ class SampleRecorder:
         self._folder.mkdir(parents=True, exist_ok=True)
         self._collection: _Collection | None = _Collection()
 
-    def add(self, configurations: np.ndarray, sounding: Sounding, captures: np.ndarray) -> None:
-        """Add the frames of a band: configurations [F, N_E], and samples, complex [F, K, n]."""
+    def add(self, configurations: np.ndarray, sounding: Sounding, captures: np.ndarray,
+            times_s: Sequence[float]) -> None:
+        """Add the frames of a band: configurations [F, N_E], samples [F, K, n], times [F]."""
         found = self._collection
         if found and len(found.frames) >= _N_FRAMES and found.cycle_id != sounding.cycle_id:
             self.close()
@@ -97,7 +98,7 @@ class SampleRecorder:
                 'core:sample_start': found.n_samples, 'core:sample_count': samples.shape[1],
                 'rhs_isac:sounding': found.n_soundings, 'rhs_isac:cycle_id': sounding.cycle_id,
                 'rhs_isac:band': sounding.band, 'rhs_isac:frame': frame,
-                'rhs_isac:configuration': number,
+                'rhs_isac:configuration': number, 'rhs_isac:time_s': times_s[frame],
                 'rhs_isac:symbol': [symbol.real, symbol.imag],
                 'rhs_isac:user': sounding.user,
                 'rhs_isac:position_m': sounding.position_m.tolist()})
@@ -164,6 +165,7 @@ class _Recorded:
     band: int
     symbols: np.ndarray   # complex128 [F]
     captures: np.ndarray  # complex [F, K, n]
+    times_s: np.ndarray   # float64 [F]
 
 
 class PlaybackRadio:
@@ -181,6 +183,8 @@ class PlaybackRadio:
 
     # Files may be on a slow disk.
     waits = True
+    # Those of the recording are used.
+    time_s = 0.0
 
     def __init__(self, scenario: Scenario, air: Air, *, path: str) -> None:
         with _library('radio sigmf'):
@@ -194,7 +198,6 @@ class PlaybackRadio:
         # The id of the cycle in the network, and the number of recorded cycles so far.
         self._cycle_id: int | None = None
         self._n_cycles = 0
-        self._symbols = np.ones(scenario.n_frames, complex)
 
     @property
     def modem(self) -> Modem:
@@ -205,9 +208,12 @@ class PlaybackRadio:
         """Return the samples of a frame, [n_frame]."""
         return self._waveform.pilot(symbol)
 
-    def receive(self, cycle_id: int, captures: np.ndarray, symbols: np.ndarray) -> np.ndarray:
+    def receive(self, cycle_id: int, captures: np.ndarray, symbols: np.ndarray, band: int,
+                times_s: np.ndarray) -> np.ndarray:
         """Return the signals of a band for unit symbols, complex128 [F, N_SB, K]."""
-        return self._waveform.receive(self._n_cycles, captures, self._symbols)
+        played = self._cycle[band]
+        return self._waveform.receive(
+            self._n_cycles, captures, played.symbols, band, played.times_s)
 
     def status(self) -> Mapping[str, str]:
         """Return timing, carrier and noise, and the number of recorded cycles so far."""
@@ -223,7 +229,6 @@ class PlaybackRadio:
             raise EOFError(f'{self._path}: all {self._n_cycles} cycles are played')
         if band not in self._cycle:
             raise LookupError(f'{self._path}: band {band} is missing in cycle {self._n_cycles}')
-        self._symbols = self._cycle[band].symbols
         samples: np.ndarray = self._cycle[band].captures[self._air.frame]
         return samples
 
@@ -270,7 +275,8 @@ def _read(path: Path, scenario: Scenario) -> Iterator[_Recorded]:
             yield _Recorded(
                 frames[0]['rhs_isac:cycle_id'], frames[0]['rhs_isac:band'],
                 np.array([complex(*frame['rhs_isac:symbol']) for frame in frames]),
-                np.array([[feed[span] for feed in feeds] for span in spans]))
+                np.array([[feed[span] for feed in feeds] for span in spans]),
+                np.array([frame['rhs_isac:time_s'] for frame in frames]))
 
 
 def _check_scenario(path: Path, recorded: Mapping[str, Any], scenario: Scenario) -> None:

@@ -38,8 +38,9 @@ class Waveform:
 
     Timing and carrier are estimated from the first band of a cycle, and used for all others: an
     estimate for each band would destroy the difference of the delays between the bands, which
-    contains the range. The phase from one frame to the next is left as it is, so transmitter and
-    receiver need one clock, or a declared ``carrier_offset_std_hz``.
+    contains the range. With two clocks, the carrier's offset relative to its frequency is also the
+    drift of the clocks. From this drift and the times of the frames, phases and delays are turned
+    back to the middle of the first band.
 
     Raises ScenarioError if the scenario cannot be measured with this waveform.
 
@@ -65,12 +66,16 @@ class Waveform:
         self.n_frame = self.n_prefix + N_SYMBOLS * self.n_period
         _check(scenario, self.n_frame / self.sample_rate_hz)
         self._width_hz = width_hz
-        self.offsets_hz = subband_frequencies_hz(scenario)[0] - scenario.center_frequencies_hz[0]
+        self._frequencies_hz = subband_frequencies_hz(scenario)
+        self._centers_hz = scenario.center_frequencies_hz
+        self.offsets_hz = self._frequencies_hz[0] - self._centers_hz[0]
         index = np.arange(scenario.n_subbands)
         # Quadratic phases keep the envelope nearly constant.
         self._phases = np.exp(1j * np.pi * index**2 / scenario.n_subbands)
         self._sign = (-1) ** (scenario.n_subbands - 1)
         self._cycle_id: int | None = None
+        # Drift of the clocks, and mean time of the frames of the first band [s].
+        self._drift = self._mean_s = 0.0
         self.synchronisation: Synchronisation | None = None
         self.noise_power = 0.0
 
@@ -84,18 +89,24 @@ class Waveform:
         times = np.arange(-self.n_prefix, self.n_frame - self.n_prefix)
         return symbol * (self._phases @ self.tones(times))
 
-    def receive(self, cycle_id: int, captures: np.ndarray, symbols: np.ndarray) -> np.ndarray:
+    def receive(self, cycle_id: int, captures: np.ndarray, symbols: np.ndarray, band: int,
+                times_s: np.ndarray) -> np.ndarray:
         """Return the signals of a band for unit symbols, complex128 [F, N_SB, K].
 
-        Takes one capture of each frame, complex128 [F, K, n], and the symbols of the pilots, [F].
+        Takes one capture of each frame, complex128 [F, K, n], the symbols of the pilots, [F], and
+        the times of the frames, [F], which are all 0 with one clock.
         """
         if cycle_id != self._cycle_id or self.synchronisation is None:
             self._cycle_id, self.synchronisation = cycle_id, self.synchronise(captures)
-        values = self.subbands(captures, self.synchronisation)
+            self._drift = self.synchronisation.carrier_hz / self._centers_hz[band]
+            self._mean_s = float(times_s.mean())
+        values = self.subbands(captures, dataclasses.replace(
+            self.synchronisation, carrier_hz=self._drift * self._centers_hz[band]))
         mean = values.mean(axis=1)
         spread = np.sum(np.abs(values - mean[:, None])**2, axis=1) / (N_SYMBOLS - 1)
         self.noise_power = float(spread.mean() / N_SYMBOLS)
-        return mean / symbols[:, None, None]
+        cycles = self._drift * np.outer(times_s - self._mean_s, self._frequencies_hz[band])
+        return mean / symbols[:, None, None] * np.exp(-2j * np.pi * cycles)[..., None]
 
     def status(self) -> Mapping[str, str]:
         """Return timing, carrier and noise of the present cycle."""

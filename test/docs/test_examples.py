@@ -335,7 +335,7 @@ def test_the_transceiver_measures_both_bands_with_one_timing(monkeypatch):
     symbols, found = np.array([1.0, 1j]), []
     for band in range(2):
         captures = [radio.capture(band, radio.modem.pilot(symbol)) for symbol in symbols]
-        found.append(radio.modem.receive(1, np.stack(captures), symbols))
+        found.append(radio.modem.receive(1, np.stack(captures), symbols, band, np.zeros(2)))
         assert radio._device.rx_lo == radio._device.tx_lo == scenario.center_frequencies_hz[band]
     np.testing.assert_allclose(found[0], found[1], rtol=1e-9)
     # The feeds differ as the receivers do; the delay is removed, up to a common phase.

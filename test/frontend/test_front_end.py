@@ -23,8 +23,8 @@ CONFIGURATIONS = np.eye(4)[:3]
 class Recording:
     """A surface and a radio that record the order of their calls; `fails` is the failing one."""
 
-    n_elements, waits, modem = 4, True, types.SimpleNamespace(
-        pilot=lambda symbol: symbol, receive=lambda cycle_id, captures, symbols: captures)
+    n_elements, waits, time_s, modem = 4, True, 0.0, types.SimpleNamespace(
+        pilot=lambda symbol: symbol, receive=lambda cycle_id, captures, *others: captures)
 
     def __init__(self, fails=None, capture=((1.0,), (1.0,))):
         self.calls, self._fails, self._capture = [], fails, np.array(capture)

@@ -22,7 +22,7 @@ SCENARIO = Scenario(
     n_frames=3, frame_duration_s=0.01, n_feeds=2, band_phase_std_rad=6.2832, timing_std_s=1e-7)
 PLUGIN = """
 class Silent:
-    waits = True
+    waits, time_s = True, 0.0
     modem = object()
     def __init__(self, scenario, air, gain_db=0.0): pass
     def capture(self, band, pilot): pass
@@ -58,10 +58,11 @@ def recording(folder):
 
 
 def measured(radio, air, signals, symbols, cycle_id=1, band=0):
-    captures, air.cycle_id = [], cycle_id
+    captures, times_s, air.cycle_id = [], [], cycle_id
     for air.frame, (air.signals, symbol) in enumerate(zip(signals, symbols, strict=True)):
         captures.append(radio.capture(band, radio.modem.pilot(symbol)))
-    return radio.modem.receive(cycle_id, np.stack(captures), symbols)
+        times_s.append(radio.time_s)
+    return radio.modem.receive(cycle_id, np.stack(captures), symbols, band, np.array(times_s))
 
 
 def flat(rng):

@@ -39,6 +39,11 @@ def captured(scenario, signals, snr_db, rng, symbols=None, radio=None):
     return radio, np.stack(captures)
 
 
+def received(radio, captures, cycle_id=1, symbols=1.0, band=0, times_s=0.0):
+    return radio.modem.receive(cycle_id, captures, np.broadcast_to(symbols, 16), band,
+                               np.broadcast_to(times_s, 16))
+
+
 def to_db(power):
     return 10 * np.log10(power)
 
@@ -60,7 +65,7 @@ def test_errors_and_measured_noise_are_those_of_theory(snr_db, n_subbands):
     for cycle_id in range(40):
         signals = response(scenario, 0.3e-6, rng)
         radio, captures = captured(scenario, signals, snr_db, rng)
-        found = radio.modem.receive(cycle_id, captures, np.ones(16))
+        found = received(radio, captures, cycle_id)
         errors.append(np.mean(np.abs(without_phase_and_delay(found, signals) - signals)**2))
         noise.append(radio.modem.noise_power)
         carriers.append(radio.modem.synchronisation.carrier_hz - radio._offsets[1])
@@ -77,7 +82,7 @@ def test_a_band_without_noise_is_recovered_exactly():
     signals = response(LAB, 0.3e-6, rng)
     symbols = np.exp(2j * np.pi * rng.random(16))
     radio, captures = captured(LAB, signals, 200, rng, symbols)
-    found = radio.modem.receive(1, captures, symbols)
+    found = received(radio, captures, symbols=symbols)
     np.testing.assert_allclose(
         without_phase_and_delay(found, signals), signals, atol=1e-3)
 
@@ -89,7 +94,7 @@ def test_the_difference_of_the_delays_of_two_bands_survives():
     radio, captures = captured(LAB, first, 60, rng)
     slopes = []
     for frames in captures, captured(LAB, second, 60, rng, radio=radio)[1]:
-        found = radio.modem.receive(7, frames, np.ones(16))
+        found = received(radio, frames, 7)
         slopes.append(np.angle(np.sum(found[:, 1:] * np.conj(found[:, :-1]))))
     delays_s = -np.array(slopes) / (2 * np.pi * 125e3)
     assert delays_s[1] - delays_s[0] == pytest.approx(np.diff(DELAYS_S)[0], abs=5e-9)
@@ -101,13 +106,32 @@ def test_the_next_cycle_is_synchronised_again():
     signals = response(LAB, 0.2e-6, rng)
     radio, captures = captured(LAB, signals, 60, rng)
     assert radio.modem.status() == {}
-    radio.modem.receive(7, captures, np.ones(16))
+    received(radio, captures, 7)
     first = radio.modem.synchronisation
     assert float(radio.modem.status()['radio.carrier_hz']) == pytest.approx(
         radio._offsets[1], abs=5)
     radio.close()
-    radio.modem.receive(8, captured(LAB, signals, 60, rng, radio=radio)[1], np.ones(16))
+    received(radio, captured(LAB, signals, 60, rng, radio=radio)[1], 8)
     assert radio.modem.synchronisation != first
+
+
+@pytest.mark.parametrize('clock_ppm', [0.0, 0.1, -2.0])
+def test_the_drift_of_two_clocks_is_turned_back_in_all_bands(clock_ppm):
+    scenario = dataclasses.replace(LAB, center_frequencies_hz=(5.25e9, 5.75e9))
+    rng = np.random.default_rng(RNG_SEED)
+    air = Air(scenario, rng)
+    radio = WaveformRadio(scenario, air, carrier_std_hz=0.0, clock_ppm=clock_ppm)
+    ratios = []
+    for band in range(2):
+        signals, captures, times_s = response(scenario, 0.2e-6, rng), [], []
+        for air.frame, air.signals in enumerate(signals):
+            captures.append(radio.capture(band, radio.modem.pilot(1.0)))
+            times_s.append(radio.time_s)
+        ratio = received(radio, np.stack(captures), band=band, times_s=times_s) / signals
+        ratios.append(ratio / ratio[0, 0, 0])
+    # One phase and one delay remain unknown, and only the phase differs between the bands.
+    expected = np.broadcast_to(ratios[0][0, :, :1], ratios[0].shape)
+    np.testing.assert_allclose(ratios, [expected, expected], atol=0.05)
 
 
 def test_a_pilot_is_a_prefix_and_equal_symbols_of_alternating_sign():
@@ -138,4 +162,4 @@ def test_a_scenario_that_is_no_waveform_is_refused(changes, text):
 
 def test_too_few_samples_are_an_error():
     with pytest.raises(ValueError, match='captures: 67 samples, expected at least 68'):
-        Waveform(LAB).receive(1, np.ones((16, 2, 67)), np.ones(16))
+        Waveform(LAB).synchronise(np.ones((16, 2, 67)))

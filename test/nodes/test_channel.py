@@ -75,7 +75,7 @@ def test_the_board_shows_each_frame_before_the_signals_are_sent(bench, node, boa
     for cycle_id in (1, 2):
         cycle.ask(cycle_id, random_analog(cycle_id))
         assert np.any(cycle.answer(cycle_id).signals != 0)
-        assert board.n_patterns == 4 * cycle_id
+        assert board.n_patterns == 3 * cycle_id
         np.testing.assert_array_equal(board.configuration, random_analog(cycle_id)[-1])
 
 

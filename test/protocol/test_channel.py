@@ -320,6 +320,23 @@ def test_a_cycle_is_served_in_spite_of_a_fault_or_given_up(network):
     net.verify()
 
 
+@pytest.mark.parametrize('duration_s', [0.0, 0.6, 10.0])
+def test_users_are_served_within_three_seconds_after_a_fault_at_any_pattern(network, duration_s):
+    net = network(1, retries=3)
+    surface = Faulty(net.scenario.n_elements, ())
+    net.front_end = emulated_front_end(net.scenario, surface)
+    net.run_cycles(1)
+    for pattern in range(1, surface.n + 1):
+        first = surface.n + pattern
+        surface.faults = range(first, 10**6 if duration_s else first + 1)
+        net.run(lambda n=first: surface.n >= n)
+        net.run(limit_s=duration_s)
+        surface.faults, end_s, n_served = (), net.now_s, len(net.served())
+        net.run(lambda n=n_served: len(net.served()) > n, limit_s=3.0)
+        assert net.now_s - end_s < 3.0
+    net.verify()
+
+
 DEVIATING = {
     'user_gain_std_db': 3.0, 'phase_std_rad': 7.0, 'band_phase_std_rad': 7.0,
     'timing_std_s': 1e-6, 'carrier_offset_std_hz': 1e4, 'element_error_rms': 0.2,

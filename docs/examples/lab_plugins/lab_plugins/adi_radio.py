@@ -22,6 +22,8 @@ class AdiRadio:
     """
 
     waits = True
+    # One clock drives transmitter and receiver.
+    time_s = 0.0
 
     def __init__(self, scenario, air, *, uri='ip:192.168.2.1', gain_db=40, scale=1.0, n_stale=5):
         if scenario.n_feeds > 2:
