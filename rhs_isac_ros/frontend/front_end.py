@@ -52,7 +52,7 @@ class FrontEnd:
         self._surface.apply(configurations[-1])
         feeds = self._receive(sounding, captures, np.array(times_s))
         if self._recorder:
-            self._recorder.add(configurations, sounding, np.stack(captures), times_s)
+            self._recorder.add(configurations, sounding, np.array(captures), times_s)
         return feeds
 
     def status(self) -> Mapping[str, str]:
@@ -79,7 +79,7 @@ class FrontEnd:
         # The captures may have any size.
         try:
             feeds = self._radio.modem.receive(
-                sounding.cycle_id, np.stack(captures), sounding.symbols, sounding.band, times_s)
+                sounding.cycle_id, np.array(captures), sounding.symbols, sounding.band, times_s)
         except ValueError as error:
             raise RadioFault(str(error)) from error
         if feeds.shape != sounding.arriving.shape or not np.isfinite(feeds).all():
