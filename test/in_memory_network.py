@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import Codebook, random_codebook
+from rhs_isac_ros.codebook.library import EMPTY
 from rhs_isac_ros.frontend import Air, EmulatedRadio, EmulatedSurface, FrontEnd, Surface
 from rhs_isac_ros.link import Beam, CapacityReport
 from rhs_isac_ros.model import Scenario, mobility
@@ -38,6 +39,7 @@ from rhs_isac_ros.protocol.events import (
     Timeout,
 )
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
+from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.protocol.settings import BaseStationSettings, Impairments, PositionerSettings
 from rhs_isac_ros.protocol.transmission import Transmission
 from rhs_isac_ros.ros.roster import ROSTER
@@ -177,7 +179,7 @@ class Network:
     `users` maps user numbers to positions or mobilities; `make` builds the estimator of a
     codebook, which takes `make_s`; `ordered` keeps the order of messages of a class from one role
     to another. `plain_beams` replaces the optimisation of beams, which takes most of a cycle, by a
-    simple function.
+    simple function. The roles have the `library`, except for those in `without_library`.
     """
 
     def __init__(
@@ -187,8 +189,10 @@ class Network:
             make_s: float = 0.0, absent: Iterable[str] = (),
             begin_s: float = 0.0, retries: int = 0, beacon_timeout_s: float = 3.0,
             allowed_users: str = '', ack_rate_hz: float = np.inf,
-            plain_beams: bool = False, positioner=None) -> None:
-        self._positioner = positioner
+            plain_beams: bool = False, positioner=None, library=EMPTY,
+            without_library: Iterable[str] = ()) -> None:
+        self._positioner, self._library = positioner, library
+        self._without_library = frozenset(without_library)
         self.scenario, self.seed = scenario, seed
         self._beams: dict[str, Any] = PLAIN_BEAMS if plain_beams else {}
         self.transport, self.ordered = transport, ordered
@@ -208,7 +212,9 @@ class Network:
         self.replies: list[Reply] = []
         self.tracks: list[PublishTrack] = []
         self._ends: list[tuple[int, int, str]] = []
-        self.codebooks = {} if codebook is None else {codebook.id: codebook}
+        self.codebooks = dict(library.by_id)
+        if codebook is not None:
+            self.codebooks[codebook.id] = codebook
         self._roles: dict[str, Any] = {}
         # Instance of each role, in the order in which they were started.
         self.instances: dict[str, int] = {}
@@ -445,13 +451,17 @@ class Network:
 
     def _build(self, name: str):
         scenario, step_s = self.scenario, self.settings.step_timeout_s
+        library = EMPTY if name in self._without_library else self._library
         match kind := self._kind(name):
             case 'bs':
                 rng = streams.generator(self.seed, streams.BASE_STATION)
                 # Cycle ids are never repeated, as with the clock of the node.
                 first = 1_000_000 * self._n_starts + 1
                 self._n_starts += 1
-                return BaseStation(scenario, self.settings, rng, self._receive, first)
+                return BaseStation(
+                    scenario, self.settings, rng, self._receive, first, library)
+            case 'rhs_controller':
+                return RhsController(library)
             case 'user':
                 return user_role.User(
                     self._mobilities[name], step_s, self._beacon_timeout_s,
@@ -462,9 +472,10 @@ class Network:
                 return Channel(scenario, self.seed + name.endswith('_twin'),
                                Impairments(multipath_memory=False))
             case 'positioner':
-                return Positioner(scenario, lambda: self.now_s, self._positioner)
+                return Positioner(
+                    scenario, lambda: self.now_s, self._positioner, library=library)
             case 'transmission':
-                return Transmission(scenario, **self._beams)
+                return Transmission(scenario, **self._beams, library=library)
         return ROLES[kind]()
 
     def _receive(self, codebook, feeds, user: int, cycle_id: int, noise: bool) -> np.ndarray:

@@ -4,6 +4,9 @@ The codebook of a cell is optimised for a user whose position is known to a stan
 spread. Cells form a lattice in the region, with a pitch for each spread. The pitch follows from a
 loss: by how much the objective of a codebook exceeds that of one optimised for the very position,
 on average over the positions in its cell.
+
+A network always has a library, in addition to the codebook for the whole region: `EMPTY`, unless
+it is given another one.
 """
 
 import dataclasses
@@ -92,8 +95,9 @@ class Library:
 
     @functools.cached_property
     def id(self) -> str:
-        """Hash of the codebooks' ids: ``lib`` and 16 hex digits."""
-        return f'lib{hashlib.sha256(" ".join(self.by_id).encode()).hexdigest()[:16]}'
+        """Hash of the codebooks' ids: ``lib`` and 16 hex digits; ``none`` if it is empty."""
+        digest = hashlib.sha256(' '.join(self.by_id).encode()).hexdigest()
+        return f'lib{digest[:16]}' if self.by_id else 'none'
 
     def codebook_at(self, position_m: np.ndarray, std_m: float) -> Codebook | None:
         """Return the codebook for a predicted position, float64 [3] [m], in the surface's frame.
@@ -140,6 +144,11 @@ class Library:
             library = cls(plan, **arrays)
             _ = library.codebooks
         return library
+
+
+#: The library without cells, which has no codebook for any prediction.
+EMPTY = Library(Plan('', '', '', (), ()), np.empty((0, 3)), np.empty(0),
+                np.empty((0, 1, 1, 1)), np.empty((0, 1, 1, 1, 1), complex))
 
 
 def plan_library(

@@ -3,7 +3,7 @@
 import collections
 import dataclasses
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -34,9 +34,13 @@ class Report:
 
 
 class RoleStatistics:
-    """Collects the statistics of a role from its events and the resulting actions."""
+    """Collects the statistics of a role from its events and the resulting actions.
 
-    def __init__(self) -> None:
+    The role may use a codebook of a `library`, given by their ids, while none is pending.
+    """
+
+    def __init__(self, library: Collection[str] = ()) -> None:
+        self._library = library
         # Descriptions of the roles that are missing.
         self.missing: tuple[str, ...] = ()
         # Number of messages by section of the report and by type; faults until the last report.
@@ -112,8 +116,8 @@ class RoleStatistics:
         """Return the ids of the codebook in use (or else the latest one) and of a pending one."""
         if not self._codebook_id:
             return {}
-        if in_use in ('', self._codebook_id):
-            return {'codebook_id': self._codebook_id}
+        if in_use in ('', self._codebook_id, *self._library):
+            return {'codebook_id': in_use or self._codebook_id}
         return {'codebook_id': in_use, 'pending.codebook_id': self._codebook_id}
 
 

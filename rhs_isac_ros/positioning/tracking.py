@@ -264,7 +264,10 @@ class Tracker:
         if self._mixture is None or not 0 < elapsed_s <= MAX_GAP_S:
             return None
         pose = self.estimator.scenario.pose
-        mean, covariance = self._motion.predict(self._mixture, elapsed_s).position().moments()
+        # The motion maps moments to moments, so those of one Gaussian are those of the mixture.
+        mean, covariance = self._mixture.moments()
+        gaussian = Mixture(np.zeros(1), mean[None], covariance[None])
+        mean, covariance = self._motion.predict(gaussian, elapsed_s).position().moments()
         return pose.to_surface(mean), pose.covariances_to_surface(covariance)
 
     def _alone(self, time_s: float, received: np.ndarray) -> TrackEstimate:

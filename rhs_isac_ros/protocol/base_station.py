@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.codebook.library import EMPTY, Library
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
@@ -131,6 +132,9 @@ class BaseStation(StateMachine):
     first_cycle_id
         Id of the first cycle. After a restart, it must exceed all earlier ids, so that messages
         still in transit are recognised as stale.
+    library
+        Codebooks besides the offered one, which is for the whole region. The codebook of a cycle
+        is chosen at the grant, and its id in the messages of the cycle selects it in every role.
     """
 
     SENDS = (m.Beacon, m.Grant, m.RhsCommand, m.PilotRequest, m.ReceivedSignals, m.Data,
@@ -143,7 +147,7 @@ class BaseStation(StateMachine):
     def __init__(
             self, scenario: Scenario, settings: BaseStationSettings, rng: np.random.Generator,
             receiver: Callable[[Codebook, np.ndarray, int, int, bool], np.ndarray],
-            first_cycle_id: int = 1) -> None:
+            first_cycle_id: int = 1, library: Library = EMPTY) -> None:
         super().__init__(State.WAITING)
         self._scenario, self._receiver = scenario, receiver
         self._bands = frozenset(range(scenario.n_bands))
@@ -152,6 +156,9 @@ class BaseStation(StateMachine):
         self._admission = _admission(settings)
         self._pause_requested = False  # whether a pause begins after the current cycle
         self._offered: Codebook | None = None  # codebook for the next beacon
+        self._library = library
+        # The estimate of each user in its latest cycle, and its time of arrival [s].
+        self._estimates: NewestDict[int, tuple[m.PositionEstimate, float]] = NewestDict(MAX_USERS)
         # Roles that are missing; None before the first report.
         self._missing: tuple[str, ...] | None = None
         self._cycle = Cycle(first_cycle_id - 1)
@@ -361,9 +368,19 @@ class BaseStation(StateMachine):
         self._lose_absent()
         self._cycle.user = self._users.select()
         self._cycle.user_instance = self._users.owner(self._cycle.user)
+        self._choose_codebook()
         self._send(m.Grant)
         self._command_bands(event)
         self._announce(m.Phase.POSITIONING)
+
+    def _choose_codebook(self) -> None:
+        """Choose the codebook that the estimate of the user proposes, if the proposal holds."""
+        # A proposal serves once: after a cycle without an estimate, there is none.
+        estimate, time_s = self._estimates.pop(self._cycle.user, (None, 0.0))
+        if (estimate and self.now_s <= time_s + estimate.next_codebook_s
+                and m.same_instance(estimate.user_instance, self._cycle.user_instance)):
+            self._cycle.codebook = self._library.by_id.get(
+                estimate.next_codebook_id, self._cycle.codebook)
 
     def _lose_absent(self) -> None:
         """Count missed invitations, and remove the users that no longer answer."""
@@ -409,6 +426,9 @@ class BaseStation(StateMachine):
         assert self._cycle.received
         self.send(self._cycle.received)
 
+    def _store_estimate(self, event: m.PositionEstimate) -> None:
+        self._estimates.put(event.user, (event, self.now_s))
+
     def _store_beam(self, event: m.Beam) -> None:
         self._cycle.beam = event
 
@@ -433,6 +453,7 @@ class BaseStation(StateMachine):
     def _abandon(self, event: Timeout | m.NoFix) -> None:
         """End the cycle without service."""
         assert self.outcome
+        self._estimates.pop(self._cycle.user, None)
         self._end_cycle(self.outcome.value)
 
     def _finish(self, event: m.Data) -> None:
@@ -571,8 +592,8 @@ class BaseStation(StateMachine):
                 guard=_last_signals),
             Row((State.SOUNDING,), (_store_signals,), State.SOUNDING)),
         *on(m.PositionEstimate, 'estimate', _OF_USER | _OF_CODEBOOK)(
-            Row((State.ESTIMATING,), target=State.STEERING),
-            Row((State.STEERING,)),
+            Row((State.ESTIMATING,), (_store_estimate,), State.STEERING),
+            Row((State.STEERING,), (_store_estimate,)),
             Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
         *on(m.NoFix, 'no_fix', _OF_USER | _OF_CODEBOOK)(
             Row((State.ESTIMATING,), (_abandon, _apply_settings), State.RESTING,

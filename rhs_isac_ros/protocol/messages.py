@@ -337,6 +337,10 @@ class PositionEstimate(Message):
     latency_s: float = number(0, 3600)
     outside_probability: float = number(0, 1, default=0.0)
     blocked_probability: float = number(0, 1, default=0.0)
+    #: Codebook proposed for the next cycle of the user, if this begins within a time [s]; empty
+    #: for that of the whole region.
+    next_codebook_id: str = ''
+    next_codebook_s: float = number(0, 3600, default=0.0)
 
 
 # Maximum number of components of a mixture in a message.

@@ -4,15 +4,18 @@ import collections
 import dataclasses
 import enum
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.codebook.library import EMPTY, Library
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import position_problem
+from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning import (
+    BayesEstimator,
     Estimate,
     Estimator,
     Motion,
@@ -37,11 +40,15 @@ from rhs_isac_ros.protocol.user_registry import MAX_NAMED, MAX_USERS
 
 @dataclasses.dataclass
 class _Track:
-    """A track, and the latest signals that it includes, which were measured at `time_s` [s]."""
+    """A track, and the latest signals that it includes, which were measured at `time_s` [s].
+
+    `interval_s` is the time since the signals before [s]; 0 if there are none.
+    """
 
     tracker: Tracker
     latest: m.ReceivedSignals
     time_s: float
+    interval_s: float = 0.0
 
     def is_late(self, received: m.ReceivedSignals) -> bool:
         """Return whether signals have the same sender as `latest`, and are not newer."""
@@ -92,9 +99,23 @@ class Tracks:
         estimate = track.tracker.update(now_s, signals)
         self.posterior = track.tracker.latest
         if estimate.fix:
+            track.interval_s = now_s - track.time_s
             track.latest, track.time_s = received, now_s
             self._tracks.put(received.user, track)
         return estimate
+
+    def predict(self, user: int) -> tuple[np.ndarray, float, float] | None:
+        """Predict a user's position at its next signals, if these come after equal intervals.
+
+        Returns the position in the frame of the surface, float64 [3] [m], the root of the mean
+        variance of its coordinates [m], and the interval [s]; None without two signals.
+        """
+        track = self._tracks.get(user)
+        if not track or not track.interval_s > 0:
+            return None
+        predicted = track.tracker.predict(track.time_s + track.interval_s)
+        return predicted and (
+            predicted[0], float(np.trace(predicted[1]) / 3)**0.5, track.interval_s)
 
 
 def _stacked(received: m.ReceivedSignals) -> np.ndarray:
@@ -102,6 +123,8 @@ def _stacked(received: m.ReceivedSignals) -> np.ndarray:
     return received.signals.reshape(len(received.signals), -1)
 
 
+# Time for which a proposed codebook holds, in intervals between the signals of the user.
+_PATIENCE = 2.0
 # Number of residuals that are kept for each user.
 _USER_WINDOW = 100
 
@@ -114,17 +137,14 @@ class ResidualWatch:
     """
 
     def __init__(self, level_db: tuple[float, float] = (0.0, 0.0)) -> None:
-        self._codebook_id, self._level_db = '', level_db
+        self._level_db = level_db
         self._all = InnovationTest(WINDOW, level_db)
         self._users: NewestDict[int, InnovationTest] = NewestDict(MAX_USERS)
         self._warning = ''
         self._estimates: collections.deque[Estimate] = collections.deque(maxlen=WINDOW)
 
-    def add(self, user: int, codebook_id: str, estimate: Estimate) -> tuple[str, bool]:
+    def add(self, user: int, estimate: Estimate) -> tuple[str, bool]:
         """Add an estimate; return a text if a warning begins or ends, and whether it begins."""
-        if codebook_id != self._codebook_id:
-            self.clear()
-            self._codebook_id = codebook_id
         self._estimates.append(estimate)
         own = self._users.get(user) or InnovationTest(_USER_WINDOW, self._level_db)
         self._users.put(user, own)
@@ -136,7 +156,7 @@ class ResidualWatch:
         return self._warning or 'the residuals match the scenario again', bool(self._warning)
 
     def clear(self) -> None:
-        """Forget all estimates, because the estimator or the codebook has changed."""
+        """Forget all estimates, because the estimator of the whole region has changed."""
         self._all.clear()
         self._estimates.clear()
         self._users.clear()
@@ -205,6 +225,10 @@ class Positioner(Role):
     them; if the build fails, the old settings and estimator remain in use. The tracks of the prior
     ``track`` do not survive a restart. `stopwatch` returns a time [s], to measure latencies, and
     `is_observed` whether anyone receives posteriors, which take a moment to convert.
+
+    Estimates from a track propose the codebook of the `library` for the predicted position. The
+    estimator of such a codebook is created when it is first used. It computes a table of the
+    region only if a track does not explain the signals, or there is none.
     """
 
     SENDS = (m.PositionEstimate, m.Posterior, m.NoFix)
@@ -213,14 +237,16 @@ class Positioner(Role):
     def __init__(
             self, scenario: Scenario, stopwatch: Callable[[], float],
             settings: PositionerSettings | None = None,
-            is_observed: Callable[[], bool] = lambda: False) -> None:
+            is_observed: Callable[[], bool] = lambda: False, library: Library = EMPTY) -> None:
         super().__init__()
+        self._library = library
         self._scenario, self._stopwatch = scenario, stopwatch
         self._is_observed = is_observed
         self._settings = PendingSettings(settings or PositionerSettings())
         # Reason why the latest change of settings was reverted; empty if it was not.
         self._failure = ''
-        self._estimators: CodebookCache[_Built] = CodebookCache()
+        self._estimators: CodebookCache[_Built] = CodebookCache(library.by_id)
+        self._surface: Surface | None = None  # knowledge of the surface in the estimators
         self._codebook: Codebook | None = None
         # The job whose estimator is being built, and the job that comes next.
         self._building: _Job | None = None
@@ -278,12 +304,26 @@ class Positioner(Role):
         codebook = job.codebook
         if job.settings != self._settings.latest and codebook.id in self._estimators:
             return
-        surface = estimator.surface if isinstance(estimator, SearchEstimator) else None
-        model = MeasurementModel(self._scenario, codebook, surface).prepare()
-        self._estimators.put(codebook.id, _Built(job, model, estimator))
+        for known in self._library.by_id:
+            self._estimators.pop(known, None)
+        self._surface = estimator.surface if isinstance(estimator, SearchEstimator) else None
+        self._put(job, estimator)
         self._settings.in_use = job.settings
         self._residuals.clear()
         self.log(f'{estimator.name} is ready for codebook {codebook.id} after {elapsed_s:.1f} s')
+
+    def _put(self, job: _Job, estimator: Estimator) -> None:
+        model = MeasurementModel(self._scenario, job.codebook, self._surface).prepare()
+        self._estimators.put(job.codebook.id, _Built(job, model, estimator))
+
+    def _has_estimator(self, codebook_id: str) -> bool:
+        """Return whether there is an estimator; first create one for a codebook of the library."""
+        settings, cell = self._settings.in_use, self._library.by_id.get(codebook_id)
+        if cell and settings.prior == TRACK and codebook_id not in self._estimators:
+            self._put(_Job(cell, settings), BayesEstimator(
+                self._scenario, cell, reject_outside=settings.reject_outside,
+                surface=self._surface, lazy=True))
+        return codebook_id in self._estimators
 
     def _revert(self, job: _Job, reason: str) -> None:
         """Handle a failed build; if it had the latest settings, revert to the settings in use."""
@@ -311,7 +351,7 @@ class Positioner(Role):
         if self._answered and m.same(self._answered[0], received):
             self.count(Outcome.DUPLICATE)
             self._actions += self._answered[1]
-        elif received.codebook_id in self._estimators:
+        elif self._has_estimator(received.codebook_id):
             self._locate(received, now_s)
             self._answered = received, [
                 action for action in self._actions if isinstance(action, events.Send)]
@@ -340,12 +380,12 @@ class Positioner(Role):
                 m.PositionEstimate, received, stamp_ns=received.stamp_ns,
                 position=placed.mean, covariance_m2=placed.covariance,
                 crlb_m2=float(crlb_of(model, estimate.mean[None])[0]), estimator=estimator.name,
-                latency_s=latency_s, **probabilities))
+                latency_s=latency_s, **probabilities, **self._proposal(received.user, estimate)))
             self._publish_track(received, placed)
             self._publish_posterior(received, posterior, probabilities)
         else:
             self._no_fix(received, f'position: {problem}' if problem else str(estimate.reason))
-        text, begins = self._residuals.add(received.user, received.codebook_id, estimate)
+        text, begins = self._residuals.add(received.user, estimate)
         if text:
             self.log_state('residuals', text, begins)
 
@@ -363,6 +403,16 @@ class Positioner(Role):
             return estimator.estimate(signals), None
         posterior = estimator.posterior(signals)
         return posterior.estimate, posterior
+
+    def _proposal(self, user: int, estimate: Estimate) -> dict[str, Any]:
+        """Return the fields of an estimate that propose a codebook for the user's next cycle."""
+        if not (self._library.by_id and isinstance(estimate, TrackEstimate)):
+            return {}
+        predicted = self._tracks.predict(user)
+        codebook = predicted and self._library.codebook_at(*predicted[:2])
+        if not (predicted and codebook):
+            return {}
+        return {'next_codebook_id': codebook.id, 'next_codebook_s': _PATIENCE * predicted[2]}
 
     def _publish_posterior(self, received: m.ReceivedSignals, posterior: Posterior | None,
                            probabilities: Mapping[str, float]) -> None:

@@ -4,6 +4,7 @@ import enum
 from collections.abc import Mapping
 
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.codebook.library import EMPTY, Library
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered, Outcome
 from rhs_isac_ros.protocol.role import (
@@ -28,16 +29,19 @@ class State(enum.Enum):
 class RhsController(StateMachine):
     """The role that applies configurations to the surface.
 
-    It keeps the latest codebooks. Each command of the base station selects a codebook and a band.
+    It keeps the latest codebooks and those of a library. Each command of the base station selects
+    a codebook and a band.
     """
 
     SENDS = (m.RhsConfiguration,)
 
     STATES = State
 
-    def __init__(self) -> None:
+    def __init__(self, library: Library = EMPTY) -> None:
         super().__init__(State.IDLE)
-        self._codebooks: CodebookCache[Codebook] = CodebookCache()
+        self._codebooks: CodebookCache[Codebook] = CodebookCache(library.by_id)
+        self._codebooks.update(library.by_id)
+        self._library_id = library.id
         self._cycle_id = 0
         # Sender of the beam that was applied last.
         self._beam_sender = 0
@@ -105,7 +109,8 @@ class RhsController(StateMachine):
         if not self._unknown_logged:
             self._unknown_logged = True
             self.log(f'codebook {event.codebook_id!r} rejected; in use: '
-                     f'{self._codebooks.in_use!r}, available: {list(self._codebooks)}',
+                     f'{self._codebooks.in_use!r}, known: {len(self._codebooks)}, library: '
+                     f'{self._library_id}',
                      warning=True, key='rejected codebook')
 
     TABLE = (

@@ -4,7 +4,7 @@ import collections
 import dataclasses
 import enum
 import itertools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
 
 from rhs_isac_ros.protocol.events import (
@@ -111,21 +111,26 @@ class NewestDict(dict[Key, Value]):
         return n_surplus
 
 
-# Number of codebooks that are kept, including the one in use.
+# Number of codebooks that are kept besides those of a library, including the one in use.
 _MAX_CODEBOOKS = 4
 
 
 class CodebookCache(NewestDict[str, Value]):
-    """A cache of items by codebook id, which never discards the item that was taken last."""
+    """A cache of items by codebook id.
 
-    def __init__(self) -> None:
-        super().__init__(_MAX_CODEBOOKS)
+    It never discards the item that was taken last, nor those of the codebooks in a library.
+    """
+
+    def __init__(self, library: Collection[str] = ()) -> None:
+        super().__init__(_MAX_CODEBOOKS + len(library))
+        self._library = library
         self.in_use = ''  # id of the codebook whose item is in use; empty at first
 
     def put(self, codebook_id: str, item: Value) -> int:
-        """Store an item as `NewestDict.put` does, but never discard the item in use."""
-        if self.in_use:
-            super().put(self.in_use, self[self.in_use])
+        """Store an item as `NewestDict.put` does, but discard none that is to be kept."""
+        for kept in (*self._library, self.in_use):
+            if kept in self:
+                super().put(kept, self[kept])
         return super().put(codebook_id, item)
 
     def take(self, codebook_id: str) -> Value:

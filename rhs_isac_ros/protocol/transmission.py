@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.codebook.library import EMPTY, Library
 from rhs_isac_ros.link import (
     Beam,
     CapacityReport,
@@ -61,7 +62,7 @@ class Transmission(Role):
     to compute as a beam, so reports are usually computed between cycles. `surface_of` takes the
     name of a calibration file, and returns the surface in the file, or None for an empty name. The
     statistics are those of the newest `window` reports. `choose` and `evaluate` take the place of
-    `choose_beam` and `capacity_report`.
+    `choose_beam` and `capacity_report`. Estimates may have the codebooks of a `library`, too.
     """
 
     SENDS = (m.Beam, m.Capacity, m.CapacityStatistics)
@@ -71,12 +72,14 @@ class Transmission(Role):
             self, scenario: Scenario, settings: TransmissionSettings | None = None,
             surface_of: Callable[[str], SurfaceEstimate | None] = lambda file: None,
             window: int = _WINDOW, choose: Callable[..., Choice] = choose_beam,
-            evaluate: Callable[..., CapacityReport] = capacity_report) -> None:
+            evaluate: Callable[..., CapacityReport] = capacity_report,
+            library: Library = EMPTY) -> None:
         super().__init__()
         self._scenario, self._surface_of = scenario, surface_of
         self._choose, self._evaluate = choose, evaluate
         self._settings = PendingSettings(settings or TransmissionSettings())
-        self._codebooks: CodebookCache[None] = CodebookCache()
+        self._codebooks: CodebookCache[None] = CodebookCache(library.by_id)
+        self._codebooks.update(dict.fromkeys(library.by_id))
         # Beams, by cycle; true positions, by cycle, user and instance; cycles in the statistics.
         self._steered: NewestDict[int, _Steered] = NewestDict(REMEMBERED_CYCLES)
         self._truths: NewestDict[tuple[int, int, int], m.GroundTruth] = NewestDict(

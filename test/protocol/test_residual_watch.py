@@ -21,10 +21,10 @@ def estimate(factor, expected=EXPECTED):
     return Estimate(PLACE, np.eye(3), '', factor * EXPECTED, expected)
 
 
-def add(watch, user, n, factor, codebook_id='a'):
+def add(watch, user, n, factor):
     """Return text and severity of the messages about n residuals of a user."""
     return [message for _ in range(n) if (message := watch.add(
-        user, codebook_id, estimate(factor))) != ('', False)]
+        user, estimate(factor))) != ('', False)]
 
 
 def test_residuals_of_the_model_are_shown_without_a_warning():
@@ -50,7 +50,7 @@ def test_one_user_does_not_hide_among_many():
     watch, logged = ResidualWatch(), []
     for _ in range(2 * MIN_FIXES):
         for user in range(1, 65):
-            logged.append(watch.add(user, 'a', estimate(1.3 if user == 7 else 1.0))[0])
+            logged.append(watch.add(user, estimate(1.3 if user == 7 else 1.0))[0])
     (text,) = filter(None, logged)
     assert 'scenario: user 7: residuals 1.3 times' in text
     assert float(watch.status()['residual.ratio']) < 1.01
@@ -74,8 +74,8 @@ def test_the_shipped_hall_causes_no_warning(pytestconfig, shipped, n_places):
     watch, unaware = ResidualWatch(scenario.multipath.level_db), ResidualWatch()
     for one in zip(found.mean, found.covariance, found.reason, found.residual,
                    found.expected_residual, strict=True):
-        assert watch.add(1, 'a', Estimate(*one)) == ('', False)
-        unaware.add(1, 'a', Estimate(*one))
+        assert watch.add(1, Estimate(*one)) == ('', False)
+        unaware.add(1, Estimate(*one))
     assert 'warning.residual' in unaware.status()
     assert 0.7 < float(watch.status()['residual.ratio']) < 1.5
 
@@ -83,16 +83,8 @@ def test_the_shipped_hall_causes_no_warning(pytestconfig, shipped, n_places):
 def test_users_who_may_be_outside_are_not_compared():
     watch = ResidualWatch()
     for _ in range(WINDOW):
-        assert watch.add(1, 'a', estimate(9.0, expected=np.nan)) == ('', False)
+        assert watch.add(1, estimate(9.0, expected=np.nan)) == ('', False)
     assert watch.status() == {}
-
-
-def test_a_change_of_the_codebook_begins_anew():
-    watch = ResidualWatch()
-    assert len(add(watch, 1, MIN_FIXES, 3.0)) == 1
-    assert add(watch, 1, MIN_FIXES - 1, 3.0, 'b') == []
-    assert watch.status()['residual.fixes'] == str(MIN_FIXES - 1)
-    assert 'warning.residual' not in watch.status()
 
 
 class Residuals:

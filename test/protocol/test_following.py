@@ -1,0 +1,175 @@
+"""Codebooks that follow a user: proposed by the positioner, chosen by the base station."""
+
+import numpy as np
+import pytest
+from in_memory_network import LATENCY_S, LosesFirst, Network
+
+from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.codebook.library import Library, Plan
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.mobility import Waypoints
+from rhs_isac_ros.positioning import BayesEstimator
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import PauseRequested, ResumeRequested
+from rhs_isac_ros.protocol.settings import PositionerSettings
+
+PLACE = np.array([8.0, -2.0, 0.5])
+TRACK = PositionerSettings(prior='track')
+
+
+@pytest.fixture(scope='module')
+def scenario():
+    return Scenario(center_frequencies_hz=(2.5e9, 2.56e9, 2.58e9, 2.6e9), n_subbands=4,
+                    n_frames=2, elements_per_side=6, roi_center_m=(8.0, 0.0, 0.0),
+                    roi_size_m=(4.0, 6.0, 2.0))
+
+
+@pytest.fixture(scope='module')
+def region(scenario):
+    return random_codebook(scenario, np.random.default_rng(1))
+
+
+@pytest.fixture(scope='module')
+def library(scenario, region):
+    """Random codebooks for 12 cells of 2 m x 2 m x 1 m."""
+    plan = Plan(scenario.unplaced.id, region.id, 'error', (0.5,), (2.0,))
+    cells, rng = plan.cells(scenario), np.random.default_rng(2)
+    return Library.of(plan, cells, [random_codebook(scenario, rng) for _ in cells])
+
+
+@pytest.fixture(scope='module')
+def estimator(scenario, region):
+    return BayesEstimator(scenario, region)
+
+
+@pytest.fixture
+def net(scenario, region, library, estimator):
+    def make(place=PLACE, **options):
+        return Network(scenario, region, {1: place}, library=library, positioner=TRACK,
+                       make=lambda codebook: estimator, plain_beams=True, **options)
+    return make
+
+
+def used(network):
+    """Return the id of the codebook in each cycle."""
+    return [signals.codebook_id for signals in network.sent(m.ReceivedSignals)]
+
+
+def test_codebooks_follow_a_walk(net, library, region):
+    network = net(Waypoints([[8, -2.5, 0.5], [8, 2.5, 0.5]], 1.0))
+    network.run_cycles(40)
+    assert network.served() == [1] * 40
+    ids = used(network)
+    # The interval between cycles, and therefore the prediction, is known after two cycles.
+    assert ids[:2] == [region.id] * 2
+    assert set(ids[2:]) <= set(library.by_id)
+    assert len(set(ids[2:])) >= 3
+    network.verify()
+    # The watch on residuals goes on.
+    assert network['positioner'].status()['residual.fixes'] == '40'
+    assert not any('wrong' in reason for c in network.counters().values() for reason in c)
+
+
+class Jump:
+    """A user that is 3 m away after a time [s]."""
+
+    def __init__(self, time_s):
+        self.time_s = time_s
+
+    def state(self, time_s):
+        return PLACE + [0.0, 3.0 * (time_s > self.time_s), 0.0], np.zeros(3)
+
+
+def test_a_user_that_jumps_is_found_within_three_cycles(net, library):
+    network = net(Jump(1.0))
+    network.run(lambda: network.now_s > 1.0)
+    network.run_cycles(4)
+    ids, estimates = used(network), network.sent(m.PositionEstimate)
+    errors = [estimate.position - network.sent(
+        m.GroundTruth, cycle_id=estimate.cycle_id)[0].position for estimate in estimates]
+    jumped = next(n for n, estimate in enumerate(estimates)
+                  if network.sent(m.GroundTruth, cycle_id=estimate.cycle_id)[0].position[1] > 0)
+    assert ids[jumped] in library.by_id
+    for error, estimate in zip(errors[jumped + 2:], estimates[jumped + 2:], strict=True):
+        # A chi-square variable with three degrees of freedom exceeds 21.1 with probability 1e-4.
+        assert error @ np.linalg.solve(estimate.covariance_m2, error) < 21.1
+        assert np.linalg.norm(error) < 1.5
+
+
+def without_fix(cycle_id):
+    """Return a transport that replaces the estimate of a cycle by a report without one."""
+    def transport(message, recipient):
+        if isinstance(message, m.PositionEstimate) and message.cycle_id == cycle_id:
+            message = m.derive(m.NoFix, message, reason='none')
+            return [(LATENCY_S, message)] if recipient == 'bs' else []
+        return [(LATENCY_S, message)]
+    return transport
+
+
+@pytest.mark.parametrize(('transport', 'outcome'), [
+    (without_fix(6), 'no_fix'), (LosesFirst(m.Beam, {'cycle_id': 6}), 'transmission_silent')],
+    ids=['no_fix', 'lost'])
+def test_a_cycle_without_service_is_followed_by_one_for_the_whole_region(
+        net, library, region, transport, outcome):
+    network = net(transport=transport, step_timeout_s=0.1)
+    network.run_cycles(8)
+    assert [end for _, _, end in network.outcomes()][5:] == [outcome, 'served', 'served']
+    assert used(network)[5] in library.by_id
+    assert used(network)[6] == region.id
+    assert used(network)[7] in library.by_id
+
+
+def test_a_proposal_expires(net, library, region):
+    network = net()
+    network.run_cycles(5)
+    network.dispatch('bs', PauseRequested())
+    network.run(limit_s=3.0)
+    network.dispatch('bs', ResumeRequested())
+    network.run_cycles(1)
+    assert used(network)[4] in library.by_id
+    assert used(network)[-1] == region.id
+
+
+def test_a_restarted_user_begins_with_the_codebook_of_the_region(net, library, region):
+    network = net()
+    network.run_cycles(5)
+    network.restart('user1')
+    network.run_cycles(1)
+    assert used(network)[4] in library.by_id
+    assert used(network)[-1] == region.id
+
+
+def test_a_positioner_without_the_library_proposes_nothing(net, region):
+    network = net(without_library=['positioner'])
+    network.run_cycles(5)
+    assert used(network) == [region.id] * 5
+
+
+def test_a_base_station_without_the_library_uses_the_codebook_of_the_region(net, region):
+    network = net(without_library=['bs'])
+    network.run_cycles(5)
+    assert used(network) == [region.id] * 5
+
+
+def test_a_controller_without_the_library_rejects_its_codebooks(net, region):
+    network = net(without_library=['rhs_controller'])
+    network.run_cycles(6)
+    outcomes = [end for _, _, end in network.outcomes()]
+    # After the long interval, the next prediction is too uncertain for a codebook.
+    assert outcomes == [
+        'served', 'served', 'rhs_silent', 'served', 'served', 'rhs_silent']
+    assert set(used(network)) == {region.id}
+    assert 'library: none' in network.logged('rhs_controller')[0]
+
+
+def test_signals_of_a_cell_without_a_track_are_searched_in_the_whole_region(
+        net, scenario, library):
+    network = net()
+    cell = library.codebook_at(PLACE, 0.3)
+    drawn = MeasurementModel(scenario, cell).sample(PLACE[None], np.random.default_rng(3))[0]
+    before = len(network.sent(m.PositionEstimate))
+    network.dispatch('positioner', m.ReceivedSignals(
+        cycle_id=1, user=7, codebook_id=cell.id,
+        signals=drawn.reshape(cell.digital.shape[:3])))
+    (estimate,) = network.sent(m.PositionEstimate)[before:]
+    assert np.linalg.norm(estimate.position - PLACE) < 1.5
