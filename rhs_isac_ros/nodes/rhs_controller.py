@@ -12,7 +12,7 @@ class RhsControllerNode(RoleNode[RhsController]):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('rhs_controller', **node_options)
-        self.start(RhsController(), needs_codebook=True)
+        self.start(RhsController(self.library), needs_codebook=True)
 
 
 main = entry('rhs_controller', lambda: [RhsControllerNode()])

@@ -20,8 +20,8 @@ class TransmissionNode(RoleNode[Transmission]):
         # Surfaces by calibration file, as read when the parameter was checked.
         self._surfaces: dict[str, SurfaceEstimate | None] = {}
         settings = self.make_settings(self.values)
-        self.start(Transmission(self.scenario, settings, self._surfaces.__getitem__),
-                   needs_codebook=True)
+        self.start(Transmission(self.scenario, settings, self._surfaces.__getitem__,
+                                library=self.library), needs_codebook=True)
 
     def make_settings(self, values: types.SimpleNamespace) -> Any:
         """Return the settings; raise ParameterError for an invalid value or calibration file."""

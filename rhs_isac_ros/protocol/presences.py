@@ -29,6 +29,7 @@ class Presence:
     node: str  # fully qualified name
     scenario: str  # the result of `Scenario.fields`, in JSON
     use_sim_time: bool = False  # whether the node uses simulated time
+    library_id: str = ''  # library of codebooks; empty if the role uses none
 
 
 class Presences:
@@ -36,8 +37,9 @@ class Presences:
 
     A node announces itself periodically, and counts as gone when it falls silent. Among the nodes
     with the same role and scenario, the node that started last serves. Nodes with another scenario
-    are reported and otherwise ignored. `now_s` is the time of the latest call of `add`, or later
-    [s], on a clock that stops while this node cannot receive announcements.
+    are reported and otherwise ignored. A role that this node requires is missing if its node has
+    another library of codebooks, which is reported, too. `now_s` is the time of the latest call of
+    `add`, or later [s], on a clock that stops while this node cannot receive announcements.
     """
 
     def __init__(self, own: Presence) -> None:
@@ -52,8 +54,13 @@ class Presences:
             self._known.put(other.sender, (other, now_s))
 
     def newest(self, role: str) -> int:
-        """Return the instance that started last among the other nodes of a role; 0 if none."""
-        return max((other.sender for other in self._of_role(role)), default=0)
+        """Return the instance that started last among the other nodes of a role; 0 if none.
+
+        It is also 0 if this node has another role, and that node has another library.
+        """
+        latest = max(self._of_role(role), key=lambda other: other.sender, default=None)
+        is_usable = latest and (role == self.own.role or not self._has_other_library(latest))
+        return latest.sender if latest and is_usable else 0
 
     @property
     def stands_by(self) -> bool:
@@ -75,6 +82,11 @@ class Presences:
                 f'{first.node}{others} uses another scenario, {first.scenario_id}, with '
                 f'{_differences(own.scenario, first.scenario) or "unknown differences"}; '
                 'its messages are dropped')
+        if divergent := [other for other in present if self._has_other_library(other)]:
+            first = min(divergent, key=lambda other: (other.node, other.library_id))
+            found['conflict.library'] = (
+                f'{first.node}: library of codebooks {first.library_id}, expected '
+                f'{own.library_id} of this node; set the same library_file')
         if names := {other.node for other in present if other.use_sim_time != own.use_sim_time}:
             found['conflict.clock'] = (
                 f'{", ".join(sorted(names))[:_MAX_LENGTH]}: use_sim_time '
@@ -88,6 +100,10 @@ class Presences:
     def _of_role(self, role: str) -> list[Presence]:
         return [other for other in self._present()
                 if role and other.role == role and not self._is_stranger(other)]
+
+    def _has_other_library(self, other: Presence) -> bool:
+        return (not self._is_stranger(other) and bool(self.own.library_id and other.library_id)
+                and other.library_id != self.own.library_id)
 
     def _is_stranger(self, other: Presence) -> bool:
         return other.scenario_id not in ('', self.own.scenario_id)

@@ -109,6 +109,11 @@ _TABLES = _parameter(
     'table_folder', '', 'Directory in which tables are cached; empty: the cache directory of the '
     'user.')
 
+# For all roles that take part in the choice or the use of a codebook.
+_LIBRARY = _parameter(
+    'library_file', '', 'Library of codebooks, the same for all nodes, from which each cycle '
+    'takes the one for the predicted position; empty: only the codebook of the optimizer.')
+
 # Mobilities of robots. The library has further mobilities.
 ODOMETRY, TF = ROBOTS = ('odometry', 'tf')
 _FRAME = _parameter(
@@ -116,9 +121,12 @@ _FRAME = _parameter(
 
 # Parameters of the roles other than their settings.
 _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
+    'rhs_controller': (_LIBRARY,),
+    'transmission': (_LIBRARY,),
     'bs': (
         _SEED,
         _FRAME,
+        _LIBRARY,
         _parameter(
             'first_cycle', 0, 'Id of the first cycle; 0: derived from the clock, so that no id '
             'is reused after a restart.', low=0, high=2**53),
@@ -175,6 +183,7 @@ _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
     'receiver': (_SEED,),
     'fusion': (_SEED, _TABLES, _FRAME, _USER_TOPICS),
     'positioner': (
+        _LIBRARY,
         _TABLES,
         _FRAME,
         _USER_TOPICS,

@@ -46,17 +46,19 @@ class Peers:
         every change.
     on_rival
         Called with True if this node has to stand by for another one, or False if it may serve.
+    library_id
+        Id of the library of codebooks; empty for a role that uses none.
     """
 
     def __init__(
             self, node: Node, role: str, instance: int, scenario: Scenario,
             on_missing: Callable[[tuple[str, ...]], None],
-            on_rival: Callable[[bool], None]) -> None:
+            on_rival: Callable[[bool], None], library_id: str = '') -> None:
         self._node, self._on_missing, self._on_rival = node, on_missing, on_rival
         self._role, self._needed = role, MEMBERS[role].needed
         self._presences = Presences(Presence(
             instance, scenario.id, '', node.get_fully_qualified_name(),
-            json.dumps(scenario.fields())))
+            json.dumps(scenario.fields()), library_id=library_id))
         # The newest instance of each role of interest at the last poll, and the newest one ever.
         self._newest, self._latest = dict.fromkeys((role, *self._needed), 0), 0
         self._clock, self._mismatches = ClockWatch(), endpoints.Mismatches(node)

@@ -13,6 +13,7 @@ from rclpy.publisher import Publisher
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.codebook.library import EMPTY, Library
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.role_statistics import Report, RoleStatistics
 from rhs_isac_ros.protocol import events
@@ -26,6 +27,8 @@ from rhs_isac_ros.ros.parameters import CODEBOOK, ParameterizedNode
 from rhs_isac_ros.ros.peers import Peers
 from rhs_isac_ros.ros.place import Place
 from rhs_isac_ros.ros.roster import MEMBERS
+from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.fields import ParameterError
 
 _NAMES = list(CODEBOOK)
 # Time without a response after which a request is repeated [s]: a killed optimizer does not
@@ -139,7 +142,8 @@ class Clocks:
 class RoleNode(ParameterizedNode, Generic[_RoleT]):
     """A node that passes messages to a role and performs the returned actions.
 
-    A subclass creates the role from the parameters and the `scenario`, and passes it to `start`.
+    A subclass creates the role from the parameters, the `scenario` and, if it has the parameter
+    ``library_file``, the `library`, and passes it to `start`.
     The `instance` is the value of `Message.sender`. Raises ParameterError or ScenarioError if a
     parameter or the scenario file is invalid.
     """
@@ -151,6 +155,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self.place = Place.of(
             self.values, self.get_namespace(), MEMBERS[executable].of_site)
         self.scenario = self.place.scenario
+        self.library = self._load_library(getattr(self.values, 'library_file', ''))
         if hasattr(self.values, 'seed'):
             self.values.seed = self.place.seed(self.values.seed)
         self.instance = time.time_ns()
@@ -163,7 +168,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self.stands_by = False
         self._sending: dict[type[m.Message], Publisher] = {}
         self._receiving: set[type[m.Message]] = set()
-        self._statistics = RoleStatistics()
+        self._statistics = RoleStatistics(self.library.by_id)
         # The same timer serves all deadlines. It is set only if it would expire too late, or after
         # it has expired too early.
         self._timer = endpoints.steady_timer(self, 3600.0, self._on_timer)
@@ -182,12 +187,20 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         publish_reports(self, self.report)
         self._peers = Peers(
             self, self._executable, self.instance, self.scenario, self._on_missing,
-            self._on_rival)
+            self._on_rival, self.library.id if hasattr(self.values, 'library_file') else '')
         self.endings.callback(self._peers.close)
         if subscribe and not needs_codebook:
             self.subscribe()
         if MEMBERS[self._executable].has_codebook:
             self._codebook_client = CodebookClient(self, self.scenario, self._on_codebook)
+
+    def _load_library(self, file: str) -> Library:
+        if not file:
+            return EMPTY
+        with translated((CodebookError, OSError), ParameterError, 'library_file'):
+            library = Library.load(file)
+            library.check(self.scenario)
+        return library
 
     def _advertise(self) -> None:
         self._sending = {kind: endpoints.create_publisher(

@@ -49,6 +49,29 @@ def test_the_newer_node_serves(presences):
                          'started 2023-11-14 22:13:11 UTC'}
 
 
+@pytest.mark.parametrize(('own', 'library'), [('lib1', 'none'), ('none', 'lib1'),
+                                              ('lib1', 'lib2')])
+def test_a_required_role_with_another_library_is_missing_and_reported(own, library):
+    presences = Presences(dataclasses.replace(OWN, library_id=own))
+    presences.add(other(role='rhs_controller', node='/rhs_controller', library_id=library),
+                  NOW_NS, 0.0)
+    assert presences.newest('rhs_controller') == 0
+    assert presences.conflicts() == {
+        'conflict.library': f'/rhs_controller: library of codebooks {library}, expected {own} of '
+                            'this node; set the same library_file'}
+    # Of two nodes with the same role, one stands by whatever their libraries are.
+    presences.add(other(library_id=library), NOW_NS, 0.0)
+    assert presences.stands_by
+
+
+@pytest.mark.parametrize('library', ['', 'lib1'])
+def test_the_same_library_or_none_is_no_conflict(library):
+    presences = Presences(dataclasses.replace(OWN, library_id='lib1'))
+    presences.add(other(role='channel', library_id=library), NOW_NS, 0.0)
+    assert presences.newest('channel') == NOW_NS
+    assert presences.conflicts() == {}
+
+
 def test_nodes_with_different_poses_refuse_each_other_by_name():
     scenarios = Scenario(), Scenario(pose={'position_m': [0, 10, 1]})
     own, stranger = (dataclasses.replace(
