@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike
 
 # Largest coordinate of a position [m]; sums of squares of larger ones lose all digits of others.
 _MAX_COORDINATE_M = 1e12
+# Relative difference of values that are equal up to rounding.
+_TIE = 1e-6
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
@@ -38,6 +40,15 @@ def log_sum(values: np.ndarray) -> float:
     if np.isneginf(highest):
         return highest
     return highest + float(np.log(np.sum(np.exp(values - highest))))
+
+
+def untied(values: np.ndarray) -> np.ndarray:
+    """Raise values [..., K] so little that only the order of equal ones along K is affected.
+
+    The first of them is then the smallest. Otherwise, rounding would decide, and thus the
+    processor.
+    """
+    return values + np.abs(values) * (_TIE * np.arange(values.shape[-1]))
 
 
 def blocks(n: int, size: int) -> list[slice]:

@@ -74,7 +74,7 @@ class PoseTest:
             reference = self._references[pair]
             if self._places is not None:
                 distances = np.linalg.norm(self._places[self._rows[pair]] - place, axis=1)
-                near = np.argsort(distances)[:_N_NEAR]
+                near = np.argsort(distances, kind='stable')[:_N_NEAR]
                 self._near[pair].append(near)
                 reference = reference[near]
             below = np.count_nonzero(reference < agreements[pair])

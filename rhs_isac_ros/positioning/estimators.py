@@ -439,7 +439,7 @@ def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> Weighted
     samples = WeightedSamples.of(draw_samples(
         modes, estimator._normal, Resolution.of(estimator.scenario).bounds_m), modes)
     shares = samples.weights.sum(axis=1)
-    order = np.argsort(-shares)[:np.count_nonzero(shares)]
+    order = np.argsort(-shares, kind='stable')[:np.count_nonzero(shares)]
     weights = samples.weights[order] / shares[order, None]
     return WeightedModes(shares[order], *moments(weights, samples.positions[order]))
 

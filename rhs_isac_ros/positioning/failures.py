@@ -107,7 +107,7 @@ class FailedElements:
 
     def _search(self, modes: Modes, signals: Signals) -> 'FailureSearch':
         """Search for probable sets of failed elements at the modes and, if needed, elsewhere."""
-        order = np.argsort(-modes.log_likelihood)
+        order = modes.order
         search = FailureSearch(self._model, signals)
         keys = search.add(modes.points[order], modes.values[order])
         if search.explains(keys):
@@ -147,8 +147,7 @@ class FailedElements:
             parts.append(ascend(conditionals[number], self._likelihood, starts, signals,
                                 LIMITS.steps, LIMITS.first_margin, number))
         modes = concatenate(*parts)
-        order = np.argsort(-modes.log_likelihood)[:LIMITS.hypotheses]
-        return select(modes, order), conditionals
+        return select(modes, modes.order[:LIMITS.hypotheses]), conditionals
 
 
 def first_sites(points: np.ndarray, radii: np.ndarray) -> list[int]:

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import log_sum, mixture_weights, read_only
+from rhs_isac_ros.model.arrays import log_sum, mixture_weights, read_only, untied
 from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximum, symmetric
 from rhs_isac_ros.model.geometry import (
     jacobian,
@@ -59,8 +59,6 @@ _N_FIRST, _N_LAST = 400, 64
 # that touch have a product with more weight at its borders.
 _N_SAMPLES = 128
 _SPREAD = 1.2
-# Relative difference of curvatures that are equal up to rounding.
-_TIE = 1e-6
 # Smallest cosine of the angle between boresight and the maximum of a mode.
 _MIN_COSINE = 0.05
 
@@ -294,10 +292,9 @@ class _Products(NamedTuple):
         Returns positions [T, S, 3] [m], and the logarithm of the factor by which their density
         differs from that of the offsets, [T, S].
         """
-        # Of equally thin components, the first one is taken, whatever the rounding.
-        thinnest = np.argmax([
-            one.curvature[rows, 0, 0] * (1 - _TIE * number) for number, (one, rows) in enumerate(
-                zip(sheets, self.rows.T, strict=True))], axis=0)
+        curvature = np.stack([one.curvature[rows, 0, 0] for one, rows in zip(
+            sheets, self.rows.T, strict=True)], axis=1)
+        thinnest = np.argmin(untied(-curvature), axis=1)
         positions, log_factor = np.empty_like(offsets), np.empty(offsets.shape[:2])
         for number, one in enumerate(sheets):
             (mine,) = np.nonzero(thinnest == number)

@@ -152,7 +152,7 @@ def multiply(bent: Mixture, modes: Modes, share: float, likelihood: Likelihood |
     log_weights, precision = _evidence(offsets, bent.covariances[:, :3, :3], spread[:, None])
     log_weights += share * modes.log_likelihood[:, None] + bent.log_weights
     mode, component = np.unravel_index(
-        np.argsort(-log_weights, axis=None)[:_PRODUCTS], log_weights.shape)
+        np.argsort(-log_weights, axis=None, kind='stable')[:_PRODUCTS], log_weights.shape)
     chosen = select(bent, component)._replace(log_weights=log_weights[mode, component])
     found = _shifted(chosen, precision[mode, component], offsets[mode, component])
     if likelihood is not None:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import untied
 from rhs_isac_ros.model.gaussian import step_to_maximum
 from rhs_isac_ros.model.geometry import polar_derivative, to_polar, to_positions
 from rhs_isac_ros.positioning.segments import select
@@ -63,7 +64,7 @@ class Restricted(NamedTuple):
         centre = positions + step_to_maximum(
             precision, np.matmul(transposed, gradient[..., None])[..., 0])
         freedom = extent * np.sqrt(np.diagonal(precision, axis1=1, axis2=2))
-        order = np.argsort(freedom, axis=1, kind='stable')
+        order = np.argsort(untied(freedom), axis=1, kind='stable')
         rows = np.arange(len(points))[:, None]
         low, high = bounds
         return cls._in_order(

@@ -22,6 +22,9 @@ GRID_MARGIN = 8.0
 EXACT_MARGIN = 7.0
 # A mode has converged when its last step changed the log-likelihood by less.
 _MIN_GAIN = 0.05
+# Log-likelihood per u and v by which modes are ordered that are equal up to rounding, as those of
+# a surface whose halves mirror each other. Otherwise, the processor would choose one.
+_PREFERENCE = 1e-6 * np.array([0.0, 1.0, 0.6])
 # Maximum number of exact steps. Few modes need more than two, unless signals are strong. At the
 # border of the region, small gains may alternate.
 MAX_STEPS = 8
@@ -50,6 +53,11 @@ class Modes(NamedTuple):
     def centres(self) -> np.ndarray:
         """Maxima that the modes would have without the region, (r [m], u, v), float64 [M, 3]."""
         return self.points + step_to_maximum(self.curvature, self.gradient)
+
+    @property
+    def order(self) -> np.ndarray:
+        """Indices of the modes of each shot, the most likely first, int [M]."""
+        return np.lexsort((-self.log_likelihood - self.points @ _PREFERENCE, self.shots))
 
     def starts(self) -> Starts:
         """Return the points, to start another search from them."""
@@ -195,7 +203,7 @@ def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float
     # The likelihood of a mode is a prediction, and may be arbitrarily wrong before convergence.
     # The likelihood before the last step is known, and its maximum limits the best prediction.
     value = modes.log_likelihood + np.maximum(gain, 0)
-    order = np.lexsort((-modes.log_likelihood, modes.shots))
+    order = modes.order
     of_shot = Segments.of_keys(modes.shots[order])
     known = (modes.log_likelihood - gain)[order]
     best = np.minimum(of_shot.first(modes.log_likelihood[order]), of_shot.max(known))

@@ -18,7 +18,7 @@ from rhs_isac_ros.link import (
     steer,
 )
 from rhs_isac_ros.model import ElementErrors, MeasurementModel, mobility, simulate_received
-from rhs_isac_ros.model.arrays import checked_positions, numbers
+from rhs_isac_ros.model.arrays import checked_positions, numbers, untied
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.positioning import SignalError, make_estimator
@@ -135,3 +135,10 @@ def test_numbers_are_converted_without_a_copy_or_loss():
     assert numbers('x', array) is array
     assert numbers('x', [1, True], complex).dtype == complex
     assert np.isnan(numbers('x', [np.nan], finite=False)).all()
+
+
+def test_of_values_that_are_equal_up_to_rounding_the_first_is_the_smallest():
+    values = np.array([0.1 + 0.2, 0.3, 0.3 - 1e-15, 0.2999])
+    for one in (values, -values):
+        assert np.argmin(untied(one[:3])) == 0
+    assert np.argsort(untied(np.stack([values, values]))).tolist() == [[3, 0, 1, 2]] * 2

@@ -111,3 +111,12 @@ def test_a_distant_gaussian_is_sampled_on_the_border():
     assert np.isfinite(log_weights).all()
     assert (positions[0, :, 2] > -1.8).mean() > 0.8
     assert np.isfinite(to_positions(to_polar(positions))).all()
+
+
+def test_axes_that_are_equally_wide_are_chosen_in_their_order_whatever_the_rounding():
+    bounds = np.array([[5.0, -3.0, -3.0], [15.0, 3.0, 3.0]])
+    centre = to_polar(np.array([[10.0, 0.0, 0.0]]))
+    for rounding in (-1e-13, 0.0, 1e-13):
+        curvature = np.diag([1e4, 3e2 * (1 + rounding), 3e2])[None]
+        order = Restricted.of(centre, np.zeros((1, 3)), curvature, bounds).order
+        assert order.tolist() == [[1, 2, 0]]

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds.fisher import fisher_information
+from rhs_isac_ros.codebook import Codebook, random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.geometry import jacobian, to_polar, to_positions
+from rhs_isac_ros.model.geometry import element_positions, jacobian, to_polar, to_positions
 from rhs_isac_ros.positioning import simulate_pairs
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.likelihood import Alignment, DispersedLikelihood, Likelihood
@@ -74,6 +75,26 @@ def test_every_phase_has_modes_the_most_likely_first(setting):
     for one in of_each(modes):
         assert len(one.points)
         assert (np.diff(one.log_likelihood) <= 0).all()
+
+
+def test_modes_that_mirror_each_other_have_the_same_order_on_all_machines():
+    """If both halves of the surface are the same, u and -u are, up to rounding, equally likely."""
+    places = element_positions(SCENARIO)
+    mirrored = [np.argmin(np.linalg.norm(places - one, axis=1)) for one in places * [1, -1, 1]]
+    codebook = random_codebook(SCENARIO, np.random.default_rng(2))
+    likelihood = Likelihood(SCENARIO, Codebook(
+        (codebook.analog + codebook.analog[:, :, mirrored]) / 2, codebook.digital))
+    positions = SCENARIO.sample_positions(20, np.random.default_rng(0))
+    signals = likelihood.signals(
+        likelihood.model.sample(positions, np.random.default_rng(1)))
+    modes = find_modes(likelihood, TemplateTable(SCENARIO, tabulate(likelihood.model)), signals,
+                       np.zeros((20, 0)))
+    pairs = [one for one in of_each(modes)
+             if len(one.points) > 1 and abs(np.ptp(one.log_likelihood[:2])) < 1e-9]
+    assert len(pairs) > 10
+    for one in pairs:
+        np.testing.assert_allclose(one.points[1], one.points[0] * [1, -1, 1], atol=1e-6)
+        assert one.points[0, 1] > 0
 
 
 def test_modes_are_separate(setting):
