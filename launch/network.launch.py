@@ -22,7 +22,7 @@ from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from rhs_isac_ros.positioning import Site
 from rhs_isac_ros.ros.parameters import NODES
 from rhs_isac_ros.ros.processes import MAX_USER_NODES
-from rhs_isac_ros.ros.roster import FOLLOWING, MEMBERS, ROSTER
+from rhs_isac_ros.ros.roster import MEMBERS, networks
 
 PACKAGE = 'rhs_isac_ros'
 # A launch that receives SIGTERM does not end its processes, so the kernel does.
@@ -82,7 +82,7 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
               if given[name] not in ('', 'false')]
     if given['site'] and others:
         raise ValueError(f'site: {given["site"]!r}, expected none with {others[0]}')
-    networks = _networks(given['site'])
+    parts = networks(Site.from_yaml(given['site']).surfaces if given['site'] else ())
     file = given['params_file']
     if file and not Path(file).is_file():
         raise ValueError(f'params_file: {file!r}, expected an existing file')
@@ -90,21 +90,13 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         # Without a name, the parameters apply to every node of the process.
         nodes = [_node(given, 'network', None, users=users, **values)]
     else:
-        nodes = [node for name, roles in networks for role in roles
+        nodes = [node for name, roles in parts for role in roles
                  for node in _nodes(_below(given, name), role, users, values)]
     if 'true' in (given['visualizer'], given['rviz']):
         nodes += [_node(_below(given, name), 'visualizer', 'visualizer')
-                  for name, roles in networks if 'positioner' in roles]
+                  for name, roles in parts if 'positioner' in roles]
     # The recorder comes first, because it misses earlier messages that are not latched.
     return [*_recorder(given), *nodes, *_rviz(given)]
-
-
-def _networks(site: str) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the names of the networks and their roles; a network without a site has no name."""
-    if not site:
-        return [('', tuple(ROSTER))]
-    leader, *others = Site.from_yaml(site).surfaces
-    return [(leader, tuple(ROSTER)), *((name, FOLLOWING) for name in others), ('', ('fusion',))]
 
 
 def _below(given: dict[str, str], name: str) -> dict[str, str]:

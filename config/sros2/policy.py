@@ -1,6 +1,7 @@
 """Prints the permissions of the nodes for topics and services, as a policy for SROS2."""
 
 import argparse
+import posixpath
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,13 +10,17 @@ from typing import NamedTuple
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.validate_namespace import validate_namespace
 
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.cycle_log import ANSWERS
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES
+from rhs_isac_ros.positioning import Site, SiteError
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.parameters import TF
+from rhs_isac_ros.ros.place import Place
 from rhs_isac_ros.ros.recording import recorded_topics
-from rhs_isac_ros.ros.roster import ROSTER
+from rhs_isac_ros.ros.roster import MEMBERS, ROSTER, networks
 from rhs_isac_ros.support.arguments import ArgumentParser, integer
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.exits import exit_code_of
 
 # Topics that every rclpy node publishes, and services that it offers.
@@ -54,9 +59,13 @@ class Permissions(NamedTuple):
     request: tuple[str, ...] = ()
 
 
+# A network with one surface, whose scenario permissions do not depend on.
+_ALONE = Place(Scenario())
+
+
 def permissions(
-        users: int, robots: Mapping[int, str] | None = None, is_simulated: bool = False
-) -> dict[str, Permissions]:
+        users: int, robots: Mapping[int, str] | None = None, is_simulated: bool = False,
+        place: Place = _ALONE, roles: Iterable[str] = ROSTER) -> dict[str, Permissions]:
     """Return the permissions that the nodes of a network may need, and no others.
 
     Parameters
@@ -67,37 +76,45 @@ def permissions(
         Topic of the odometry, or ``tf``, of each user that is a robot.
     is_simulated
         Whether the nodes follow the clock of a simulation.
+    place, roles
+        Surface of the nodes in their site, and their roles; by default, those of a network with
+        one surface.
 
     Returns
     -------
     dict
         Permissions by node. ``users`` is a node with all users, ``network`` the process of all
-        nodes of `ROSTER`. ``operator`` stands for all tools, which may read every topic, set
-        parameters and pause cycles, except for ``replay``, which may publish every topic and
-        take the place of the optimizer.
+        nodes of a network with one surface. ``operator`` stands for all tools, which may read
+        every topic, set parameters and pause cycles, except for ``replay``, which may publish
+        every topic and take the place of the optimizer.
     """
     numbers = range(1, users + 1)
     nodes = {
-        name if member.is_unique else f'{name}_{number}': _of_member(
-            name, numbers if member.is_unique else [number])
-        for name, member in sorted(ROSTER.items())
-        for number in ((1,) if member.is_unique else numbers)}
-    for user, source in (robots or {}).items():
-        nodes[f'user_{user}'] = _with_robot(nodes[f'user_{user}'], source)
-    nodes['users'] = _of_member('user', numbers)
-    nodes['network'] = _together({**nodes, 'network': Permissions(publish=_RCLPY_TOPICS)})
-    nodes['visualizer'] = Permissions(
-        publish=(*sorted((topics.MARKERS, topics.TF, topics.TF_STATIC,
-                          *_of_users(numbers, topics.PATH, topics.TRUE_PATH))), *_RCLPY_TOPICS),
-        subscribe=tuple(sorted(topics.NAMES[kind] for kind in SCENE_RECEIVES)))
+        name if MEMBERS[name].is_unique else f'{name}_{number}': _of_member(
+            name, numbers if MEMBERS[name].is_unique else [number], place)
+        for name in sorted(roles)
+        for number in ((1,) if MEMBERS[name].is_unique else numbers)}
+    if 'user' in roles:
+        for user, source in (robots or {}).items():
+            nodes[f'user_{user}'] = _with_robot(nodes[f'user_{user}'], source)
+        nodes['users'] = _of_member('user', numbers, place)
+    if not place.site:
+        nodes['network'] = _together({**nodes, 'network': Permissions(publish=_RCLPY_TOPICS)})
     optimizer = topics.OPTIMIZER_NODE
-    # It provides the recorded codebook, as an optimizer or to the one that is present, and awaits
-    # the answers to the signals.
-    replay = _together({optimizer: nodes[optimizer], 'replay': Permissions(
-        publish=tuple(recorded_topics()), reply=(),
-        subscribe=tuple(topics.NAMES[kind] for kind in ANSWERS),
-        request=tuple(f'{optimizer}/{service}' for service in _PARAMETER_SERVICES))})
-    nodes |= {'operator': _operator(nodes, numbers), 'replay': replay}
+    tools = {}
+    if optimizer in roles:
+        nodes['visualizer'] = Permissions(
+            publish=(*sorted((topics.MARKERS, topics.TF, topics.TF_STATIC,
+                              *_of_users(numbers, topics.PATH, topics.TRUE_PATH))),
+                     *_RCLPY_TOPICS),
+            subscribe=tuple(sorted(topics.NAMES[kind] for kind in SCENE_RECEIVES)))
+        # It provides the recorded codebook, as an optimizer or to the one that is present, and
+        # awaits the answers to the signals.
+        tools['replay'] = _together({optimizer: nodes[optimizer], 'replay': Permissions(
+            publish=tuple(recorded_topics()), reply=(),
+            subscribe=tuple(topics.NAMES[kind] for kind in ANSWERS),
+            request=tuple(f'{optimizer}/{service}' for service in _PARAMETER_SERVICES))})
+    nodes |= {'operator': _operator(nodes, numbers), **tools}
     if is_simulated:
         return {name: allowed._replace(subscribe=(*allowed.subscribe, topics.CLOCK))
                 for name, allowed in nodes.items()}
@@ -111,14 +128,16 @@ def _together(nodes: Mapping[str, Permissions]) -> Permissions:
                       for name in getattr(allowed, right)})) for right in Permissions._fields))
 
 
-def _of_member(name: str, users: Iterable[int]) -> Permissions:
+def _of_member(name: str, users: Iterable[int], place: Place) -> Permissions:
     """Return the permissions of a node of a role that serves some users."""
-    member = ROSTER[name]
+    member = MEMBERS[name]
+    received = (f'{source.prefix}{topics.NAMES[kind]}' for source in place.sources(
+        member.role.RECEIVES if member.role else ()) for kind in source.kinds)
     sent = {name for topic in member.sent for name in (
         _of_users(users, topic) if '{user}' in topic else (topic,))}
     return Permissions(
         publish=(*sorted(sent), *_RCLPY_TOPICS, *(_LOCATE_TOPICS if name == 'bs' else ())),
-        subscribe=tuple(sorted(member.received)),
+        subscribe=tuple(sorted({*member.announced, *received})),
         reply=(*_OFFERED_SERVICES,
                *((*_CYCLE_SERVICES, *_LOCATE_SERVICES) if name == 'bs' else ())),
         request=(_GET_CODEBOOK,) if member.has_codebook else ())
@@ -153,9 +172,31 @@ def _operator(nodes: Iterable[str], users: Iterable[int]) -> Permissions:
                  *_LOCATE_SERVICES))
 
 
+def _of_site(
+        base: str, site: Site | None, users: int, robots: Mapping[int, str] | None,
+        is_simulated: bool) -> dict[tuple[str, str], Permissions]:
+    """Return the permissions of a site, or of a single network, by namespace and node.
+
+    The operator of the whole site has the permissions of those of the surfaces, too.
+    """
+    found, operators = {}, {}
+    for name, roles in networks(site.surfaces if site else ()):
+        place = Place(site.surfaces[name or site.leader].scenario, site, base, name
+                      ) if site else _ALONE
+        nodes = permissions(users, robots, is_simulated, place, roles)
+        found |= {(f'{base}/{name}'.rstrip('/'), node): allowed
+                  for node, allowed in nodes.items()}
+        operators[name] = nodes['operator']
+    found[base, 'operator'] = Permissions(*(
+        tuple(dict.fromkeys(posixpath.join(name, one) for name, allowed in operators.items()
+                            for one in getattr(allowed, right)))
+        for right in Permissions._fields))
+    return found
+
+
 def policy(
         namespace: str = '/', users: int = 2, robots: Mapping[int, str] | None = None,
-        is_simulated: bool = False) -> str:
+        is_simulated: bool = False, site: Site | None = None) -> str:
     """Return the policy of a network in the XML format of SROS2, with one enclave for each node.
 
     Parameters
@@ -164,15 +205,18 @@ def policy(
         Namespace of the network and of its enclaves.
     users, robots, is_simulated
         As for `permissions`.
+    site
+        Site, whose surfaces have namespaces of their own in the given one; by default, there is a
+        single network.
     """
     add = ElementTree.SubElement
     root = ElementTree.Element('policy', version=_VERSION)
     enclaves = ElementTree.SubElement(root, 'enclaves')
-    for node, allowed in permissions(users, robots, is_simulated).items():
-        enclave = ElementTree.SubElement(
-            enclaves, 'enclave', path=f'{namespace.rstrip("/")}/{node}')
+    for (space, node), allowed in _of_site(
+            namespace.rstrip('/'), site, users, robots, is_simulated).items():
+        enclave = ElementTree.SubElement(enclaves, 'enclave', path=f'{space}/{node}')
         profiles = ElementTree.SubElement(enclave, 'profiles')
-        profile = ElementTree.SubElement(profiles, 'profile', ns=namespace, node=node)
+        profile = ElementTree.SubElement(profiles, 'profile', ns=space or '/', node=node)
         for right, names in allowed._asdict().items():
             kind = 'topic' if right in ('publish', 'subscribe') else 'service'
             if names:
@@ -188,10 +232,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print the policy, and return the exit code 0."""
     parser = ArgumentParser(
         prog='policy.py',
-        description='Print the SROS2 policy of a network.',
+        description='Print the SROS2 policy of a network or of a site.',
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--namespace', type=_namespace, default='/',
                         help='namespace of the network')
+    parser.add_argument('--site', type=_site, metavar='FILE',
+                        help='site file, whose surfaces have namespaces of their own')
     parser.add_argument('--users', type=integer(0, 1000), default=2, help='number of users')
     parser.add_argument('--robot', type=_robot, action='append', default=[], metavar='USER=TOPIC',
                         help='number of a user that is a robot, and its odometry topic or tf')
@@ -200,7 +246,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     robots = dict(options.robot)
     if beyond := [user for user in robots if not 1 <= user <= options.users]:
         parser.error(f'argument --robot: user {beyond[0]}, expected one of {options.users} users')
-    print(policy(options.namespace, options.users, robots, options.use_sim_time), end='')
+    print(policy(options.namespace, options.users, robots, options.use_sim_time, options.site),
+          end='')
     return 0
 
 
@@ -209,6 +256,11 @@ def _robot(text: str) -> tuple[int, str]:
     if not (user.isascii() and user.isdecimal() and source):
         raise argparse.ArgumentTypeError(f'{text!r}, expected USER=TOPIC or USER=tf')
     return int(user), source
+
+
+def _site(text: str) -> Site:
+    with translated(SiteError, argparse.ArgumentTypeError):
+        return Site.from_yaml(text)
 
 
 def _namespace(text: str) -> str:

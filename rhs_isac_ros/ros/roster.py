@@ -5,7 +5,7 @@ the declarations in `MEMBERS`.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from rhs_isac_ros.protocol.base_station import BaseStation
@@ -50,7 +50,12 @@ class Member:
     def received(self) -> tuple[str, ...]:
         """Topics of the network to which nodes of the role subscribe; protocol messages first."""
         return (*(topics.NAMES[kind] for kind in (self.role.RECEIVES if self.role else ())),
-                *((topics.CODEBOOK,) if self.has_codebook else ()), topics.PRESENCE)
+                *self.announced)
+
+    @property
+    def announced(self) -> tuple[str, ...]:
+        """Topics with the codebook and the presence of other nodes, in its own namespace."""
+        return (*((topics.CODEBOOK,) if self.has_codebook else ()), topics.PRESENCE)
 
     @property
     def needed(self) -> tuple[str, ...]:
@@ -86,3 +91,16 @@ MEMBERS: Mapping[str, Member] = {**ROSTER, **_OF_SITES}
 FOLLOWING = ('rhs_controller', 'positioner', topics.OPTIMIZER_NODE, 'channel', 'receiver')
 # Roles in which only one node of a network serves.
 UNIQUE = tuple(name for name, member in ROSTER.items() if member.is_unique)
+
+
+def networks(surfaces: Collection[str] = ()) -> list[tuple[str, tuple[str, ...]]]:
+    """Return the namespaces and the roles of the networks of a site, given its surfaces.
+
+    Namespaces are relative to that of the site. The first surface leads, and comes first; the
+    roles of the whole site come last. Without surfaces, there is one network without a name.
+    """
+    if not surfaces:
+        return [('', tuple(ROSTER))]
+    leader, *others = surfaces
+    return [(leader, tuple(ROSTER)), *((name, FOLLOWING) for name in others),
+            ('', tuple(name for name, member in MEMBERS.items() if member.of_site))]

@@ -2,13 +2,14 @@
 
 import contextlib
 import importlib.util
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+from policy_rules import RIGHTS, permissions, rules, used
 
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.positioning import Site
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.recording import Recorder, recorded_topics
 from rhs_isac_ros.tools import replay
@@ -19,29 +20,6 @@ from rhs_isac_ros.tools.replay import RepublisherNode
 from rhs_isac_ros.tools.snapshot import SnapshotNode
 from rhs_isac_ros.tools.view import ViewNode
 from rhs_isac_ros.tools.watch import WatchNode
-
-ROOT = Path(__file__).parents[2]
-RIGHTS = ('publish', 'subscribe', 'reply', 'request')
-SPEC = importlib.util.spec_from_file_location('policy', ROOT / 'config' / 'sros2' / 'policy.py')
-permissions = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(permissions)
-
-
-def rules(text):
-    """Return the allowed full names by right, for each path of an enclave."""
-    found = {}
-    for enclave in ElementTree.fromstring(text).iter('enclave'):
-        (profile,) = enclave.iter('profile')
-        space = profile.get('ns').rstrip('/')
-        rights = {right: set() for right in RIGHTS}
-        for group in profile:
-            for right, rule in group.attrib.items():
-                assert rule == 'ALLOW'
-                for name in (element.text for element in group):
-                    full = name.replace('~', f'{space}/{profile.get("node")}')
-                    rights[right].add(full if full.startswith('/') else f'{space}/{full}')
-        found[enclave.get('path')] = rights
-    return found
 
 
 def test_the_command_prints_the_policy_of_two_users(capsys):
@@ -80,6 +58,44 @@ def test_a_robot_may_read_its_odometry_or_transforms(processes, make_watch):
     assert robot['subscribe'] - plain['subscribe'] == {topics.TF, topics.TF_STATIC}
     assert '/closed/tf2_frames' in robot['reply']
     assert allowed['/closed/network']['subscribe'] >= rights | robot['subscribe']
+
+
+@pytest.fixture(scope='module')
+def of_site():
+    site = Site.from_yaml(Path(__file__).parents[2] / 'config' / 'site.yaml')
+    return rules(permissions.policy('/lab', site=site))
+
+
+def test_a_surface_that_follows_may_read_some_topics_of_the_leader_and_publish_none(of_site):
+    for name, expected in {
+            'channel': {'ground_truth', 'pilot'}, 'receiver': {'grant'}, 'optimizer': set(),
+            'positioner': set(), 'visualizer': set(), 'operator': set(), 'replay': set()}.items():
+        read = of_site[f'/lab/side/{name}']['subscribe']
+        assert {one for one in read if one.startswith('/lab/front/')} == {
+            f'/lab/front/{one}' for one in expected}
+    for path, rights in of_site.items():
+        space = path.rpartition('/')[0]
+        for right in ('publish', 'reply'):
+            assert {name.rpartition('/')[0] for name in rights[right]
+                    if name.startswith('/lab/') and not name.startswith(f'{space}/')} == set()
+
+
+def test_the_fusion_may_read_what_the_surfaces_say_about_positions(of_site):
+    assert of_site['/lab/fusion']['subscribe'] == {'/lab/presence', *(
+        f'/lab/{name}/{topic}' for name in ('front', 'side')
+        for topic in ('posterior', 'no_fix'))}
+
+
+def test_the_operator_of_a_site_has_the_permissions_of_those_of_its_surfaces(of_site):
+    for name in ('front', 'side'):
+        for right in RIGHTS:
+            assert of_site[f'/lab/{name}/operator'][right] <= of_site['/lab/operator'][right]
+    assert '/lab/fusion/set_parameters' in of_site['/lab/operator']['request']
+    assert {'/lab/front/bs/pause', '/lab/side/channel/set_parameters'} <= of_site[
+        '/lab/operator']['request']
+    # Users and the base station are those of the leader.
+    assert {path for path in of_site if 'user' in path or path.endswith('/bs')} == {
+        f'/lab/front/{name}' for name in ('bs', 'user_1', 'user_2', 'users')}
 
 
 def test_only_the_operator_may_set_parameters_of_other_nodes():
@@ -146,6 +162,7 @@ def test_the_tools_use_no_more_than_the_permissions_of_the_operator(tmp_path):
 @pytest.mark.parametrize(('arguments', 'expected'), [
     (['--namespace', 'lab'], 'argument --namespace'),
     (['--users', '-1'], 'expected 0 to 1000'),
+    (['--site', 'missing.yaml'], 'missing.yaml'),
     (['--robot', '2'], "'2', expected USER=TOPIC or USER=tf"),
     (['--robot', '3=odom'], 'user 3, expected one of 2 users')])
 def test_invalid_arguments_are_rejected(arguments, expected, capsys):
@@ -175,18 +192,6 @@ def test_policy_and_graph_agree(processes, make_watch, small_files):
     allowed[f'{space}/users']['publish'] -= {
         f'{space}/{topics.TRUE_ODOMETRY.format(user=user)}' for user in (1, 2)}
 
-    def used(path):
-        node, name = watch.node, path.rpartition('/')[2]
-        if (name, space) not in node.get_node_names_and_namespaces():
-            return {right: set() for right in RIGHTS}
-        found = {
-            'publish': node.get_publisher_names_and_types_by_node(name, space),
-            'subscribe': node.get_subscriber_names_and_types_by_node(name, space),
-            'reply': node.get_service_names_and_types_by_node(name, space),
-            'request': node.get_client_names_and_types_by_node(name, space)}
-        return {right: {name for name, _ in pairs}
-                for right, pairs in found.items()}
-
     # After two cycles, all nodes have created all their publishers and subscriptions.
     for user in range(1, 5):
         watch.until_served(2, user, processes=[network, visualizer, users])
@@ -195,5 +200,6 @@ def test_policy_and_graph_agree(processes, make_watch, small_files):
                 'every node in the graph', [network, visualizer])
     for path, rights in allowed.items():
         watch.until(lambda path=path, rights=rights: all(
-            used(path)[right] >= rights[right] for right in RIGHTS), f'{path} in the graph')
-        assert used(path) == rights, path
+            used(watch.node, path)[right] >= rights[right] for right in RIGHTS),
+            f'{path} in the graph')
+        assert used(watch.node, path) == rights, path

@@ -10,6 +10,7 @@ import pytest
 import yaml
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+from policy_rules import permissions, rules, used
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
@@ -60,7 +61,8 @@ class Running:
         for role, member in ROSTER.items():
             if member.is_unique:
                 self.start('/front', role, **({'rest_s': 0.02} if role == 'bs' else {}))
-        self.start('/front', 'user', user_count=N_USERS, mobility='random_walk', speed_mps=1.0)
+        self.start('/front', 'user', name='users', user_count=N_USERS, mobility='random_walk',
+                   speed_mps=1.0)
 
     def start(self, namespace, role, **parameters):
         self.running[namespace, role] = self._processes.start(
@@ -127,6 +129,23 @@ def test_the_surfaces_receive_the_same_pilots_with_noise_of_their_own(running):
     assert (front.user, front.user_instance) == (side.user, side.user_instance)
     assert not np.isclose(front.signals, side.signals).any()
     assert not running.side.received[m.Grant]
+
+
+def test_the_policy_and_the_graph_of_a_site_agree(running):
+    running.until_fused(BOTH)
+    allowed = rules(permissions.policy(users=N_USERS, site=running.site))
+    nodes = {f'{"" if space == "/" else space}/{"users" if role == "user" else role}'
+             for space, role in running.running}
+    # Without tracks, a positioner publishes no odometry.
+    unused = {f'{space}/{topics.ODOMETRY.format(user=user)}'
+              for space in ('/front', '/side') for user in range(1, N_USERS + 1)}
+    node = running.fused.node
+    for path in sorted(nodes):
+        expected = {right: names - unused for right, names in allowed[path].items()}
+        running.fused.until(lambda path=path, expected=expected: all(
+            names <= used(node, path)[right] for right, names in expected.items()),
+            f'{path} in the graph')
+        assert used(node, path) == expected, path
 
 
 def test_any_program_can_read_posteriors_poses_and_odometry(running):
