@@ -34,7 +34,10 @@ def sigmf():
 
 
 class Float32Radio(WaveformRadio):
-    """A radio with samples of single precision."""
+    """A radio with samples of single precision, and another clock than the user."""
+
+    def __init__(self, scenario, air):
+        super().__init__(scenario, air, clock_ppm=1.0)
 
     def capture(self, band, pilot):
         return super().capture(band, pilot).astype(np.complex64)
