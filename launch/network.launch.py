@@ -78,7 +78,7 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     users = _integer('users', given, 1)
     values = {'seed': _integer('seed', given, 0), 'codebook_file': given['codebook'],
               'estimator': given['estimator']}
-    others = [name for name in ('config', 'codebook', 'record', 'composed')
+    others = [name for name in ('config', 'codebook', 'composed')
               if given[name] not in ('', 'false')]
     if given['site'] and others:
         raise ValueError(f'site: {given["site"]!r}, expected none with {others[0]}')
@@ -146,7 +146,8 @@ def _recorder(given: dict[str, str]) -> list[Node]:
     # Not restarted, because a second process would replace the recording. If the disk is full, the
     # network does not end with the recorder.
     return [_process(given, 'record', False, [], is_optional=True, executable='record',
-                     name='recorder', arguments=[given['record'], '--config', given['config']])]
+                     name='recorder', arguments=[given['record'], '--config', given['config'],
+                                                 '--site', given['site']])]
 
 
 def _process(

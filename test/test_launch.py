@@ -119,9 +119,9 @@ def test_the_started_executables(values, expected):
 @needs_launch
 def test_a_site_has_a_network_for_each_surface_and_their_fusion():
     site = str(ROOT / 'config' / 'site.yaml')
-    nodes = started(site=site, namespace='lab', users='1', visualizer='true')
+    nodes = started(site=site, namespace='lab', users='1', visualizer='true', record='a.mcap')
     assert [(node._Node__node_namespace, name) for name, node in nodes] == [
-        *(('lab/front', name) for name in [*ONE_EACH, 'user', 'bs']),
+        ('lab', 'record'), *(('lab/front', name) for name in [*ONE_EACH, 'user', 'bs']),
         *(('lab/side', name) for name in FOLLOWING), ('lab', 'fusion'),
         ('lab/front', 'visualizer'), ('lab/side', 'visualizer')]
 
@@ -142,7 +142,7 @@ def test_rviz_opens_the_layout_of_the_network_in_its_namespace(values, file, mon
 
 
 @needs_launch
-@pytest.mark.parametrize('other', ['config', 'codebook', 'record', 'composed'])
+@pytest.mark.parametrize('other', ['config', 'codebook', 'composed'])
 def test_a_site_excludes_arguments_of_a_single_surface(other):
     with pytest.raises(ValueError, match=f"^site: 'site.yaml', expected none with {other}"):
         started(site='site.yaml', **{other: 'true'})
@@ -297,8 +297,8 @@ def test_all_users_are_served_and_no_process_remains(
 
 def assert_complete(path, cycles):
     """Assert that a recording is closed and contains the cycles that the observer logged."""
-    from rhs_isac_ros.ros.recording import read, read_scenario
-    assert read_scenario(path) == Scenario.from_yaml(ROOT / 'config' / 'quick.yaml')
+    from rhs_isac_ros.ros.recording import read, read_networks
+    assert read_networks(path).scenario == Scenario.from_yaml(ROOT / 'config' / 'quick.yaml')
     topics = [topic for topic, _, _ in read(path)]
     assert topics.count('/launched/capacity') >= len(cycles) - 2
     assert '/launched/codebook' in topics

@@ -1,17 +1,21 @@
-"""Recordings of a network, and a node that observes cycles.
+"""Recordings of networks, and a node that observes cycles.
 
+A recording holds the topics of a namespace with their scenario. If the namespace is that of a
+site, it also holds those of each surface, in a namespace below, with the scenarios and the region.
 Recordings are self-contained MCAP files, which Foxglove, ``ros2 bag info`` and ``ros2 bag play``
 can read. The library mcap is optional.
 """
 
 import contextlib
 import dataclasses
+import posixpath
 import re
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import yaml
 from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
@@ -22,7 +26,9 @@ from rclpy.qos import QoSProfile
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import numbers
 from rhs_isac_ros.monitoring import cycle_log
+from rhs_isac_ros.positioning.site import Site
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.support.errors import translated
@@ -31,7 +37,9 @@ from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 # Separator between the message definitions of a schema, as in ROS 1 and 2.
 _SEPARATOR = '=' * 80
-_SCENARIO = 'scenario'
+# Metadata: scenarios by the name of the surface, empty for the namespace of the recorder; and the
+# bounds of the region of a site.
+_SCENARIO, _NETWORK, _WHOLE, _REGION = 'scenario', 'network', '', 'region'
 # Maximum size of a record, and of a decompressed chunk [bytes].
 _MAX_BYTES = 2**26
 # Period of completing a chunk, so that a killed process loses at most this time [s].
@@ -98,14 +106,14 @@ def _parts(text: str, package: str) -> Iterator[str]:
 
 
 class Recorder:
-    """Writes the messages and the scenario of a network to a file.
+    """Writes the messages and the scenario of a network, or of those of a site, to a file.
 
     Until `close` completes the file, its name is ``<name>.part``; an incomplete file keeps it.
     The messages up to `_FLUSH_S` before the end of a process that is killed are readable. Raises
     RecordingError if mcap is not installed or the file cannot be created.
     """
 
-    def __init__(self, path: str | Path, scenario: Scenario) -> None:
+    def __init__(self, path: str | Path, scenario: Scenario, site: Site | None = None) -> None:
         with translated(MissingLibraryError, RecordingError), optional_import(
                 'recording', extra='recording'):
             from mcap.writer import Writer
@@ -117,7 +125,13 @@ class Recorder:
             raise RecordingError(f'{path}: cannot be written: {error.strerror}') from None
         self._writer = Writer(self._stream)
         self._writer.start(profile='ros2', library='rhs_isac_ros')
-        self._writer.add_metadata(_SCENARIO, {'yaml': yaml.safe_dump(scenario.changes())})
+        surfaces = {name: one.scenario for name, one in site.surfaces.items()} if site else {}
+        for name, one in {_WHOLE: scenario, **surfaces}.items():
+            self._writer.add_metadata(
+                _SCENARIO, {_NETWORK: name, 'yaml': yaml.safe_dump(one.changes())})
+        if site:
+            self._writer.add_metadata(_REGION, {'yaml': yaml.safe_dump(site.bounds_m.tolist())})
+        self._networks = [_WHOLE, *surfaces]
         # The library completes a chunk at a certain size, but has no public method for it.
         self._complete_chunk: Callable[[], None] = getattr(self._writer, _COMPLETE_CHUNK)
         # Number of messages written, and the reason why writing failed, such as a full disk.
@@ -126,12 +140,16 @@ class Recorder:
 
     def record_topics(
             self, node: Node, on_message: Callable[[str, bytes], None] | None = None) -> None:
-        """Record the topics of `recorded_topics` in the namespace of a node.
+        """Record the topics of `recorded_topics` in the namespace of a node and of the surfaces.
 
-        `on_message` is called with the name of the topic, as in `recorded_topics`, and the
-        serialized message, once the message is written or writing has failed.
+        `on_message` is called with the name of the topic, as in `recorded_topics` after the name
+        of the surface, and the serialized message, once the message is written or writing has
+        failed.
         """
-        for name, (kind, profile) in recorded_topics().items():
+        # Absolute names are the same in all namespaces.
+        for name, (kind, profile) in {
+                posixpath.join(network, name): found for network in self._networks
+                for name, found in recorded_topics().items()}.items():
             channel = self._writer.register_channel(
                 topic=node.resolve_topic_name(name), message_encoding='cdr',
                 schema_id=self._writer.register_schema(
@@ -225,25 +243,65 @@ def _fields(text: str) -> list[str]:
     return [' '.join(line.split()) for line in lines if line.strip()]
 
 
-def read_scenario(path: str | Path) -> Scenario | None:
-    """Return the scenario of a recording; None if there is none, as with ``ros2 bag record``.
+class Recorded(NamedTuple):
+    """What a recording declares about its networks."""
 
-    Raises RecordingError if the file or scenario is unreadable, ScenarioError if a value is wrong.
+    #: Scenario of the recorded namespace; None if there is none, as with ``ros2 bag record``.
+    scenario: Scenario | None
+    #: Scenarios of the surfaces of a site, in namespaces of their names; empty without a site.
+    surfaces: Mapping[str, Scenario]
+    bounds_m: np.ndarray  #: Bounds of the region of a site, float64 [2, 3] [m]; NaN without one.
+
+    def is_site(self, namespace: str) -> bool:
+        """Return whether a namespace is that of a whole site."""
+        return bool(self.surfaces) and _last(namespace) not in self.surfaces
+
+    def of(self, namespace: str) -> Scenario | None:
+        """Return the scenario of a namespace, whose last part may name a surface."""
+        return self.surfaces.get(_last(namespace), self.scenario)
+
+
+def _last(namespace: str) -> str:
+    """Return the last part of a namespace."""
+    return namespace.rstrip('/').rpartition('/')[2]
+
+
+def read_networks(path: str | Path) -> Recorded:
+    """Return the scenarios of a recording.
+
+    Raises RecordingError if the file, a scenario or the region is unreadable, ScenarioError if a
+    value is wrong.
     """
+    scenarios: dict[str, Scenario] = {}
+    bounds_m = np.full((2, 3), np.nan)
     for record in _records(path):
-        if type(record).__name__ == 'Metadata' and record.name == _SCENARIO:
-            try:
-                text = record.metadata['yaml']
-                # With references, a short text can describe an enormous value.
-                if '&' in text or len(text) > _MAX_SCENARIO:
-                    raise TypeError('it contains references, or is too long')
-                fields = parse_yaml(text)
-            # The file may come from another version or another program.
-            except (KeyError, TypeError, ValueError) as error:
-                raise RecordingError(f'{path}: invalid scenario: {error}') from None
-            with translated(TypeError, RecordingError, f'{path}: invalid scenario'):
-                return Scenario(**fields)
-    return None
+        match type(record).__name__:
+            case 'Metadata' if record.name == _SCENARIO:
+                fields = _parsed(path, record)
+                with translated(TypeError, RecordingError, f'{path}: invalid scenario'):
+                    scenarios[record.metadata.get(_NETWORK, _WHOLE)] = Scenario(**fields)
+            case 'Metadata' if record.name == _REGION:
+                with translated(ValueError, RecordingError, f'{path}: invalid region'):
+                    bounds_m = numbers('bounds', _parsed(path, record)).reshape(2, 3)
+            case 'Message' if scenarios:
+                break
+    scenario = scenarios.pop(_WHOLE, None)
+    if scenarios and np.isnan(bounds_m).any():
+        raise RecordingError(f'{path}: surfaces {", ".join(scenarios)}, but no region')
+    return Recorded(scenario, scenarios, bounds_m)
+
+
+def _parsed(path: str | Path, record: Any) -> Any:
+    """Return the content of metadata in YAML."""
+    try:
+        text = record.metadata['yaml']
+        # With references, a short text can describe an enormous value.
+        if '&' in text or len(text) > _MAX_SCENARIO:
+            raise TypeError('it contains references, or is too long')
+        return parse_yaml(text)
+    # The file may come from another version or another program.
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordingError(f'{path}: invalid {record.name}: {error}') from None
 
 
 def _records(path: str | Path) -> Iterator[Any]:

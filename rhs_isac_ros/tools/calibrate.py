@@ -211,7 +211,8 @@ def _calibrate(options: argparse.Namespace, arguments: list[str]) -> int:
         return _align(options, arguments)
     has_arrays = options.file and options.file.suffix == '.npz'
     try:
-        scenario = command.choose_scenario(options.config, None if has_arrays else options.file)
+        scenario = command.choose_scenario(
+            options.config, None if has_arrays else options.file, options.namespace)
         if options.states:
             if options.file:
                 raise CalibrationError(f'{options.file}: expected no file with --states')

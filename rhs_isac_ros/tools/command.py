@@ -25,13 +25,13 @@ from rhs_isac_ros.calibration import CalibrationError
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.role_statistics import Report
-from rhs_isac_ros.positioning import ModelError
+from rhs_isac_ros.positioning import ModelError, SiteError
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, diagnostics, endpoints, topics
 from rhs_isac_ros.ros.endpoints import subscribe
 from rhs_isac_ros.ros.environment import is_secure
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
-from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
+from rhs_isac_ros.ros.recording import RecordingError, read, read_networks
 from rhs_isac_ros.ros.run import StartError, init, parse, run, starting
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import check_distinct, input_file
@@ -45,8 +45,8 @@ _POLL_PERIOD_S = 0.02
 # discovery pauses while keys are exchanged.
 _SETTLE_S = 1.0 if is_secure() else 0.4
 # Errors in arguments and files.
-INVALID = (StartError, RecordingError, ScenarioError, CodebookError, CalibrationError, ModelError,
-           plugins.PluginError, OSError)
+INVALID = (StartError, RecordingError, ScenarioError, SiteError, CodebookError, CalibrationError,
+           ModelError, plugins.PluginError, OSError)
 # Advice after an error about messages that do not match the scenario.
 OTHER_SCENARIO = '; if the network uses another scenario, pass it with --config FILE'
 _NodeT = TypeVar('_NodeT', bound=Node)
@@ -156,11 +156,16 @@ def subscribe_codebooks(
     subscribe(node, ros.Codebook, topics.CODEBOOK, receive, endpoints.LATCHED, raw=True)
 
 
-def choose_scenario(config: Path | None, recording: Path | None = None) -> Scenario:
-    """Return the scenario in a file, or else in a recording, or else the paper's Table I."""
+def choose_scenario(config: Path | None, recording: Path | None = None,
+                    namespace: str | None = None) -> Scenario:
+    """Return the scenario in a file, or else in a recording, or else the paper's Table I.
+
+    In a recording of a site, each surface has its own scenario in its own namespace.
+    """
     if config:
         return Scenario.from_yaml(config)
-    return (read_scenario(recording) if recording else None) or Scenario()
+    found = read_networks(recording).of(namespace or '') if recording else None
+    return found or Scenario()
 
 
 def topic_prefix(namespace: str) -> str:

@@ -4,6 +4,7 @@ import argparse
 
 from rclpy.node import Node
 
+from rhs_isac_ros.positioning import Site
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import Recorder
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, output_file
@@ -27,7 +28,9 @@ class RecorderNode(Node):
 
 
 def _record(options: argparse.Namespace, arguments: list[str]) -> int:
-    recorder = Recorder(options.file, choose_scenario(options.config))
+    site = Site.from_yaml(options.site) if options.site else None
+    recorder = Recorder(options.file, site.surfaces[site.leader].scenario if site
+                        else choose_scenario(options.config), site)
     try:
         code, _ = observe(
             lambda: RecorderNode(recorder), arguments, lambda _: bool(recorder.failure))
@@ -41,13 +44,16 @@ def _record(options: argparse.Namespace, arguments: list[str]) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
-        prog='record', description='Record a network as MCAP until Ctrl-C. ROS arguments select '
-        'the namespace: --ros-args -r __ns:=/lab')
+        prog='record', description='Record a network as MCAP until Ctrl-C, or a site with the '
+        'networks of all surfaces. ROS arguments select the namespace: --ros-args -r __ns:=/lab')
     parser.add_argument('file', type=output_file, help='recording to write')
-    # Launch files pass an empty name by default.
-    parser.add_argument('--config', metavar='FILE',
-                        type=lambda text: input_file(text) if text else None,
-                        help="scenario file of the network; the paper's Table I if empty")
+    files = parser.add_mutually_exclusive_group()
+    for name, text in [
+            ('config', "scenario file of the network; the paper's Table I if empty"),
+            ('site', 'site file, instead of a scenario file')]:
+        # Launch files pass an empty name by default.
+        files.add_argument(f'--{name}', metavar='FILE', help=text,
+                           type=lambda text: input_file(text) if text else None)
     return parser
 
 

@@ -5,12 +5,14 @@ With ``--publish``, it publishes the signals, or other topics, to running nodes 
 
 import argparse
 import dataclasses
+import functools
 import math
 import sys
 import tempfile
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import yaml
@@ -29,7 +31,9 @@ from rhs_isac_ros.positioning import (
     BayesEstimator,
     Estimator,
     Motion,
+    Sighting,
     file_options,
+    fuse,
     make_estimator,
 )
 from rhs_isac_ros.positioning.store import default_folder
@@ -44,13 +48,22 @@ from rhs_isac_ros.ros.endpoints import (
 )
 from rhs_isac_ros.ros.environment import is_secure
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
-from rhs_isac_ros.ros.recording import RecordingError, read, recorded_topics
+from rhs_isac_ros.ros.recording import (
+    Recorded,
+    RecordingError,
+    read,
+    read_networks,
+    recorded_topics,
+)
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
 from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.command import ToolError
 
+# Cycle and user, and positions by these, float64 [3] [m].
+_Key: TypeAlias = tuple[int, int]
+_Positions: TypeAlias = dict[_Key, np.ndarray]
 _SIGNALS = topics.NAMES[m.ReceivedSignals]
 _ESTIMATES = topics.NAMES[m.PositionEstimate]
 # Period of looking for subscribers; maximum time to discover an optimizer, without and with DDS
@@ -236,7 +249,7 @@ def _without_gaps(
 
 def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     names = options.topic or [_SIGNALS]
-    scenario = command.choose_scenario(options.config, options.file)
+    scenario = command.choose_scenario(options.config, options.file, options.namespace)
     first_codebook = _first_codebook(options) if _SIGNALS in names else None
     if first_codebook:
         first_codebook.check(scenario)
@@ -331,7 +344,7 @@ def load(path: Path, namespace: str = '/', config: Path | None = None) -> Record
     The scenario file `config` replaces the recorded scenario. Raises ScenarioError if the scenario
     is invalid, RecordingError if the recording is, or has no complete cycle in the namespace.
     """
-    scenario = command.choose_scenario(config, path)
+    scenario = command.choose_scenario(config, path, namespace)
     log = CycleLog()
     codebooks: dict[str, Codebook] = {}
     for found, time_s in command.recorded(path, namespace, scenario, [*RECEIVES, Codebook]):
@@ -367,6 +380,109 @@ def errors_m(
     return np.array(errors)
 
 
+@dataclasses.dataclass
+class _Answers:
+    """What a surface of a site, or their fusion, has sent, by cycle and user."""
+
+    signals: dict[_Key, m.ReceivedSignals] = dataclasses.field(default_factory=dict)
+    positions: _Positions = dataclasses.field(default_factory=dict)
+    truths: dict[_Key, list[m.GroundTruth]] = dataclasses.field(default_factory=dict)
+    codebooks: dict[str, Codebook] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(cls, path: Path, namespace: str, scenario: Scenario) -> '_Answers':
+        """Read the messages of a namespace."""
+        answers = cls()
+        for found, _ in command.recorded(path, namespace, scenario, [
+                m.ReceivedSignals, m.PositionEstimate, m.GroundTruth, Codebook]):
+            match found:
+                case m.ReceivedSignals():
+                    answers.signals[found.cycle_id, found.user] = found
+                case m.PositionEstimate():
+                    answers.positions[found.cycle_id, found.user] = found.position
+                case m.GroundTruth():
+                    answers.truths.setdefault((found.cycle_id, found.user), []).append(found)
+                case Codebook():
+                    answers.codebooks[found.id] = found
+        return answers
+
+
+class SiteRecording:
+    """The signals and positions of all surfaces of a recorded site, and of their fusion.
+
+    `live` contains the recorded positions by name, '' for the fusion, and `truths` those of users
+    whom the fusion has located. Raises RecordingError if there are none.
+    """
+
+    def __init__(self, path: Path, namespace: str, networks: Recorded) -> None:
+        self._path, self._networks = path, networks
+        leader = next(iter(networks.surfaces))
+        self._answers = {
+            name: _Answers.of(path, f'{namespace.rstrip("/")}/{name}',
+                              networks.surfaces[name or leader])
+            for name in (*networks.surfaces, '')}
+        self.live = {name: one.positions for name, one in self._answers.items()}
+        self.truths = {
+            key: truth.position for key in self.live['']
+            for truth in self._answers[leader].truths.get(key, ())
+            if any(m.same_instance(truth.sender, one.signals[key].user_instance)
+                   for one in self._answers.values() if key in one.signals)}
+        if not self.truths:
+            raise RecordingError(f'{path}: no position of the fusion in the namespace '
+                                 f'{namespace}; see --namespace')
+
+    def located(self, table_folder: Path | None = None) -> dict[str, _Positions]:
+        """Locate the users again from the recorded signals; the result is like `live`."""
+        find = functools.cache(functools.partial(self._estimator, table_folder))
+        again: dict[str, _Positions] = {name: {} for name in self.live}
+        for key in self.truths:
+            sightings = []
+            # In the order of the node `fusion`.
+            for name, scenario in sorted(self._networks.surfaces.items()):
+                signals = self._answers[name].signals.get(key)
+                if signals is None:
+                    continue
+                posterior = find(name, signals.codebook_id).posterior(
+                    signals.signals.reshape(len(signals.signals), -1))
+                if sighting := Sighting.of(posterior, scenario.pose):
+                    again[name][key] = posterior.estimate.to_site(scenario.pose).mean
+                    sightings.append(sighting)
+            if sightings:
+                again[''][key] = fuse(sightings, self._networks.bounds_m).mixture.moments()[0]
+        return again
+
+    def _estimator(self, folder: Path | None, name: str, codebook_id: str) -> BayesEstimator:
+        if codebook_id not in self._answers[name].codebooks:
+            raise RecordingError(f'{self._path}: codebook {codebook_id} of {name}: not recorded')
+        return BayesEstimator(
+            self._networks.surfaces[name], self._answers[name].codebooks[codebook_id], folder,
+            reject_outside=True)
+
+    def errors_m(self, positions: _Positions) -> np.ndarray:
+        """Return the errors of positions, float64 [N] [m]; NaN without a position."""
+        return np.array([np.linalg.norm(positions.get(key, np.full(3, np.nan)) - truth)
+                         for key, truth in self.truths.items()])
+
+
+def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
+    """Compare the errors of each surface and of the fusion with the recorded errors."""
+    given = [name for name in ('publish', 'codebook', 'config', 'calibration', 'model', 'track')
+             if getattr(options, name)]
+    if options.estimator and options.estimator != [BayesEstimator.name]:
+        given.append('estimator')
+    if given:
+        names = ', '.join(f'{options.namespace.rstrip("/")}/{name}' for name in networks.surfaces)
+        raise ToolError(f'--{given[0]}: not available for a whole site; select one of its '
+                        f'surfaces with --namespace: {names}')
+    recording = SiteRecording(options.file, options.namespace, networks)
+    command.print_now(f'{len(recording.truths)} cycles')
+    again = recording.located(default_folder())
+    rows = [_row(f'{label}{name or "fusion"}', recording.errors_m(positions[name]))
+            for name in again for label, positions in (('live ', recording.live), ('', again))]
+    _print_table(rows)
+    return 0
+
+
 def _conflict(options: argparse.Namespace) -> str:
     estimators = options.estimator or [BayesEstimator.name]
     if options.publish and (
@@ -388,6 +504,9 @@ def _conflict(options: argparse.Namespace) -> str:
 
 def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     """Publish a recording, or compare the errors of estimators with the recorded errors."""
+    networks = read_networks(options.file)
+    if networks.is_site(options.namespace):
+        return _replay_site(options, networks)
     if options.publish:
         return _republish(options, arguments)
     recording = load(options.file, options.namespace, options.config)
@@ -408,8 +527,12 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
         rows.append(_row(name, errors_m(recording, estimators)))
         if options.track and name == BayesEstimator.name:
             rows.append(_row('track', errors_m(recording, estimators, options.track_speed)))
-    print(command.text_table(['', 'median error', 'root mean square', 'no fix'], rows, '<>>>'))
+    _print_table(rows)
     return 0
+
+
+def _print_table(rows: Iterable[Sequence[str]]) -> None:
+    print(command.text_table(['', 'median error', 'root mean square', 'no fix'], rows, '<>>>'))
 
 
 def _row(name: str, errors: np.ndarray) -> list[str]:

@@ -153,7 +153,7 @@ def _conflict(options: argparse.Namespace) -> str:
 def _view(options: argparse.Namespace, arguments: list[str]) -> int:
     stream = RerunStream()
     try:
-        scenario = command.choose_scenario(options.config, options.file)
+        scenario = command.choose_scenario(options.config, options.file, options.namespace)
         _open(stream, options)
         if options.file:
             code = _show_recording(stream, scenario, options)

@@ -162,6 +162,79 @@ def test_any_program_can_read_posteriors_poses_and_odometry(running):
     assert posteriors[0].means.shape.tolist() == [len(weights), 3]
 
 
+@pytest.fixture(scope='module')
+def recorded(running, built_scripts, tmp_path_factory):
+    """A recording of some cycles, and the positions from both surfaces meanwhile."""
+    pytest.importorskip('mcap', reason='mcap is not installed')
+    path = tmp_path_factory.mktemp('recording') / 'site.mcap'
+    with subprocess.Popen(
+            [ROOT / 'scripts' / 'record', path, '--site', running.site_file],
+            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        running.fused.until(
+            lambda: all('recorder' in [one.node_name for one in
+                        running.fused.node.get_subscriptions_info_by_topic(f'{space}/presence')]
+                        for space in ('', '/front', '/side')), 'the recorder')
+        estimates = running.until_fused(BOTH, 3 * N_USERS)
+        process.send_signal(signal.SIGINT)
+        output = process.communicate(timeout=60)[0]
+    assert process.returncode == 0, output
+    return path, estimates
+
+
+def test_a_recording_holds_each_surface_and_the_fusion(running, recorded):
+    from rhs_isac_ros.ros.recording import read, read_networks
+    path, estimates = recorded
+    networks = read_networks(path)
+    assert {name: one.id for name, one in networks.surfaces.items()} == {
+        name: one.scenario.id for name, one in running.site.surfaces.items()}
+    assert np.array_equal(networks.bounds_m, running.site.bounds_m)
+    assert networks.of('/side').id == running.site.surfaces['side'].scenario.id
+    assert networks.of('/').id == networks.of('/front/').id == networks.scenario.id
+    names = {topic for topic, *_ in read(path)}
+    assert {'/posterior', '/front/posterior', '/side/posterior', '/front/beacon',
+            '/side/codebook', topics.DIAGNOSTICS} <= names
+
+
+def test_a_replay_locates_the_users_of_each_surface_and_of_the_fusion_again(recorded, capsys):
+    from rhs_isac_ros.ros.recording import read_networks
+    from rhs_isac_ros.tools.replay import SiteRecording, main
+    path, estimates = recorded
+    recording = SiteRecording(path, '/', read_networks(path))
+    again = recording.located()
+    assert again.keys() == recording.live.keys() == {'front', 'side', ''}
+    # With all signals, the positions are the same.
+    keys = {(one.cycle_id, one.user) for one in estimates} & recording.truths.keys()
+    assert len(keys) > N_USERS
+    for name, found in again.items():
+        for key in keys & recording.live[name].keys():
+            np.testing.assert_allclose(found[key], recording.live[name][key], atol=1e-6)
+    assert main([str(path)]) == 0
+    number, _, *rows = capsys.readouterr().out.splitlines()
+    assert number == f'{len(recording.truths)} cycles'
+    assert [row.split('  ')[0] for row in rows] == [
+        f'{label}{name}' for name in ('front', 'side', 'fusion') for label in ('live ', '')]
+
+
+@pytest.mark.parametrize(('arguments', 'code', 'expected'), [
+    (['--publish'], 1, '--publish: not available for a whole site; select one of its surfaces '
+     'with --namespace: /front, /side'),
+    (['--estimator', 'ml'], 1, '--estimator: not available for a whole site'),
+    (['--namespace', '/side'], 2, 'no complete cycle in the namespace /side'),
+    (['--namespace', '/lab'], 2, 'no position of the fusion in the namespace /lab')])
+def test_a_replay_of_a_site_names_what_is_not_available(
+        recorded, capsys, arguments, code, expected):
+    from rhs_isac_ros.tools.replay import main
+    assert main([str(recorded[0]), *arguments]) == code
+    assert expected in capsys.readouterr().err
+
+
+def test_the_leading_surface_is_replayed_like_a_single_network(recorded, capsys):
+    from rhs_isac_ros.tools.replay import main
+    assert main([str(recorded[0]), '--namespace', '/front']) == 0
+    _, _, live, bayes = capsys.readouterr().out.splitlines()
+    assert live.split()[2:] == bayes.split()[1:]
+
+
 @pytest.mark.parametrize('role', FOLLOWING)
 def test_the_others_continue_without_a_node_of_one_surface(running, role):
     running.until_fused(BOTH, 2)

@@ -35,7 +35,7 @@ from rhs_isac_ros.ros.recording import (
     RecordingError,
     _offered_qos,
     read,
-    read_scenario,
+    read_networks,
     recorded_topics,
     schema,
     type_name,
@@ -84,7 +84,7 @@ def test_messages_are_read_back(recording):
         '/received_signals', '/position_estimate', '/received_signals']
     times = [time_s for _, _, time_s in found]
     assert times == sorted(times)
-    assert read_scenario(path) == Scenario(n_frames=2)
+    assert read_networks(path).scenario == Scenario(n_frames=2)
 
 
 def test_another_decoder_needs_only_the_file(recording):
@@ -152,7 +152,7 @@ def test_the_error_names_a_file_that_is_not_a_recording(tmp_path, content):
     path = tmp_path / 'bad.mcap'
     if content is not None:
         path.write_bytes(content)
-    for act in (lambda: list(read(path)), lambda: read_scenario(path)):
+    for act in (lambda: list(read(path)), lambda: read_networks(path)):
         with pytest.raises(RecordingError, match=f'^{path}: '):
             act()
 
@@ -176,7 +176,7 @@ def test_changed_bytes_cause_no_other_error(recording):
         for place in rng.integers(len(content), size=2):
             changed[place] = rng.integers(256)
         path.write_bytes(changed)
-        for act in (lambda: list(read(path)), lambda: read_scenario(path)):
+        for act in (lambda: list(read(path)), lambda: read_networks(path)):
             try:
                 act()
             except RecordingError as error:
@@ -227,7 +227,7 @@ def test_a_scenario_of_another_version_is_an_error(tmp_path):
     recorder = Recorder(tmp_path / 'run.mcap', Other())
     recorder.close()
     with pytest.raises(RecordingError, match='invalid scenario: .*n_moons'):
-        read_scenario(tmp_path / 'run.mcap')
+        read_networks(tmp_path / 'run.mcap')
 
 
 @pytest.mark.parametrize(('text', 'reason'), [
@@ -239,7 +239,23 @@ def test_a_scenario_that_would_occupy_the_process_is_an_error(
     monkeypatch.setattr(yaml, 'safe_dump', lambda changes: text)
     Recorder(tmp_path / 'run.mcap', Scenario()).close()
     with pytest.raises(RecordingError, match=f'run.mcap: invalid scenario: {reason}'):
-        read_scenario(tmp_path / 'run.mcap')
+        read_networks(tmp_path / 'run.mcap')
+
+
+@pytest.mark.parametrize(('region', 'reason'), [
+    (None, 'surfaces side, but no region'), ('[1, 2]', 'invalid region: '),
+    ('[[a, b, c], [1, 2, 3]]', 'invalid region: '), ('[[&a 1, 2, 3], *a]', 'invalid region: ')])
+def test_a_site_without_a_valid_region_is_an_error(tmp_path, region, reason):
+    from mcap.writer import Writer
+    path = tmp_path / 'site.mcap'
+    writer = Writer(str(path))
+    writer.start()
+    writer.add_metadata('scenario', {'network': 'side', 'yaml': '{}'})
+    if region:
+        writer.add_metadata('region', {'yaml': region})
+    writer.finish()
+    with pytest.raises(RecordingError, match=f'^{path}: {reason}'):
+        read_networks(path)
 
 
 def test_a_recording_with_other_fields_is_an_error(recording, monkeypatch):
