@@ -9,6 +9,7 @@ import numpy as np
 from rhs_isac_ros.frontend.waveform import N_SYMBOLS, Waveform
 from rhs_isac_ros.model.multipath import complex_normal
 from rhs_isac_ros.model.scenario import Scenario
+from rhs_isac_ros.support.fields import finite
 
 
 class RadioFault(Exception):
@@ -156,10 +157,10 @@ class WaveformRadio:
         Noise, by default that of the scenario: if all combining vectors have the same power, the
         combined signals have the noise of the scenario.
     carrier_std_hz : float
-        Standard deviation of the offset of the carrier.
+        Standard deviation of the offset of the carrier with one clock.
     clock_ppm : float
-        Excess of the user's clock over that of the receiver; 0 for one clock. It changes phase and
-        delay from frame to frame.
+        Excess of the user's clock over that of the receiver; 0 for one clock. It changes carrier,
+        phase and delay.
     """
 
     waits, time_s = False, 0.0
@@ -167,9 +168,10 @@ class WaveformRadio:
     def __init__(self, scenario: Scenario, air: Air, *, noise_psd_dbm_hz: float | None = None,
                  carrier_std_hz: float = 300.0, clock_ppm: float = 0.0) -> None:
         self.modem = Waveform(scenario)
-        self._air, self._carrier_std_hz = air, carrier_std_hz
+        self._drift = 1e-6 * finite('clock_ppm', clock_ppm)
+        self._air, self._carrier_std_hz = air, 0.0 if self._drift else carrier_std_hz
         self._n_frames, self._frame_s = scenario.n_frames, scenario.frame_duration_s
-        self._drift, self._centers_hz = 1e-6 * clock_ppm, scenario.center_frequencies_hz
+        self._centers_hz = scenario.center_frequencies_hz
         excess_db = 0.0 if noise_psd_dbm_hz is None else (
             noise_psd_dbm_hz - scenario.noise_psd_dbm_hz)
         # The mean over the samples of the symbols has the noise of a feed.

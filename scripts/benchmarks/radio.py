@@ -46,7 +46,7 @@ class Uncorrected(Waveform):
 
 def free_clocks(scenario: Scenario, air: Air, clock_ppm: float, corrects: bool) -> Radio:
     """Create a radio whose clock is not that of the user."""
-    radio = WaveformRadio(scenario, air, clock_ppm=clock_ppm, carrier_std_hz=0.0)
+    radio = WaveformRadio(scenario, air, clock_ppm=clock_ppm)
     if not corrects:
         radio.modem = Uncorrected(scenario)
     return radio

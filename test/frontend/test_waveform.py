@@ -120,7 +120,7 @@ def test_the_drift_of_two_clocks_is_turned_back_in_all_bands(clock_ppm):
     scenario = dataclasses.replace(LAB, center_frequencies_hz=(5.25e9, 5.75e9))
     rng = np.random.default_rng(RNG_SEED)
     air = Air(scenario, rng)
-    radio = WaveformRadio(scenario, air, carrier_std_hz=0.0, clock_ppm=clock_ppm)
+    radio = WaveformRadio(scenario, air, clock_ppm=clock_ppm)
     ratios = []
     for band in range(2):
         signals, captures, times_s = response(scenario, 0.2e-6, rng), [], []
@@ -132,6 +132,11 @@ def test_the_drift_of_two_clocks_is_turned_back_in_all_bands(clock_ppm):
     # One phase and one delay remain unknown, and only the phase differs between the bands.
     expected = np.broadcast_to(ratios[0][0, :, :1], ratios[0].shape)
     np.testing.assert_allclose(ratios, [expected, expected], atol=0.05)
+
+
+def test_a_clock_is_a_number():
+    with pytest.raises(ValueError, match="clock_ppm: 'x'"):
+        WaveformRadio(LAB, Air(LAB, np.random.default_rng(0)), clock_ppm='x')
 
 
 def test_a_pilot_is_a_prefix_and_equal_symbols_of_alternating_sign():
