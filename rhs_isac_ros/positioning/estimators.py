@@ -229,14 +229,15 @@ class SearchEstimator(abc.ABC):
                 # The position is an average over draws, as in `estimate`; a search yields modes.
                 ((_, modes),) = self._locate_block(self._region, signals, draws=False)
             found = uniform(modes, self._bounds).normalised() if modes else None
+            is_elsewhere = False
         else:
-            located, modes, found = self._update(signals, prior, wrong, share)
+            located, modes, found, is_elsewhere = self._update(signals, prior, wrong, share)
         return Posterior(Estimate(*located), modes, signals,
-                         found and flatten(found, self.scenario.pose))
+                         found and flatten(found, self.scenario.pose), is_elsewhere)
 
     def _update(self, signals: Signals, prior: Mixture, wrong: float, share: float
-                ) -> tuple[Located, Modes | None, Mixture | None]:
-        """Return position, modes of the likelihood, and the mixture in (r [m], u, v)."""
+                ) -> tuple[Located, Modes | None, Mixture | None, bool]:
+        """Return position, modes, mixture in (r [m], u, v), and `Posterior.is_elsewhere`."""
         pose, extent = self.scenario.pose, self._bounds[1] - self._bounds[0]
         region = (pose.to_site(self._bounds.mean(axis=0)), pose.covariances_to_site(
             np.diag(np.maximum(extent, MIN_EXTENT_M)**2)))
@@ -251,7 +252,7 @@ class SearchEstimator(abc.ABC):
             if not is_doubtful(products.energy / self._level, self._n_measurements):
                 break
         if modes is None:
-            return located, None, None
+            return located, None, None, False
         found, estimate = products.bent, Estimate(*located)
         blocked, outside = np.nan_to_num(
             [float(estimate.blocked_probability), float(estimate.outside_probability)])
@@ -263,7 +264,7 @@ class SearchEstimator(abc.ABC):
             found = concatenate(found, before.weighted(everywhere + odds))
         found, mean, covariance = inside(
             found.reduce(MAX_COMPONENTS), self._bounds, self.normal[:_N_NARROW])
-        return (mean, covariance, *located[2:]), modes, found
+        return (mean, covariance, *located[2:]), modes, found, products.is_last
 
     @abc.abstractmethod
     def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:

@@ -45,6 +45,8 @@ class Posterior(NamedTuple):
     modes: Modes | None  # Of the likelihood; None without a position.
     signals: Signals  # Signals of the shot, N = 1.
     mixture: Mixture | None = None  # Normalised, in the frame of the site; None without one.
+    # Whether a mode beside the prior is a better explanation than all modes near the prior.
+    is_elsewhere: bool = False
 
 
 class Samples(NamedTuple):

@@ -136,6 +136,7 @@ class Products(NamedTuple):
     #: Energy of the residual at the heaviest product inside the region, plus half of the squared
     #: Mahalanobis distance from its component.
     energy: float
+    is_last: bool  #: Whether the heaviest product is that of the last component.
 
 
 def multiply(bent: Mixture, modes: Modes, share: float, likelihood: Likelihood | None,
@@ -166,7 +167,8 @@ def multiply(bent: Mixture, modes: Modes, share: float, likelihood: Likelihood |
     best = int(np.argmax(found.log_weights))
     energy = _energy(found.means[best, :3], select(bent, component[[best]]),
                      select(modes, mode[[best]]), bounds_m)
-    return Products(concatenate(found, bent.weighted(floor)), energy)
+    return Products(concatenate(found, bent.weighted(floor)), energy,
+                    bool(component[best] == len(bent.log_weights) - 1))
 
 
 def _energy(point: np.ndarray, component: Mixture, mode: Modes, bounds_m: np.ndarray) -> float:

@@ -108,10 +108,11 @@ class Tracks:
         """Predict a user's position at its next signals, if these come after equal intervals.
 
         Returns the position in the frame of the surface, float64 [3] [m], the root of the mean
-        variance of its coordinates [m], and the interval [s]; None without two signals.
+        variance of its coordinates [m], and the interval [s]. The result is None without two
+        signals, or if the latest signals speak against the track.
         """
         track = self._tracks.get(user)
-        if not track or not track.interval_s > 0:
+        if not (track and track.interval_s > 0 and self.posterior) or self.posterior.is_elsewhere:
             return None
         predicted = track.tracker.predict(track.time_s + track.interval_s)
         return predicted and (
