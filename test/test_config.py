@@ -7,6 +7,7 @@ import pytest
 
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
+from rhs_isac_ros.codebook.library import Library
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_intervals_m
 
@@ -62,6 +63,12 @@ def test_the_band_plan_has_the_spectrum_and_the_pilots_of_table1():
 def test_codebooks_fit_their_scenarios(name):
     scenario = SCENARIOS.get(name.removeprefix('codebook_'), Scenario())
     Codebook.load(CONFIG / f'{name}.yaml').check(scenario)
+
+
+def test_the_library_fits_the_band_plan_and_its_codebook():
+    library = Library.load(CONFIG / 'library_bandplan.npz')
+    library.check(SCENARIOS['bandplan'])
+    assert library.plan.start == Codebook.load(CONFIG / 'codebook_bandplan.yaml').id
 
 
 def test_the_default_codebook_is_found_in_a_clone():
