@@ -293,7 +293,8 @@ class NetworkView:
             yield Entry(cycle, LOG, Text(
                 f'user {complete.user}: error {complete.error_m:.2f} m, '
                 f'loss {complete.capacity.loss_percent:.1f} %'
-                f'{doubts and f", {doubts}"} (cycle {complete.cycle_id})'))
+                f'{doubts and f", {doubts}"}, codebook {complete.signals.codebook_id} '
+                f'(cycle {complete.cycle_id})'))
             yield from self._charts.entries(cycle, self._charts.of_cycle(complete))
         self.n_ended += len(self._log.given_up) + len(self._log.complete)
         self._log.clear()

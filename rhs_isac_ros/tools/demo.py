@@ -18,13 +18,14 @@ import rclpy
 from rclpy.utilities import try_shutdown
 
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
+from rhs_isac_ros.codebook.library import Library
 from rhs_isac_ros.frontend import RADIOS, SURFACES
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog, CycleRecord
 from rhs_isac_ros.positioning.site import Site, SiteError
 from rhs_isac_ros.protocol.messages import Phase
-from rhs_isac_ros.protocol.settings import PRIORS, REGION
+from rhs_isac_ros.protocol.settings import PRIORS, REGION, TRACK
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import parameters
 from rhs_isac_ros.ros.environment import check_environment, private_domain
@@ -150,7 +151,8 @@ def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) ->
     losses = np.array([cycle.capacity.loss_percent for cycle in cycles])
     users = len({cycle.user for cycle in cycles})
     return '\n'.join([
-        f'{len(cycles)} cycles of {users} users served, {len(given_up)} given up',
+        f'{len(cycles)} cycles of {users} users served, {len(given_up)} given up; codebooks: '
+        f'{len({cycle.signals.codebook_id for cycle in cycles})}',
         f'position error: median {np.median(errors):.2f} m, root mean square '
         f'{np.sqrt(np.mean(errors**2)):.2f} m; median √CRLB {np.median(bounds):.2f} m',
         f'cycle: median {1e3 * np.nanmedian(lengths):.1f} ms; estimator: median '
@@ -186,11 +188,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 2
 
 
+def follow(options: argparse.Namespace) -> None:
+    """Select the tracks as prior; without a library, fill in that of the band plan."""
+    options.prior = TRACK
+    if options.follow is True:
+        folder = default_codebook_file().parent
+        options.follow = folder / 'library_bandplan.npz'
+        options.config = options.config or folder / 'bandplan.yaml'
+        options.codebook = options.codebook or folder / 'codebook_bandplan.yaml'
+
+
 class _Demonstration:
     """A network with one surface: its processes, observer, recording and report."""
 
     def __init__(self, options: argparse.Namespace) -> None:
+        if options.follow:
+            follow(options)
         self.scenario, self._codebook_file = load_files(options.config, options.codebook)
+        if options.follow:
+            Library.load(options.follow).check(self.scenario)
         self.options = options
         self.recorder = Recorder(options.record, self.scenario) if options.record else None
         self.board = EmulatedBoard() if options.port == 'emulated' else None
@@ -201,7 +217,7 @@ class _Demonstration:
         start_network(
             processes, options.users, self.scenario, together=together, first_cycle=1,
             seed=options.seed, scenario_file=options.config, codebook_file=self._codebook_file,
-            prior=options.prior, calibration_file=options.calibration,
+            prior=options.prior, library_file=options.follow, calibration_file=options.calibration,
             states_file=options.calibration, surface=options.surface,
             surface_options=_surface_options(options, self.board),
             # Other radios have noise of their own.
@@ -228,8 +244,8 @@ class _SiteDemonstration(_Demonstration):
 
     def __init__(self, parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
         if other := [name for name in (
-                'config', 'codebook', 'record', 'calibration', 'surface', 'port', 'radio',
-                'radio_options', 'samples', 'picture')
+                'config', 'codebook', 'follow', 'record', 'calibration', 'surface', 'port',
+                'radio', 'radio_options', 'samples', 'picture')
                 # Defaults of files are texts.
                 if str(getattr(options, name)) != str(parser.get_default(name))]:
             option = other[0].replace('_', '-')
@@ -350,6 +366,9 @@ def _parser() -> argparse.ArgumentParser:
         help='folder in which the samples of the radio are recorded (SigMF)')
     add('--prior', choices=PRIORS, default=REGION,
         help='prior of the positions: the region, or the track of each user')
+    add('--follow', nargs='?', type=input_file, const=True, metavar='LIBRARY',
+        help='follow the tracks of the users with the codebooks of a library; by default, with '
+             'the band plan and its library')
     add('--record', type=output_file, metavar='FILE', help='recording to write (MCAP)')
     add('--picture', type=picture_file, default='demo.png', metavar='FILE',
         help='file to draw: PNG, PDF or SVG')

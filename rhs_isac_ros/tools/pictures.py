@@ -278,7 +278,8 @@ def _scene_title(scene: SceneState) -> str:
     if shown is None or shown.estimate is None:
         return 'no estimate yet'
     error = f', error {shown.error_m:.2f} m' if not math.isnan(shown.error_m) else ''
-    return f'cycle {shown.estimate.cycle_id}, user {shown.user}{error}'
+    return (f'cycle {shown.estimate.cycle_id}, user {shown.user}{error}, codebook '
+            f'{shown.estimate.codebook_id}')
 
 
 def _scene_legend(scene: SceneState) -> list[Any]:

@@ -11,7 +11,9 @@ position, in a random horizontal direction. The codebook is that of the wrong ce
 position is estimated with the region as prior, or with the wrong prediction as prior.
 
 Tracks are those of walks between random positions, with a cycle each 0.1 s; multipath and noise
-are independent in each cycle. Cycles within the first two seconds are not counted.
+are independent in each cycle. The role `Positioner` proposes the codebook of each cycle, as in the
+network. Cycles within the first two seconds are not counted. Other users jump by 3 m after two
+seconds at rest, and are found again once the error is at most 0.5 m.
 
 The intervals of ratios are from resampling positions or walks. The 95 % region is the ellipsoid of
 the covariance that contains 95 % of a Gaussian.
@@ -33,10 +35,14 @@ from parts import frame
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.codebook.cell import Cell
-from rhs_isac_ros.codebook.library import Library
+from rhs_isac_ros.codebook.library import EMPTY, Library
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.mobility import RandomWalk
-from rhs_isac_ros.positioning import BayesEstimator, Mixture, Motion, Tracker
+from rhs_isac_ros.positioning import BayesEstimator, Estimate, Mixture
+from rhs_isac_ros.protocol import events
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.positioner import Positioner
+from rhs_isac_ros.protocol.settings import TRACK, PositionerSettings
 from rhs_isac_ros.support.arguments import input_file, integer
 
 PLANS = {'table1': ('table1.yaml', 'codebook.yaml'),
@@ -44,6 +50,7 @@ PLANS = {'table1': ('table1.yaml', 'codebook.yaml'),
 STD_M = 0.2
 WRONG_M = (1.0, 2.0, 3.0)
 PERIOD_S, N_CYCLES, WARM_UP_S = 0.1, 40, 2.0
+JUMP_M, FOUND_M, N_BEFORE, N_AFTER = 3.0, 0.5, 20, 5
 
 
 class World(NamedTuple):
@@ -65,7 +72,7 @@ def main() -> None:
                         metavar=('PLAN', 'FILE'), help=f'one of {", ".join(PLANS)}, and a file of '
                         'python3 -m rhs_isac_ros.codebook library')
     parser.add_argument('--walks', type=integer(0, 10**5), default=200,
-                        help='number of walks')
+                        help='number of walks, and of jumps')
     options = parser.parse_args()
     results = {}
     for name, file in options.library:
@@ -110,6 +117,7 @@ def measure(world: World, options: argparse.Namespace) -> dict:
     print(f'\nratio {ratio:.3f} [{interval[0]:.3f}, {interval[1]:.3f}]\n')
     if options.walks:
         results['tracked'] = tracked(world, options.walks, walks)
+        results |= jumps(world, options.walks, walks)
     return results
 
 
@@ -194,17 +202,40 @@ def tracked(world: World, n: int, rng: np.random.Generator) -> dict:
 
 
 def track(world: World, path: np.ndarray, times_s: np.ndarray, follows: bool,
-          rng: np.random.Generator) -> Iterator:
-    """Yield the estimates of a walk."""
-    tracker = Tracker(known_estimator(world.scenario, world.fixed), Motion())
-    for time_s, position in zip(times_s, path, strict=True):
-        codebook, predicted = world.fixed, tracker.predict(float(time_s))
-        if follows and predicted:
-            mean, covariance = predicted
-            codebook = world.codebook_at(mean, float(np.sqrt(np.trace(covariance) / 3)))
-        tracker.estimator = known_estimator(world.scenario, codebook)
-        yield tracker.update(float(time_s), model_of(world.scenario, codebook).sample(
-            position[None], rng)[0])
+          rng: np.random.Generator) -> Iterator[Estimate]:
+    """Yield the estimates of the positioner for a walk, with the codebooks that it proposes."""
+    codebook = world.fixed
+    positioner = Positioner(
+        world.scenario, time.perf_counter, PositionerSettings(prior=TRACK),
+        library=world.library if follows else EMPTY)
+    positioner.handle(events.CodebookOffered(codebook), 0.0)
+    positioner.handle(events.EstimatorBuilt(
+        codebook, known_estimator(world.scenario, codebook)), 0.0)
+    for cycle_id, (time_s, position) in enumerate(zip(times_s.tolist(), path, strict=True), 1):
+        signals = model_of(world.scenario, codebook).sample(position[None], rng)[0]
+        actions = positioner.handle(m.ReceivedSignals(
+            cycle_id=cycle_id, user=1, codebook_id=codebook.id,
+            signals=signals.reshape(codebook.digital.shape[:3])), time_s)
+        yield next((one.estimate for one in actions if isinstance(one, events.PublishTrack)),
+                   Estimate(np.full(3, np.nan), np.full((3, 3), np.nan)))
+        proposed = [one.message.next_codebook_id for one in actions if isinstance(
+            one, events.Send) and isinstance(one.message, m.PositionEstimate)]
+        codebook = world.library.by_id.get(*proposed, world.fixed) if proposed else world.fixed
+
+
+def jumps(world: World, n: int, rng: np.random.Generator) -> dict:
+    """Measure in which cycle after a jump of 3 m n users are found again."""
+    before, after = displaced(world.scenario, n, JUMP_M, rng)
+    times_s = PERIOD_S * np.arange(N_BEFORE + N_AFTER)
+    found = [0] * (N_AFTER + 1)
+    for one, other in zip(before, after, strict=True):
+        path = np.array([one] * N_BEFORE + [other] * N_AFTER)
+        errors_m = [float(np.linalg.norm(estimate.mean - other)) for estimate in track(
+            world, path, times_s, True, rng)][N_BEFORE:]
+        found[next((k for k, error_m in enumerate(errors_m) if error_m < FOUND_M), -1)] += 1
+    print(f'\nfound within {FOUND_M:g} m after a jump of {JUMP_M:g} m: {found[:-1]} users in the '
+          f'first cycles, {found[-1]} later')
+    return {'found_after_jump': found}
 
 
 def new_estimator(scenario: Scenario, codebook: Codebook) -> BayesEstimator:

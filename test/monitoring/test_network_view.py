@@ -56,7 +56,7 @@ def test_the_log_names_doubts_about_a_position(watched, scenario):
             message = dataclasses.replace(
                 message, outside_probability=0.004, blocked_probability=0.12)
         for _, text in on(view.add(message, sent.time_s), network_view.LOG):
-            assert re.search(r'loss .* %, blocked 12 % \(cycle', text.text)
+            assert re.search(r'loss .* %, blocked 12 %, codebook cb\w{16} \(cycle', text.text)
     assert view.n_ended == N_CYCLES
 
 

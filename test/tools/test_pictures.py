@@ -99,7 +99,7 @@ def test_both_views_show_region_users_and_ellipses_at_their_positions():
     surface = views['$z$ [cm]'].images[0].get_array()
     assert surface.shape == (10, 10)
     # No error is shown: the true position of user 3 belongs to another cycle.
-    assert [text.get_text() for text in figure.texts] == ['cycle 103, user 3']
+    assert [text.get_text() for text in figure.texts] == ['cycle 103, user 3, codebook cb']
 
 
 def test_region_surface_and_lobe_are_where_the_surface_hangs():
@@ -130,7 +130,7 @@ def test_title_beam_and_lobe_are_of_one_user():
     scene.add(m.Beam(cycle_id=102, user=2, codebook_id='cb', band=0, analog=beam.analog,
                      digital=beam.digital, expected_bps=1e6), 0.0)
     figure = compose_scene(scene, scenario)
-    assert [text.get_text() for text in figure.texts] == ['cycle 102, user 2']
+    assert [text.get_text() for text in figure.texts] == ['cycle 102, user 2, codebook cb']
     (polar,) = [axes for axes in figure.axes if axes.name == 'polar']
     assert polar.get_title() == 'data beam to user 2, band 0 [dB]'
     assert [text.get_text() for text in polar.get_legend().get_texts()] == [
