@@ -1,15 +1,17 @@
-"""The users of a base station: whom it admits, their turns, and the owners of their numbers."""
+"""The users of a base station: admission, turns, owners of their numbers, log of their service."""
 
 import bisect
 import collections
 import dataclasses
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import LogMessage, Outcome
+from rhs_isac_ros.protocol.role import NewestDict
 
 POLICIES = ('round_robin', 'first', 'random')
 # Highest user number that is ever accepted. It bounds the memory, whatever acks arrive.
@@ -287,3 +289,54 @@ class Admission:
             self._second = second
             self._acks.clear()
         self._acks[user] += 1
+
+
+# Reasons for a lost cycle that concern one user. All others concern the whole network.
+_USER_REASONS = (Outcome.USER_GONE, Outcome.NO_FIX)
+
+
+class ServiceLog:
+    """Derives the messages of the log from what happens to cycles."""
+
+    def __init__(self) -> None:
+        # Outages that have been logged and have not ended, by reason, and number of the user, or 0
+        # for all users, with the name of the state, which contains the instance of the user.
+        self._outages: NewestDict[tuple[str, tuple[int, str]], None] = NewestDict(MAX_USERS)
+        # Missing roles and codebook as logged last; empty once a cycle has begun.
+        self._lacking: tuple[str, ...] = ()
+        # Whether a cycle has been served since the last time that something was missing.
+        self._serving = False
+
+    def waits(self, lacking: tuple[str, ...]) -> Iterator[LogMessage]:
+        """Log missing roles and codebook if they have changed."""
+        self._serving = False
+        if lacking != self._lacking:
+            self._lacking = lacking
+            yield LogMessage(f'waiting for {", ".join(lacking)}', True, 'service', True)
+
+    def begins(self) -> None:
+        """Note that a cycle has begun; a role that is missing later is then logged again."""
+        self._lacking = ()
+
+    def gives_up(self, cycle_id: int, user: int, instance: int, outcome: Outcome
+                 ) -> Iterator[LogMessage]:
+        """Log a lost cycle unless its outage has been logged."""
+        affected = ((user, f'outage of user {user} {instance}') if outcome in _USER_REASONS
+                    else (0, 'outage'))
+        if (outcome.value, affected) not in self._outages:
+            self._outages.put((outcome.value, affected), None)
+            yield LogMessage(f'cycle {cycle_id} of user {user} given up: {outcome.value}', True,
+                             affected[1], True)
+
+    def serves(self, cycle_id: int, user: int, use: str) -> Iterator[LogMessage]:
+        """Log the start of service, with what it uses, and the outages that ended."""
+        if not self._serving:
+            self._serving = True
+            yield LogMessage(f'serving: {use}', False, 'service', False)
+        ended = [outage for outage in self._outages if outage[1][0] in (0, user)]
+        for outage in ended:
+            del self._outages[outage]
+        for affected in dict.fromkeys(affected for _, affected in ended):
+            reasons = ', '.join(sorted(reason for reason, other in ended if other == affected))
+            yield LogMessage(f'cycle {cycle_id}: user {user} served again after: {reasons}', False,
+                             affected[1], False)
