@@ -42,13 +42,13 @@ from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.protocol.settings import BaseStationSettings, Impairments, PositionerSettings
 from rhs_isac_ros.protocol.transmission import Transmission
-from rhs_isac_ros.ros.roster import ROSTER
+from rhs_isac_ros.ros.roster import MEMBERS, ROSTER
 from rhs_isac_ros.support import streams
 
 ROLES = {name: member.role for name, member in ROSTER.items() if member.role}
 SUBSCRIPTIONS = {name: role.RECEIVES for name, role in ROLES.items()}
 PEERS = {name: ROSTER[name].requires for name in ('bs', 'user')}
-USE_CODEBOOKS = tuple(name for name, member in ROSTER.items() if member.has_codebook)
+USE_CODEBOOKS = tuple(name for name, member in MEMBERS.items() if member.has_codebook)
 LATENCY_S = 1e-3
 DATA_DURATION_S = 1e-3
 # A model file that does not match any codebook.
@@ -258,8 +258,8 @@ class Network:
         """Start a role, or start it again; ``<name>_twin`` is a second instance."""
         self.instances[name] = next(self._next_instance)
         role = self._roles[name] = self._build(name)
-        if self._kind(name) in USE_CODEBOOKS and self._codebook is not None:
-            self.dispatch(name, CodebookOffered(self._codebook))
+        if self._kind(name) in USE_CODEBOOKS and self._codebook_of(name) is not None:
+            self.dispatch(name, CodebookOffered(self._codebook_of(name)))
         self._reported.pop(role, None)
         self._report_missing()
 
@@ -330,8 +330,7 @@ class Network:
         if isinstance(message, m.ProtocolState) and message.outcome:
             self._ends.append((message.cycle_id, message.user, message.outcome))
         for name, role in self._roles.items():
-            kind = self._kind(name)
-            if type(message) not in SUBSCRIPTIONS[kind]:
+            if not self._receives(name, message, sender):
                 continue
             for delay_s, arriving in self.transport(message, name):
                 key = (sender, name, type(message))
@@ -447,7 +446,13 @@ class Network:
 
     @staticmethod
     def _kind(name: str) -> str:
-        return name.removesuffix('_twin').rstrip('0123456789')
+        return name.rpartition('/')[2].removesuffix('_twin').rstrip('0123456789')
+
+    def _codebook_of(self, name: str) -> Codebook | None:
+        return self._codebook
+
+    def _receives(self, name: str, message: m.Message, sender: str) -> bool:
+        return type(message) in SUBSCRIPTIONS[self._kind(name)]
 
     def _build(self, name: str):
         scenario, step_s = self.scenario, self.settings.step_timeout_s

@@ -31,17 +31,26 @@ class FusionNode(LocatingNode[Fusion]):
         self.endings.callback(worker.close)
         self._rng = streams.generator(self.values.seed, streams.AGREEMENTS)
         self._drawn: list[AgreementsDrawn] = []
-        self.start(Fusion(site, time.perf_counter, self.make_settings(self.values)))
+        self.start(Fusion(site, time.perf_counter, self.make_settings(self.values)),
+                   subscribe=False)
         if len(site.surfaces) > 1:
             folder = self.table_folder
             worker.run(lambda: SiteEstimator(site, folder), self._begin_drawing)
+        else:
+            self.subscribe()
 
     def _begin_drawing(self, estimator: SiteEstimator) -> None:
+        # The first fusion takes longer than later ones; no user should have to wait for it.
+        self._draw(estimator)
+        self.subscribe()
         # In a thread, the draws would take the interpreter from the fusion for seconds.
         self._timer_of_draws = endpoints.steady_timer(
             self, _DRAW_PERIOD_S, functools.partial(self._draw, estimator))
 
     def _draw(self, estimator: SiteEstimator) -> None:
+        if self.role.next_deadline() is not None:
+            # The base station waits for a position.
+            return
         self._drawn.append(AgreementsDrawn(*estimator.draw_agreements(1, self._rng)))
         if len(self._drawn) == _N_REFERENCES:
             self.destroy_timer(self._timer_of_draws)

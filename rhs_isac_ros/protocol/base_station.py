@@ -15,9 +15,16 @@ from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Event, LogMessage, Outcome, Timeout
 from rhs_isac_ros.protocol.receiver import Reception
-from rhs_isac_ros.protocol.role import ANY, Drops, Row, StateMachine, on
+from rhs_isac_ros.protocol.role import ANY, Drops, NewestDict, Row, StateMachine, on
 from rhs_isac_ros.protocol.settings import BaseStationSettings, PendingSettings
-from rhs_isac_ros.protocol.user_registry import Admission, ServiceLog, UserRegistry, join_users
+from rhs_isac_ros.protocol.transmission import Carriers, Steering
+from rhs_isac_ros.protocol.user_registry import (
+    MAX_USERS,
+    Admission,
+    ServiceLog,
+    UserRegistry,
+    join_users,
+)
 
 
 class State(enum.Enum):
@@ -50,8 +57,8 @@ class Cycle(Reception):
     piloted: set[int] = dataclasses.field(default_factory=set)
     # Signals that were sent to the positioner once all bands were complete.
     received: m.ReceivedSignals | None = None
-    beam: m.Beam | None = None
-    beam_applied: bool = False  # whether the RHS has reported the configuration of the beam
+    steering: Steering = dataclasses.field(default_factory=Steering)
+    carrier: str = ''  # surface that carries the data
     # Start of each phase [s]; NaN if it has not begun. The latest beacon begins the first phase.
     began_s: np.ndarray = dataclasses.field(
         default_factory=lambda: np.full(len(m.Phase), math.nan))
@@ -113,6 +120,7 @@ class BaseStation(StateMachine):
         # Roles that are missing; None before the first report.
         self._missing: tuple[str, ...] | None = None
         self._cycle = Cycle(first_cycle_id - 1)
+        self._carriers = Carriers()
         self._service = ServiceLog()
 
     def react(self, event: Event) -> None:
@@ -154,8 +162,12 @@ class BaseStation(StateMachine):
 
     def status(self) -> Mapping[str, str]:
         """Return the settings and the codebook in use, pending settings and conflicts."""
-        return (self._settings.describe() | {'codebook_id': self._cycle.codebook_id}
+        return (self._settings.describe() | {'codebook_id': self._cycle.codebook_id,
+                                             'handovers': str(self._carriers.n_handovers)}
                 | self._users.conflicts(self.now_s))
+
+    def _surface(self, message: m.Message) -> str:
+        return message.scenario_id or self._scenario.id
 
     # Guards
 
@@ -188,7 +200,7 @@ class BaseStation(StateMachine):
                     and m.same_instance(event.sender, self._cycle.channel))
 
     def _wrong_codebook(self, event: Any) -> bool:
-        return bool(event.codebook_id != self._cycle.codebook_id)
+        return event.codebook_id not in ('', self._cycle.codebook_id)
 
     def _duplicate_signals(self, event: m.FeedSignals) -> bool:
         return event.band in self._cycle.signals
@@ -226,11 +238,21 @@ class BaseStation(StateMachine):
         return (self._for_positioning(event)
                 and self._cycle.configured | {event.band} == self._bands)
 
-    def _beam_known(self, event: m.RhsConfiguration) -> bool:
-        return self._cycle.beam is not None
+    def _sounds_elsewhere(self, event: m.RhsConfiguration) -> bool:
+        return self._for_positioning(event) and self._surface(event) != self._scenario.id
 
-    def _beam_applied(self, event: m.Beam) -> bool:
-        return self._cycle.beam_applied
+    def _shown_late(self, event: m.RhsConfiguration) -> bool:
+        return self._wrong_cycle(event) and not self._for_positioning(event)
+
+    def _last_answer(self, event: m.Beam | m.RhsConfiguration) -> bool:
+        return self._cycle.steering.is_complete_with(self._surface(event), event)
+
+    def _some_ready(self, event: Timeout) -> bool:
+        return bool(self._cycle.steering.ready)
+
+    def _late_surface(self, event: m.Beam | m.RhsConfiguration) -> bool:
+        ready = self._cycle.steering.ready
+        return bool(ready) and self._surface(event) not in ready
 
     # Steps, in the order of a cycle
 
@@ -281,7 +303,7 @@ class BaseStation(StateMachine):
         self.log('resumed')
 
     def _begin_cycle(self, event: Event) -> None:
-        self._cycle = Cycle(self._cycle.cycle_id + 1)
+        self._cycle = Cycle(self._cycle.cycle_id + 1, steering=self._cycle.steering.next())
         self._beacon()
 
     def _beacon_again(self, event: Timeout) -> None:
@@ -380,22 +402,29 @@ class BaseStation(StateMachine):
     def _store_estimate(self, event: m.PositionEstimate) -> None:
         self._estimates.put(event.user, (event, self.now_s))
 
-    def _store_beam(self, event: m.Beam) -> None:
-        self._cycle.beam = event
+    def _store_answer(self, event: m.Beam | m.RhsConfiguration) -> None:
+        self._cycle.steering.add(self._surface(event), event)
 
-    def _store_beam_applied(self, event: m.RhsConfiguration) -> None:
-        self._cycle.beam_applied = True
+    def _await_surface(self, event: m.Beam | m.RhsConfiguration) -> None:
+        """Wait for the beam of a surface that was too late in an earlier cycle."""
+        self._cycle.steering.awaited.add(self._surface(event))
 
     def _begin_transmission(self, event: Event) -> None:
         self._send_downlink(event)
         self._announce(m.Phase.TRANSMITTING)
 
     def _send_downlink(self, event: Event) -> None:
-        """Offer as much data as the beam is expected to carry."""
-        assert self._cycle.beam
-        duration_s = self._settings.in_use.data_duration_s
-        self._send(m.Data, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
-                   duration_s=duration_s, bits=self._cycle.beam.expected_bps * duration_s // 1)
+        """Choose a surface, and offer as much data as its beam is expected to carry."""
+        cycle, settings, beams = self._cycle, self._settings.in_use, self._cycle.steering.ready
+        cycle.carrier = self._carriers.choose(
+            cycle.user, beams, settings.handover_ratio, self.now_s)
+        duration_s = settings.data_duration_s
+        self._send(m.Data, scenario_id=cycle.carrier, direction=m.Direction.DOWNLINK,
+                   stage=m.Stage.OFFERED, duration_s=duration_s,
+                   bits=beams[cycle.carrier].expected_bps * duration_s // 1)
+
+    def _note_loss(self, event: Timeout) -> None:
+        self._carriers.lose(self._cycle.carrier, self.now_s)
 
     def _remove_user(self, event: Timeout) -> None:
         """Stop waiting for the user until the user answers again."""
@@ -409,6 +438,7 @@ class BaseStation(StateMachine):
 
     def _finish(self, event: m.Data) -> None:
         """End the cycle with service."""
+        self._carriers.deliver(self._cycle.user, self._surface(event))
         self._end_cycle('served')
 
     def _end_cycle(self, outcome: str) -> None:
@@ -430,9 +460,11 @@ class BaseStation(StateMachine):
 
     # Conditions under which a message of a cycle is dropped.
     _OF_CYCLE: Drops = {_wrong_cycle: Outcome.WRONG_CYCLE}
-    _OF_USER: Drops = _OF_CYCLE | {_wrong_user: Outcome.WRONG_USER}
+    _SAME_USER: Drops = {_wrong_user: Outcome.WRONG_USER}
+    _OF_USER: Drops = _OF_CYCLE | _SAME_USER
     _OF_CODEBOOK: Drops = {_wrong_codebook: Outcome.WRONG_CODEBOOK}
     _DELIVERED: Drops = {_not_delivered_uplink: None}
+    _ELSEWHERE: Drops = {_sounds_elsewhere: None}
 
     # In each table, the first matching row for an event applies. The operator and the other roles
     # decide when cycles begin.
@@ -512,17 +544,22 @@ class BaseStation(StateMachine):
                 outcome=Outcome.RETRY_POSITION, restart_timeout=True),
             Row((State.ESTIMATING,), (_abandon, _apply_settings), State.RESTING,
                 outcome=Outcome.POSITIONER_SILENT),
+            # A surface that does not answer is not awaited in the next cycle either.
+            Row((State.STEERING,), (_begin_transmission,), State.TRANSMITTING, guard=_some_ready),
             # Roles answer a repeated message again, so repeated signals lead to the beam again.
             Row((State.STEERING,), (_resend_signals,), guard=_may_retry,
                 outcome=Outcome.RETRY_BEAM, restart_timeout=True),
             Row((State.STEERING,), (_abandon, _apply_settings), State.RESTING,
                 outcome=Outcome.TRANSMISSION_SILENT),
-            # The channel may have missed the beam or its configuration.
-            Row((State.TRANSMITTING,), (_resend_signals, _send_downlink), guard=_may_retry,
-                outcome=Outcome.RETRY_DATA, restart_timeout=True),
-            Row((State.TRANSMITTING,), (_abandon, _apply_settings), State.RESTING,
+            # The channel may have missed the beam or its configuration, or another surface can
+            # carry the data.
+            Row((State.TRANSMITTING,), (_note_loss, _resend_signals, _send_downlink),
+                guard=_may_retry, outcome=Outcome.RETRY_DATA, restart_timeout=True),
+            Row((State.TRANSMITTING,), (_note_loss, _abandon, _apply_settings), State.RESTING,
                 outcome=Outcome.DATA_LOST)),
-        *on(m.RhsConfiguration, 'configured', _OF_CYCLE | _OF_CODEBOOK)(
+        *on(m.RhsConfiguration, 'configured')(
+            Row(ANY, (_await_surface,), guard=_shown_late, outcome=Outcome.WRONG_CYCLE)),
+        *on(m.RhsConfiguration, 'configured', _ELSEWHERE | _OF_CYCLE | _OF_CODEBOOK)(
             # The report concerns the configurations of a band or the configuration of the beam.
             Row((State.CONFIGURING,), (_store_configured, _request_pilots), State.SOUNDING,
                 guard=_last_configuration),
@@ -530,9 +567,11 @@ class BaseStation(StateMachine):
             Row((State.ESTIMATING, State.STEERING, State.TRANSMITTING), guard=_for_positioning,
                 outcome=Outcome.DUPLICATE),
             # The beam and its configuration come from two roles, in either order.
-            Row((State.ESTIMATING,), (_store_beam_applied,), State.STEERING),
-            Row((State.STEERING,), (_begin_transmission,), State.TRANSMITTING, guard=_beam_known),
-            Row((State.STEERING,), (_store_beam_applied,)),
+            Row((State.ESTIMATING,), (_store_answer,), State.STEERING),
+            Row((State.STEERING,), (_store_answer, _begin_transmission), State.TRANSMITTING,
+                guard=_last_answer),
+            Row((State.STEERING,), (_store_answer,)),
+            Row((State.TRANSMITTING, State.RESTING), (_store_answer,), guard=_late_surface),
             # A repeated request may be answered twice.
             Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
         # Only who is silent, the user or the channel, depends on the pilots.
@@ -549,11 +588,14 @@ class BaseStation(StateMachine):
         *on(m.NoFix, 'no_fix', _OF_USER | _OF_CODEBOOK)(
             Row((State.ESTIMATING,), (_abandon, _apply_settings), State.RESTING,
                 outcome=Outcome.NO_FIX)),
-        *on(m.Beam, 'beam', _OF_USER | _OF_CODEBOOK)(
-            Row((State.ESTIMATING,), (_store_beam,), State.STEERING),
-            Row((State.STEERING,), (_store_beam, _begin_transmission), State.TRANSMITTING,
-                guard=_beam_applied),
-            Row((State.STEERING,), (_store_beam,)),
+        *on(m.Beam, 'beam')(
+            Row(ANY, (_await_surface,), guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE)),
+        *on(m.Beam, 'beam', _SAME_USER | _OF_CODEBOOK)(
+            Row((State.ESTIMATING,), (_store_answer,), State.STEERING),
+            Row((State.STEERING,), (_store_answer, _begin_transmission), State.TRANSMITTING,
+                guard=_last_answer),
+            Row((State.STEERING,), (_store_answer,)),
+            Row((State.TRANSMITTING,), (_store_answer,), guard=_late_surface),
             Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
         *on(m.Data, 'delivered', _DELIVERED | _OF_USER)(
             Row((State.TRANSMITTING,), (_finish, _apply_settings), State.RESTING),

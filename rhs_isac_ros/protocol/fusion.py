@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import numpy as np
 
@@ -35,7 +35,7 @@ _MAX_MISSED = 3
 _MAX_CLOSED, _MAX_OPEN = 256, 64
 
 
-def posterior_of(source: object, sighting: Sighting, **fields: float | int) -> m.Posterior:
+def posterior_of(source: object, sighting: Sighting, **fields: float | str) -> m.Posterior:
     """Return the message about a likelihood, with the cycle, user and codebook of a source."""
     mixture, pose = sighting.mixture.normalised(), sighting.pose
     return m.derive(
@@ -98,7 +98,9 @@ class Fusion(Role):
         self._missed = dict.fromkeys(site.surfaces, 0)
         # By cycle and user.
         self._open: NewestDict[tuple[int, int], _Fix] = NewestDict(_MAX_OPEN)
-        self._closed: NewestDict[tuple[int, int], None] = NewestDict(_MAX_CLOSED)
+        # The surfaces that had answered, and the answer of the fusion, if any.
+        self._closed: NewestDict[tuple[int, int], tuple[Collection[str], m.Message | None]] = (
+            NewestDict(_MAX_CLOSED))
 
     def next_deadline(self) -> float | None:
         """Return the time at which the wait for answers ends [s], or None."""
@@ -148,7 +150,7 @@ class Fusion(Role):
         self._missed[name] = 0
         fix = self._open.get(key)
         if key in self._closed:
-            self.count(Outcome.STALE)
+            self._answer_again(name, *self._closed[key])
         elif fix is None:
             due_s = self.now_s + self._settings.in_use.wait_s
             self.count(Outcome.OVERFLOW, self._open.put(key, _Fix(due_s, {name: message})))
@@ -157,8 +159,19 @@ class Fusion(Role):
         else:
             fix.answers[name] = message
 
+    def _answer(self, fix: _Fix, answer: m.PositionEstimate | m.NoFix) -> None:
+        self._closed[answer.cycle_id, answer.user] = frozenset(fix.answers), answer
+        self.send(answer)
+
+    def _answer_again(
+            self, name: str, answered: Collection[str], answer: m.Message | None) -> None:
+        """Repeat an answer, which may have been lost, if a surface repeats its own."""
+        self.count(Outcome.DUPLICATE if name in answered else Outcome.STALE)
+        if answer and name in answered:
+            self.send(answer)
+
     def _close(self, key: tuple[int, int], fix: _Fix) -> None:
-        self._closed.put(key, None)
+        self._closed.put(key, ((), None))
         for name in self._missed.keys() - fix.answers.keys():
             self._missed[name] += 1
             if self._missed[name] == _MAX_MISSED:
@@ -193,13 +206,14 @@ class Fusion(Role):
         answers = fix.posteriors
         source = next(iter(answers.values()))
         mean, covariance = fused.mixture.moments()
-        common = {
+        common: dict[str, float | str] = {
             'stamp_ns': source.stamp_ns,
+            'codebook_id': '',  # of no single surface
             'outside_probability': max(one.outside_probability for one in answers.values()),
             # From all surfaces.
             'blocked_probability': math.prod(
                 one.blocked_probability for one in answers.values())}
-        self.send(m.derive(
+        self._answer(fix, m.derive(
             m.PositionEstimate, source, position=mean, covariance_m2=covariance,
             crlb_m2=self._bound_m2(answers, mean), estimator=f'fusion of {", ".join(answers)}',
             latency_s=latency_s, **common))
@@ -236,9 +250,10 @@ class Fusion(Role):
     def _no_fix(self, fix: _Fix) -> None:
         source = next(iter(fix.answers.values()))
         self.count(Outcome.NO_FIX)
-        self.send(m.derive(m.NoFix, source, stamp_ns=source.stamp_ns, reason='; '.join(
-            f'{name}: {answer.reason}' for name, answer in sorted(fix.answers.items())
-            if isinstance(answer, m.NoFix))))
+        reason = '; '.join(f'{name}: {answer.reason}' for name, answer in sorted(
+            fix.answers.items()) if isinstance(answer, m.NoFix))
+        self._answer(fix, m.derive(m.NoFix, source, stamp_ns=source.stamp_ns, codebook_id='',
+                                   reason=reason))
 
     def _examine(self, suspects: tuple[str, ...]) -> None:
         """Log when poses begin or cease to be suspect."""

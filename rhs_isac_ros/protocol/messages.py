@@ -174,15 +174,16 @@ class Phase(enum.IntEnum):
 class Message:
     """Base of all messages.
 
-    The adapter to ROS sets `sender` and `scenario_id` when a role sends a message, and drops
-    received messages of another scenario.
+    The adapter to ROS sets `sender` and, unless the role has done so, `scenario_id` when a role
+    sends a message. It drops received messages of another scenario.
     """
 
     cycle_id: int
     #: Instance of the node that sent the message: the time at which the node started, in
     #: nanoseconds since 1970; 0 if unknown, as in messages sent by hand.
     sender: int = 0
-    scenario_id: str = ''  #: `Scenario.id` of the sending node; empty if unknown.
+    #: `Scenario.id` of the sending node, or of the surface that carries `Data`; empty if unknown.
+    scenario_id: str = ''
     #: Stamp of the header on the clock of the emulated world [ns]. Signals, and the estimates
     #: from them, carry the time of the measurement. If 0, the adapter inserts the current time.
     stamp_ns: int = 0
@@ -497,6 +498,8 @@ class ProtocolState(Message):
 
 #: Messages of the base station and the users that concern every surface of a site.
 SHARED = (Grant, Pilot, GroundTruth)
+#: Messages with which a surface, or in a site their fusion, answers the signals of a user.
+LOCATED = (PositionEstimate, NoFix)
 #: Messages that contain positions.
 POSITIONS = (PositionEstimate, Posterior, GroundTruth, GroundTruths)
 

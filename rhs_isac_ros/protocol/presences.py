@@ -53,6 +53,10 @@ class Presences:
         if other.sender not in (0, self.own.sender) and other.sender <= now_ns + _MAX_AHEAD_NS:
             self._known.put(other.sender, (other, now_s))
 
+    def knows(self, instance: int) -> bool:
+        """Return whether an instance has been announced."""
+        return instance in self._known
+
     def newest(self, role: str) -> int:
         """Return the instance that started last among the other nodes of a role; 0 if none.
 

@@ -79,7 +79,7 @@ class RhsController(StateMachine):
                 and not m.same_instance(self._beam_sender, event.sender))
 
     def _wrong_codebook(self, event: m.Beam) -> bool:
-        return event.codebook_id != self._codebooks.in_use
+        return event.codebook_id not in ('', self._codebooks.in_use)
 
     # Steps
 

@@ -59,6 +59,9 @@ class BaseStationSettings(ReceiverSettings):
     data_duration_s: float = setting(
         1e-3, 'Duration of the data transmission in each direction.', unit='s',
         low=1e-6, high=10.0)
+    handover_ratio: float = setting(
+        1.02, 'In a site, ratio of the expected capacities of two surfaces from which the data of '
+        'a user move to the better one.', low=1.0, high=1e3)
     allowed_users: str = setting(
         '', 'Users whose acks are accepted, such as 1, 4, 10-20; empty: all.')
     max_users: int = setting(
@@ -110,8 +113,8 @@ class FusionSettings:
     """Settings of the fusion of a site."""
 
     wait_s: float = setting(
-        0.2, 'Time to wait for the other surfaces after the first one has answered.', unit='s',
-        low=0.0, high=60.0)
+        0.2, 'Time to wait for the other surfaces after the first one has answered; less than '
+        'step_timeout_s of the base station.', unit='s', low=0.0, high=60.0)
     track_speed_mps: float = _track_speed_mps()
 
 

@@ -1,8 +1,13 @@
-"""The role ``transmission``, which steers beams to estimated positions and reports capacities."""
+"""Beams to estimated positions: the role ``transmission``, and the choice among its beams.
+
+The role steers the beam of a surface and reports its capacity. In a site, the base station chooses
+among the beams of several surfaces.
+"""
 
 import collections
+import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +29,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Event, Outcome
 from rhs_isac_ros.protocol.role import REMEMBERED_CYCLES, CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.settings import PendingSettings, TransmissionSettings
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
 
 # Fields of `Capacity`; `CapacityStatistics` contains their quartiles under the same names.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
@@ -36,6 +42,71 @@ _IDLE_S = 5e-3
 # number of postponed reports.
 _MAX_DELAY_S = 0.25
 _MAX_WAITING = 8
+# Time during which a surface that has not delivered data carries data only if no other can [s].
+_AVOIDED_S = 10.0
+
+
+@dataclasses.dataclass
+class Steering:
+    """The beams with which surfaces answer the estimate of one cycle, by `Scenario.id`."""
+
+    awaited: set[str] = dataclasses.field(default_factory=set)  #: Surfaces that answered before.
+    beams: dict[str, m.Beam] = dataclasses.field(default_factory=dict)
+    applied: set[str] = dataclasses.field(default_factory=set)  #: Surfaces that show their beams.
+
+    @property
+    def ready(self) -> dict[str, m.Beam]:
+        """The beams that can carry data."""
+        return {surface: beam for surface, beam in self.beams.items() if surface in self.applied}
+
+    def add(self, surface: str, answer: m.Beam | m.RhsConfiguration) -> None:
+        """Store the beam of a surface, or that the surface shows it."""
+        if isinstance(answer, m.Beam):
+            self.beams[surface] = answer
+        else:
+            self.applied.add(surface)
+
+    def is_complete_with(self, surface: str, answer: m.Beam | m.RhsConfiguration) -> bool:
+        """Return whether an answer makes its surface ready, which is the last awaited one."""
+        others: Collection[str] = self.applied if isinstance(answer, m.Beam) else self.beams
+        return surface in others and self.awaited <= self.ready.keys() | {surface}
+
+    def next(self) -> 'Steering':
+        """Return the begin of the next cycle, which awaits the surfaces that showed a beam."""
+        return Steering(self.applied or self.awaited)
+
+
+class Carriers:
+    """Chooses the surface that carries the data of a user, by expected capacities.
+
+    The data of a user move to another surface only if its capacity exceeds that of the present one
+    by a ratio.
+    """
+
+    def __init__(self) -> None:
+        self.n_handovers = 0
+        # The surface that delivered the latest data of each user.
+        self._latest: NewestDict[int, str] = NewestDict(MAX_USERS)
+        # End of the time during which a surface is avoided [s].
+        self._avoided_until_s: dict[str, float] = {}
+
+    def choose(self, user: int, beams: Mapping[str, m.Beam], ratio: float, now_s: float) -> str:
+        """Return the surface of one of the beams, of which there must be one at least."""
+        def preference(surface: str) -> tuple[bool, float]:
+            weight = ratio if surface == self._latest.get(user) else 1.0
+            return (now_s >= self._avoided_until_s.get(surface, -math.inf),
+                    weight * beams[surface].expected_bps)
+        return max(beams, key=preference)
+
+    def lose(self, surface: str, now_s: float) -> None:
+        """Note that a surface has not delivered data."""
+        self._avoided_until_s[surface] = now_s + _AVOIDED_S
+
+    def deliver(self, user: int, surface: str) -> None:
+        """Note that a surface has delivered the data of a user."""
+        self.n_handovers += self._latest.get(user, surface) != surface
+        self._latest.put(user, surface)
+        self._avoided_until_s.pop(surface, None)
 
 
 class _Steered(NamedTuple):
@@ -108,8 +179,10 @@ class Transmission(Role):
                 self.log(self._settings.apply())
             case m.GroundTruth() if event.cycle_id:
                 self._truths.put((event.cycle_id, event.user, event.sender), event)
-            case m.PositionEstimate() if event.codebook_id not in self._codebooks:
+            case m.PositionEstimate() if event.codebook_id not in ('', *self._codebooks):
                 self.count(Outcome.WRONG_CODEBOOK)
+            case m.PositionEstimate() if self._place_of(event)[0] <= 0:
+                self.count(Outcome.BEHIND)
             case m.PositionEstimate():
                 self._steer(event)
             case m.RhsConfiguration(mode=m.Mode.TRANSMISSION):
@@ -130,6 +203,9 @@ class Transmission(Role):
         """Return the settings and the codebook in use."""
         return self._settings.describe() | {'codebook_id': self._codebooks.in_use}
 
+    def _place_of(self, event: m.PositionEstimate | m.GroundTruth) -> np.ndarray:
+        return self._scenario.pose.to_surface(event.position)
+
     def _steer(self, estimate: m.PositionEstimate) -> None:
         known = self._steered.get(estimate.cycle_id)
         is_other = known and not m.same_instance(known.estimate.sender, estimate.sender)
@@ -138,17 +214,17 @@ class Transmission(Role):
             self.count(Outcome.WRONG_INSTANCE if is_other else Outcome.DUPLICATE)
             self.send(known.beam)
             return
-        self._codebooks.take(estimate.codebook_id)
+        if estimate.codebook_id:
+            self._codebooks.take(estimate.codebook_id)
         if known:
             bands, surface = known.bands, known.surface
         else:
             settings = self._settings.in_use
             bands = range(self._scenario.n_bands) if settings.band < 0 else (settings.band,)
             surface = self._surface_of(settings.calibration_file)
-        pose = self._scenario.pose
         choice = self._choose(
-            self._scenario, pose.to_surface(estimate.position),
-            pose.covariances_to_surface(estimate.covariance_m2), bands, surface)
+            self._scenario, self._place_of(estimate),
+            self._scenario.pose.covariances_to_surface(estimate.covariance_m2), bands, surface)
         beam = choice.beam
         sent = m.derive(
             m.Beam, estimate, band=beam.band, analog=beam.analog, digital=beam.digital,
@@ -172,16 +248,14 @@ class Transmission(Role):
         waiting = next(filter(self._truth_of, self._waiting), self._waiting[0])
         self._waiting.remove(waiting)
         steered, applied, _ = waiting
-        pose = self._scenario.pose
         beam, result = steered.beam, CapacityReport(math.nan, math.nan)
         if truth := self._truth_of(waiting):
             used = Beam(applied.analog[0], beam.digital, beam.band)
             result = self._evaluate(
-                self._scenario, used, pose.to_surface(truth.position), steered.bands,
-                steered.surface)
+                self._scenario, used, self._place_of(truth), steered.bands, steered.surface)
         steering = applied_beam(Beam(beam.analog, beam.digital, beam.band), steered.surface)
         at_estimate_bps = float(capacity(
-            self._scenario, steering, pose.to_surface(steered.estimate.position)[None])[0])
+            self._scenario, steering, self._place_of(steered.estimate)[None])[0])
         report = m.derive(
             m.Capacity, beam, expected_bps=beam.expected_bps, actual_bps=result.actual_bps,
             perfect_bps=result.perfect_bps, loss_bps=result.loss_bps,

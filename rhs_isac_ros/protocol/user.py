@@ -192,7 +192,8 @@ class User(StateMachine):
 
     def _send_uplink(self, event: m.Data) -> None:
         self.send(m.derive(m.Data, event, direction=m.Direction.UPLINK, stage=m.Stage.OFFERED,
-                           duration_s=event.duration_s, bits=event.bits))
+                           duration_s=event.duration_s, bits=event.bits,
+                           scenario_id=event.scenario_id))
 
     TABLE = (
         *on(PeersChanged, 'peers')(

@@ -1,6 +1,7 @@
 """Presence of other nodes, from their announcements, and endpoints that do not fit this node."""
 
 import dataclasses
+import functools
 import json
 import threading
 import time
@@ -46,6 +47,8 @@ class Peers:
         every change.
     on_rival
         Called with True if this node has to stand by for another one, or False if it may serve.
+    site_prefix
+        Namespace of the nodes of the whole site, with a final slash; empty without a site.
     library_id
         Id of the library of codebooks; empty for a role that uses none.
     """
@@ -53,9 +56,11 @@ class Peers:
     def __init__(
             self, node: Node, role: str, instance: int, scenario: Scenario,
             on_missing: Callable[[tuple[str, ...]], None],
-            on_rival: Callable[[bool], None], library_id: str = '') -> None:
+            on_rival: Callable[[bool], None], site_prefix: str = '', library_id: str = ''
+    ) -> None:
         self._node, self._on_missing, self._on_rival = node, on_missing, on_rival
-        self._role, self._needed = role, MEMBERS[role].needed
+        of_site = MEMBERS[role].requires_of_site if site_prefix else ()
+        self._role, self._needed = role, (*of_site, *MEMBERS[role].needed)
         self._presences = Presences(Presence(
             instance, scenario.id, '', node.get_fully_qualified_name(),
             json.dumps(scenario.fields()), library_id=library_id))
@@ -70,6 +75,11 @@ class Peers:
         self._closed, self._changed, self._thread = False, threading.Event(), threading.Thread()
         endpoints.subscribe(node, ros.Presence, topics.PRESENCE, self._receive,
                             endpoints.PRESENCES, raw=True)
+        if of_site:
+            # Other nodes in this namespace may belong to another network.
+            endpoints.subscribe(
+                node, ros.Presence, site_prefix + topics.PRESENCE,
+                functools.partial(self._receive, roles=of_site), endpoints.PRESENCES, raw=True)
         if MEMBERS[role].is_unique:
             # A thread announces the node even while the node computes.
             self._thread = threading.Thread(
@@ -176,11 +186,14 @@ class Peers:
                 self._changed.wait(PERIOD_S)
                 self._changed.clear()
 
-    def _receive(self, content: bytes) -> None:
+    def _receive(self, content: bytes, roles: tuple[str, ...] = ()) -> None:
+        """Process an announcement; with `roles`, only of a node that has had one of them."""
         try:
             presence = convert.from_bytes(Presence, content)
         # Anything may be published on the topic.
         except MessageError:
+            return
+        if roles and presence.role not in roles and not self._presences.knows(presence.sender):
             return
         self._presences.add(presence, time.time_ns(), self._now_s())
         if self._find() != self._newest:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import types
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from typing import NamedTuple
 
 from rhs_isac_ros.codebook import Codebook
@@ -17,11 +17,11 @@ _SEED_STEP = 2**31
 
 
 class Source(NamedTuple):
-    """Topics with the same prefix, and the scenario of their messages."""
+    """The topic of a class of messages, and their scenario."""
 
+    kind: type[m.Message]
     prefix: str  # empty, or a namespace with a final slash
     scenario: Scenario
-    kinds: tuple[type[m.Message], ...]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -72,22 +72,37 @@ class Place:
         number = list(self.site.surfaces).index(self.name) if self.site and self.name else 0
         return seed + _SEED_STEP * number
 
-    def sources(self, kinds: Iterable[type[m.Message]]) -> Iterator[Source]:
+    @property
+    def site_prefix(self) -> str:
+        """Namespace of the nodes of the whole site, with a final slash; empty without a site."""
+        return f'{self.base}/' if self.site else ''
+
+    def carries_elsewhere(self, message: m.Message) -> bool:
+        """Return whether a message is `Data` that another surface of the site carries."""
+        surfaces = self.site.surfaces.values() if self.site else ()
+        return isinstance(message, m.Data) and message.scenario_id in (
+            one.scenario.id for one in surfaces)
+
+    def sources(self, kinds: Iterable[type[m.Message]], from_all: Container[type[m.Message]] = ()
+                ) -> Iterator[Source]:
         """Yield the topics on which the node receives messages of some classes.
 
-        Messages in `SHARED` come from the surface whose base station leads. A node of the whole
-        site receives the messages of every surface.
+        In a site, messages in `SHARED` come from the surface whose base station leads, and those
+        in `LOCATED` from the fusion. The leader also sends all `Data`, with the scenario of the
+        surface that carries them. Classes in `from_all` come from every surface.
         """
-        site, kinds = self.site, tuple(kinds)
-        if site is None:
-            yield Source('', self.scenario, kinds)
-        elif self.name:
-            shared = tuple(kind for kind in kinds if kind in m.SHARED)
-            yield Source('', self.scenario, tuple(kind for kind in kinds if kind not in shared))
-            yield self._of(site, site.leader, shared)
-        else:
-            for name in site.surfaces:
-                yield self._of(site, name, kinds)
-
-    def _of(self, site: Site, name: str, kinds: tuple[type[m.Message], ...]) -> Source:
-        return Source(f'{self.base}/{name}/', site.surfaces[name].scenario, kinds)
+        if not self.site:
+            yield from (Source(kind, '', self.scenario) for kind in kinds)
+            return
+        surfaces = [(f'{self.base}/{name}/', one.scenario)
+                    for name, one in self.site.surfaces.items()]
+        prefix, scenario = surfaces[0]
+        for kind in kinds:
+            if kind in from_all:
+                yield from (Source(kind, *surface) for surface in surfaces)
+            elif kind in m.SHARED:
+                yield Source(kind, prefix, scenario)
+            elif kind in m.LOCATED:
+                yield Source(kind, self.site_prefix, scenario)
+            else:
+                yield Source(kind, prefix if kind is m.Data else '', self.scenario)

@@ -159,7 +159,6 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         if hasattr(self.values, 'seed'):
             self.values.seed = self.place.seed(self.values.seed)
         self.instance = time.time_ns()
-        self._identity = self.instance, self.scenario.id
         self.frame = Frame.of(self, self.values)
         self.clocks = Clocks(self)
         self._missing: tuple[str, ...] | None = None
@@ -187,7 +186,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         publish_reports(self, self.report)
         self._peers = Peers(
             self, self._executable, self.instance, self.scenario, self._on_missing,
-            self._on_rival, self.library.id if hasattr(self.values, 'library_file') else '')
+            self._on_rival, self.place.site_prefix,
+            self.library.id if hasattr(self.values, 'library_file') else '')
         self.endings.callback(self._peers.close)
         if subscribe and not needs_codebook:
             self.subscribe()
@@ -211,9 +211,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         """Create the subscriptions, and announce the role, which is now ready."""
         kinds = [kind for kind in self.role.RECEIVES if kind not in self._receiving]
         self._receiving.update(kinds)
-        for prefix, scenario, of_source in self.place.sources(kinds):
+        for kind, prefix, scenario in self.place.sources(
+                kinds, MEMBERS[self._executable].from_all):
             endpoints.subscribe_messages(
-                self, of_source, scenario, self._on_message, self._on_malformed,
+                self, [kind], scenario, self._on_message, self._on_malformed,
                 on_foreign=functools.partial(self._on_foreign, scenario),
                 on_arrival=self._statistics.count_received, prefix=prefix)
         self._peers.take_role()
@@ -314,7 +315,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         try:
             m.check(message, self.scenario)
             content = convert.to_bytes(
-                message, stamp_ns, self._identity,
+                message, stamp_ns, (self.instance, message.scenario_id or self.scenario.id),
                 self.frame.name if isinstance(message, m.POSITIONS) else self.frame.surface)
         except m.MessageError as error:
             endpoints.journal(self).event(
@@ -342,7 +343,9 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         endpoints.log_dropped(self, error)
 
     def _on_foreign(self, scenario: Scenario, message: m.Message) -> None:
-        """Count and log a message of another scenario."""
+        """Count and log a message of another scenario, but no data of another surface."""
+        if self.place.carries_elsewhere(message):
+            return
         self.role.counters[events.Outcome.WRONG_SCENARIO.value] += 1
         endpoints.journal(self).event(
             'foreign', f'{type(message).__name__} dropped: sent with scenario '

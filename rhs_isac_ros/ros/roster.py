@@ -11,6 +11,7 @@ from typing import Any
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.channel import Channel
 from rhs_isac_ros.protocol.fusion import Fusion
+from rhs_isac_ros.protocol.messages import Beam, Data, Message, RhsConfiguration
 from rhs_isac_ros.protocol.positioner import Positioner
 from rhs_isac_ros.protocol.receiver import Receiver
 from rhs_isac_ros.protocol.rhs_controller import RhsController
@@ -34,6 +35,8 @@ class Member:
     role: Any = None  # class of the role, if it exchanges messages of the protocol
     settings: type | None = None  # dataclass of the settings that are parameters, if any
     requires: tuple[str, ...] = ()  # roles that must be present before it serves
+    requires_of_site: tuple[str, ...] = ()  # roles of the whole site, if any, that must be, too
+    from_all: tuple[type[Message], ...] = ()  # messages from every surface of a site, not only its
     is_unique: bool = True  # whether only one node serves in the role; others stand by
     has_codebook: bool = False  # whether it uses the codebook of the optimizer
     of_site: bool = False  # whether it serves all surfaces of a site instead of one
@@ -74,21 +77,23 @@ ROSTER: Mapping[str, Member] = {
     'channel': Member(role=Channel, settings=Impairments),
     'user': Member(
         role=User, publishes=(topics.TRUE_ODOMETRY,), requires=('channel', 'bs'),
-        is_unique=False),
+        from_all=(Data,), is_unique=False),
     'bs': Member(
         role=BaseStation, settings=BaseStationSettings, has_codebook=True,
-        requires=('rhs_controller', 'channel', 'positioner', 'transmission')),
+        requires=('rhs_controller', 'channel', 'positioner', 'transmission'),
+        requires_of_site=('fusion',), from_all=(Beam, RhsConfiguration, Data)),
 }
 # The other roles of a site.
 _OF_SITES: Mapping[str, Member] = {
     'receiver': Member(role=Receiver, settings=ReceiverSettings, has_codebook=True),
     'fusion': Member(
-        role=Fusion, settings=FusionSettings, of_site=True,
+        role=Fusion, settings=FusionSettings, of_site=True, from_all=Fusion.RECEIVES,
         publishes=(topics.POSITION, topics.POSE, topics.ODOMETRY)),
 }
 MEMBERS: Mapping[str, Member] = {**ROSTER, **_OF_SITES}
 # The roles of a surface that follows the base station of another one.
-FOLLOWING = ('rhs_controller', 'positioner', topics.OPTIMIZER_NODE, 'channel', 'receiver')
+FOLLOWING = ('rhs_controller', 'positioner', 'transmission', topics.OPTIMIZER_NODE, 'channel',
+             'receiver')
 # Roles in which only one node of a network serves.
 UNIQUE = tuple(name for name, member in ROSTER.items() if member.is_unique)
 

@@ -122,8 +122,10 @@ def watch(
         for name, code in processes.ended().items():
             return f'{name} ended with exit code {code}:\n{processes.log(name)}'
         if time.monotonic() - changed_s > _CYCLE_TIMEOUT_S:
+            # In a site, the name of the leading surface precedes that of the role.
+            (name,) = (name for name in processes.names if name.endswith('bs'))
             return (f'no cycle within {_CYCLE_TIMEOUT_S:.0f} s; log of the base station:\n'
-                    f'{processes.log("bs")}')
+                    f'{processes.log(name)}')
     return ''
 
 
@@ -159,8 +161,12 @@ def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) ->
         f'{1e3 * np.median([cycle.estimate.latency_s for cycle in cycles]):.1f} ms',
         f'capacity: median {np.median([c.capacity.actual_bps for c in cycles]) / 1e6:.2f} '
         f'Mbit/s; loss: median {np.median(losses):.3f} %, worst {losses.max():.3f} %',
-        *(f'cycle {record.cycle_id} of user {record.user} given up: {record.outcome}'
-          for record in given_up)])
+        *_abandoned(given_up)])
+
+
+def _abandoned(given_up: Sequence[CycleRecord]) -> list[str]:
+    return [f'cycle {record.cycle_id} of user {record.user} given up: {record.outcome}'
+            for record in given_up]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -266,7 +272,7 @@ class _SiteDemonstration(_Demonstration):
         return self._observer
 
     def report(self, log: CycleLog) -> None:
-        for line in report(self._observer):
+        for line in [*report(self._observer), *_abandoned(log.given_up)]:
             print(line)
 
 

@@ -1,5 +1,6 @@
-"""A site of two surfaces, as processes: fusion, faults of a surface, and wrong poses."""
+"""A site of two surfaces, as processes: fusion, handover, faults of a surface, and wrong poses."""
 
+import re
 import signal
 import subprocess
 import time
@@ -31,19 +32,51 @@ BOTH, FRONT = 'fusion of front, side', 'fusion of front'
 N_USERS = 8
 # Time within which the other surface and the fusion continue [s].
 OUTAGE_S = 3.0
+# Roles without which a surface carries no data, and those without which it has no posterior.
+OF_DATA = {'rhs_controller', 'transmission', 'channel', 'receiver'}
+OF_POSTERIOR = {'rhs_controller', 'positioner', 'channel', 'receiver'}
+POSES = {'front': ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]),
+         'side': ([10.0, -10.0, 0.0], [0.0, 0.0, 1.0, 1.0]),
+         'opposite': ([20.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0])}
 
 
 @pytest.fixture(scope='module')
-def site_file(tmp_path_factory):
-    """Two surfaces of Table I at a right angle, as in config/site.yaml."""
-    config = Path(__file__).parents[2] / 'config'
-    content = yaml.safe_load((config / 'site.yaml').read_text(encoding='utf-8'))
-    for surface in content['surfaces'].values():
-        surface |= {'scenario': str(config / 'table1.yaml'),
-                    'codebook': str(default_codebook_file())}
-    file = tmp_path_factory.mktemp('site') / 'site.yaml'
-    file.write_text(yaml.safe_dump(content, sort_keys=False), encoding='utf-8')
-    return file
+def make_site_file(tmp_path_factory):
+    """Function that writes a site file with the given surfaces, all of Table I."""
+    def make(*names):
+        file = tmp_path_factory.mktemp('site') / 'site.yaml'
+        file.write_text(yaml.safe_dump({
+            'roi_center_m': [10.0, 0.0, 0.0], 'roi_size_m': [10.0, 10.0, 2.0],
+            'surfaces': {name: {
+                'scenario': str(ROOT / 'config' / 'table1.yaml'),
+                'codebook': str(default_codebook_file()),
+                'pose': {'position_m': POSES[name][0], 'quaternion': POSES[name][1],
+                         'uncertainty': [0.02, 0.2]}} for name in names}},
+            sort_keys=False), encoding='utf-8')
+        return file
+    return make
+
+
+@pytest.fixture(scope='module')
+def site_file(make_site_file):
+    return make_site_file('front', 'side')
+
+
+# First, while no other site runs.
+@pytest.mark.parametrize(('prior', 'names'), [
+    ('region', ('front', 'side')), ('track', ('side', 'opposite', 'front'))])
+def test_the_demonstration_compares_all_surfaces_with_the_fusion_and_counts_their_data(
+        prior, names, built_scripts, make_site_file, tmp_path):
+    done = subprocess.run(
+        [ROOT / 'scripts' / 'demo', '--site', make_site_file(*names), '--cycles', '4',
+         '--prior', prior],
+        cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    for text in (*(f'{name}: ' for name in names), 'fused: 4 positions, root mean square error'):
+        assert text in done.stdout
+    carried, handovers = done.stdout.splitlines()[-1].removeprefix('data: ').split('; ')
+    assert sum(int(one.split(' over ')[0]) for one in carried.split(', ')) == 4
+    assert re.fullmatch(r'\d handovers?', handovers)
 
 
 class Running:
@@ -79,6 +112,14 @@ class Running:
                    if one.estimator == estimator]
             return new if len(new) >= n else None
         return self.fused.until(found, estimator, self.running.values())
+
+    def delivered(self):
+        """Return the delivered uplink data that have arrived, by surface."""
+        self.front._spin()
+        self.side._spin()
+        return {name: [one for one in watch.received[m.Data]
+                       if (one.direction, one.stage) == (m.Direction.UPLINK, m.Stage.DELIVERED)]
+                for name, watch in (('front', self.front), ('side', self.side))}
 
     def of_front(self, kind, estimate):
         """Wait for the messages of a kind about the user and cycle of a fused position."""
@@ -160,6 +201,18 @@ def test_any_program_can_read_posteriors_poses_and_odometry(running):
     weights = np.exp(posteriors[0].log_weights.data)
     assert weights.sum() == pytest.approx(1)
     assert posteriors[0].means.shape.tolist() == [len(weights), 3]
+
+
+def test_data_of_walking_users_move_to_another_surface(running):
+    def moved():
+        front, side = ({one.user for one in data} for data in running.delivered().values())
+        return front & side
+    running.fused.until(moved, 'a handover', running.running.values())
+    for name, data in running.delivered().items():
+        assert {one.scenario_id for one in data} == {running.site.surfaces[name].scenario.id}
+    delivered = {one.cycle_id for data in running.delivered().values() for one in data}
+    assert {end.cycle_id for end in running.front.served[:-1]} <= delivered
+    assert not running.front.given_up
 
 
 @pytest.fixture(scope='module')
@@ -253,7 +306,12 @@ def test_the_others_continue_without_a_node_of_one_surface(running, role):
     estimates = running.fused.until(continued, 'a position', running.running.values())
     assert time.monotonic() - killed_s < OUTAGE_S
     # Without its optimizer, a surface keeps its codebook.
-    rest = running.until_fused(BOTH if role == topics.OPTIMIZER_NODE else FRONT, 5)
+    rest = running.until_fused(FRONT if role in OF_POSTERIOR else BOTH, 5)
+    if role in OF_DATA:
+        delivered = {name: [one for one in data if one.cycle_id > latest]
+                     for name, data in running.delivered().items()}
+        assert delivered['front']
+        assert not delivered['side']
     for estimate in [*estimates, *rest]:
         running.verify(estimate)
     running.start('/side', role)
@@ -318,14 +376,3 @@ def test_the_pose_of_a_surface_that_has_moved_is_found(running, built_scripts, t
     assert error @ np.linalg.solve(found.covariance, error) < 25
     assert declared.error_of(found)[0] < -0.05
     assert 'side: moved by [-0.' in done.stdout
-
-
-@pytest.mark.parametrize('prior', ['region', 'track'])
-def test_the_demonstration_compares_each_surface_with_the_fusion(
-        prior, built_scripts, site_file, tmp_path):
-    done = subprocess.run(
-        [ROOT / 'scripts' / 'demo', '--site', site_file, '--cycles', '4', '--prior', prior],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    for text in ('front: ', 'side: ', 'fused: 4 positions, root mean square error'):
-        assert text in done.stdout

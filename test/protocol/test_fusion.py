@@ -220,6 +220,24 @@ def test_an_answer_counts_once_and_only_from_a_surface_of_the_site(fusion, answe
     assert fusion.counters == {'duplicate': 1, 'wrong_scenario': 2}
 
 
+def test_a_surface_that_answers_again_gets_the_same_position_and_a_late_one_none(
+        fusion, answer, no_fix):
+    *_, (estimate, _) = at_once(fusion, [answer('front'), answer('side')])
+    fusion.handle(answer('front', 2), 0.0)
+    (late, _) = sent(fusion.handle(Timeout(), WAIT_S))
+    assert at_once(fusion, [answer('front'), answer('front', 2), answer('side', 2)]) == [
+        [estimate], [late], []]
+    *_, (nothing,) = at_once(fusion, [no_fix('front', 3), no_fix('side', 3)])
+    assert at_once(fusion, [no_fix('side', 3)]) == [[nothing]]
+    assert fusion.counters == {'duplicate': 3, 'stale': 1, 'no_fix': 1}
+
+
+def test_a_position_of_the_site_names_no_codebook_of_a_single_surface(fusion, answer, no_fix):
+    *_, (estimate, posterior) = at_once(fusion, [answer('front'), answer('side')])
+    *_, (nothing,) = at_once(fusion, [no_fix('front', 2), no_fix('side', 2)])
+    assert {one.codebook_id for one in (estimate, posterior, nothing)} == {''}
+
+
 def test_a_mixture_that_cannot_be_located_is_dropped_and_logged(fusion, answer):
     # `check` drops such a message from a node: in the surface, there is no direction.
     fusion.handle(answer('front', place=np.zeros(3)), 0.0)

@@ -21,7 +21,8 @@ NUMBERS = {
     BaseStationSettings: {
         'ack_timeout_s': (0.1, 0.001, 60.0), 'step_timeout_s': (1.0, 0.01, 60.0),
         'retries': (3, 0, 100), 'rest_s': (0.1, 0.0, 3600.0),
-        'data_duration_s': (0.001, 1e-6, 10.0), 'max_users': (4096, 1, 4096),
+        'data_duration_s': (0.001, 1e-6, 10.0), 'handover_ratio': (1.02, 1.0, 1e3),
+        'max_users': (4096, 1, 4096),
         'ack_rate_hz': (200.0, 1.0, 1e6)},
     PositionerSettings: {'track_speed_mps': (1.0, 0.01, 1000.0)},
     TransmissionSettings: {'band': (-1, -1, 4095)},

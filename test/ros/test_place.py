@@ -9,9 +9,8 @@ import pytest
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import Site
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.fusion import Fusion
 from rhs_isac_ros.ros.place import Place
+from rhs_isac_ros.ros.roster import MEMBERS
 from rhs_isac_ros.support.fields import ParameterError
 
 FILE = str(Path(__file__).parents[2] / 'config' / 'site.yaml')
@@ -27,9 +26,12 @@ def place(namespace, site_file=FILE, scenario_file='', of_site=False):
     return Place.of(values, namespace, of_site)
 
 
-def listed(one, kinds):
-    return [(prefix, scenario.id, set(of_prefix))
-            for prefix, scenario, of_prefix in one.sources(kinds)]
+def listed(one, role):
+    """The classes of messages that a role receives, by prefix and scenario."""
+    found = {}
+    for kind, prefix, scenario in one.sources(MEMBERS[role].role.RECEIVES, MEMBERS[role].from_all):
+        found.setdefault((prefix, scenario.id), set()).add(kind)
+    return found
 
 
 def test_without_a_site_every_message_is_of_the_own_scenario():
@@ -37,7 +39,9 @@ def test_without_a_site_every_message_is_of_the_own_scenario():
     assert one.scenario.id == Scenario().id
     assert one.codebook is None
     assert one.seed(5) == 5
-    assert listed(one, Channel.RECEIVES) == [('', Scenario().id, set(Channel.RECEIVES))]
+    assert one.site_prefix == ''
+    for role in ('bs', 'channel'):
+        assert listed(one, role) == {('', Scenario().id): set(MEMBERS[role].role.RECEIVES)}
 
 
 @pytest.mark.parametrize(('namespace', 'base'), [('/side', ''), ('/lab/two/side', '/lab/two')])
@@ -45,26 +49,42 @@ def test_a_surface_receives_shared_messages_from_the_leader(site, namespace, bas
     one, (front, side) = place(namespace), site.surfaces.values()
     assert one.scenario.id == side.scenario.id != front.scenario.id
     assert one.codebook.id == side.codebook.id
-    shared = {m.GroundTruth, m.Pilot}
-    assert listed(one, Channel.RECEIVES) == [
-        ('', side.scenario.id, set(Channel.RECEIVES) - shared),
-        (f'{base}/front/', front.scenario.id, shared)]
+    assert listed(one, 'channel') == {
+        ('', side.scenario.id): {m.RhsConfiguration, m.Beam},
+        (f'{base}/front/', front.scenario.id): {m.GroundTruth, m.Pilot},
+        # All data are on one topic, and name the surface that carries them.
+        (f'{base}/front/', side.scenario.id): {m.Data}}
+    assert listed(one, 'transmission') == {
+        ('', side.scenario.id): {m.RhsConfiguration},
+        (f'{base}/', front.scenario.id): {m.PositionEstimate},
+        (f'{base}/front/', front.scenario.id): {m.GroundTruth}}
 
 
-def test_the_leader_receives_all_messages_from_itself(site):
-    one = place('/front')
-    assert {prefix for prefix, *_ in one.sources(Channel.RECEIVES)} == {'', '/front/'}
-    assert {scenario.id for _, scenario, _ in one.sources(Channel.RECEIVES)} == {
-        site.surfaces['front'].scenario.id}
+def test_the_base_station_receives_from_the_fusion_and_from_every_surface(site):
+    one, (front, side) = place('/lab/front'), site.surfaces.values()
+    every = {m.Beam, m.RhsConfiguration, m.Data}
+    assert listed(one, 'bs') == {
+        ('', front.scenario.id): {m.Ack, m.FeedSignals},
+        ('/lab/', front.scenario.id): {m.PositionEstimate, m.NoFix},
+        ('/lab/front/', front.scenario.id): every, ('/lab/side/', side.scenario.id): every}
+    assert one.site_prefix == '/lab/'
+
+
+def test_data_that_another_surface_carries_are_not_foreign(site, example):
+    one, (front, side) = place('/front'), site.surfaces.values()
+    assert one.carries_elsewhere(example(m.Data, scenario_id=side.scenario.id))
+    assert not one.carries_elsewhere(example(m.Data, scenario_id='other'))
+    assert not one.carries_elsewhere(example(m.Beam, scenario_id=side.scenario.id))
+    assert not place('/', '').carries_elsewhere(example(m.Data, scenario_id=front.scenario.id))
 
 
 @pytest.mark.parametrize(('namespace', 'base'), [('/', ''), ('/lab', '/lab')])
 def test_a_node_of_the_site_receives_the_messages_of_every_surface(site, namespace, base):
     one = place(namespace, of_site=True)
     assert one.scenario.id == site.surfaces['front'].scenario.id
-    assert listed(one, Fusion.RECEIVES) == [
-        (f'{base}/{name}/', of_name.scenario.id, set(Fusion.RECEIVES))
-        for name, of_name in site.surfaces.items()]
+    assert listed(one, 'fusion') == {
+        (f'{base}/{name}/', of_name.scenario.id): {m.Posterior, m.NoFix}
+        for name, of_name in site.surfaces.items()}
 
 
 def test_surfaces_have_seeds_of_their_own():
