@@ -66,7 +66,8 @@ def test_the_base_station_receives_from_the_fusion_and_from_every_surface(site):
     assert listed(one, 'bs') == {
         ('', front.scenario.id): {m.Ack, m.FeedSignals},
         ('/lab/', front.scenario.id): {m.PositionEstimate, m.NoFix},
-        ('/lab/front/', front.scenario.id): every, ('/lab/side/', side.scenario.id): every}
+        ('/lab/front/', front.scenario.id): {*every, m.Pilot},
+        ('/lab/side/', side.scenario.id): every}
     assert one.site_prefix == '/lab/'
 
 
