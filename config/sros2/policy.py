@@ -131,8 +131,10 @@ def _together(nodes: Mapping[str, Permissions]) -> Permissions:
 def _of_member(name: str, users: Iterable[int], place: Place) -> Permissions:
     """Return the permissions of a node of a role that serves some users."""
     member = MEMBERS[name]
-    received = (f'{source.prefix}{topics.NAMES[kind]}' for source in place.sources(
-        member.role.RECEIVES if member.role else ()) for kind in source.kinds)
+    received = [f'{source.prefix}{topics.NAMES[source.kind]}' for source in place.sources(
+        member.role.RECEIVES if member.role else (), member.from_all)]
+    if member.requires_of_site and place.site:
+        received.append(f'{place.site_prefix}{topics.PRESENCE}')
     sent = {name for topic in member.sent for name in (
         _of_users(users, topic) if '{user}' in topic else (topic,))}
     return Permissions(

@@ -68,8 +68,9 @@ def of_site():
 
 def test_a_surface_that_follows_may_read_some_topics_of_the_leader_and_publish_none(of_site):
     for name, expected in {
-            'channel': {'ground_truth', 'pilot'}, 'receiver': {'grant'}, 'optimizer': set(),
-            'positioner': set(), 'visualizer': set(), 'operator': set(), 'replay': set()}.items():
+            'channel': {'ground_truth', 'pilot', 'data'}, 'transmission': {'ground_truth'},
+            'receiver': {'grant'}, 'optimizer': set(), 'positioner': set(), 'visualizer': set(),
+            'operator': set(), 'replay': set()}.items():
         read = of_site[f'/lab/side/{name}']['subscribe']
         assert {one for one in read if one.startswith('/lab/front/')} == {
             f'/lab/front/{one}' for one in expected}
@@ -84,6 +85,14 @@ def test_the_fusion_may_read_what_the_surfaces_say_about_positions(of_site):
     assert of_site['/lab/fusion']['subscribe'] == {'/lab/presence', *(
         f'/lab/{name}/{topic}' for name in ('front', 'side')
         for topic in ('posterior', 'no_fix'))}
+
+
+def test_the_base_station_of_a_site_may_read_the_fusion_and_the_answers_of_all_surfaces(of_site):
+    assert of_site['/lab/front/bs']['subscribe'] == {
+        f'/lab/front/{topic}' for topic in ('ack', 'codebook', 'feed_signals', 'pilot', 'presence')
+    } | {f'/lab/{topic}' for topic in ('no_fix', 'position_estimate', 'presence')} | {
+        f'/lab/{name}/{topic}' for name in ('front', 'side')
+        for topic in ('beam', 'data', 'rhs/configuration')}
 
 
 def test_the_operator_of_a_site_has_the_permissions_of_those_of_its_surfaces(of_site):
