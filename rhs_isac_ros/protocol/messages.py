@@ -174,8 +174,8 @@ class Phase(enum.IntEnum):
 class Message:
     """Base of all messages.
 
-    The adapter to ROS sets `sender` and, unless the role has done so, `scenario_id` when a role
-    sends a message. It drops received messages of another scenario.
+    The adapter to ROS sets `sender` and, except for `Data` of a surface of the site, `scenario_id`
+    when a role sends a message. It drops received messages of another scenario.
     """
 
     cycle_id: int

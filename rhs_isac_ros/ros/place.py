@@ -77,8 +77,8 @@ class Place:
         """Namespace of the nodes of the whole site, with a final slash; empty without a site."""
         return f'{self.base}/' if self.site else ''
 
-    def carries_elsewhere(self, message: m.Message) -> bool:
-        """Return whether a message is `Data` that another surface of the site carries."""
+    def is_carried(self, message: m.Message) -> bool:
+        """Return whether a message is `Data` whose scenario is that of a surface of the site."""
         surfaces = self.site.surfaces.values() if self.site else ()
         return isinstance(message, m.Data) and message.scenario_id in (
             one.scenario.id for one in surfaces)

@@ -312,10 +312,11 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         if self.stands_by:
             return False
         stamp_ns = message.stamp_ns or self.get_clock().now().nanoseconds
+        scenario_id = message.scenario_id if self.place.is_carried(message) else self.scenario.id
         try:
             m.check(message, self.scenario)
             content = convert.to_bytes(
-                message, stamp_ns, (self.instance, message.scenario_id or self.scenario.id),
+                message, stamp_ns, (self.instance, scenario_id),
                 self.frame.name if isinstance(message, m.POSITIONS) else self.frame.surface)
         except m.MessageError as error:
             endpoints.journal(self).event(
@@ -344,7 +345,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def _on_foreign(self, scenario: Scenario, message: m.Message) -> None:
         """Count and log a message of another scenario, but no data of another surface."""
-        if self.place.carries_elsewhere(message):
+        if self.place.is_carried(message):
             return
         self.role.counters[events.Outcome.WRONG_SCENARIO.value] += 1
         endpoints.journal(self).event(

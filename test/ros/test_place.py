@@ -71,12 +71,12 @@ def test_the_base_station_receives_from_the_fusion_and_from_every_surface(site):
     assert one.site_prefix == '/lab/'
 
 
-def test_data_that_another_surface_carries_are_not_foreign(site, example):
+def test_data_of_a_surface_of_the_site_are_not_foreign(site, example):
     one, (front, side) = place('/front'), site.surfaces.values()
-    assert one.carries_elsewhere(example(m.Data, scenario_id=side.scenario.id))
-    assert not one.carries_elsewhere(example(m.Data, scenario_id='other'))
-    assert not one.carries_elsewhere(example(m.Beam, scenario_id=side.scenario.id))
-    assert not place('/', '').carries_elsewhere(example(m.Data, scenario_id=front.scenario.id))
+    assert one.is_carried(example(m.Data, scenario_id=side.scenario.id))
+    assert not one.is_carried(example(m.Data, scenario_id='other'))
+    assert not one.is_carried(example(m.Beam, scenario_id=side.scenario.id))
+    assert not place('/', '').is_carried(example(m.Data, scenario_id=front.scenario.id))
 
 
 @pytest.mark.parametrize(('namespace', 'base'), [('/', ''), ('/lab', '/lab')])
