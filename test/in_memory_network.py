@@ -31,6 +31,7 @@ from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     LogMessage,
     PeersChanged,
+    PrepareEstimator,
     PublishTrack,
     Reply,
     RevertSettings,
@@ -211,6 +212,8 @@ class Network:
         # Replies to operators.
         self.replies: list[Reply] = []
         self.tracks: list[PublishTrack] = []
+        # Estimators to prepare in the background, which is left out.
+        self.prepared: list[Any] = []
         self._ends: list[tuple[int, int, str]] = []
         self.codebooks = dict(library.by_id)
         if codebook is not None:
@@ -292,6 +295,8 @@ class Network:
                 self.publish(action.message, name)
             elif isinstance(action, BuildEstimator):
                 self._make_estimator(name, action)
+            elif isinstance(action, PrepareEstimator):
+                self.prepared.append(action.estimator)
             elif isinstance(action, ApplyPatterns):
                 self.dispatch(name, apply_patterns(self.front_end, action))
             elif isinstance(action, RevertSettings):

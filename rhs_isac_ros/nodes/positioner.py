@@ -83,6 +83,9 @@ class PositionerNode(LocatingNode[Positioner]):
         center = np.array([self.scenario.roi_center_m])
         estimator.estimate(simulate_received(
             self.scenario, codebook, center, np.random.default_rng(0))[0])
+        for cell in self.library.codebooks[:1]:
+            # The same applies to the first estimator without a table, whose imports take a second.
+            positioning.BayesEstimator(self.scenario, cell, lazy=True)
         return estimator
 
     def _on_progress(self, share: float) -> None:
@@ -101,13 +104,15 @@ class PositionerNode(LocatingNode[Positioner]):
             report, values={**report.values, 'table.progress': self._table})
 
     def execute(self, action: events.Action) -> None:
-        """Build an estimator in the background, or process another action."""
+        """Build or prepare an estimator in the background, or process another action."""
         match action:
             case events.BuildEstimator(codebook, settings):
                 make = functools.partial(self._make_estimator, settings)
                 self._worker.run(
                     functools.partial(build_estimator, codebook, make, time.perf_counter),
                     self._on_estimator)
+            case events.PrepareEstimator(estimator):
+                self._worker.run(estimator.prepare, lambda _: None)
             case _:
                 super().execute(action)
 

@@ -185,6 +185,10 @@ class SearchEstimator(abc.ABC):
             scope = scope._replace(drawn=DrawnPosterior(scenario, scope.table))
         return scope
 
+    def prepare(self) -> None:
+        """Compute the table of the region, unless it exists; any thread may call this."""
+        _ = self._region
+
     def _scopes(self, bent: Mixture) -> Iterator[Scope]:
         """Yield where a prior in (r [m], u, v) is, unless the table is there, and the region."""
         likelihood, grid = self._likelihood, lay_grid(self.scenario)

@@ -9,7 +9,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.frontend import Sounding
-from rhs_isac_ros.positioning import Estimator, TrackEstimate
+from rhs_isac_ros.positioning import Estimator, SearchEstimator, TrackEstimate
 from rhs_isac_ros.positioning.agreement import Pair
 from rhs_isac_ros.protocol.messages import Message
 
@@ -161,6 +161,13 @@ class BuildEstimator:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class PrepareEstimator:
+    """Compute the table of an estimator in the background, while the estimator is in use."""
+
+    estimator: SearchEstimator
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class ApplyPatterns:
     """Show configurations on the surface, one after the other, float64 [F, N_E].
 
@@ -192,8 +199,8 @@ class PublishTrack:
     stamp_ns: int = 0
 
 
-Action = (Send | LogMessage | Reply | BuildEstimator | ApplyPatterns | RevertSettings
-          | PublishTrack)
+Action = (Send | LogMessage | Reply | BuildEstimator | PrepareEstimator | ApplyPatterns
+          | RevertSettings | PublishTrack)
 
 
 class Kind(enum.Enum):

@@ -228,8 +228,8 @@ class Positioner(Role):
     `is_observed` whether anyone receives posteriors, which take a moment to convert.
 
     Estimates from a track propose the codebook of the `library` for the predicted position. The
-    estimator of such a codebook is created when it is first used. It computes a table of the
-    region only if a track does not explain the signals, or there is none.
+    estimator of such a codebook is created when it is first used. Its table of the region is
+    computed in the background, or when a track does not explain the signals, or there is none.
     """
 
     SENDS = (m.PositionEstimate, m.Posterior, m.NoFix)
@@ -321,9 +321,11 @@ class Positioner(Role):
         """Return whether there is an estimator; first create one for a codebook of the library."""
         settings, cell = self._settings.in_use, self._library.by_id.get(codebook_id)
         if cell and settings.prior == TRACK and codebook_id not in self._estimators:
-            self._put(_Job(cell, settings), BayesEstimator(
+            estimator = BayesEstimator(
                 self._scenario, cell, reject_outside=settings.reject_outside,
-                surface=self._surface, lazy=True))
+                surface=self._surface, lazy=True)
+            self._put(_Job(cell, settings), estimator)
+            self.act(events.PrepareEstimator(estimator))
         return codebook_id in self._estimators
 
     def _revert(self, job: _Job, reason: str) -> None:

@@ -52,6 +52,8 @@ from rhs_isac_ros.tools.site_demo import SiteObserver, report, start_others
 
 # Maximum time between two complete cycles [s].
 _CYCLE_TIMEOUT_S = 60.0
+# Speed of users whom codebooks follow; faster ones move too far between two cycles.
+_WALKING_MPS = 1.0
 # Period of checks [s].
 _PERIOD_S = 0.5
 _PHASES = (Phase.BEACONING, Phase.POSITIONING, Phase.ESTIMATING, Phase.TRANSMITTING)
@@ -85,9 +87,10 @@ def start_network(
         namespace: str = '', **given: Any) -> None:
     """Start each node of a network in a separate process; if `together`, the users share a node.
 
-    Users walk at random at the scenario's maximum speed. Each parameter in `given` applies to all
-    nodes that have it; None selects its default. A scenario other than Table I must also be given
-    as ``scenario_file``. With ``first_cycle=1``, the seed determines multipath and noise.
+    Users walk at random, by default at the scenario's maximum speed. Each parameter in `given`
+    applies to all nodes that have it; None selects its default. A scenario other than Table I must
+    also be given as ``scenario_file``. With ``first_cycle=1``, the seed determines multipath and
+    noise.
     """
     for role, member in ROSTER.items():
         known = {parameter.name for parameter in parameters.NODES[role]}
@@ -99,8 +102,8 @@ def start_network(
         for name, first, count in [('users', 1, users)] if together else [
                 (f'user_{user}', user, 1) for user in range(1, users + 1)]:
             processes.start(
-                role, name, namespace=namespace, **values, user_id=first, user_count=count,
-                mobility='random_walk', speed_mps=scenario.max_user_speed_mps)
+                role, name, namespace=namespace, user_id=first, user_count=count,
+                mobility='random_walk', **{'speed_mps': scenario.max_user_speed_mps, **values})
 
 
 def watch(
@@ -229,9 +232,10 @@ class _Demonstration:
             # Other radios have noise of their own.
             radio=options.radio, radio_options=options.radio_options,
             samples_folder=options.samples, receiver_noise=options.radio == 'emulated',
+            speed_mps=_WALKING_MPS if options.follow else None,
             # The parameter does not admit 0.
-            track_speed_mps=None if options.prior == REGION else max(
-                self.scenario.max_user_speed_mps, 0.01))
+            track_speed_mps=None if options.prior == REGION else _WALKING_MPS if options.follow
+            else max(self.scenario.max_user_speed_mps, 0.01))
 
     def observer(self, log: CycleLog) -> CycleObserver:
         """Create the observer of the cycles."""
@@ -373,8 +377,8 @@ def _parser() -> argparse.ArgumentParser:
     add('--prior', choices=PRIORS, default=REGION,
         help='prior of the positions: the region, or the track of each user')
     add('--follow', nargs='?', type=input_file, const=True, metavar='LIBRARY',
-        help='follow the tracks of the users with the codebooks of a library; by default, with '
-             'the band plan and its library')
+        help='follow the tracks of walking users, at 1 m/s, with the codebooks of a library; by '
+             'default, with the band plan and its library')
     add('--record', type=output_file, metavar='FILE', help='recording to write (MCAP)')
     add('--picture', type=picture_file, default='demo.png', metavar='FILE',
         help='file to draw: PNG, PDF or SVG')

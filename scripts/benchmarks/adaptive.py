@@ -181,7 +181,8 @@ def tracked(world: World, n: int, rng: np.random.Generator) -> dict:
     for _ in range(n):
         walk = RandomWalk(world.scenario, 1.0, rng)
         paths.append(np.array([walk.state(time_s)[0] for time_s in times_s]))
-    table = frame.Table('tracks', 'rms error [m]', 'in the 95 % region [%]', 'normalised error')
+    table = frame.Table('tracks', 'rms error [m]', 'in the 95 % region [%]', 'normalised error',
+                        'without a fix [%]')
     counted = times_s >= WARM_UP_S
     walk_of = np.repeat(np.arange(n), counted.sum())
     results, squared = {}, {}
@@ -190,15 +191,17 @@ def tracked(world: World, n: int, rng: np.random.Generator) -> dict:
             list(track(world, path, times_s, follows, rng)), object)[counted]]
         fixes = frame.Fixes.of(
             frame.stacked(estimates), np.concatenate([path[counted] for path in paths]))
-        squared[name] = fixes.squared
-        rms = [value**0.5 for value in frame.mean_interval(fixes.squared, walk_of)]
-        covered = frame.mean_interval(100.0 * fixes.inside, walk_of)
+        walk = walk_of[fixes.fix]
+        squared[name] = np.bincount(walk, fixes.squared) / np.bincount(walk)
+        rms = [value**0.5 for value in frame.mean_interval(fixes.squared, walk)]
+        covered = frame.mean_interval(100.0 * fixes.inside, walk)
         table.row(name, frame.shown(rms, 3), frame.shown(covered, 1),
-                  frame.shown(fixes.normalised.mean(), 2))
+                  frame.shown(fixes.normalised.mean(), 2), frame.shown(fixes.without_fix, 2))
         results |= {'rms_m' if follows else 'rms_fixed_m': rms,
                     'in_region' if follows else 'in_region_fixed': covered}
-    return results | {'ratio': np.sqrt(ratio_interval(*(
-        squared[name].reshape(n, -1).mean(axis=1) for name in ('following', 'fixed')))).tolist()}
+    ratio = np.sqrt(ratio_interval(squared['following'], squared['fixed'])).tolist()
+    print(f'\nratio of the rms errors {frame.shown(ratio, 3)}')
+    return results | {'ratio': ratio}
 
 
 def track(world: World, path: np.ndarray, times_s: np.ndarray, follows: bool,

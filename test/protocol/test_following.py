@@ -65,6 +65,8 @@ def test_codebooks_follow_a_walk(net, library, region):
     assert set(ids[2:]) <= set(library.by_id)
     assert len(set(ids[2:])) >= 3
     network.verify()
+    # Each estimator is prepared once.
+    assert len(network.prepared) == len(set(ids[2:]))
     # The watch on residuals goes on.
     assert network['positioner'].status()['residual.fixes'] == '40'
     assert not any('wrong' in reason for c in network.counters().values() for reason in c)
