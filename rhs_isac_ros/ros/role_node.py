@@ -197,6 +197,9 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def _load_library(self, file: str) -> Library:
         if not file:
             return EMPTY
+        if self.place.site:
+            # The fusion, which locates the users of a site, proposes no codebooks.
+            raise ParameterError(f'library_file: {file!r}, expected none in a site')
         with translated((CodebookError, OSError), ParameterError, 'library_file'):
             library = Library.load(file)
             library.check(self.scenario)

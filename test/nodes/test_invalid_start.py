@@ -27,6 +27,10 @@ CASES = {
     'unknown key': ('rhs_controller', {'scenario_file': 'unknown_key.yaml'},
                     ['unknown_key.yaml', 'n_feed:', 'n_feeds']),
     'no YAML': ('optimizer', {'scenario_file': 'broken.yaml'}, ['broken.yaml', 'cannot be read']),
+    'library in a site': (
+        'bs', ['-r', '__ns:=/front', '-p', f'site_file:={CONFIG}/site.yaml',
+               '-p', f'library_file:={CONFIG}/library_bandplan.npz'],
+        ['library_file: ', 'library_bandplan.npz', 'expected none in a site']),
     'band': ('transmission', {'band': 2}, ['band', '2', '0 to 1']),
     'position': ('user', {'position_m': [-2.0, 0.0, 0.0]},
                  ['position_m', '[-2.0, 0.0, 0.0]', 'in front of the surface']),
