@@ -131,10 +131,16 @@ def _moved(mixture: Mixture, reach_s: float, decay: float, noise: np.ndarray) ->
 
     `noise`, [2, 2], is the covariance of position and velocity that each axis gains.
     """
-    transition = np.kron([[1.0, reach_s], [0.0, decay]], np.eye(3))
+    transition = _for_each_axis(np.array([[1.0, reach_s], [0.0, decay]]))
     return Mixture(
         mixture.log_weights, mixture.means @ transition.T,
-        transition @ mixture.covariances @ transition.T + np.kron(noise, np.eye(3)))
+        transition @ mixture.covariances @ transition.T + _for_each_axis(noise))
+
+
+def _for_each_axis(matrix: np.ndarray) -> np.ndarray:
+    """Expand a matrix of position and velocity, [2, 2], to all axes, [6, 6]."""
+    # `np.kron` returns the same, but takes ten times as long.
+    return (matrix[:, None, :, None] * np.eye(3)[:, None]).reshape(6, 6)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
