@@ -38,6 +38,10 @@ CASES = {
     'mixed list': ('user', {'position_m': '[10, 0.0, 0.0]'}, ['position_m']),
     'codebook file': ('optimizer', {'codebook_file': 'short.yaml'},
                       ['short.yaml', 'codebook.analog', '799 values', '800']),
+    'library': ('bs', {'library_file': 'short.yaml'}, ['library_file', 'short.yaml', 'cannot be']),
+    'library of another scenario': (
+        'positioner', {'library_file': str(CONFIG / 'library_bandplan.npz')},
+        ['library_file: scenario: sc043027b08ab600bf, expected sc']),
     'no codebook file': ('optimizer', {'codebook_file': '/no/book.yaml'}, ['/no/book.yaml']),
     'another scenario': ('optimizer', {'scenario_file': 'one_feed.yaml'},
                          ['config/codebook.yaml', 'one_feed.yaml', 'digital', '(2, 8, 4, 3)',
