@@ -15,12 +15,12 @@ from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Event, LogMessage, Outcome, Timeout
 from rhs_isac_ros.protocol.receiver import Reception
-from rhs_isac_ros.protocol.role import ANY, Drops, NewestDict, Row, StateMachine, on
+from rhs_isac_ros.protocol.role import ANY, Drops, Row, StateMachine, on
 from rhs_isac_ros.protocol.settings import BaseStationSettings, PendingSettings
 from rhs_isac_ros.protocol.transmission import Carriers, Steering
 from rhs_isac_ros.protocol.user_registry import (
-    MAX_USERS,
     Admission,
+    Proposals,
     ServiceLog,
     UserRegistry,
     join_users,
@@ -114,9 +114,7 @@ class BaseStation(StateMachine):
         self._admission = _admission(settings)
         self._pause_requested = False  # whether a pause begins after the current cycle
         self._offered: Codebook | None = None  # codebook for the next beacon
-        self._library = library
-        # The estimate of each user in its latest cycle, and its time of arrival [s].
-        self._estimates: NewestDict[int, tuple[m.PositionEstimate, float]] = NewestDict(MAX_USERS)
+        self._proposals = Proposals(library)
         # Roles that are missing; None before the first report.
         self._missing: tuple[str, ...] | None = None
         self._cycle = Cycle(first_cycle_id - 1)
@@ -341,19 +339,11 @@ class BaseStation(StateMachine):
         self._lose_absent()
         self._cycle.user = self._users.select()
         self._cycle.user_instance = self._users.owner(self._cycle.user)
-        self._choose_codebook()
+        self._cycle.codebook = self._proposals.take(
+            self._cycle.user, self._cycle.user_instance, self.now_s) or self._cycle.codebook
         self._send(m.Grant)
         self._command_bands(event)
         self._announce(m.Phase.POSITIONING)
-
-    def _choose_codebook(self) -> None:
-        """Choose the codebook that the estimate of the user proposes, if the proposal holds."""
-        # A proposal serves once: after a cycle without an estimate, there is none.
-        estimate, time_s = self._estimates.pop(self._cycle.user, (None, 0.0))
-        if (estimate and self.now_s <= time_s + estimate.next_codebook_s
-                and m.same_instance(estimate.user_instance, self._cycle.user_instance)):
-            self._cycle.codebook = self._library.by_id.get(
-                estimate.next_codebook_id, self._cycle.codebook)
 
     def _lose_absent(self) -> None:
         """Count missed invitations, and remove the users that no longer answer."""
@@ -400,7 +390,7 @@ class BaseStation(StateMachine):
         self.send(self._cycle.received)
 
     def _store_estimate(self, event: m.PositionEstimate) -> None:
-        self._estimates.put(event.user, (event, self.now_s))
+        self._proposals.add(event, self.now_s)
 
     def _store_answer(self, event: m.Beam | m.RhsConfiguration) -> None:
         self._cycle.steering.add(self._surface(event), event)
@@ -433,7 +423,7 @@ class BaseStation(StateMachine):
     def _abandon(self, event: Timeout | m.NoFix) -> None:
         """End the cycle without service."""
         assert self.outcome
-        self._estimates.pop(self._cycle.user, None)
+        self._proposals.drop(self._cycle.user)
         self._end_cycle(self.outcome.value)
 
     def _finish(self, event: m.Data) -> None:

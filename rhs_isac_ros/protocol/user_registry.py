@@ -1,4 +1,4 @@
-"""The users of a base station: admission, turns, owners of their numbers, log of their service."""
+"""The users of a base station: admission, turns, owners of numbers, codebooks, log of service."""
 
 import bisect
 import collections
@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.codebook.library import Library
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, Outcome
 from rhs_isac_ros.protocol.role import NewestDict
@@ -293,6 +295,34 @@ class Admission:
 
 # Reasons for a lost cycle that concern one user. All others concern the whole network.
 _USER_REASONS = (Outcome.USER_GONE, Outcome.NO_FIX)
+
+
+class Proposals:
+    """The codebooks of a library that estimates propose for the next cycle of their users.
+
+    A proposal serves once: after a cycle without an estimate, there is none.
+    """
+
+    def __init__(self, library: Library) -> None:
+        self._library = library
+        # The latest estimate of each user, and its time of arrival [s].
+        self._estimates: NewestDict[int, tuple[m.PositionEstimate, float]] = NewestDict(MAX_USERS)
+
+    def add(self, estimate: m.PositionEstimate, now_s: float) -> None:
+        """Store the proposal of an estimate that arrives at a time [s]."""
+        self._estimates.put(estimate.user, (estimate, now_s))
+
+    def drop(self, user: int) -> None:
+        """Remove the proposal for a user."""
+        self._estimates.pop(user, None)
+
+    def take(self, user: int, instance: int, now_s: float) -> Codebook | None:
+        """Remove the proposal for a user; return its codebook if it holds at a time [s]."""
+        estimate, time_s = self._estimates.pop(user, (None, 0.0))
+        if (estimate and now_s <= time_s + estimate.next_codebook_s
+                and m.same_instance(estimate.user_instance, instance)):
+            return self._library.by_id.get(estimate.next_codebook_id)
+        return None
 
 
 class ServiceLog:
