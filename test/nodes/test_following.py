@@ -1,5 +1,6 @@
 """Codebooks of a library in a network of processes, and a node that lacks the library."""
 
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from rhs_isac_ros.codebook.library import Library
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros.diagnostics import subscribe_reports
 from rhs_isac_ros.ros.parameters import NODES
 from rhs_isac_ros.ros.roster import UNIQUE
 
@@ -32,6 +34,8 @@ def start(processes):
 def test_a_network_uses_its_library_until_a_node_lacks_it(start, make_watch):
     library, watch = Library.load(LIBRARY), make_watch()
     running = {role: start(role) for role in UNIQUE}
+    summaries = {}
+    subscribe_reports(watch.node, lambda name, report: summaries.update({name: report.summary}))
     running['user'] = start('user', user_id=1, position_m=[9.0, 1.5, 0.3])
 
     def followed():
@@ -46,7 +50,9 @@ def test_a_network_uses_its_library_until_a_node_lacks_it(start, make_watch):
     assert np.linalg.norm(estimate.position - [9.0, 1.5, 0.3]) < 1.0
     # The newer controller serves. Without the library, the base station does not count it.
     running['newer'] = start('rhs_controller', ['library_file'], name='newer')
-    for text in ('/newer: library of codebooks none, expected lib', 'waiting for rhs_controller'):
-        watch.until(lambda text=text: text in running['bs'].log, text, running.values())
-    running.pop('newer').end()
+    watch.until(lambda: '/newer: library of codebooks none' in summaries.get('bs', '')
+                and summaries.get('user') == 'blocked: no_beacon', 'a pause', running.values())
+    newer = running.pop('newer')
+    newer.signal(signal.SIGINT)
+    newer.wait()
     watch.until_served(2, processes=running.values())
