@@ -38,7 +38,7 @@ _N_TRIALS = 12
 _N_POSITIONS = 32
 _STEPS = 60
 _FORMAT = 1
-_ARRAYS = {'centres_m', 'spreads_m', 'analog', 'digital'}
+_ARRAYS = ('centres_m', 'spreads_m', 'analog', 'digital')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Library:
     def load(cls, path: str | Path) -> 'Library':
         """Read a file; raise CodebookError if it is no library, or damaged."""
         with translated((ValueError, TypeError), CodebookError, path):
-            arrays, about = read_archive(path, 'library of codebooks', _FORMAT, _ARRAYS)
+            arrays, about = read_archive(path, 'library of codebooks', _FORMAT, {*_ARRAYS})
             lengths = {len(array) for array in arrays.values()}
             if len(lengths) != 1 or arrays['centres_m'].shape[1:] != (3,):
                 raise CodebookError(f'lengths {sorted(lengths)}, expected one for all arrays')

@@ -163,8 +163,9 @@ def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np
                 raise ValueError('more than 256 MiB of arrays')
             return {key: file[key] for key in found}
     # Reading verifies the checksum of every array. A header may declare any shape.
-    except (OSError, ValueError, EOFError, NotImplementedError, SyntaxError, KeyError, MemoryError,
-            OverflowError, RecursionError, zipfile.BadZipFile) as error:
+    # `zipfile` raises RuntimeError for an entry that is marked as encrypted.
+    except (OSError, ValueError, EOFError, RuntimeError, SyntaxError, KeyError, MemoryError,
+            OverflowError, zipfile.BadZipFile) as error:
         reason = ' '.join(str(error).split())
         raise ArchiveError(f'{path}: cannot be read: {reason}') from error
 
