@@ -8,13 +8,15 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped, Vector3
 from nav_msgs.msg import Odometry
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.positioning import TrackEstimate
 from rhs_isac_ros.protocol.events import PublishTrack
-from rhs_isac_ros.protocol.messages import Message, PositionEstimate
+from rhs_isac_ros.protocol.messages import Message, MessageError, PositionEstimate
 from rhs_isac_ros.protocol.presences import Presence
 from rhs_isac_ros.ros import cdr, frames
 from rhs_isac_ros.ros.frames import Frame
@@ -82,6 +84,14 @@ def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
     deserialize.
     """
     return _CODECS[kind].decode(serialized)
+
+
+def deserialize(content: bytes, kind: type) -> Any:
+    """Return a message of any ROS type; raise MessageError if it has no valid serialization."""
+    try:
+        return deserialize_message(content, kind)
+    except rclpy_implementation.RMWError as error:
+        raise MessageError(f'{kind.__name__}: {str(error).partition(",")[0]}') from error
 
 
 def stamp_of(message: Message | PublishTrack, node: Any) -> Time:

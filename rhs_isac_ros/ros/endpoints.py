@@ -160,12 +160,22 @@ def subscribe(
         raw: bool = False, overridable: bool = False) -> None:
     """Subscribe to a topic of a ROS type; a `raw` callback receives serialized bytes (CDR).
 
-    Parameters ``qos_overrides.*`` change the quality of service of an `overridable` topic.
+    The node logs that it drops a message without a valid serialization. Parameters
+    ``qos_overrides.*`` change the quality of service of an `overridable` topic.
     """
+    def deserialize(content: bytes) -> None:
+        try:
+            message = convert.deserialize(content, kind)
+        except m.MessageError as error:
+            log_dropped(node, error)
+            return
+        callback(message)
     # A copy, as in `create_publisher`.
     own = copy.copy(profile)
+    # A subscription of rclpy that is not raw drops an invalid message without a word, and leaves
+    # the error to the next call that fails.
     create_or_refuse(node, f'subscription to {name}', lambda: node.create_subscription(
-        kind, name, callback, own, raw=raw,
+        kind, name, callback if raw else deserialize, own, raw=True,
         qos_overriding_options=_overriding(overridable),
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False)))
 

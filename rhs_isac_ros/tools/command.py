@@ -16,7 +16,6 @@ from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 from rclpy.utilities import try_shutdown
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
@@ -191,7 +190,7 @@ def recorded(
         kind = by_topic[topic]
         with translated((m.MessageError, CodebookError), RecordingError, f'{path}: {topic}'):
             if kind is Report:
-                array = deserialize_message(content, DiagnosticArray)
+                array = convert.deserialize(content, DiagnosticArray)
                 yield from ((pair, time_s) for pair in diagnostics.from_ros(array, namespace))
             elif kind is Codebook:
                 codebook = convert.from_bytes(convert.CodebookMessage, content).codebook()

@@ -10,6 +10,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
+from rclpy.serialization import serialize_message
 
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.nodes import bs
@@ -40,6 +41,20 @@ def test_a_message_is_created_once_for_all_topics_with_subscribers(bench, probe)
     endpoints.publish_if_subscribed(publishers, make)
     bench.until(lambda: len(received) == 2, 'the messages')
     assert received == 2 * made
+
+
+def test_the_node_logs_that_it_drops_an_invalid_message(bench, probe, capfd):
+    publisher = endpoints.create_publisher(probe, Point, 'point', endpoints.EXCHANGE)
+    received = []
+    endpoints.subscribe(probe, Point, 'point', received.append, endpoints.EXCHANGE)
+    bench.until(publisher.get_subscription_count, 'the subscription')
+    content = serialize_message(Point(x=1.0))
+    for one in (content[:8], content[:12], content):
+        publisher.publish(one)
+    bench.until(lambda: received == [Point(x=1.0)], 'the valid message')
+    text = capfd.readouterr().err
+    assert 'dropped: Point: failed to deserialize ROS message' in text
+    assert 'rcutils' not in text
 
 
 @pytest.fixture

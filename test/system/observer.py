@@ -8,7 +8,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
 from ros_messages import codebook_from_ros
 
 import rhs_isac_msgs.msg as ros
@@ -18,6 +17,7 @@ from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import diagnostics, topics
+from rhs_isac_ros.ros.convert import deserialize
 from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, subscribe
 from rhs_isac_ros.ros.recording import CycleObserver
 from system import invariants
@@ -101,9 +101,8 @@ class NetworkObserver(CycleObserver):
             self, kind: type, name: str, profile: QoSProfile,
             callback: Callable[[Any], None]) -> None:
         def receive(serialized: bytes) -> None:
-            # rclpy raises a RuntimeError without a public name for bytes that are no message.
-            with contextlib.suppress(CodebookError, RuntimeError, ValueError):
-                callback(deserialize_message(serialized, kind))
+            with contextlib.suppress(CodebookError, ValueError):
+                callback(deserialize(serialized, kind))
         subscribe(self, kind, name, receive, profile, raw=True)
 
     def _on_codebook(self, message: ros.Codebook) -> None:
