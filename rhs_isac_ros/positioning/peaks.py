@@ -26,10 +26,10 @@ class RangeWindows:
     def __init__(self, grid: Grid, wavenumbers: np.ndarray) -> None:
         self._cell = grid.cell
         counts = np.ceil(grid.widths_m / grid.widths_m.min() - 1e-9).astype(int)
-        self._of_cell = of_cell = Segments.of_counts(counts)
-        self.width_m = of_cell.repeat(grid.widths_m / counts)
-        low_m = of_cell.repeat(grid.ranges_m - grid.widths_m / 2)
-        self.range_m = low_m + (of_cell.places + 0.5) * self.width_m
+        self._of_cell = Segments.of_counts(counts)
+        self.width_m = self._of_cell.repeat(grid.widths_m / counts)
+        low_m = self._of_cell.repeat(grid.ranges_m - grid.widths_m / 2)
+        self.range_m = low_m + (self._of_cell.places + 0.5) * self.width_m
         self.turns = turns_at(wavenumbers, self.range_m).astype(np.complex64)
 
     def of(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -37,10 +37,9 @@ class RangeWindows:
 
         Returns the index from 0 to K - 1 of each window's pair, and of the window, int [W].
         """
-        ranges = self._cell[cells]
-        of_pair = Segments.of_counts(self._of_cell.counts[ranges])
-        pair = of_pair.repeat(np.arange(len(cells)))
-        return pair, of_pair.repeat(self._of_cell.starts[ranges]) + of_pair.places
+        first, counts = (field[self._cell[cells]] for field in self._of_cell)
+        of_pair = Segments.of_counts(counts)
+        return of_pair.repeat(np.arange(len(cells))), of_pair.repeat(first) + of_pair.places
 
 
 class Candidates(NamedTuple):
@@ -66,10 +65,10 @@ class Peaks(NamedTuple):
 
 
 class PeakFinder:
-    """Search for peaks in windows, with known or with uniform phases of the bands.
+    """Search for peaks in windows, in which the bands' carriers [N_B] [1/m] turn along the range.
 
-    Known phases: the log-likelihood is evaluated at fine steps across a window, in which the
-    carriers, float64 [N_B] [1/m], rotate. Uniform phases: it hardly changes within a window.
+    With known phases, the log-likelihood is evaluated at fine steps across a window. With uniform
+    phases of the bands, it hardly changes within a window.
     """
 
     def __init__(self, width_m: float, wavelength_m: float, carriers: np.ndarray) -> None:
@@ -79,10 +78,11 @@ class PeakFinder:
         self._offsets_m = (np.arange(n_steps + 2) - (n_steps + 1) / 2) * self._step_m
         turns = np.exp(1j * carriers * self._offsets_m[:, None])
         self._turns = np.ascontiguousarray(turns.T.astype(np.complex64))
+        # The real part of the product with complex outputs, as a product of real numbers.
         self._rotation = (2 * np.hstack([turns.real, -turns.imag])).astype(np.float32)
 
     def find(self, windows: Candidates, query: Query) -> Peaks:
-        """Find all peaks in windows; their order follows the steps, not the shots."""
+        """Find all peaks, at least one of each shot; their order follows the steps."""
         if query.prior.is_coarse:
             return self._centres(windows, query)
         return self._maxima(windows, query)
@@ -102,10 +102,7 @@ class PeakFinder:
             outputs = windows.outputs
             along = self._rotation @ np.concatenate([outputs.real, outputs.imag])
         along, gain = _over_gain(along, windows, query)
-        is_peak = along[1:-1] >= along[:-2]
-        is_peak &= along[1:-1] > along[2:]
-        step, window = np.nonzero(is_peak)
-        step += 1
+        step, window = _inner_maxima(along, Segments.of_keys(windows.shots))
         # The vertex of a parabola through a maximum and the steps beside it.
         before, highest, after = (along[step + side, window] for side in (-1, 0, 1))
         slope, bend = (after - before) / 2, 2 * highest - after - before
@@ -119,6 +116,24 @@ class PeakFinder:
             1j * self._carriers * (range_m - centre_m)[:, None])
         return Peaks(windows.shots[window], windows.cell[window], centre_m, range_m, value,
                      gain[step, window], outputs)
+
+
+def _inner_maxima(along: np.ndarray, of_shot: Segments) -> tuple[np.ndarray, np.ndarray]:
+    """Return step and window of the local maxima of values [S, W], int [P] each.
+
+    The values of a shot have no maximum if the wavelength is far longer than the region. Its
+    highest value between the ends of a window is then returned.
+    """
+    inner = along[1:-1]
+    is_peak = inner >= along[:-2]
+    is_peak &= inner > along[2:]
+    has_peak = of_shot.max(is_peak.max(axis=0))
+    for rows, is_found in zip(of_shot.slices, has_peak.tolist(), strict=True):
+        if not is_found:
+            values = inner[:, rows]
+            is_peak[:, rows][np.unravel_index(values.argmax(), values.shape)] = True
+    step, window = np.nonzero(is_peak)
+    return step + 1, window
 
 
 def _amplified(turns: np.ndarray, windows: Candidates, query: Query) -> np.ndarray:

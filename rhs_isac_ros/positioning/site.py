@@ -44,8 +44,9 @@ class SiteSurface:
 class Site:
     """Surfaces by their names, and the region of interest in the frame of the site.
 
-    Raises SiteError without surfaces, if a name is no name of a ROS namespace, if a codebook does
-    not fit, or if the region of a scenario does not contain that of the site.
+    Raises SiteError without surfaces, if a name is no name of a ROS namespace, if two surfaces
+    have the same scenario and pose, if a codebook does not fit, or if the region of a scenario
+    does not contain that of the site.
     """
 
     surfaces: Mapping[str, SiteSurface]
@@ -55,10 +56,16 @@ class Site:
         """Check the surfaces."""
         if not self.surfaces:
             raise SiteError('surfaces: none, expected at least one')
+        names: dict[str, str] = {}
         for name, one in self.surfaces.items():
             if not re.fullmatch('[a-z][a-z0-9_]*', name):
                 raise SiteError(f'surfaces: {name!r}, expected a name of small letters, digits '
                                 'and underscores')
+            # Messages name their surface by the identifier of its scenario.
+            same = names.setdefault(one.scenario.id, name)
+            if same != name:
+                raise SiteError(f'{same}, {name}: pose {one.pose.position_m} m, expected surfaces '
+                                'with different scenarios or poses')
             with translated(ValueError, SiteError, name):
                 one.codebook.check(one.scenario)
             low, high = one.scenario.roi_bounds_m
