@@ -23,27 +23,41 @@ from rhs_isac_ros.support.threads import one_blas_thread
 
 # Smallest number of common users. A pose has six unknowns, and a user yields up to three numbers.
 MIN_USERS = 10
-# Standard deviations by which mixtures are widened in successive steps [m]: from the first pose,
-# and from a pose in its neighbourhood.
-_WIDTHS_M = tuple(3.0 * 0.7**np.arange(16))
-_NEAR_WIDTHS_M = _WIDTHS_M[11:]
-# Number of poses in the neighbourhood, and their standard deviations [m] and [rad]. Positions have
-# ambiguities half a metre apart, so the likelihood of a pose has several maxima.
-_N_NEAR, _NEAR_STD = 64, np.repeat([0.3, np.deg2rad(1.0)], 3)
-# Maximum number of steps with the mixtures as they are; they end when no element of the error
-# changes by more than the second number [m] or [rad].
-_MAX_STEPS, _MIN_CHANGE = 50, 1e-5
-# Logarithm of the smallest probability of a candidate; others only cost time.
-_MIN_LOG_WEIGHT = -6.0
-# Maximum number of maxima around which errors are sampled, number of samples of each, a power of
-# two, and factor by which they are wider than a Gaussian.
-_MAX_MAXIMA, _N_SAMPLES, _SPREAD = 4, 128, 1.5
-# Distance of maxima that are the same one [m] and [rad].
-_SAME = 1e-3
+
+
+class _Limits(NamedTuple):
+    """Numbers that trade the speed of the search for a pose for its reliability."""
+
+    # Standard deviations by which mixtures are widened in successive steps [m]; from a pose in the
+    # neighbourhood of the first result, only the last ones.
+    widths_m: tuple[float, ...] = tuple((3.0 * 0.7**np.arange(16)).tolist())
+    near_widths: int = 5
+    # Number of poses in the neighbourhood, and their standard deviations [m] and [rad]. Positions
+    # have ambiguities half a metre apart, so the likelihood of a pose has several maxima.
+    near: int = 64
+    near_std: tuple[float, float] = (0.3, float(np.deg2rad(1.0)))
+    # Maximum number of steps with the mixtures as they are; they end when no element of the error
+    # changes by more than the second number [m] or [rad].
+    steps: int = 50
+    change: float = 1e-5
+    # Logarithm of the smallest probability of a candidate; others only cost time.
+    log_weight: float = -6.0
+    # Maximum number of maxima around which errors are sampled, distance of maxima that are the
+    # same one [m] and [rad], number of samples of each, a power of two, and factor by which they
+    # are wider than a Gaussian.
+    maxima: int = 4
+    same: float = 1e-3
+    samples: int = 128
+    spread: float = 1.5
+    # Largest standard deviations of a result [m] and [rad]: beyond them, users do not determine
+    # the pose.
+    std_m: float = 2.0
+    std_rad: float = 0.2
+
+
+_LIMITS = _Limits()
 # Information of a prior that keeps undetermined errors finite: 10 m and 1 rad.
 _PRIOR = np.diag(1 / np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])**2)
-# Largest standard deviation of a result [m] and [rad]: beyond it, users do not determine the pose.
-_MAX_STD_M, _MAX_STD_RAD = 2.0, 0.2
 
 
 class PoseError(ValueError):
@@ -78,12 +92,12 @@ def estimate_pose(
         raise PoseError(f'sightings: {len(reference)} and {len(other)}, expected equal numbers, '
                         f'at least {MIN_USERS}')
     pairs = _Pairs.of(reference, other, bounds_m)
-    pose = pairs.climb(other[0].pose, _WIDTHS_M)[1]
-    near = [pairs.climb(pose.displaced(error), _NEAR_WIDTHS_M)
-            for error in standard_normal(_N_NEAR, 6) * _NEAR_STD]
+    pose = pairs.climb(other[0].pose, _LIMITS.widths_m)[1]
+    near = [pairs.climb(pose.displaced(error), _LIMITS.widths_m[-_LIMITS.near_widths:])
+            for error in standard_normal(_LIMITS.near, 6) * np.repeat(_LIMITS.near_std, 3)]
     score, pose = max(near, key=lambda found: found[0].value)
     std = np.sqrt(np.diagonal(score.covariance()))
-    if not (std[:3].max() <= _MAX_STD_M and std[3:].max() <= _MAX_STD_RAD):
+    if not (std[:3].max() <= _LIMITS.std_m and std[3:].max() <= _LIMITS.std_rad):
         raise PoseError(
             f'users: standard deviations of the pose up to {std[:3].max():.2g} m and '
             f'{np.rad2deg(std[3:].max()):.2g} deg, expected users at more different places')
@@ -101,14 +115,14 @@ def _moments(pairs: '_Pairs', pose: Pose, found: Sequence[tuple['_Score', Pose]]
     components: list[tuple[float, np.ndarray, np.ndarray]] = []
     for score, maximum in found:
         error = pose.error_of(maximum)
-        if not any(np.abs(error - known).max() < _SAME for _, known, _ in components):
+        if not any(np.abs(error - known).max() < _LIMITS.same for _, known, _ in components):
             covariance = score.covariance()
             log_weight = score.value + np.linalg.slogdet(covariance)[1] / 2
             components.append((log_weight, error, covariance))
-    components = sorted(components, key=lambda one: -one[0])[:_MAX_MAXIMA]
+    components = sorted(components, key=lambda one: -one[0])[:_LIMITS.maxima]
     proposal = Mixture(*map(np.array, zip(*components, strict=True))).normalised()
-    proposal = proposal._replace(covariances=_SPREAD**2 * proposal.covariances)
-    normal = standard_normal(_N_SAMPLES, 6)
+    proposal = proposal._replace(covariances=_LIMITS.spread**2 * proposal.covariances)
+    normal = standard_normal(_LIMITS.samples, 6)
     errors = np.concatenate([mean + normal @ root.T for mean, root in zip(
         proposal.means, np.linalg.cholesky(proposal.covariances), strict=True)])
     density = proposal._replace(log_weights=np.zeros(len(components))).log_density(errors)
@@ -124,7 +138,7 @@ def _thickened(sighting: Sighting) -> Mixture:
     it is nearer by d^2 / (2 r), whose mean and variance are added to the Gaussian.
     """
     pose, mixture = sighting.pose, sighting.mixture.normalised()
-    mixture = select(mixture, mixture.log_weights >= _MIN_LOG_WEIGHT)
+    mixture = select(mixture, mixture.log_weights >= _LIMITS.log_weight)
     means = pose.to_surface(mixture.means)
     covariances = pose.covariances_to_surface(mixture.covariances)
     range_m = np.linalg.norm(means, axis=1)
@@ -190,11 +204,11 @@ class _Pairs(NamedTuple):
 
     def climb(self, pose: Pose, widths_m: Sequence[float]) -> tuple[_Score, Pose]:
         """Return the nearest maximum of the likelihood, and the derivatives there."""
-        for width_m in (*widths_m, *(0.0,) * _MAX_STEPS):
+        for width_m in (*widths_m, *(0.0,) * _LIMITS.steps):
             score = self.score(pose, width_m)
             step = step_to_maximum(score.paired + _PRIOR, score.gradients.sum(axis=0))
             pose = pose.displaced(step)
-            if not width_m and np.abs(step).max() < _MIN_CHANGE:
+            if not width_m and np.abs(step).max() < _LIMITS.change:
                 break
         return self.score(pose, 0.0), pose
 

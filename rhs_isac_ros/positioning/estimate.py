@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable
-from typing import NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -16,11 +16,6 @@ from rhs_isac_ros.model.gaussian import symmetric
 _MAX_MAGNITUDE = 1e3
 # Standard deviation that every coordinate of a position has, so that covariances have inverses.
 _MIN_STD_M = 1e-5
-# The fields of an `Estimate` of one shot: mean [3], covariance [3, 3] and reason, optionally
-# followed by the four other fields.
-Located: TypeAlias = (
-    tuple[np.ndarray, np.ndarray, str]
-    | tuple[np.ndarray, np.ndarray, str, float, float, float, float])
 _EstimateT = TypeVar('_EstimateT', bound='Estimate')
 
 
@@ -98,10 +93,11 @@ def regular(covariances: np.ndarray) -> np.ndarray:
 
 def estimate_each(
         scenario: Scenario, codebook: Codebook, received: np.ndarray,
-        locate: Callable[[np.ndarray], Iterable[Located]]) -> Estimate:
+        locate: Callable[[np.ndarray], Iterable[tuple[Any, ...]]]) -> Estimate:
     """Check received signals, locate every shot, and return an estimate of matching shape.
 
-    `locate` takes checked signals, [N, N_B, N_SB F], and yields a `Located` for each shot. If
+    `locate` takes checked signals, [N, N_B, N_SB F]. For each shot, it yields the mean [3], the
+    covariance [3, 3] and the reason of an `Estimate`, optionally followed by its other fields. If
     the reason is not empty, mean and covariance are ignored. Raises SignalError if the shape is
     wrong, a value is not a finite number, or a magnitude exceeds 1000.
     """

@@ -1,11 +1,12 @@
 """Estimators that search for the modes of the posterior: `bayes` and `ml`."""
 
 import abc
+import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,19 +16,12 @@ from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.gaussian import moments, share_of_level
 from rhs_isac_ros.model.geometry import to_positions
 from rhs_isac_ros.model.measurement import Surface
-from rhs_isac_ros.positioning.alternatives import (
-    ALTERNATIVES,
-    Alternative,
-    Blocked,
-    Outside,
-    rejection,
-)
+from rhs_isac_ros.positioning.alternatives import Alternative, Blocked, Outside, rejection
 from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.draws import DrawnPosterior
 from rhs_isac_ros.positioning.estimate import (
     Estimate,
     Fit,
-    Located,
     checked_received,
     estimate_each,
     regular,
@@ -51,7 +45,6 @@ from rhs_isac_ros.positioning.posterior import (
     draw_samples,
 )
 from rhs_isac_ros.positioning.prior import (
-    MAX_COMPONENTS,
     MIN_EXTENT_M,
     PRIOR_MARGIN,
     WRONG,
@@ -227,28 +220,24 @@ class SearchEstimator(abc.ABC):
         """
         batch = checked_received(self._likelihood.codebook, received)
         signals = self._likelihood.signals(batch)
-        if prior is None:
-            ((located, modes),) = self._locate_block(self._region, signals, draws=True)
-            if modes is None and not located[2]:
-                # The position is an average over draws, as in `estimate`; a search yields modes.
-                ((_, modes),) = self._locate_block(self._region, signals, draws=False)
-            found = uniform(modes, self._bounds).normalised() if modes else None
-            is_elsewhere = False
-        else:
-            located, modes, found, is_elsewhere = self._update(signals, prior, wrong, share)
-        return Posterior(Estimate(*located), modes, signals,
-                         found and flatten(found, self.scenario.pose), is_elsewhere)
+        if prior is not None:
+            return self._update(signals, prior, wrong, share)
+        ((estimate, modes),) = self._locate_block(self._region, signals, draws=True)
+        if modes is None and not estimate.reason:
+            # The position is an average over draws, as in `estimate`; a search yields modes.
+            ((_, modes),) = self._locate_block(self._region, signals, draws=False)
+        return Posterior(estimate, modes, signals, modes and flatten(
+            uniform(modes, self._bounds).normalised(), self.scenario.pose))
 
-    def _update(self, signals: Signals, prior: Mixture, wrong: float, share: float
-                ) -> tuple[Located, Modes | None, Mixture | None, bool]:
-        """Return position, modes, mixture in (r [m], u, v), and `Posterior.is_elsewhere`."""
+    def _update(self, signals: Signals, prior: Mixture, wrong: float, share: float) -> Posterior:
+        """Compute the posterior with a mixture as prior; see `posterior`."""
         pose, extent = self.scenario.pose, self._bounds[1] - self._bounds[0]
         region = (pose.to_site(self._bounds.mean(axis=0)), pose.covariances_to_site(
             np.diag(np.maximum(extent, MIN_EXTENT_M)**2)))
         # The component for the whole region comes last.
         before = bend(prior.or_within(*region, wrong), pose)
         for scope in self._scopes(select(before, slice(-1))):
-            ((located, modes),) = self._locate_block(scope, signals, draws=False)
+            ((estimate, modes),) = self._locate_block(scope, signals, draws=False)
             if modes is None:
                 continue
             products = multiply(
@@ -256,8 +245,8 @@ class SearchEstimator(abc.ABC):
             if not is_doubtful(products.energy / self._level, self._n_measurements):
                 break
         if modes is None:
-            return located, None, None, False
-        found, estimate = products.bent, Estimate(*located)
+            return Posterior(estimate, None, signals)
+        found = products.bent
         blocked, outside = np.nan_to_num(
             [float(estimate.blocked_probability), float(estimate.outside_probability)])
         if blocked:
@@ -267,39 +256,42 @@ class SearchEstimator(abc.ABC):
             everywhere = uniform(modes, self._bounds, share).log_mass
             found = concatenate(found, before.weighted(everywhere + odds))
         found, mean, covariance = inside(
-            found.reduce(MAX_COMPONENTS), self._bounds, self.normal[:_N_NARROW])
-        return (mean, covariance, *located[2:]), modes, found, products.is_last
+            found.reduce(), self._bounds, self.normal[:_N_NARROW])
+        return Posterior(dataclasses.replace(estimate, mean=mean, covariance=covariance), modes,
+                         signals, flatten(found, pose), products.is_last)
 
     @abc.abstractmethod
     def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
         """Return positions, [N, 3], and covariances, [N, 3, 3], of N shots."""
 
-    def _locate(self, batch: np.ndarray) -> Iterable[Located]:
+    def _locate(self, batch: np.ndarray) -> Iterable[tuple[Any, ...]]:
         signals = self._likelihood.signals(batch)
         parts = map_blocks(
             lambda block: self._locate_block(self._region, select(signals, block), draws=True),
             blocks(len(batch), _BLOCK))
-        return (located for located, _ in itertools.chain.from_iterable(parts))
+        return (tuple(vars(one).values()) for one, _ in itertools.chain.from_iterable(parts))
 
     def _locate_block(self, scope: Scope, signals: Signals, draws: bool
-                      ) -> list[tuple[Located, Modes | None]]:
-        """Locate shots together; with `draws`, draw positions if the search is too long."""
-        energies = np.sum(np.abs(signals.received)**2, axis=(1, 2)) / self.scenario.noise_power_w
-        reasons = [self._test.min_energy_test(energy) for energy in energies.tolist()]
-        (usable,) = np.nonzero([not reason for reason in reasons])
-        found = self._locate_usable(scope, select(signals, usable), draws)
-        return [((*_no_fix(), reason), None) if reason else next(found) for reason in reasons]
+                      ) -> list[tuple[Estimate, Modes | None]]:
+        """Return the estimate and the modes of each of several shots.
 
-    def _locate_usable(self, scope: Scope, signals: Signals, draws: bool
-                       ) -> Iterator[tuple[Located, Modes | None]]:
-        """Yield the position and the modes of each shot; modes are None without a position."""
-        aligned = scope.alignment.values_of_each(signals.received)
-        whitened = self._likelihood.whitened(aligned, signals)
-        for (fit, modes), *shot in zip(
-                self._fits(scope, signals, aligned, whitened, draws), whitened, aligned,
-                strict=True):
-            located = self._judge(scope.alternatives, fit, *shot)
-            yield located, None if located[2] else modes
+        With `draws`, positions are drawn if the search for modes would be too long. The modes are
+        None after draws and without a position.
+        """
+        energies = np.sum(np.abs(signals.received)**2, axis=(1, 2)) / self.scenario.noise_power_w
+        found: list[tuple[Estimate, Modes | None]] = [
+            (Estimate(*_no_fix(), self._test.min_energy_test(energy)), None)
+            for energy in energies.tolist()]
+        usable = [row for row, (estimate, _) in enumerate(found) if not estimate.reason]
+        if usable:
+            signals = select(signals, usable)
+            aligned = scope.alignment.values_of_each(signals.received)
+            whitened = self._likelihood.whitened(aligned, signals)
+            fits = self._fits(scope, signals, aligned, whitened, draws)
+            for row, (fit, modes), *shot in zip(usable, fits, whitened, aligned, strict=True):
+                estimate = self._judge(scope.alternatives, fit, *shot)
+                found[row] = estimate, None if estimate.reason else modes
+        return found
 
     def _fits(self, scope: Scope, signals: Signals, aligned: np.ndarray, whitened: np.ndarray,
               draws: bool) -> list[tuple[Fit, Modes | None]]:
@@ -358,7 +350,7 @@ class SearchEstimator(abc.ABC):
         return modes, dict.fromkeys(shots, [self._dispersed or self._likelihood])
 
     def _judge(self, alternatives: Sequence[Alternative], fit: Fit, whitened: np.ndarray,
-               aligned: np.ndarray) -> Located:
+               aligned: np.ndarray) -> Estimate:
         """Return the position of one shot, or the reason why there is none."""
         log_weights = np.array([fit.log_evidence, *(
             one.log_odds + one.log_evidence_of(
@@ -371,11 +363,10 @@ class SearchEstimator(abc.ABC):
         # Without a fix, only a residual that nothing explains is evidence against the scenario.
         counts = (reason == self._test.residual_test(fit.residual) if reason
                   else probabilities[0] >= 1 - _DOUBT_LIMIT)
-        by_name = {one.name: float(share) for one, share in zip(
-            alternatives, probabilities[1:], strict=True)}
-        outside, blocked = (by_name.get(kind.name, np.nan) for kind in ALTERNATIVES)
-        expected = fit.expected if counts else np.nan
-        return mean, covariance, reason, fit.residual, expected, outside, blocked
+        return Estimate(
+            mean, covariance, reason, fit.residual, fit.expected if counts else np.nan,
+            **{f'{one.name}_probability': float(share) for one, share in zip(
+                alternatives, probabilities[1:], strict=True)})
 
     def _covariance(self, fit: Fit) -> np.ndarray:
         """Return the covariance, scaled to the multipath level that the residual indicates."""

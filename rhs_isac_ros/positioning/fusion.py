@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import log_sum, mixture_weights, read_only, untied
+from rhs_isac_ros.model.arrays import log_sum, mixture_weights, untied
 from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximum, symmetric
 from rhs_isac_ros.model.geometry import (
     jacobian,
@@ -32,7 +32,7 @@ from rhs_isac_ros.model.geometry import (
 )
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.estimate import regular
-from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.mixture import Mixture, log_volume
 from rhs_isac_ros.positioning.posterior import Posterior
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.templates import standard_normal
@@ -40,27 +40,33 @@ from rhs_isac_ros.support.threads import one_blas_thread
 
 # Number of modes of each surface that are used.
 MAX_MODES = 32
-# Number of components of a posterior.
-MAX_COMPONENTS = 48
+
+
+class _Limits(NamedTuple):
+    """Numbers that trade the speed of a product for its accuracy."""
+
+    # Gauss-Newton steps of every product, then further steps of those that are kept. A first step
+    # from one sheet to another one that is nearly parallel may be far too long.
+    steps: tuple[int, int] = (2, 3)
+    # After each of the two, products with a log-weight below the best by more than this are
+    # discarded, and so are the lightest ones beyond a number.
+    margins: tuple[float, float] = (40.0, 12.0)
+    products: tuple[int, int] = (400, 64)
+    # Number of samples of a product, and factor by which they are wider than its Gaussian. Two
+    # sheets that touch have a product with more weight at its borders.
+    samples: int = 128
+    spread: float = 1.2
+    # Information of a prior that keeps matrices invertible, relative to a uniform one in the
+    # region, and smallest extent of the region along an axis [m].
+    floor: float = 1e-3
+    extent_m: float = 0.01
+    # Smallest cosine of the angle between boresight and the maximum of a mode.
+    cosine: float = 0.05
+
+
+_LIMITS = _Limits()
 # Probability that a mixture does not contain the position of a user in sight.
 _MISS_PROBABILITY = 1e-3
-# Information of a prior that keeps matrices invertible, relative to a uniform prior in the region.
-_FLOOR = 1e-3
-# Smallest extent of the region along an axis [m].
-_MIN_EXTENT_M = 0.01
-# Gauss-Newton steps of every product, then further steps of those that are kept. A first step from
-# one sheet to another one that is nearly parallel may be far too long.
-_FIRST_STEPS, _LAST_STEPS = 2, 3
-# After each of the two, products with a log-weight below the best by more than this are discarded,
-# and so are the lightest ones beyond a number.
-_FIRST_MARGIN, _LAST_MARGIN = 40.0, 12.0
-_N_FIRST, _N_LAST = 400, 64
-# Number of samples of a product, and factor by which they are wider than its Gaussian. Two sheets
-# that touch have a product with more weight at its borders.
-_N_SAMPLES = 128
-_SPREAD = 1.2
-# Smallest cosine of the angle between boresight and the maximum of a mode.
-_MIN_COSINE = 0.05
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,7 +89,7 @@ class Sighting:
         modes = select(posterior.modes, slice(MAX_MODES))
         points = modes.centres
         # The maximum of a mode on the border of the region may be far outside.
-        valid = np.sum(points[:, 1:]**2, axis=1) < 1 - _MIN_COSINE**2
+        valid = np.sum(points[:, 1:]**2, axis=1) < 1 - _LIMITS.cosine**2
         valid &= np.abs(points[:, 0] / modes.points[:, 0] - 1) < 0.5
         points = np.where(valid[:, None], points, modes.points)
         rise = np.sum(modes.gradient * (points - modes.points), axis=1) / 2
@@ -91,7 +97,7 @@ class Sighting:
         covariances = symmetric(
             by_point @ np.linalg.inv(modes.curvature) @ np.swapaxes(by_point, 1, 2))
         mixture = Mixture(
-            modes.log_likelihood + rise + _log_volume(covariances),
+            modes.log_likelihood + rise + log_volume(covariances),
             pose.to_site(to_positions(points)), pose.covariances_to_site(covariances))
         blocked = float(np.nan_to_num(posterior.estimate.blocked_probability))
         return cls(pose, mixture, blocked + (1 - blocked) * _MISS_PROBABILITY)
@@ -123,7 +129,7 @@ class Fuser:
 
     def __init__(self, bounds_m: np.ndarray) -> None:
         """Take the bounds of the region in the frame of the site, float64 [2, 3] [m]."""
-        extent = np.maximum(np.ptp(bounds_m, axis=0), _MIN_EXTENT_M)
+        extent = np.maximum(np.ptp(bounds_m, axis=0), _LIMITS.extent_m)
         self._bounds_m = bounds_m.mean(axis=0) + np.outer([-0.5, 0.5], extent)
         self._log_volume = float(np.log(extent).sum())
         self._sheets = functools.cache(lambda one: _Sheets.of(one, self._bounds_m))
@@ -148,7 +154,7 @@ class Fuser:
         # At least one surface sees the user.
         products = select(products, ~products.are_constant(sheets))
         mixture = products.restricted(sheets, self._bounds_m)
-        return Fused(mixture.normalised().reduce(MAX_COMPONENTS),
+        return Fused(mixture.normalised().reduce(),
                      mixture.log_mass + (len(sheets) - 1) * self._log_volume)
 
 
@@ -170,15 +176,14 @@ class _Sheets(NamedTuple):
         by_point = pose.rotation @ jacobian(points)
         curvature = (np.swapaxes(by_point, 1, 2)
                      @ np.linalg.solve(mixture.covariances, by_point))
-        log_peaks = mixture.log_weights - _log_volume(mixture.covariances)
-        sheets = cls(pose, points, symmetric(curvature), log_peaks, mixture.means)
-        found = _Products.of(sheets).climb([sheets], bounds_m, _LAST_STEPS)
+        sheets = cls(pose, points, symmetric(curvature), mixture.log_peaks, mixture.means)
+        found = _Products.of(sheets).climb([sheets], bounds_m, _LIMITS.steps[1])
         log_total = log_sum(found.log_weights) - np.log1p(-sighting.missing)
         log_constant = np.log(sighting.missing) - np.log(np.ptp(bounds_m, axis=0)).sum()
         return cls(
             pose, np.append(points, points[:1], axis=0),
             np.append(sheets.curvature, np.zeros((1, 3, 3)), axis=0),
-            np.append(log_peaks - log_total, log_constant),
+            np.append(mixture.log_peaks - log_total, log_constant),
             np.append(found.positions, bounds_m.mean(axis=0)[None], axis=0))
 
     def logarithm(self, rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
@@ -225,8 +230,10 @@ class _Products(NamedTuple):
         alone = self.are_constant(sheets)[first, None]
         found = found._replace(
             positions=np.where(alone, sheets[-1].best_m[last], found.positions))
-        found = found.climb(sheets, bounds_m, _FIRST_STEPS).heaviest(_FIRST_MARGIN, _N_FIRST)
-        return found.climb(sheets, bounds_m, _LAST_STEPS).heaviest(_LAST_MARGIN, _N_LAST)
+        for stage in zip(_LIMITS.steps, _LIMITS.margins, _LIMITS.products, strict=True):
+            found = found.climb(sheets, bounds_m, stage[0])
+            found = found.heaviest(*stage[1:], found.are_constant(sheets))
+        return found
 
     def climb(self, sheets: Sequence[_Sheets], bounds_m: np.ndarray, n_steps: int
               ) -> '_Products':
@@ -252,26 +259,31 @@ class _Products(NamedTuple):
     @property
     def log_weights(self) -> np.ndarray:
         """Logarithms of the masses, float64 [T]."""
-        return self.log_peaks + _log_volume(np.linalg.inv(self.curvature))
+        return self.log_peaks + log_volume(np.linalg.inv(self.curvature))
 
-    def heaviest(self, margin: float, number: int) -> '_Products':
-        """Return the heaviest products; raise ValueError if none is finite."""
+    def heaviest(self, margin: float, number: int, constant: np.ndarray) -> '_Products':
+        """Return the heaviest products, among them one that is not constant; mask [T] `constant`.
+
+        Raises ValueError if none of these is finite.
+        """
         log_weights = self.log_weights
-        if not np.isfinite(log_weights).any():
+        order = np.argsort(-log_weights, kind='stable')
+        best = log_weights[order[~constant[order]][0]]
+        if not np.isfinite(best):
             raise ValueError('sightings: no finite product, expected mixtures in front of their '
                              'surfaces')
-        order = np.argsort(-log_weights, kind='stable')[:number]
-        return select(self, order[log_weights[order] >= log_weights[order[0]] - margin])
+        order = order[:number]
+        return select(self, order[log_weights[order] >= best - margin])
 
     def restricted(self, sheets: Sequence[_Sheets], bounds_m: np.ndarray) -> Mixture:
         """Return the mixture of the products inside the bounds, with the moments of samples."""
-        normal = _normal()
+        normal = standard_normal(_LIMITS.samples)
         information = self.curvature + _region_information(bounds_m, 0.25)
-        covariances = _SPREAD**2 * np.linalg.inv(information)
+        covariances = _LIMITS.spread**2 * np.linalg.inv(information)
         roots = np.linalg.cholesky(covariances)
         positions, log_density = self._bent(
             np.matmul(normal, np.swapaxes(roots, 1, 2)), sheets)
-        log_density -= np.sum(normal**2, axis=1) / 2 + _log_volume(covariances)[:, None]
+        log_density -= np.sum(normal**2, axis=1) / 2 + log_volume(covariances)[:, None]
         logs = sum(one.logarithm(rows, positions)
                    for one, rows in zip(sheets, self.rows.T, strict=True)) - log_density
         inside = ((positions >= bounds_m[0]) & (positions <= bounds_m[1])).all(axis=-1)
@@ -309,12 +321,6 @@ class _Products(NamedTuple):
         return positions, log_factor
 
 
-@functools.cache
-def _normal() -> np.ndarray:
-    """Return points that represent a standard Gaussian, float64 [S, 3], read-only."""
-    return read_only(standard_normal(_N_SAMPLES))
-
-
 def _step_inside(positions: np.ndarray, gradient: np.ndarray, curvature: np.ndarray,
                  bounds_m: np.ndarray) -> np.ndarray:
     """Return the steps to the maxima between the bounds, float64 [T, 3] [m]."""
@@ -334,12 +340,6 @@ def _step_inside(positions: np.ndarray, gradient: np.ndarray, curvature: np.ndar
     return limited
 
 
-def _region_information(bounds_m: np.ndarray, share: float = _FLOOR) -> np.ndarray:
+def _region_information(bounds_m: np.ndarray, share: float = _LIMITS.floor) -> np.ndarray:
     """Return a share of the information of a uniform prior, float64 [3, 3] [1/m^2]."""
     return np.diag(12 * share / np.ptp(bounds_m, axis=0)**2)
-
-
-def _log_volume(covariances: np.ndarray) -> np.ndarray:
-    """Return logarithms of integrals of Gaussians with the maximum 1, float64 [C]."""
-    log_volume: np.ndarray = (3 * np.log(2 * np.pi) + np.linalg.slogdet(covariances)[1]) / 2
-    return log_volume

@@ -12,6 +12,8 @@ from rhs_isac_ros.model.arrays import log_sum, mixture_weights
 from rhs_isac_ros.model.gaussian import likelihood_loss, moments, symmetric
 from rhs_isac_ros.positioning.segments import concatenate, select
 
+# Number of components of a posterior of one phase.
+MAX_COMPONENTS = 48
 # Components whose squared Mahalanobis distance is below this are merged.
 _MERGE_DISTANCE = 1.0
 # Components whose log-weight is below the heaviest by more than this are discarded.
@@ -38,6 +40,11 @@ class Mixture(NamedTuple):
         """Weights of the components with the sum 1, float64 [C]."""
         return mixture_weights(self.log_weights)[0]
 
+    @property
+    def log_peaks(self) -> np.ndarray:
+        """Logarithms of the densities of the components at their means, float64 [C]."""
+        return self.log_weights - log_volume(self.covariances)
+
     def normalised(self) -> 'Mixture':
         """Return the mixture with a mass of 1."""
         return self.weighted(-self.log_mass)
@@ -49,7 +56,7 @@ class Mixture(NamedTuple):
     def powered(self, exponent: float) -> 'Mixture':
         """Return the mixture with the density of each component raised to a power."""
         powered = self._replace(covariances=self.covariances / exponent)
-        return powered.weighted(exponent * self._log_peaks() - powered._log_peaks())
+        return powered.weighted(exponent * self.log_peaks - powered.log_peaks)
 
     def widened(self, covariance: np.ndarray) -> 'Mixture':
         """Return the mixture after independent errors, [D, D] or [C, D, D]; the mass stays."""
@@ -91,7 +98,7 @@ class Mixture(NamedTuple):
         precision = np.linalg.inv(self.covariances)
         offsets = points[..., None, :] - self.means
         squares = np.einsum('...cp,cpq,...cq->...c', offsets, precision, offsets)
-        logs = self._log_peaks() - squares / 2
+        logs = self.log_peaks - squares / 2
         highest = logs.max(axis=-1, keepdims=True)
         density: np.ndarray = highest[..., 0] + np.log(np.exp(logs - highest).sum(axis=-1))
         return density
@@ -103,7 +110,8 @@ class Mixture(NamedTuple):
         normal = rng.standard_normal((n, self.means.shape[1], 1))
         return self.means[chosen] + np.matmul(roots, normal)[..., 0]
 
-    def reduce(self, max_components: int, distance: float = _MERGE_DISTANCE) -> 'Mixture':
+    def reduce(self, max_components: int = MAX_COMPONENTS, distance: float = _MERGE_DISTANCE
+               ) -> 'Mixture':
         """Merge components close to a heavier one; discard light ones and any beyond the maximum.
 
         A component is close to another one if its squared Mahalanobis distance from it, with the
@@ -146,12 +154,6 @@ class Mixture(NamedTuple):
             pairs.means + np.matmul(gain, offsets[..., None])[..., 0],
             symmetric(pairs.covariances - np.matmul(gain, pairs.covariances[:, :size])))
 
-    def _log_peaks(self) -> np.ndarray:
-        """Return the logarithms of the densities of the components at their means, [C]."""
-        size = self.means.shape[1]
-        return self.log_weights - (
-            np.linalg.slogdet(self.covariances)[1] + size * np.log(2 * np.pi)) / 2
-
     def _merged(self, group: np.ndarray) -> 'Mixture':
         """Merge the components of each group; discard group -1."""
         members = np.equal.outer(np.arange(group.max() + 1), group)
@@ -162,3 +164,10 @@ class Mixture(NamedTuple):
         size = means.shape[1]
         covariances = (shares @ spread.reshape(len(group), -1)).reshape(-1, size, size)
         return Mixture(log_weights, means, covariances)
+
+
+def log_volume(covariances: np.ndarray) -> np.ndarray:
+    """Return logarithms of integrals of Gaussians with the maximum 1, for [C, D, D], [C]."""
+    size = covariances.shape[-1]
+    volume: np.ndarray = (size * np.log(2 * np.pi) + np.linalg.slogdet(covariances)[1]) / 2
+    return volume

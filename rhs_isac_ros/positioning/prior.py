@@ -26,47 +26,54 @@ from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.estimate import regular
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Grid, Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
-from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.mixture import Mixture, log_volume
 from rhs_isac_ros.positioning.region import Restricted, move_inside
 from rhs_isac_ros.positioning.search import EXACT_MARGIN, Modes
 from rhs_isac_ros.positioning.segments import concatenate, select
 
-# Number of components of a posterior.
-MAX_COMPONENTS = 48
 # Probability that a prior does not hold.
 WRONG = 0.1
-# Reach of a component in the search, in standard deviations of each coordinate, and negative
-# logarithm of the density at its end, by which modes there may be less likely than others.
-# Components whose squared Mahalanobis distance is below a limit are searched together.
-_REACH = 4.0
-_N_BOXES = 12
-_SAME_BOX = 9.0
-PRIOR_MARGIN = _REACH**2 / 2
-# Maximum number of products of a component and a mode, and of those at which the likelihood is
-# evaluated.
-_PRODUCTS = 160
-_EXACT = 16
+# Smallest extent of the region of which modes are part without a prior [m].
+MIN_EXTENT_M = 1.0
+
+
+class _Limits(NamedTuple):
+    """Numbers that trade the speed of an update for its accuracy; weights are logarithms."""
+
+    # Reach of a component in the search, in standard deviations of each coordinate. Components
+    # whose squared Mahalanobis distance is below a limit are searched together.
+    reach: float = 4.0
+    boxes: int = 12
+    same_box: float = 9.0
+    # Maximum number of products of a component and a mode, and of those at which the likelihood is
+    # evaluated.
+    products: int = 160
+    exact: int = 16
+    # Components with a smaller weight, or with a smaller density in the region relative to their
+    # largest one, do not contribute to moments.
+    weight: float = -9.0
+    density: float = 0.01
+    # Smallest x of a position [m], and smallest cosine of its angle from boresight in curvatures;
+    # no user is behind the surface.
+    x_m: float = 1e-3
+    cosine: float = 0.05
+    # Share of true priors that are doubted.
+    doubt: float = 0.02
+
+
+_LIMITS = _Limits()
+# Negative logarithm of the density at the end of a component's reach, by which modes there may be
+# less likely than others.
+PRIOR_MARGIN = _LIMITS.reach**2 / 2
 # Log-likelihood of a mode that the search has missed, relative to the best mode. The search finds
 # all modes above this value.
 _FLOOR = -(EXACT_MARGIN + PRIOR_MARGIN)
-# Components with a smaller log-weight, or with a smaller density in the region relative to their
-# largest one, do not contribute to moments.
-_LEAST_WEIGHT = -9.0
-_LEAST_DENSITY = 0.01
-# Smallest extent of the region of which modes are part without a prior [m].
-MIN_EXTENT_M = 1.0
-# Smallest x of a position [m], and smallest cosine of its angle from boresight in curvatures; no
-# user is behind the surface.
-_MIN_X_M = 1e-3
-_MIN_COSINE = 0.05
-# Share of true priors that are doubted.
-_DOUBT = 0.02
 
 
 def bend(mixture: Mixture, pose: Pose) -> Mixture:
     """Convert a mixture of the site to (r [m], u, v) around a surface; other coordinates stay."""
     positions = pose.to_surface(mixture.means[:, :3])
-    positions[:, 0] = np.maximum(positions[:, 0], _MIN_X_M)
+    positions[:, 0] = np.maximum(positions[:, 0], _LIMITS.x_m)
     points = to_polar(positions)
     bent = _converted(mixture, points, polar_derivative(points) @ pose.rotation.T)
     # The second derivative of the range is the projection across the line of sight over the range.
@@ -86,7 +93,7 @@ def flatten(bent: Mixture, pose: Pose) -> Mixture:
     mixture = _converted(
         bent, pose.to_site(to_positions(points)), pose.rotation @ jacobian(points))
     # Of the position, only x = r (1 - u^2 - v^2)^(1/2) is curved in u and v.
-    w = np.sqrt(np.maximum(1 - np.sum(cosines**2, axis=1), _MIN_COSINE**2))[:, None, None]
+    w = np.sqrt(np.maximum(1 - np.sum(cosines**2, axis=1), _LIMITS.cosine**2))[:, None, None]
     bending = -points[:, :1, None] * (
         np.eye(2) / w + cosines[:, :, None] * cosines[:, None, :] / w**3)
     shift_m, variance_m2 = _moments_of_square(bending, bent.covariances[:, 1:3, 1:3])
@@ -118,10 +125,10 @@ def cells_of(bent: Mixture, grid: Grid, resolution: Resolution) -> np.ndarray:
     half = np.column_stack([
         grid.widths_m[grid.cell] / 2,
         np.tile(PHASE_ERROR * resolution.direction, (len(grid.cell), 1))])
-    merged = bent.position().reduce(_N_BOXES, _SAME_BOX)
+    merged = bent.position().reduce(_LIMITS.boxes, _LIMITS.same_box)
     points, chosen = grid.points, np.zeros(len(grid.cell), bool)
     for mean, covariance in zip(merged.means, merged.covariances, strict=True):
-        reach = _REACH * np.sqrt(np.diagonal(covariance))
+        reach = _LIMITS.reach * np.sqrt(np.diagonal(covariance))
         chosen |= (np.abs(points - mean) <= reach + half).all(axis=1)
     return chosen
 
@@ -153,14 +160,15 @@ def multiply(bent: Mixture, modes: Modes, share: float, likelihood: Likelihood |
     log_weights, precision = _evidence(offsets, bent.covariances[:, :3, :3], spread[:, None])
     log_weights += share * modes.log_likelihood[:, None] + bent.log_weights
     mode, component = np.unravel_index(
-        np.argsort(-log_weights, axis=None, kind='stable')[:_PRODUCTS], log_weights.shape)
+        np.argsort(-log_weights, axis=None, kind='stable')[:_LIMITS.products], log_weights.shape)
     chosen = select(bent, component)._replace(log_weights=log_weights[mode, component])
     found = _shifted(chosen, precision[mode, component], offsets[mode, component])
     if likelihood is not None:
         # The heaviest products come first.
-        exact = _exact(select(bent, component[:_EXACT]), found.means[:_EXACT, :3], share,
-                       likelihood, signals)
-        found = concatenate(exact, select(found, slice(_EXACT, None)))
+        n = _LIMITS.exact
+        exact = _exact(
+            select(bent, component[:n]), found.means[:n, :3], share, likelihood, signals)
+        found = concatenate(exact, select(found, slice(n, None)))
     # The best mode comes first.
     floor, _ = _evidence(np.zeros(3), bent.covariances[:, :3, :3], spread[0])
     floor += share * (modes.log_likelihood[0] + _FLOOR)
@@ -220,7 +228,7 @@ def is_doubtful(energy: float, n: int) -> bool:
     """Return whether an energy of `Products`, of n numbers, is unusual for a true prior."""
     from scipy.special import gammainccinv
 
-    return energy > float(gammainccinv(n, _DOUBT))
+    return energy > float(gammainccinv(n, _LIMITS.doubt))
 
 
 def uniform(modes: Modes, bounds_m: np.ndarray, share: float = 1.0) -> Mixture:
@@ -230,8 +238,8 @@ def uniform(modes: Modes, bounds_m: np.ndarray, share: float = 1.0) -> Mixture:
     """
     covariances = np.linalg.inv(modes.curvature) / share
     extent_m = np.maximum(np.ptp(bounds_m, axis=0), MIN_EXTENT_M)
-    log_mass = (np.log(np.linalg.det(jacobian(modes.points))) + 1.5 * np.log(2 * np.pi)
-                + np.linalg.slogdet(covariances)[1] / 2 - np.log(extent_m).sum())
+    log_mass = (np.log(np.linalg.det(jacobian(modes.points))) + log_volume(covariances)
+                - np.log(extent_m).sum())
     return Mixture(share * modes.log_likelihood + log_mass, modes.points, covariances)
 
 
@@ -243,7 +251,7 @@ def inside(bent: Mixture, bounds_m: np.ndarray, normal: np.ndarray
     and covariance of the position inside. `normal`, float64 [S, 3], contains points that represent
     a standard Gaussian.
     """
-    heavy = bent.log_weights >= bent.log_mass + _LEAST_WEIGHT
+    heavy = bent.log_weights >= bent.log_mass + _LIMITS.weight
     bent, light = select(bent, heavy), select(bent, ~heavy)
     precision = np.linalg.inv(bent.covariances[:, :3, :3])
     points = to_polar(np.clip(to_positions(bent.means[:, :3]), *bounds_m))
@@ -251,7 +259,7 @@ def inside(bent: Mixture, bounds_m: np.ndarray, normal: np.ndarray
     gaussians = Restricted.of(
         points, np.matmul(precision, offsets[..., None])[..., 0], precision, bounds_m)
     peaks = gaussians.logarithm(gaussians.nearest()[:, None])[:, 0]
-    reaches = peaks - likelihood_loss(offsets, precision) >= np.log(_LEAST_DENSITY)
+    reaches = peaks - likelihood_loss(offsets, precision) >= np.log(_LIMITS.density)
     chosen = reaches if reaches.any() else np.ones(len(reaches), bool)
     bent, gaussians = select(bent, chosen), select(gaussians, chosen)
     positions, log_ratio = gaussians.sample(normal)

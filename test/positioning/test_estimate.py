@@ -24,14 +24,6 @@ def test_the_error_for_another_shape_names_field_shape_and_expectation(small, sh
     assert message.startswith(f'received: shape {shape}, expected [N_B, N_SB F] = (1, 6)')
 
 
-@pytest.mark.parametrize('value', [np.nan, np.inf, 1j * np.nan])
-def test_values_that_are_not_finite_are_errors(small, value):
-    signals = np.zeros((3, 1, 6), complex)
-    signals[1, 0, 4] = value
-    with pytest.raises(SignalError, match='^received: not finite, expected finite signals'):
-        checked_received(small.codebook, signals)
-
-
 def test_a_position_behind_the_surface_is_no_fix(small):
     places = np.array([[8.0, 1.0, 0.0], [-8.0, 1.0, 0.0]])
     found = estimate_each(small.scenario, small.codebook, np.zeros((2, 1, 6)), lambda batch: (

@@ -172,20 +172,3 @@ def test_signals_without_a_position_have_no_mixture(table1_estimator, model):
     found = table1_estimator.posterior(signals, around(PLACE))
     assert found.mixture is None
     assert 'residual' in found.estimate.reason
-
-
-@pytest.mark.slow
-def test_errors_have_the_stated_covariance(shipped, model):
-    """Positions drawn from the prior, with a table of the prior's cells alone."""
-    rng, normalised = np.random.default_rng(12), []
-    centres = Scenario(roi_size_m=(8, 8, 1)).sample_positions(300, rng)
-    places = centres + 0.2 * rng.standard_normal(centres.shape)
-    for centre, place in zip(centres, places, strict=True):
-        estimator = BayesEstimator(Scenario(), shipped, lazy=True)
-        found = estimator.posterior(
-            model.sample(place[None], rng)[0], around(centre, 0.2)).estimate
-        offset = found.mean - place
-        normalised.append(offset @ np.linalg.solve(found.covariance, offset))
-    # The standard errors are 1.3 % and 0.14.
-    assert 0.91 < np.mean(np.array(normalised) <= REGION_RADIUS) < 0.99
-    assert np.mean(normalised) == pytest.approx(3.0, abs=0.6)
