@@ -18,8 +18,9 @@ from rhs_isac_ros.model.arrays import blocks, log_sum
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
 from rhs_isac_ros.model.geometry import element_positions, to_positions
-from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers, groups
+from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers
 from rhs_isac_ros.positioning.likelihood import NuisancePrior
+from rhs_isac_ros.positioning.segments import Segments
 from rhs_isac_ros.support.threads import map_blocks
 
 # Above this probability, a position is less probable than its alternatives.
@@ -307,17 +308,16 @@ def _template_ranges(scenario: Scenario, ranges: np.ndarray) -> tuple[np.ndarray
     """
     resolution = Resolution.of(scenario)
 
-    def node(first: int, end: int) -> float:
+    def midway(first: np.ndarray | int, end: np.ndarray | int) -> np.ndarray:
         # Midway in 1 / r, the curvature causes the same error at both ends.
-        return float(2 / (1 / ranges[first] + 1 / ranges[end - 1]))
+        return 2 / (1 / ranges[first] + 1 / ranges[end - 1])
 
     def fits(first: int, end: int) -> bool:
-        ends_m, node_m = ranges[[first, end - 1]], node(first, end)
+        ends_m, node_m = ranges[[first, end - 1]], midway(first, end)
         errors = (resolution.curvature_m * np.abs(1 / ends_m - 1 / node_m)
                   + np.abs(ends_m - node_m) / resolution.delay_m)
         return bool(errors.max() <= GRID.phase_error)
 
-    shared = groups(len(ranges), fits)
-    index = np.repeat(np.arange(len(shared), dtype=np.int64),
-                      [end - first for first, end in shared])
-    return np.array([node(*ends) for ends in shared]), index
+    shared = Segments.as_long_as(fits, len(ranges))
+    return (midway(shared.starts, shared.ends),
+            shared.repeat(np.arange(len(shared.starts), dtype=np.int64)))

@@ -54,8 +54,6 @@ class SearchLimits(NamedTuple):
 
 
 LIMITS = SearchLimits()
-
-
 # Squared Mahalanobis distance below which points belong to the same mode.
 _SAME_MODE = 2.0
 # Largest distance at which points are compared, in radii of the ellipsoid.
@@ -163,28 +161,28 @@ class TemplateTable:
 
         Also returns the posteriors of the shots for which `draw` has returned one.
         """
-        loss, shots = self.cells.loss, np.arange(len(query.bound))[:, None]
+        bound, loss, shots = query.bound, self.cells.loss, np.arange(len(query.bound))[:, None]
         # The cells with the highest bounds determine how likely peaks in the others must be.
-        n_first = min(self._limits.first_cells, query.bound.shape[1])
-        first = np.sort(np.argpartition(query.bound, -n_first, axis=1)[:, -n_first:], axis=1)
+        n_first = min(self._limits.first_cells, bound.shape[1])
+        first = np.sort(np.argpartition(bound, -n_first, axis=1)[:, -n_first:], axis=1)
         peaks = self._peaks_in(np.repeat(shots, n_first), first.ravel(), query)
         best = np.full(len(shots), -np.inf)
         np.maximum.at(best, peaks.shots, peaks.value)
-        limit = best[:, None] - query.margin
-        likely = query.bound + loss >= limit
-        likely[shots, first] = False
+        limit = np.broadcast_to(best[:, None] - query.margin, bound.shape)
+        is_likely = bound + loss >= limit
+        is_likely[shots, first] = False
         drawn = {}
         if draw:
-            many = np.count_nonzero(likely, axis=1) > self._limits.searched_cells
+            many = np.count_nonzero(is_likely, axis=1) > self._limits.searched_cells
             weak = np.flatnonzero(many & (best <= self._limits.drawn_likelihood)).tolist()
             drawn = {shot: fit for shot in weak if (fit := draw(query, shot)) is not None}
-            likely[[*drawn]] = False
+            is_likely[[*drawn]] = False
             peaks = select(peaks, ~np.isin(peaks.shots, [*drawn]))
-        others, cells = np.nonzero(likely)
+        others, cells = np.nonzero(is_likely)
         if len(others):
             peaks = concatenate(peaks, self._peaks_in(others, cells, query))
-        limit = np.broadcast_to(limit, likely.shape)[peaks.shots, peaks.cell]
-        peaks = select(peaks, peaks.value + loss[peaks.cell] >= limit)
+        peaks = select(
+            peaks, peaks.value + loss[peaks.cell] >= limit[peaks.shots, peaks.cell])
         peaks = select(peaks, np.lexsort((-peaks.value, peaks.shots)))
         peaks = select(peaks, Segments.of_keys(peaks.shots).places < self._limits.peaks)
         radii = self._resolution.separation(query.prior.is_coarse)
@@ -201,7 +199,7 @@ class TemplateTable:
         grid, outputs = self.grid, query.outputs
         amplitude = np.empty((len(outputs), len(grid.node)), np.float32)
         turns = np.swapaxes(self._cell_turns, 1, 2)
-        for nodes, cells, pairs in grid.segments:
+        for nodes, cells, pairs in grid.shells:
             by_range = np.abs(np.matmul(turns[:, cells], outputs[..., nodes])).sum(axis=1)
             dense = ((grid.cell[pairs] - cells.start) * by_range.shape[2]
                      + grid.node[pairs] - nodes.start)
@@ -250,47 +248,52 @@ class TemplateTable:
     def _step(self, query: Query, peaks: Peaks, points: np.ndarray, values: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:
         """Compute a Gauss-Newton step [P, 3] for each peak; predict its new log-likelihood [P]."""
-        cells, node, range_m = self.cells, self.grid.node[peaks.cell], points[:, 0]
-        outputs = query.outputs[peaks.shots, :, :, node]
-        slopes = self._output_slopes(query, peaks.shots, node)
-        # The curvature of the wavefront is that at the range of the template.
-        node_m = self.grid.nodes[node, 0]
-        ratio = node_m / range_m
-        corrected = outputs + (node_m * (1 - ratio))[:, None, None] * slopes[..., 0]
-        slopes[..., 0] *= (ratio**2)[:, None, None]
+        cells, range_m, window_m = self.cells, points[:, 0], peaks.window_m
+        outputs, at_point, slopes = self._outputs(query, peaks, range_m)
         # At a peak, delays and amplitudes were those at the centre of the window.
         turns, at_window = (np.moveaxis(turns_at(self._wavenumbers, at_m), 2, 0)
-                            for at_m in (range_m, peaks.window_m))
-        scale = peaks.window_m / range_m
+                            for at_m in (range_m, window_m))
+        scale = window_m / range_m
         at_window *= (scale[:, None] * np.exp(
-            1j * self._carriers * (range_m - peaks.window_m)[:, None]))[..., None]
+            1j * self._carriers * (range_m - window_m)[:, None]))[..., None]
         if len(query.prior):
             factor = np.exp(-1j * (values @ query.prior.phases.T) - peaks.gain[:, None])[..., None]
             turns, at_window = turns * factor, at_window * factor
-        value = 2 * np.einsum('pis,pis->p', turns, corrected).real
-        value -= 2 * np.einsum('pis,pis->p', at_window, outputs).real
-        value += scale**2 * cells.energy_at(peaks.cell, peaks.window_m)
-        value -= cells.mean_energy_at(peaks.cell, range_m)
-        rate = 1j * self._wavenumbers - 1 / range_m[:, None, None]
+        # What the value of a peak lacks at the point.
+        change = 2 * np.einsum('pis,pis->p', turns, at_point).real
+        change -= 2 * np.einsum('pis,pis->p', at_window, outputs).real
+        change += scale**2 * cells.energy_at(peaks.cell, window_m)
+        change -= cells.mean_energy_at(peaks.cell, range_m)
         gradient = np.einsum('pis,pisq->pq', turns, slopes).real
-        gradient[:, 0] += np.einsum('pis,pis->p', turns * rate, corrected).real
+        rate = 1j * self._wavenumbers - 1 / range_m[:, None, None]
+        gradient[:, 0] += np.einsum('pis,pis->p', turns * rate, at_point).real
         gradient *= 2
         # Energies decrease with the squared range.
         scale = ((cells.range_m[peaks.cell] / range_m)**2)[:, None]
         gradient -= scale * cells.energy_slope[peaks.cell]
         step = np.einsum('pij,pj->pi', cells.inverse[peaks.cell], gradient) / scale
-        value = peaks.value + value + np.sum(gradient * step, axis=1) / 2
         limits = self._resolution.step_limits(query.prior.is_coarse)
-        return np.clip(step, -limits, limits), value
+        return (np.clip(step, -limits, limits),
+                peaks.value + change + np.sum(gradient * step, axis=1) / 2)
 
-    def _output_slopes(self, query: Query, shots: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """Return derivatives of filter outputs for shots and templates, [P, N_B, N_SB, 3]."""
-        n_nodes = len(self.grid.nodes)
-        pairs, index = np.unique(shots * n_nodes + nodes, return_inverse=True)
+    def _outputs(self, query: Query, peaks: Peaks, range_m: np.ndarray
+                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return filter outputs [P, N_B, N_SB] of peaks, without and with the curvature at ranges.
+
+        The curvature of the wavefront in a template is that at its own range. The last result
+        contains the derivatives at the ranges [P], [P, N_B, N_SB, 3].
+        """
+        n_nodes, nodes = len(self.grid.nodes), self.grid.node[peaks.cell]
+        # Many peaks of a shot have the same template.
+        pairs, index = np.unique(peaks.shots * n_nodes + nodes, return_inverse=True)
         shot, node = np.divmod(pairs, n_nodes)
-        slopes = np.einsum(
-            'iskqf,kisf->kisq', self.filters.slopes[:, :, node], query.signals[shot])
-        return slopes[index]
+        slopes = np.einsum('iskqf,kisf->kisq', self.filters.slopes[:, :, node],
+                           query.signals[shot])[index]
+        outputs, node_m = query.outputs[peaks.shots, :, :, nodes], self.grid.nodes[nodes, 0]
+        ratio = node_m / range_m
+        at_range = outputs + (node_m * (1 - ratio))[:, None, None] * slopes[..., 0]
+        slopes[..., 0] *= (ratio**2)[:, None, None]
+        return outputs, at_range, slopes
 
 
 def heaviest(of_shot: Segments, value: np.ndarray, margin: float | np.ndarray) -> np.ndarray:

@@ -6,7 +6,6 @@ coarse as they permit. The cells of a template share one expansion of the mean s
 
 import functools
 import itertools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -22,31 +21,36 @@ from rhs_isac_ros.model.geometry import (
 )
 from rhs_isac_ros.positioning.segments import Segments
 
-# Largest sine of the angle from boresight on the grid; at 1, derivatives are infinite.
-_MAX_SINE = 0.995
-# Longest steps for which the linear model of the mean holds, in wavelengths and in radians at the
-# edge of the aperture.
-_STEP_WAVELENGTHS = 0.2
-_STEP_RAD = 0.5
-# Phase error of a template at the edge of the aperture or of the band [rad], and error of its
-# amplitude, at which the next template or range cell takes over. The slopes of the templates
-# correct both errors to first order.
+# Phase error of a template at the edge of the aperture or of the band [rad] at which the next
+# template or range cell takes over. The slopes of the templates correct the error to first order.
 PHASE_ERROR = 0.2
-_AMPLITUDE_ERROR = 0.05
-# Radii of an ellipsoid around a mode that contains no other mode, in wavelengths and radians.
-_SEPARATION_WAVELENGTHS = 0.37
-_SEPARATION_RAD = 0.57
-# Steps and radii in range, in cells, if the phases of the bands do not constrain the range.
-_COARSE_CELLS = 0.75
-# Largest value of `Resolution.direction`. It applies to apertures below one wavelength, where
-# the gains of elements and of the user also change with the direction.
-_MAX_DIRECTION = 0.4
-# Smallest range relative to the farthest one, because directions lose their meaning at the
-# surface.
-_MIN_RANGE = 1e-3
-# Information about the position that is added everywhere, relative to a uniform prior over the
-# region. It keeps matrices invertible where the signals contain no information.
-_FLOOR = 0.01
+
+
+class _Limits(NamedTuple):
+    """Limits of the lengths of a grid."""
+
+    # Error of the amplitude of a template at which the next range cell takes over.
+    amplitude_error: float = 0.05
+    # In wavelengths and in radians at the edge of the aperture: longest steps for which the linear
+    # model of the mean holds, and radii of an ellipsoid around a mode that contains no other mode.
+    step: tuple[float, float] = (0.2, 0.5)
+    separation: tuple[float, float] = (0.37, 0.57)
+    # Both in range, in cells, if the phases of the bands do not constrain the range.
+    coarse_cells: float = 0.75
+    # Largest value of `Resolution.direction`. It applies to apertures below one wavelength, where
+    # the gains of elements and of the user also change with the direction.
+    direction: float = 0.4
+    # Largest sine of the angle from boresight on the grid; at 1, derivatives are infinite.
+    sine: float = 0.995
+    # Smallest range relative to the farthest one, because directions lose their meaning at the
+    # surface.
+    nearest: float = 1e-3
+    # Information about the position that is added everywhere, relative to a uniform prior over the
+    # region. It keeps matrices invertible where the signals contain no information.
+    floor: float = 0.01
+
+
+_LIMITS = _Limits()
 
 
 class Resolution(NamedTuple):
@@ -68,31 +72,32 @@ class Resolution(NamedTuple):
         """Derive the lengths from a scenario."""
         elements = element_positions(scenario)
         wavenumber = subband_wavenumbers(scenario).max()
-        wavelength_m = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
+        edge_m = np.abs(elements[:, 1:]).max(axis=0)
         bounds = scenario.roi_bounds_m
         (nearest_m, *lowest), (farthest_m, *highest) = polar_bounds(bounds).tolist()
         return cls(
-            wavelength_m,
-            1 / np.maximum(wavenumber * np.abs(elements[:, 1:]).max(axis=0), 1 / _MAX_DIRECTION),
-            max(wavenumber * np.sum(elements**2, axis=1).max() / 2, 1e-9),
-            SPEED_OF_LIGHT_MPS / (np.pi * scenario.n_subbands * scenario.subband_width_hz),
-            max(nearest_m, _MIN_RANGE * farthest_m), farthest_m,
-            np.stack([lowest, highest], axis=1), bounds)
+            wavelength_m=SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz),
+            direction=1 / np.maximum(wavenumber * edge_m, 1 / _LIMITS.direction),
+            curvature_m=max(wavenumber * np.sum(elements**2, axis=1).max() / 2, 1e-9),
+            delay_m=SPEED_OF_LIGHT_MPS / (
+                np.pi * scenario.n_subbands * scenario.subband_width_hz),
+            nearest_m=max(nearest_m, _LIMITS.nearest * farthest_m), farthest_m=farthest_m,
+            directions=np.stack([lowest, highest], axis=1), bounds_m=bounds)
 
     def cell_width_m(self, range_m: float) -> float:
         """Return the width of a range cell, in which delays and amplitudes hardly change [m]."""
-        return min(2 * _AMPLITUDE_ERROR * range_m, 2 * PHASE_ERROR * self.delay_m)
+        return min(2 * _LIMITS.amplitude_error * range_m, 2 * PHASE_ERROR * self.delay_m)
 
     def step_limits(self, is_coarse: bool) -> np.ndarray:
         """Return the longest steps in (r [m], u, v) over which the mean is nearly linear, [3]."""
-        return self._radii(is_coarse, _STEP_WAVELENGTHS, _STEP_RAD)
+        return self._radii(is_coarse, *_LIMITS.step)
 
     def separation(self, is_coarse: bool) -> np.ndarray:
         """Return the radii in (r [m], u, v) of an ellipsoid that contains only one mode, [3]."""
-        return self._radii(is_coarse, _SEPARATION_WAVELENGTHS, _SEPARATION_RAD)
+        return self._radii(is_coarse, *_LIMITS.separation)
 
     def _radii(self, is_coarse: bool, wavelengths: float, radians: float) -> np.ndarray:
-        range_m = (_COARSE_CELLS * self.cell_width_m(self.nearest_m) if is_coarse
+        range_m = (_LIMITS.coarse_cells * self.cell_width_m(self.nearest_m) if is_coarse
                    else wavelengths * self.wavelength_m)
         return np.array([range_m, *radians * self.direction])
 
@@ -101,8 +106,8 @@ class Resolution(NamedTuple):
         """Curvature in (r, u, v) that is added to every log-likelihood, [3]."""
         extent = np.array([self.farthest_m - self.nearest_m,
                            *(self.directions[:, 1] - self.directions[:, 0])])
-        return 12 * _FLOOR / np.maximum(
-            extent, _MIN_RANGE * np.array([self.farthest_m, 1.0, 1.0]))**2
+        return 12 * _LIMITS.floor / np.maximum(
+            extent, _LIMITS.nearest * np.array([self.farthest_m, 1.0, 1.0]))**2
 
 
 def carrier_wavenumbers(scenario: Scenario) -> np.ndarray:
@@ -115,6 +120,14 @@ def subband_wavenumbers(scenario: Scenario) -> np.ndarray:
     return 2 * np.pi * subband_frequencies_hz(scenario) / SPEED_OF_LIGHT_MPS
 
 
+class Shell(NamedTuple):
+    """Parts of a grid: the templates of one range, and the range cells in which they are used."""
+
+    nodes: slice
+    cells: slice
+    pairs: slice  # A subset of all combinations of these templates and range cells.
+
+
 class Grid(NamedTuple):
     """Templates and range cells that cover the ranges and directions of the region."""
 
@@ -123,21 +136,19 @@ class Grid(NamedTuple):
     widths_m: np.ndarray
     node: np.ndarray  # Index of the template of each pair in the grid, int [C].
     cell: np.ndarray  # Index of the range cell of each pair, int [C].
-    # Slices of templates, range cells and pairs, one segment for each range of the templates. The
-    # pairs of a segment are a subset of all combinations of its templates and range cells.
-    segments: list[tuple[slice, slice, slice]]
+    shells: list[Shell]
 
     def within(self, chosen: np.ndarray) -> 'Grid':
         """Return the grid of the chosen pairs, bool [C], and of the templates that they need."""
         needed = np.zeros(len(self.nodes), bool)
         needed[self.node[chosen]] = True
         n_nodes, n_pairs = (np.append(0, np.cumsum(one)) for one in (needed, chosen))
-        segments = [(slice(n_nodes[nodes.start], n_nodes[nodes.stop]), cells,
-                     slice(n_pairs[pairs.start], n_pairs[pairs.stop]))
-                    for nodes, cells, pairs in self.segments]
+        shells = [Shell(slice(n_nodes[nodes.start], n_nodes[nodes.stop]), cells,
+                        slice(n_pairs[pairs.start], n_pairs[pairs.stop]))
+                  for nodes, cells, pairs in self.shells]
         return self._replace(
             nodes=self.nodes[needed], node=n_nodes[self.node[chosen]], cell=self.cell[chosen],
-            segments=[one for one in segments if one[0].start < one[0].stop])
+            shells=[one for one in shells if one.nodes.start < one.nodes.stop])
 
     @property
     def points(self) -> np.ndarray:
@@ -153,25 +164,25 @@ def lay_grid(scenario: Scenario) -> Grid:
     resolution = Resolution.of(scenario)
     edges_m, directions = _range_edges(resolution), _directions(resolution)
     is_used = _meets_region(resolution, edges_m, directions)
-    # Range cells [first, end) across which the curvature of the wavefront hardly changes share
-    # templates.
+    # The curvature of the wavefront hardly changes across the range cells of a shell.
     step = 2 * PHASE_ERROR / resolution.curvature_m
-    shells = groups(len(edges_m) - 1, lambda first, end: bool(
-        1 / edges_m[first] - 1 / edges_m[end] <= step))
-    first, end = np.array(shells).T
-    has_template = np.logical_or.reduceat(is_used, first)
-    shell, direction = np.nonzero(has_template)
-    range_m = 2 / (1 / edges_m[first] + 1 / edges_m[end])
-    nodes = np.column_stack([range_m[shell], directions[direction]])
+    cells_of_shell = Segments.as_long_as(
+        lambda first, end: bool(1 / edges_m[first] - 1 / edges_m[end] <= step), len(edges_m) - 1)
+    n_shells = len(cells_of_shell.starts)
+    range_m = 2 / (1 / edges_m[cells_of_shell.starts] + 1 / edges_m[cells_of_shell.ends])
+    has_template = cells_of_shell.max(is_used)
     number = np.cumsum(has_template).reshape(has_template.shape) - 1
+    shell_of_node, direction = np.nonzero(has_template)
+    nodes = np.column_stack([range_m[shell_of_node], directions[direction]])
     cell, direction = np.nonzero(is_used)
-    shell_of_cell = np.repeat(np.arange(len(shells)), end - first)
-    of_shell = [Segments.of_counts(np.bincount(one, minlength=len(shells))).slices
-                for one in (shell, shell_of_cell, shell_of_cell[cell])]
+    shell_of_pair = cells_of_shell.repeat(np.arange(n_shells))[cell]
+    nodes_of_shell, pairs_of_shell = (
+        Segments.of_counts(np.bincount(shells, minlength=n_shells))
+        for shells in (shell_of_node, shell_of_pair))
     return Grid(
         read_only(nodes), read_only((edges_m[1:] + edges_m[:-1]) / 2), read_only(np.diff(edges_m)),
-        read_only(number[shell_of_cell[cell], direction]), read_only(cell),
-        list(zip(*of_shell, strict=True)))
+        read_only(number[shell_of_pair, direction]), read_only(cell),
+        list(map(Shell, nodes_of_shell.slices, cells_of_shell.slices, pairs_of_shell.slices)))
 
 
 def _range_edges(resolution: Resolution) -> np.ndarray:
@@ -191,7 +202,7 @@ def _directions(resolution: Resolution) -> np.ndarray:
              for (first, last), step in zip(resolution.directions, steps, strict=True)]
     directions = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 2)
     # Directions slightly beyond the rim of the half space are moved onto it.
-    excess = np.maximum(np.hypot(*directions.T) / _MAX_SINE, 1.0)
+    excess = np.maximum(np.hypot(*directions.T) / _LIMITS.sine, 1.0)
     return (directions / excess[:, None])[excess < 1 + 2 * steps.max()]
 
 
@@ -213,16 +224,6 @@ def _meets_region(
         found[index] = ((positions.max(axis=1) >= low) & (positions.min(axis=1) <= high)
                         ).all(axis=1)
     return found
-
-
-def groups(n: int, fits: Callable[[int, int], bool]) -> list[tuple[int, int]]:
-    """Divide n items into groups (first, end), each as long as `fits` allows, or of one item."""
-    result, first = [], 0
-    for end in range(1, n + 1):
-        if end == n or not fits(first, end + 1):
-            result.append((first, end))
-            first = end
-    return result
 
 
 class Expansion(NamedTuple):

@@ -1,6 +1,6 @@
 """Arrays whose rows belong together: rows of several arrays, and consecutive rows of a segment."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -43,10 +43,27 @@ class Segments(NamedTuple):
         starts = np.flatnonzero(changes)
         return cls(starts, np.diff(starts, append=len(keys)))
 
+    @classmethod
+    def as_long_as(cls, fits: Callable[[int, int], bool], n: int) -> 'Segments':
+        """Divide n rows into segments from a start to an end, each as long as `fits` allows.
+
+        A segment has at least one row.
+        """
+        starts = [0] if n else []
+        for end in range(2, n + 1):
+            if not fits(starts[-1], end):
+                starts.append(end - 1)
+        return cls(np.array(starts, int), np.diff(starts, append=n).astype(int))
+
+    @property
+    def ends(self) -> np.ndarray:
+        """Index after the last row of each segment, int [N]."""
+        return self.starts + self.counts
+
     @property
     def slices(self) -> Iterator[slice]:
         """The rows of each segment."""
-        return map(slice, self.starts.tolist(), (self.starts + self.counts).tolist())
+        return map(slice, self.starts.tolist(), self.ends.tolist())
 
     @property
     def places(self) -> np.ndarray:

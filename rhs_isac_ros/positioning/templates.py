@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import read_only
+from rhs_isac_ros.model.arrays import adjoint, read_only
 from rhs_isac_ros.model.gaussian import quadratic_form
 from rhs_isac_ros.model.geometry import to_positions
 from rhs_isac_ros.positioning.lattice import (
@@ -21,7 +21,6 @@ from rhs_isac_ros.positioning.lattice import (
     Grid,
     Resolution,
     lay_grid,
-    subband_wavenumbers,
     whiten,
 )
 from rhs_isac_ros.positioning.likelihood import NuisancePrior
@@ -58,12 +57,11 @@ def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None =
     and derivatives are those of limited means.
     """
     part, grid = grid, grid or lay_grid(model.scenario)
-    n_bands, n_rows = model.shape
-    points = grid.points
-    n_subbands = subband_wavenumbers(model.scenario).shape[1]
-    shape = n_bands, n_subbands, len(grid.nodes)
+    points, (n_bands, n_rows) = grid.points, model.shape
+    n_subbands = model.scenario.n_subbands
     n_frames, n_cells = n_rows // n_subbands, len(grid.cell)
-    table = {
+    shape = n_bands, n_subbands, len(grid.nodes)
+    table: dict[str, np.ndarray] = {
         'filters': np.empty((*shape, n_frames), np.complex64),
         'slope_filters': np.empty((*shape, 3, n_frames), np.complex64),
         'energy': np.empty(n_cells, np.float32),
@@ -87,18 +85,29 @@ def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None =
         table['slope_filters'][:, :, nodes] = np.moveaxis(by_frame, (0, 1), (2, 3))
         first, n = of_node.starts[start], of_node.counts[nodes].sum()
         for cells in np.array_split(by_node[first:first + n], -(-n // _BLOCK)):
-            index = grid.node[cells] - start
-            white = whiten(table['whitener'], *expansion.at(index, points[cells]))
-            template = whiten(table['whitener'], expansion.template_at(index, points[cells, 0]))
-            table['template_energy'][cells] = np.sum(np.abs(template)**2, axis=(1, 2, 3))
-            table['error'][cells] = np.sum(np.abs(template - white[:, :1])**2, axis=(1, 2, 3))
-            form = quadratic_form(white.reshape(len(cells), 4, -1))
-            table['energy'][cells] = form[:, 0, 0] / 2
-            table['energy_slope'][cells] = form[:, 0, 1:]
-            table['curvature'][cells] = form[:, 1:, 1:]
+            of_cells = _of_cells(
+                expansion, table['whitener'], grid.node[cells] - start, points[cells])
+            for name, values in of_cells.items():
+                table[name][cells] = values
 
     map_blocks(fill, range(0, len(grid.nodes), _BLOCK), progress)
     return table
+
+
+def _of_cells(expansion: Expansion, whitener: np.ndarray, index: np.ndarray, points: np.ndarray
+              ) -> dict[str, np.ndarray]:
+    """Compute arrays of `tabulate` for pairs with the templates `index` [M] and centres [M, 3]."""
+    white = whiten(whitener, *expansion.at(index, points))
+    template = whiten(whitener, expansion.template_at(index, points[:, 0]))
+    # Products of the means, in the first row and column, and of their derivatives.
+    form = quadratic_form(white.reshape(len(points), 4, -1))
+    return {
+        'template_energy': np.sum(np.abs(template)**2, axis=(1, 2, 3)),
+        'error': np.sum(np.abs(template - white[:, :1])**2, axis=(1, 2, 3)),
+        'energy': form[:, 0, 0] / 2,
+        'energy_slope': form[:, 0, 1:],
+        'curvature': form[:, 1:, 1:],
+    }
 
 
 def _positions_in(scenario: Scenario, part: Grid | None) -> np.ndarray:
@@ -135,7 +144,7 @@ def _moments(model: MeasurementModel, positions: np.ndarray) -> tuple[np.ndarray
     energies, components = np.linalg.eigh(typical)
     scale = 1 / np.sqrt(np.maximum(energies / _MAX_ENERGY, 1.0)) - 1
     limiter = np.eye(spread.shape[1]) + np.matmul(
-        components * scale[:, None], np.conj(np.swapaxes(components, 1, 2)))
+        components * scale[:, None], adjoint(components))
     return spread, limiter
 
 

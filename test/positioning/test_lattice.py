@@ -49,7 +49,7 @@ def test_the_grid_follows_the_number_of_distinguishable_directions(changes, fact
     if 'center_frequencies_hz' in changes:
         # The same aperture in metres.
         changes = changes | {'element_interval_wavelengths': 1.0}
-    counts = [len(lay_grid(scenario).nodes) / len(lay_grid(scenario).segments)
+    counts = [len(lay_grid(scenario).nodes) / len(lay_grid(scenario).shells)
               for scenario in (base, dataclasses.replace(base, **changes))]
     assert counts[1] / counts[0] == pytest.approx(factor, rel=0.35)
 
@@ -96,7 +96,7 @@ def test_a_part_of_the_grid_keeps_its_pairs_and_the_templates_that_they_need():
     part = grid.within(chosen)
     np.testing.assert_array_equal(part.points, grid.points[chosen])
     assert set(part.node) == set(range(len(part.nodes)))
-    for nodes, cells, pairs in part.segments:
+    for nodes, cells, pairs in part.shells:
         assert ((part.node[pairs] >= nodes.start) & (part.node[pairs] < nodes.stop)).all()
         assert ((part.cell[pairs] >= cells.start) & (part.cell[pairs] < cells.stop)).all()
-    assert sum(pairs.stop - pairs.start for *_, pairs in part.segments) == chosen.sum()
+    assert sum(pairs.stop - pairs.start for *_, pairs in part.shells) == chosen.sum()

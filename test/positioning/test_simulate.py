@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import CodebookError
-from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import simulate_pairs
 
 
@@ -37,33 +37,11 @@ def test_seeds_and_chunks_give_different_pairs(setting):
     assert len(np.unique(np.concatenate([first, second]), axis=0)) == 2048
 
 
-def test_signals_have_the_distribution_of_eq_8(setting):
-    """The reference is `simulate_received`, which draws multipath element by element."""
-    positions, received = simulate_pairs(*setting, 20_000, 0)
-    model = MeasurementModel(*setting)
-    scattered = received - model.mean(positions)
-    fixed = np.tile(positions[:1], (20_000, 1))
-    reference = simulate_received(*setting, fixed, np.random.default_rng(1))
-    reference -= model.mean(positions[:1])
-    moments = []
-    for sample in (scattered, reference):
-        flat = sample.reshape(len(sample), -1)
-        moments.append((flat.T @ flat.conj() / len(flat), flat.T @ flat / len(flat),
-                        flat.mean(axis=0)))
-    scale = np.sqrt(np.diag(moments[1][0]).real)
-    for found, expected in zip(*moments, strict=True):
-        unit = np.multiply.outer(scale, scale) if found.ndim == 2 else scale
-        # Five standard deviations of a difference: 1 / sqrt(20 000) on either side.
-        assert np.abs((found - expected) / unit).max() < 0.05
-
-
-def test_positions_are_uniform_in_the_region(setting):
-    low, high = setting[0].roi_bounds_m
-    unit = (simulate_pairs(*setting, 20_000, 0)[0] - low) / (high - low)
-    assert unit.min() > 0
-    assert unit.max() < 1
-    np.testing.assert_allclose(unit.mean(axis=0), 0.5, atol=0.01)
-    np.testing.assert_allclose(np.cov(unit.T), np.eye(3) / 12, atol=0.003)
+def test_signals_are_those_of_the_positions(setting):
+    model, (positions, received) = MeasurementModel(*setting), simulate_pairs(*setting, 512, 0)
+    white = model.whiten(received - model.mean(positions))
+    # The standard deviation of the mean of 4096 squares is 0.016.
+    assert np.mean(np.abs(white)**2) == pytest.approx(1, abs=0.065)
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
