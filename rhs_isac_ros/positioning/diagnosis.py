@@ -27,26 +27,31 @@ from rhs_isac_ros.model.gaussian import FALSE_ALARM, energy_limit, share_of_leve
 from rhs_isac_ros.positioning.alternatives import ALTERNATIVES, probabilities_of
 from rhs_isac_ros.positioning.estimate import Estimate
 
-# Probabilities that the mean and the variance of the residuals of a correct model cause a warning.
-# For the variance, the approximation is less accurate.
-FALSE_WARNING = 1e-6
-FALSE_SPREAD_WARNING = 1e-7
-# Probabilities of the latest residuals at which a warning ends. They are high, so that a small
-# deviation does not cause one warning after another.
-RETURN = 0.9
-SPREAD_RETURN = 0.5
 # Numbers of residuals: in the window, required to end a warning, and required to begin one.
 WINDOW = 400
 MIN_RETURN = 100
 MIN_FIXES = 10
-# Tolerated error of an expectation, and tolerated relative excess of the variance. Modes that are
-# not Gaussian cause both.
-_TOLERANCE = 0.5
-_SPREAD_TOLERANCE = 0.15
-# Limits of a residual's deviation, in standard deviations, and of its square. The first keeps a
-# single signal from causing a warning, and the second keeps a few signals from dominating.
-_MAX_DEVIATIONS = 6.0
-_MAX_SQUARE = 9.0
+
+
+class _Limits(NamedTuple):
+    """Limits of an `InnovationTest`: those of the mean of the residuals and of their variance."""
+
+    # Probabilities that the residuals of a correct model cause a warning. For the variance, the
+    # approximation is less accurate.
+    begin: tuple[float, float] = (1e-6, 1e-7)
+    # Probabilities of the latest residuals at which a warning ends. They are high, so that a small
+    # deviation does not cause one warning after another.
+    end: tuple[float, float] = (0.9, 0.5)
+    # Tolerated error of an expectation, and tolerated relative excess of the variance. Modes that
+    # are not Gaussian cause both.
+    tolerances: tuple[float, float] = (0.5, 0.15)
+    # Limits of a residual's deviation, in standard deviations, and of its square. The first keeps
+    # a single signal from causing a warning, and the second keeps a few from dominating.
+    deviation: float = 6.0
+    square: float = 9.0
+
+
+_LIMITS = _Limits()
 # Subjects with which reasons begin.
 _ENERGY = 'energy of the signals'
 _RESIDUAL = 'residual energy at the best position'
@@ -129,22 +134,22 @@ class InnovationTest:
 
     def clear(self) -> None:
         """Remove all residuals, for example after a change of the scenario or codebook."""
-        self._residuals: collections.deque[_Moments] = collections.deque(maxlen=self._window)
+        self._residuals: collections.deque[tuple[_Sum, _Sum]] = collections.deque(
+            maxlen=self._window)
         self.drifts = False
 
     def add(self, energy: float, expected: float) -> None:
         """Add a residual's energy and its expectation, unless one is NaN, and update `drifts`."""
         if np.isnan(energy) or not np.isfinite(expected):
             return
-        self._residuals.append(_Moments.of(energy / self._median, expected, self._std_db))
+        self._residuals.append(_terms(energy / self._median, expected, self._std_db))
         if self.drifts:
             latest = list(self._residuals)[-MIN_RETURN:]
-            if len(latest) == MIN_RETURN and _Moments.total(latest).fit(RETURN, SPREAD_RETURN):
+            if len(latest) == MIN_RETURN and _fit(latest, _LIMITS.end):
                 self.clear()
                 self._residuals.extend(latest)
         elif len(self._residuals) >= MIN_FIXES:
-            self.drifts = not _Moments.total(self._residuals).fit(
-                FALSE_WARNING, FALSE_SPREAD_WARNING)
+            self.drifts = not _fit(self._residuals, _LIMITS.begin)
 
     @property
     def n_fixes(self) -> int:
@@ -154,75 +159,79 @@ class InnovationTest:
     @property
     def ratio(self) -> float:
         """Mean energy relative to the expectation; NaN without residuals."""
-        total = _Moments.total(self._residuals)
-        return total.energy / max(total.expected, 0.5) if self._residuals else np.nan
+        total = _Sum.of(energy for energy, _ in self._residuals)
+        return total.value / max(total.expected, 0.5) if self._residuals else np.nan
 
     @property
     def spread(self) -> float:
         """Variance of the energy relative to its value in the model; NaN without residuals."""
-        total = _Moments.total(self._residuals)
-        return total.square / len(self._residuals) if self._residuals else np.nan
+        total = _Sum.of(square for _, square in self._residuals)
+        return total.value / total.expected if self._residuals else np.nan
 
 
-class _Moments(NamedTuple):
-    """Energy and squared deviation of a residual, with their distribution; or sums of several."""
+class _Sum(NamedTuple):
+    """A sum of n terms, whose errors have a part of their own and a part that all may share."""
 
     n: int
-    energy: float
+    value: float
     expected: float
-    square: float  # Square of the normalised deviation.
-    # Variances of the energy and of the square, apart from the level, and the standard deviations
-    # due to the level, which all residuals may have in common.
     own_variance: float
-    own_square_variance: float
     common_std: float
-    common_square_std: float
 
     @classmethod
-    def of(cls, energy: float, expected: float, level_std_db: float) -> '_Moments':
-        """Return the moments of an energy, relative to the median level of the multipath."""
-        scale = max(expected, 1.0)
-        share = share_of_level(scale, level_std_db)
-        shape = scale * (1 - share)
-        std = scale / shape**0.5
-        deviation = (energy - expected) / std
-        deviation = min(max(deviation, -_MAX_DEVIATIONS), _MAX_DEVIATIONS)
-        variance, square_variance = max(expected, 0.0), 2 + 6 / shape
-        return cls(
-            1, expected + deviation * std, expected, min(deviation**2, _MAX_SQUARE),
-            variance, square_variance * (1 - share**2),
-            (variance * share / (1 - share))**0.5, square_variance**0.5 * share)
+    def of(cls, terms: Iterable['_Sum']) -> '_Sum':
+        return cls(*map(sum, zip((0,) * len(cls._fields), *terms, strict=True)))
 
-    @classmethod
-    def total(cls, residuals: Iterable['_Moments']) -> '_Moments':
-        return cls(*map(sum, zip((0,) * len(cls._fields), *residuals, strict=True)))
+    @property
+    def variance(self) -> float:
+        return self.own_variance + self.common_std**2
 
-    def fit(self, probability: float, spread_probability: float) -> bool:
-        """Return whether both p-values are at least as high as these."""
-        return (self.probability() >= probability
-                and self.spread_probability() >= spread_probability)
 
-    def probability(self) -> float:
-        """Return the two-sided p-value of the sum of energies."""
-        # Every node imports this package, and SciPy takes longer to load than ROS.
-        from scipy.special import gammainc, gammaincc
+def _terms(energy: float, expected: float, level_std_db: float) -> tuple[_Sum, _Sum]:
+    """Return the energy of a residual and the square of its normalised deviation.
 
-        # With few measurements and many modes, an expectation may be negative.
-        expected, slack = max(self.expected, 0.5 * self.n), _TOLERANCE * self.n
-        shape = expected**2 / max(self.own_variance + self.common_std**2, 0.5 * self.n)
-        low, high = (shape / expected * (self.energy + sign * slack) for sign in (-1, 1))
-        return 2 * float(min(gammainc(shape, high), gammaincc(shape, max(low, 0.0))))
+    The energy is relative to the median level of the multipath, which causes the common parts.
+    """
+    scale = max(expected, 1.0)
+    share = share_of_level(scale, level_std_db)
+    shape = scale * (1 - share)
+    std = scale / shape**0.5
+    deviation = min(max((energy - expected) / std, -_LIMITS.deviation), _LIMITS.deviation)
+    variance = max(expected, 0.0)
+    # The square of a normalised gamma variable of shape k has the mean 1 and this variance.
+    square_variance = 2 + 6 / shape
+    return (_Sum(1, expected + deviation * std, expected, variance,
+                 (variance * share / (1 - share))**0.5),
+            _Sum(1, min(deviation**2, _LIMITS.square), 1.0, square_variance * (1 - share**2),
+                 square_variance**0.5 * share))
 
-    def spread_probability(self) -> float:
-        """Return the one-sided p-value of the sum of squared deviations."""
-        from scipy.special import gammaincc
 
-        # The sum is approximately a gamma variable. The square of a normalised gamma variable of
-        # shape k has the mean 1 and the variance 2 + 6 / k.
-        mean = self.n * (1 + _SPREAD_TOLERANCE)
-        variance = (self.own_square_variance + self.common_square_std**2) * (
-            1 + _SPREAD_TOLERANCE)**2
-        return float(gammaincc(mean**2 / variance, max(self.square, 0.0) * mean / variance))
+def _fit(residuals: Iterable[tuple[_Sum, _Sum]], probabilities: tuple[float, float]) -> bool:
+    """Return whether the p-values of the mean and the variance are at least as high as these."""
+    energy, square = (_Sum.of(terms) for terms in zip(*residuals, strict=True))
+    return (_mean_probability(energy) >= probabilities[0]
+            and _spread_probability(square) >= probabilities[1])
+
+
+def _mean_probability(total: _Sum) -> float:
+    """Return the two-sided p-value of a sum of energies."""
+    # Every node imports this package, and SciPy takes longer to load than ROS.
+    from scipy.special import gammainc, gammaincc
+
+    # With few measurements and many modes, an expectation may be negative.
+    expected, slack = max(total.expected, 0.5 * total.n), _LIMITS.tolerances[0] * total.n
+    shape = expected**2 / max(total.variance, 0.5 * total.n)
+    low, high = (shape / expected * (total.value + sign * slack) for sign in (-1, 1))
+    return 2 * float(min(gammainc(shape, high), gammaincc(shape, max(low, 0.0))))
+
+
+def _spread_probability(total: _Sum) -> float:
+    """Return the one-sided p-value of a sum of squared deviations, nearly a gamma variable."""
+    from scipy.special import gammaincc
+
+    tolerated = 1 + _LIMITS.tolerances[1]
+    mean, variance = total.expected * tolerated, total.variance * tolerated**2
+    return float(gammaincc(mean**2 / variance, max(total.value, 0.0) * mean / variance))
 
 
 def diagnose(estimates: Collection[Estimate], deviates: bool,

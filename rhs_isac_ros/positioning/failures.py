@@ -23,6 +23,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
 from rhs_isac_ros.model.gaussian import covariance_root, energy_limit
 from rhs_isac_ros.model.geometry import jacobian, to_positions
@@ -211,7 +212,7 @@ class FailureEffects(NamedTuple):
         # A product of two vectors plus its conjugate transpose, and a product of the amplitudes.
         left = np.stack([shift, cross, power * spread], axis=-1)
         right = np.stack([cross, shift, spread], axis=-1)
-        return self.correlation * np.matmul(left, np.conj(np.swapaxes(right, 2, 3)))
+        return self.correlation * np.matmul(left, adjoint(right))
 
 
 class Whitening(NamedTuple):
@@ -232,26 +233,31 @@ class Whitening(NamedTuple):
 
 
 class FailedSurfaces:
-    """Covariances of the signals for sets of failed elements, computed once for each set.
+    """Signals from surfaces with sets of failed elements; `surface` and `whitening` of each set.
 
-    `surface` and `whitening` are functions of a set. `error` is the covariance of the errors that
-    all failures together cause on average, [N_B, N_SB F, N_SB F].
+    Failures have the share that the scenario of the likelihood declares.
     """
 
-    def __init__(self, effects: FailureEffects, intact: Surface, error: np.ndarray,
-                 prior: NuisancePrior) -> None:
-        self._effects, self._intact, self._error, self._prior = effects, intact, error, prior
+    def __init__(self, likelihood: Likelihood) -> None:
+        scenario, codebook = likelihood.scenario, likelihood.codebook
+        self.likelihood, self.effects = likelihood, FailureEffects.of(scenario, codebook)
+        self.intact = MeasurementModel(
+            dataclasses.replace(scenario, failed_element_share=0.0), codebook).prepare()
+        # Covariance of the errors that all failures together cause on average.
+        failing = dataclasses.replace(scenario, element_error_rms=0.0)
+        self._error = DeclaredElements(failing).error_covariance(failing, codebook)
         self._extensions: dict[tuple[Failed, float], Whitening] = {}
         # The same set is often probable in successive shots.
         cache = functools.lru_cache(maxsize=_MAX_SURFACES)
         self.surface = cache(self._surface)
         self.whitening = cache(lambda failed: Whitening.of(
-            self.surface(failed).covariance[:, None], prior))
+            self.surface(failed).covariance[:, None], likelihood.nuisance))
 
     def _surface(self, failed: Failed) -> Surface:
-        if not failed:
-            return self._intact
-        return self._effects.with_failure(self.surface(failed[:-1]), failed[-1])
+        if failed:
+            return self.effects.with_failure(self.surface(failed[:-1]), failed[-1])
+        return Surface(np.matmul(self.intact.radiation, self.effects.spatial),
+                       self.intact.covariance())
 
     def extensions(self, failed: Failed, remainder: float) -> Whitening:
         """Return the factors for a set with each element added in turn.
@@ -261,13 +267,25 @@ class FailedSurfaces:
         if (failed, remainder) not in self._extensions:
             surface = self.surface(failed)
             covariance = surface.covariance[:, None] + np.swapaxes(
-                self._effects.growth(surface), 0, 1)
+                self.effects.growth(surface), 0, 1)
             covariance += remainder * self._error[:, None]
             # Only extensions of the intact surface serve all shots; each takes a few megabytes.
             self._extensions = {key: kept for key, kept in self._extensions.items() if not key[0]}
             self._extensions[failed, remainder] = Whitening.of(
-                covariance, self._prior, self.whitening(failed))
+                covariance, self.likelihood.nuisance, self.whitening(failed))
         return self._extensions[failed, remainder]
+
+    @property
+    def log_odds(self) -> float:
+        """Logarithm of the odds that an element has failed."""
+        share = self.likelihood.scenario.failed_element_share
+        return float(np.log(share / (1 - share)))
+
+    def roots_at(self, failed: Failed, positions: np.ndarray) -> np.ndarray:
+        """Return Cholesky factors of the covariance with the element errors at positions."""
+        excess = self.intact.covariance_at(positions) - self.surface(()).covariance
+        return covariance_root(
+            self.likelihood.scenario, self.surface(failed).covariance + excess)
 
 
 @dataclasses.dataclass(eq=False)
@@ -304,89 +322,69 @@ class FailedSet:
     Its value includes the prior of the set, and is relative to the value of `Likelihood`.
     """
 
-    def __init__(self, model: 'FailureModel', failed: Failed) -> None:
-        self._model, self._failed = model, list(failed)
-        self._covariance = model.surfaces.surface(failed).covariance
-        self._whitening = model.surfaces.whitening(failed)
-        stuck = np.full(model.scenario.n_elements, np.nan)
-        stuck[self._failed] = 0.5
+    def __init__(self, surfaces: FailedSurfaces, failed: Failed) -> None:
+        self._surfaces, self._failed = surfaces, failed
+        likelihood, scenario = surfaces.likelihood, surfaces.likelihood.scenario
+        stuck = np.full(scenario.n_elements, np.nan)
+        stuck[[*failed]] = 0.5
         self._mean_model = MeasurementModel(
-            model.scenario, model.likelihood.codebook, ElementErrors(np.ones(len(stuck)), stuck))
-        self._offset = model.log_prior(failed) + model.likelihood.log_volume
-        self._amplitudes = model.effects.amplitude[self._failed]
+            scenario, likelihood.codebook, ElementErrors(np.ones(len(stuck)), stuck))
+        intact = scenario.n_elements * float(np.log1p(-scenario.failed_element_share))
+        self._offset = len(failed) * surfaces.log_odds + intact + likelihood.log_volume
+        self._amplitudes = surfaces.effects.amplitude[[*failed]]
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate the log-likelihood at points; see `Conditional.local`."""
-        scenario, prior = self._model.scenario, self._model.likelihood.nuisance
-        positions = to_positions(points)
+        scenario, prior = self._surfaces.likelihood.scenario, self._surfaces.likelihood.nuisance
+        positions, failed = to_positions(points), [*self._failed]
         mean, slopes = self._mean_model.mean_and_jacobian(positions, jacobian(points))
         gains = np.stack([
-            np.repeat(los_gain(scenario, positions, band)[:, :, self._failed],
+            np.repeat(los_gain(scenario, positions, band)[:, :, failed],
                       scenario.n_frames, axis=1) for band in range(scenario.n_bands)])
         amplitudes = np.moveaxis(gains, (0, 1, 2, 3), (2, 0, 3, 1)) * self._amplitudes
         columns = prior.columns(values, signals.received, mean, slopes, amplitudes)
-        if self._model.is_exact:
+        whitening = self._surfaces.whitening(self._failed)
+        if self._surfaces.intact.elements.is_exact:
             white = np.einsum(
-                'irs,mcis->mcir', self._whitening.whitener[:, 0], columns, optimize=True)
-            white, log_volume = white.reshape(*columns.shape[:2], -1), self._whitening.log_volume
+                'irs,mcis->mcir', whitening.whitener[:, 0], columns, optimize=True)
+            white, log_volume = white.reshape(*columns.shape[:2], -1), whitening.log_volume
         else:
-            roots = covariance_root(
-                scenario, self._covariance + self._model.excess_at(positions))
-            white, log_volume = whiten_each(roots, columns)
-        local = assemble(prior, values, Columns.of(white, len(prior), len(self._failed)),
-                         self._whitening.information)
+            white, log_volume = whiten_each(
+                self._surfaces.roots_at(self._failed, positions), columns)
+        local = assemble(prior, values, Columns.of(white, len(prior), len(failed)),
+                         whitening.information)
         return local._replace(value=local.value + self._offset - log_volume)
 
 
 class FailureModel:
-    """Likelihood of positions and sets of failed elements under the declared share of failures."""
+    """Likelihood of positions and sets of failed elements, for signals at given points."""
 
     def __init__(self, likelihood: Likelihood) -> None:
-        scenario, codebook = likelihood.scenario, likelihood.codebook
-        self.likelihood, self.scenario = likelihood, scenario
-        self.usual_residual = energy_limit(int(np.prod(likelihood.model.shape)), LIMITS.unusual)
-        intact = dataclasses.replace(scenario, failed_element_share=0.0)
-        self._intact = model = MeasurementModel(intact, codebook).prepare()
-        self.is_exact = model.elements.is_exact
-        self.effects = effects = FailureEffects.of(scenario, codebook)
-        failing = dataclasses.replace(scenario, element_error_rms=0.0)
-        self.surfaces = FailedSurfaces(
-            effects, Surface(np.matmul(model.radiation, effects.spatial), model.covariance()),
-            DeclaredElements(failing).error_covariance(failing, codebook), likelihood.nuisance)
-        share = scenario.failed_element_share
-        self._log_odds = float(np.log(share / (1 - share)))
+        self.likelihood, self.surfaces = likelihood, FailedSurfaces(likelihood)
         self.failed_set = functools.lru_cache(maxsize=_MAX_SURFACES)(
-            lambda failed: FailedSet(self, failed))
-
-    def log_prior(self, failed: Failed) -> float:
-        """Return the logarithm of the probability of a set of failed elements."""
-        intact = self.scenario.n_elements * float(np.log1p(-self.scenario.failed_element_share))
-        return len(failed) * self._log_odds + intact
-
-    def excess_at(self, positions: np.ndarray) -> np.ndarray:
-        """Return the covariance of element errors at positions, less its average."""
-        return self._intact.covariance_at(positions) - self.surfaces.surface(()).covariance
+            lambda failed: FailedSet(self.surfaces, failed))
 
     def sites(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> list[Site]:
         """Return sites at points [P, 3] with parameters [P, Q], for the signals of one shot."""
         prior = self.likelihood.nuisance
-        mean, slopes = self._intact.mean_and_jacobian(to_positions(points), jacobian(points))
+        mean, slopes = self.surfaces.intact.mean_and_jacobian(
+            to_positions(points), jacobian(points))
         columns = prior.columns(values, signals.received, mean, slopes)[:, :4 + len(prior)]
         return [Site(self, *each) for each in zip(points, values, columns, strict=True)]
 
     def elements_at(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute `Site.elements` at a point [3]."""
-        prior, position = self.likelihood.nuisance, to_positions(point[None])
-        by_point, gains = jacobian(point[None]), []
-        for band in range(self.scenario.n_bands):
-            gain, slope = los_and_derivative(self.scenario, position, band)
-            both = np.concatenate([gain, np.tensordot(by_point[0].T, slope[0], 1)])
-            gains.append(np.repeat(both, self.scenario.n_frames, axis=1))
+        scenario, prior = self.likelihood.scenario, self.likelihood.nuisance
+        effects, gains = self.surfaces.effects, []
+        for band in range(scenario.n_bands):
+            gain, slope = los_and_derivative(scenario, to_positions(point[None]), band)
+            both = np.concatenate([gain, np.tensordot(jacobian(point[None])[0].T, slope[0], 1)])
+            gains.append(np.repeat(both, scenario.n_frames, axis=1))
         elements = np.moveaxis(np.stack(gains), (0, 1, 2, 3), (2, 1, 3, 0))
-        changes = elements * self.effects.shift[:, None]
+        changes = elements * effects.shift[:, None]
         fixed = prior.scaled_patterns * ~prior.moves_multipath[:, None, None]
         changes = np.concatenate([-changes[:, :1], changes[:, 1:], fixed * changes[:, :1]], axis=1)
-        return changes, elements[:, 0] * self.effects.amplitude
+        return changes, elements[:, 0] * effects.amplitude
 
     def weigh(self, failed: Failed, sites: Sequence[Site]) -> tuple[np.ndarray, np.ndarray]:
         """Return a set's log-probability and deviance, [P] each, after a step at each of P sites.
@@ -399,7 +397,8 @@ class FailureModel:
         columns = np.stack([np.concatenate(site.columns_of(failed)) for site in sites])
         value = self._predicted(np.stack([site.values for site in sites]), columns, whitening,
                                 len(failed))
-        return len(failed) * self._log_odds - whitening.log_volume + value, -value
+        log_prior = len(failed) * self.surfaces.log_odds
+        return log_prior - whitening.log_volume + value, -value
 
     def weigh_extensions(self, failed: Failed, site: Site, remainder: float = 0.0) -> np.ndarray:
         """Weigh a set, as `weigh` does, with each element added in turn, float64 [N_E].
@@ -415,7 +414,7 @@ class FailureModel:
         parts = np.concatenate([columns + changes, own, amplitudes[:, None]], axis=1)
         values = np.broadcast_to(site.values, (len(changes), len(site.values)))
         value = self._predicted(values, parts, extended, len(failed) + 1)
-        return (len(failed) + 1) * self._log_odds - extended.log_volume + value
+        return (len(failed) + 1) * self.surfaces.log_odds - extended.log_volume + value
 
     def _predicted(self, values: np.ndarray, columns: np.ndarray, whitening: Whitening,
                    n_failed: int) -> np.ndarray:
@@ -443,6 +442,7 @@ class FailureSearch:
     def __init__(self, model: FailureModel, signals: Signals,
                  limits: FailureLimits = LIMITS) -> None:
         self._model, self._signals, self._limits = model, signals, limits
+        self._usual = energy_limit(int(np.prod(model.likelihood.model.shape)), limits.unusual)
         self.sites: list[Site] = []
         # Logarithm of prior times likelihood of each hypothesis.
         self.values: dict[Key, float] = {}
@@ -455,7 +455,7 @@ class FailureSearch:
 
     def explains(self, keys: list[Key]) -> bool:
         """Return whether the deviance of any of these hypotheses is no higher than usual."""
-        return any(self._deviances[key] <= self._model.usual_residual for key in keys)
+        return any(self._deviances[key] <= self._usual for key in keys)
 
     def add(self, points: np.ndarray, values: np.ndarray, failed: Failed = ()) -> list[Key]:
         """Add a site at each point [P, 3] with parameters [P, Q]; return keys, the best first."""

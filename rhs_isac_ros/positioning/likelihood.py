@@ -12,13 +12,14 @@ tracker use this interface for all impairments and errors of elements.
 """
 
 import dataclasses
+import functools
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import mixture_weights
+from rhs_isac_ros.model.arrays import adjoint, mixture_weights
 from rhs_isac_ros.model.gaussian import (
     covariance_root,
     marginalise,
@@ -29,7 +30,6 @@ from rhs_isac_ros.model.geometry import jacobian, to_positions
 from rhs_isac_ros.model.impairments import (
     UNIFORM_STD_RAD,
     Exponents,
-    Nuisance,
     nuisance_of,
 )
 from rhs_isac_ros.model.measurement import Surface
@@ -41,17 +41,27 @@ _UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
 # density then has many peaks along the range, too narrow for Gaussians. Its information is added
 # to the samples of the posterior afterwards.
 COARSE_STD_RAD = 0.75
-# Grid on which parameters with several maxima are compared: reach in standard deviations, points
-# per parameter by number of parameters, and refinements of the best point.
-_REACH = 4.0
-_N_GRID = {1: 513, 2: 49, 3: 13}
-_N_REFINEMENTS = 4
-# Profile over the gain: numbers of gains and amplitudes, and reach in standard deviations.
-_N_GAIN = 161
-_N_AMPLITUDE = 256
-_GAIN_REACH = 4.5
 # Standard deviation of the gain below which the gain has no effect [nepers].
 _MIN_GAIN_STD = 1e-9
+
+
+class _GainProfile(NamedTuple):
+    """Resolution of the maximum over the gain, as a function of the amplitude."""
+
+    gains: int = 161
+    amplitudes: int = 256
+    reach: float = 4.5  # In standard deviations.
+
+
+class _Search(NamedTuple):
+    """Grid on which parameters with several maxima are compared."""
+
+    reach: float = 4.0  # In standard deviations.
+    points: tuple[int, ...] = (513, 49, 13, 5)  # Per parameter, for 1, 2, 3 and more parameters.
+    refinements: int = 4  # Of the best point.
+
+
+_GAIN, _SEARCH = _GainProfile(), _Search()
 # Smallest eigenvalue of a sum of signals, as a share of its trace.
 _MIN_SPREAD = 1e-12
 # Numbers of failures to average over: smallest probability of each, and how many at most.
@@ -116,32 +126,6 @@ class Columns(NamedTuple):
                    observed if observed.shape[1] else by_values)
 
 
-class _Parameters(NamedTuple):
-    """Effects of Q nuisance parameters; the fields are those of `Nuisance`."""
-
-    scaled_patterns: np.ndarray
-    phases: np.ndarray
-    needs_search: np.ndarray
-    moves_multipath: np.ndarray
-
-    @classmethod
-    def declared(cls, nuisance: Nuisance) -> '_Parameters':
-        """Return the parameters that a scenario declares."""
-        return cls(*(getattr(nuisance, name) for name in cls._fields))
-
-    @classmethod
-    def with_uniform_phases(cls, nuisance: Nuisance) -> '_Parameters':
-        """Return a phase of each band in place of all parameters that rotate whole bands."""
-        n_bands, keeps = len(nuisance.phases), ~nuisance.phases.any(axis=0)
-        turns, no_flags = _UNIFORM_EQUIVALENT * np.eye(n_bands), np.zeros(n_bands, bool)
-        patterns = 1j * turns[:, :, None] * np.ones(nuisance.scaled_patterns.shape[2])
-        return cls(
-            np.concatenate([nuisance.scaled_patterns[keeps], patterns]),
-            np.hstack([nuisance.phases[:, keeps], turns]),
-            np.append(nuisance.needs_search[keeps], no_flags),
-            np.append(nuisance.moves_multipath[keeps], no_flags))
-
-
 class NuisancePrior(Exponents):
     """Prior and effect of the nuisance parameters, in units in which they are standard normal.
 
@@ -150,42 +134,68 @@ class NuisancePrior(Exponents):
     rotate whole bands; the range then follows from delays, amplitudes and wavefronts only.
     """
 
+    phase_covariance: np.ndarray  #: Of the declared phases of the bands, float64 [N_B, N_B].
+    relative_phase_std_rad: float  #: Largest one of these phases relative to their mean.
+    is_coarse: bool  #: Whether every band is given a uniform phase, by the last parameters.
+    needs_search: np.ndarray  #: As in `Nuisance`, bool [Q].
+    phases: np.ndarray  #: Phase of each band per unit [rad], float64 [N_B, Q].
+    precision: np.ndarray  #: Inverse variance of the prior, 0 for a uniform phase, float64 [Q].
+    information: np.ndarray  #: That of the model's covariance, float64 [Q, Q].
+
     def __init__(self, model: MeasurementModel) -> None:
-        self.scenario, nuisance = model.scenario, nuisance_of(model.scenario)
-        # Declared covariance of the phases of the bands, float64 [N_B, N_B].
-        self.phase_covariance = nuisance.phases @ nuisance.phases.T
+        self.scenario, declared = model.scenario, nuisance_of(model.scenario)
+        self.phase_covariance = declared.phases @ declared.phases.T
         self.relative_phase_std_rad = _relative_std(self.phase_covariance)
-        # Whether every band is given a uniform phase.
         self.is_coarse = self.relative_phase_std_rad >= COARSE_STD_RAD
-        patterns, phases, self.needs_search, self.moves_multipath = (
-            _Parameters.with_uniform_phases if self.is_coarse else _Parameters.declared)(nuisance)
+        kept = ~(declared.phases.any(axis=0) & self.is_coarse)
+        n_bands, n_rows = model.shape
+        turns = _UNIFORM_EQUIVALENT * np.eye(n_bands)[:n_bands * self.is_coarse]
+        patterns = np.concatenate([
+            declared.scaled_patterns[kept], 1j * turns[:, :, None] * np.ones(n_rows)])
+        phases = np.hstack([declared.phases[:, kept], turns.T])
+        self.needs_search, self.moves_multipath = (
+            np.append(flags[kept], np.zeros(len(turns), bool))
+            for flags in (declared.needs_search, declared.moves_multipath))
         largest = np.abs(phases).max(axis=0, initial=0.0)
         uniform = largest > UNIFORM_STD_RAD
         scale = np.where(uniform, _UNIFORM_EQUIVALENT / np.where(uniform, largest, 1.0), 1.0)
-        # Per unit: exponents of the signals, complex128 [Q, N_B, N_SB F]; phase of each band
-        # [rad], float64 [N_B, Q]; precision of the prior; gain of all signals [nepers]; and change
-        # of the logarithm of the signals' volume, float64 [Q].
         self.scaled_patterns, self.phases = patterns * scale[:, None, None], phases * scale
         self.precision = np.where(uniform, 0.0, 1.0)
-        self.gain = self.scaled_patterns.real.mean(axis=(1, 2))
-        self.volume = 2 * self.scaled_patterns.real.sum(axis=(1, 2))
-        # Standard deviations of the gain of all signals [nepers], 0 if it is negligible, and of
-        # the phase of each band, infinite if it is uniform, float64 [N_B].
-        gain_std = np.linalg.norm(self.gain)
-        phase_std = np.sqrt(np.diagonal(self.phase_covariance))
-        self.gain_std = float(gain_std) if gain_std > _MIN_GAIN_STD else 0.0
-        self.phase_std_rad = np.where(
-            self.is_coarse | (phase_std > UNIFORM_STD_RAD), np.inf, phase_std)
         self._operators = self._multiplying(model.root, model.whitener)
         self.information = self.information_of(model.root, model.whitener)
-        # Curvature in (r, u, v) that is added to every log-likelihood, float64 [3].
-        self.floor = Resolution.of(model.scenario).curvature_floor
+
+    @functools.cached_property
+    def gain(self) -> np.ndarray:
+        """Gain of all signals per unit [nepers], float64 [Q]."""
+        return self.scaled_patterns.real.mean(axis=(1, 2))
+
+    @functools.cached_property
+    def gain_std(self) -> float:
+        """Standard deviation of the gain of all signals [nepers]; 0 if it is negligible."""
+        gain_std = float(np.linalg.norm(self.gain))
+        return gain_std if gain_std > _MIN_GAIN_STD else 0.0
+
+    @functools.cached_property
+    def volume(self) -> np.ndarray:
+        """Change of the logarithm of the signals' volume per unit, float64 [Q]."""
+        return 2 * self.scaled_patterns.real.sum(axis=(1, 2))
+
+    @functools.cached_property
+    def phase_std_rad(self) -> np.ndarray:
+        """Standard deviation of the phase of each band, infinite if it is uniform, [N_B]."""
+        std = np.sqrt(np.diagonal(self.phase_covariance))
+        return np.where(self.is_coarse | (std > UNIFORM_STD_RAD), np.inf, std)
+
+    @functools.cached_property
+    def floor(self) -> np.ndarray:
+        """Curvature in (r, u, v) that is added to every log-likelihood, float64 [3]."""
+        return Resolution.of(self.scenario).curvature_floor
 
     def information_of(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
         """Compute the Fisher information of a covariance about the parameters, [Q, Q]."""
         # The multipath reveals gains and offsets of carrier and timing, but no phase.
         operators = self._multiplying(root, whitener)
-        both = operators + np.conj(np.swapaxes(operators, 2, 3))
+        both = operators + adjoint(operators)
         return np.einsum('aimn,binm->ab', both, both, optimize=True).real
 
     def _multiplying(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
@@ -236,11 +246,11 @@ class NuisancePrior(Exponents):
         """
         if not self.gain_std:
             return 2 * amplitude, np.zeros(1)
-        gain = self.gain_std * np.linspace(-_GAIN_REACH, _GAIN_REACH, _N_GAIN)
+        gain = self.gain_std * np.linspace(-_GAIN.reach, _GAIN.reach, _GAIN.gains)
         factor = np.exp(-gain)
         fixed = -factor**2 * energy - 2 * n_rows * gain - gain**2 / (2 * self.gain_std**2)
         low, high = float(amplitude.min()), float(amplitude.max())
-        knots = np.linspace(low, high + 1e-9 * (1 + abs(high)), _N_AMPLITUDE)
+        knots = np.linspace(low, high + 1e-9 * (1 + abs(high)), _GAIN.amplitudes)
         table = fixed + 2 * factor * knots[:, None]
         return (np.interp(amplitude, knots, table.max(axis=1)),
                 np.interp(amplitude, knots, gain[table.argmax(axis=1)]))
@@ -318,31 +328,27 @@ def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
     `information_of_covariance`, float64 [Q, Q], is the information of the covariance about the
     parameters. The further parameters of the columns are integrated out.
     """
-    residual, by_point, by_values, linear, observed = columns
-    n, n_linear = 3 + len(prior), linear.shape[1]
-    expected = np.ascontiguousarray(np.concatenate([by_point, by_values, linear], axis=1))
+    n, n_linear = 3 + len(prior), columns.linear.shape[1]
+    # The residual energy, its gradient and information.
+    expected = np.concatenate([columns.by_point, columns.by_values, columns.linear], axis=1)
+    slopes = expected if columns.observed is columns.by_values else np.concatenate(
+        [columns.by_point, columns.observed, columns.linear], axis=1)
     information = quadratic_form(expected)
-    information += np.diag(np.concatenate([prior.floor, prior.precision, np.ones(n_linear)]))
-    slopes = expected
-    if observed is not by_values:
-        slopes = np.ascontiguousarray(np.concatenate([by_point, observed, linear], axis=1))
     # Re(a^H b) is the inner product of real and imaginary parts.
-    parts = np.ascontiguousarray(residual).view(float)
-    gradient = 2 * np.matmul(slopes.view(float), parts[..., None])[..., 0]
+    parts = np.ascontiguousarray(columns.residual).view(float)
+    gradient = 2 * np.matmul(
+        np.ascontiguousarray(slopes).view(float), parts[..., None])[..., 0]
     energy = np.sum(parts**2, axis=1)
-    value = -energy
-    if len(prior):
-        # Derivatives of parameters that move the multipath already include this information.
-        still = ~prior.moves_multipath
-        information[:, 3:n, 3:n] += np.outer(still, still) * information_of_covariance
-        gradient[:, 3:n] -= prior.precision * values + prior.volume
-        value = prior.log_prior(values) - energy
-    if not n_linear:
-        return Local(value, gradient, information, energy)
+    # The priors of point, parameters and further parameters.
+    information += np.diag(np.concatenate([prior.floor, prior.precision, np.ones(n_linear)]))
+    gradient[:, 3:n] -= prior.precision * values + prior.volume
+    # Derivatives of parameters that move the multipath already include this information.
+    still = ~prior.moves_multipath
+    information[:, 3:n, 3:n] += np.outer(still, still) * information_of_covariance
     marginal = marginalise(information, gradient, n)
     rise = np.sum(gradient[:, n:] * marginal.offset, axis=1) / 2
-    return Local(value + rise + marginal.log_volume, marginal.gradient, marginal.information,
-                 energy - rise)
+    return Local(prior.log_prior(values) - energy + rise + marginal.log_volume, marginal.gradient,
+                 marginal.information, energy - rise)
 
 
 def _relative_std(phase_covariance: np.ndarray) -> float:
@@ -503,7 +509,7 @@ class Alignment:
         values = np.zeros(len(prior))
         if prior.needs_search.any():
             values = self._best_on_grid(received)
-        for _ in range(_N_REFINEMENTS):
+        for _ in range(_SEARCH.refinements):
             divided = prior.divide(received, values)
             residual = self._whitened(divided[None]).reshape(-1)
             slopes = self._whitened(prior.scaled_patterns[moves] * divided)
@@ -521,8 +527,8 @@ class Alignment:
         """Return the best grid values of parameters whose likelihood has several maxima."""
         prior = self._prior
         (searched,) = np.nonzero(prior.needs_search)
-        n_grid = _N_GRID.get(len(searched), 5)
-        line = np.linspace(-_REACH, _REACH, n_grid)
+        n_grid = _SEARCH.points[min(len(searched), len(_SEARCH.points)) - 1]
+        line = np.linspace(-_SEARCH.reach, _SEARCH.reach, n_grid)
         grid = np.stack(np.meshgrid(*[line] * len(searched), indexing='ij'), axis=-1)
         candidates = np.zeros((n_grid**len(searched), len(prior)))
         candidates[:, searched] = grid.reshape(len(candidates), -1)

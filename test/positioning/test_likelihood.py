@@ -7,10 +7,10 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import binom
 
-from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.model.impairments import nuisance_of
+from rhs_isac_ros.positioning.failures import FailureModel
 from rhs_isac_ros.positioning.likelihood import Alignment, DispersedLikelihood, Likelihood
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.templates import tabulate
@@ -45,28 +45,6 @@ def repeated(signals, n):
     return select(signals, np.zeros(n, int))
 
 
-def test_signals_are_whitened_with_the_covariance_of_the_vectors(case, likelihood):
-    """The columns of a square root of the covariance serve as signals."""
-    n_bands, n_rows = case.vectors['cov'].shape[:2]
-    roots = np.linalg.cholesky(case.vectors['cov'])
-    columns = np.moveaxis(roots, 2, 0)
-    signals = likelihood.signals(columns)
-    assert signals.received is columns
-    assert signals.whitened.shape == (n_rows, n_bands, n_rows)
-    for band in range(n_bands):
-        root = signals.whitened[:, band].T
-        np.testing.assert_allclose(root @ root.conj().T, np.eye(n_rows), atol=1e-8)
-
-
-def test_whitened_means_have_the_scalar_products_of_the_vectors(case, likelihood):
-    """Between any two positions: t1^H t2 is the sum of mu1^H Lambda^-1 mu2 over the bands."""
-    t = likelihood.model.whiten(likelihood.model.mean(case.vectors['positions']))
-    products = np.einsum('air,bir->ab', t.conj(), t)
-    expected = sum(mean.conj() @ np.linalg.solve(covariance, mean.T) for mean, covariance
-                   in zip(case.vectors['mean'], case.vectors['cov'], strict=True))
-    np.testing.assert_allclose(products, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
-
-
 def test_the_value_is_the_gaussian_log_likelihood(case, likelihood):
     """Up to a constant, it is the log density of the signals before whitening."""
     rng = np.random.default_rng(0)
@@ -85,37 +63,6 @@ def test_the_value_is_the_gaussian_log_likelihood(case, likelihood):
     np.testing.assert_allclose(local.value - local.value[0], exact - exact[0],
                                rtol=1e-6, atol=1e-6 * np.abs(exact).max())
     np.testing.assert_array_equal(local.residual, -local.value)
-
-
-def test_whitened_slopes_are_the_limit_of_differences_of_the_mean(case, likelihood):
-    positions, step, model = case.vectors['positions'], 1e-5, likelihood.model
-    mean, slopes = model.mean_and_jacobian(positions, whitened=True)
-
-    def exact(positions):
-        return model.whiten(model.mean(positions))
-
-    np.testing.assert_allclose(mean, exact(positions), rtol=1e-9, atol=1e-9)
-    assert slopes.shape == (len(positions), 3, *mean.shape[1:])
-    for u in range(3):
-        shift = step * np.eye(3)[u]
-        difference = (exact(positions + shift) - exact(positions - shift)) / (2 * step)
-        np.testing.assert_allclose(
-            slopes[:, u], difference, rtol=0, atol=1e-7 * np.abs(slopes).max())
-
-
-def test_slopes_with_respect_to_other_coordinates_follow_the_chain_rule(case, likelihood):
-    positions, model = case.vectors['positions'], likelihood.model
-    by_coordinate = np.random.default_rng(0).normal(size=(len(positions), 3, 3))
-    mean, slopes = model.mean_and_jacobian(positions, whitened=True)
-    same, by_other = model.mean_and_jacobian(positions, by_coordinate, whitened=True)
-    np.testing.assert_array_equal(same, mean)
-    expected = np.einsum('nabr,naq->nqbr', slopes, by_coordinate)
-    np.testing.assert_allclose(by_other, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-
-
-def test_a_codebook_that_does_not_fit_is_an_error(small):
-    with pytest.raises(CodebookError, match='analog: shape'):
-        Likelihood(dataclasses.replace(small.scenario, elements_per_side=3), small.codebook)
 
 
 @pytest.mark.parametrize('changes', [{}, ALL], ids=['position', 'all parameters'])
@@ -221,28 +168,31 @@ def test_the_likelihood_is_the_average_over_the_number_of_failures(codebook):
     assert np.diff(found)[0] == pytest.approx(np.diff(expected)[0], abs=0.01)
 
 
-@pytest.mark.parametrize('changes', [
-    {'element_error_rms': 0.03}, {'failed_element_share': 0.02},
-    {'element_error_rms': 0.03, 'failed_element_share': 0.02},
-], ids=lambda changes: ' '.join(changes))
-def test_nuisance_parameters_and_element_errors_combine(codebook, changes):
+@pytest.mark.parametrize(('changes', 'conditional'), [
+    ({'element_error_rms': 0.03}, DispersedLikelihood),
+    ({'element_error_rms': 0.03, 'failed_element_share': 0.02}, DispersedLikelihood),
+    ({'failed_element_share': 0.02}, lambda one: FailureModel(one).failed_set((3, 17))),
+], ids=['errors', 'errors and failures', 'failures of a set'])
+def test_nuisance_parameters_and_element_errors_combine(codebook, changes, conditional):
     """The value at parameters is that of the signals divided by their factors."""
     scenario, rng = declaring(**ALL, **changes), np.random.default_rng(3)
     likelihood = Likelihood(scenario, codebook)
     position = np.array([[4.2, 0.3, -0.1]])
     received = MeasurementModel(scenario, codebook).sample(position, rng)
     values = 0.3 * rng.normal(size=(1, len(likelihood.nuisance)))
-    found = DispersedLikelihood(likelihood).local(
+    found = conditional(likelihood).local(
         to_polar(position), values, likelihood.signals(received))
     alone = Likelihood(declaring(**changes), codebook)
     divided = received / np.exp(
         np.tensordot(values, nuisance_of(scenario).scaled_patterns, axes=1))
-    expected = DispersedLikelihood(alone).local(
+    expected = conditional(alone).local(
         to_polar(position), without_values(1), alone.signals(divided))
     gain = values[0, 0] * np.log(10) / 20
     prior = values[0] @ values[0] / 2 + 2 * received.size * gain
     assert found.value[0] == pytest.approx(expected.value[0] - prior, rel=1e-9)
     assert found.residual[0] == pytest.approx(expected.residual[0], rel=1e-9)
+    np.testing.assert_allclose(found.gradient[0, :3], expected.gradient[0], rtol=1e-6)
+    np.testing.assert_allclose(found.information[0, :3, :3], expected.information[0], rtol=1e-6)
 
 
 def test_the_profile_over_the_gain_is_the_maximum_with_its_prior(codebook):

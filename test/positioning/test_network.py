@@ -1,9 +1,7 @@
 """The network and its file."""
 
 import dataclasses
-import io
 import json
-import os
 
 import numpy as np
 import pytest
@@ -48,18 +46,14 @@ def test_positions_from_magnitudes_do_not_depend_on_phases(network):
         network.positions(as_parts[:, 0] + 1j * as_parts[:, 1]), rtol=1e-12)
 
 
-def test_a_saved_model_can_be_loaded(network, tmp_path):
-    path = tmp_path / 'model.npz'
+@pytest.mark.parametrize('inputs', ['parts', 'magnitudes'])
+def test_a_saved_model_can_be_loaded(network, tmp_path, inputs):
+    network, path = dataclasses.replace(network, inputs=inputs), tmp_path / 'model.npz'
     network.save(path)
     loaded = Network.load(path)
     for field in dataclasses.fields(Network):
         np.testing.assert_array_equal(getattr(loaded, field.name), getattr(network, field.name))
     assert [p.name for p in tmp_path.iterdir()] == ['model.npz']
-
-
-def test_a_file_contains_the_inputs_of_the_network(network, tmp_path):
-    dataclasses.replace(network, inputs='magnitudes').save(tmp_path / 'model.npz')
-    assert Network.load(tmp_path / 'model.npz').inputs == 'magnitudes'
 
 
 def test_a_file_without_inputs_takes_real_and_imaginary_parts(network, tmp_path):
@@ -82,22 +76,9 @@ def test_the_keys_of_the_file_do_not_change(network, tmp_path):
         assert file['loudest'] == network.max_energy
 
 
-def bytes_of(array):
-    stream = io.BytesIO()
-    np.save(stream, array)
-    return stream.getvalue()
-
-
 @pytest.mark.parametrize('damage', [
-    lambda path: path.unlink(),
-    lambda path: path.write_bytes(b''),
-    lambda path: path.write_bytes(b'no model'),
-    lambda path: os.truncate(path, path.stat().st_size // 2),
-    lambda path: np.savez(path, a=np.zeros(3)),
-    lambda path: path.write_bytes(bytes_of(np.zeros(3))),
-    lambda path: np.savez(path, about=np.array([{}], object)),
-    lambda path: (path.unlink(), path.mkdir()),
-], ids=['missing', 'empty', 'text', 'truncated', 'other arrays', 'array', 'pickle', 'folder'])
+    lambda path: path.unlink(), lambda path: path.write_bytes(b'no model'),
+    lambda path: np.savez(path, a=np.zeros(3))], ids=['missing', 'text', 'other arrays'])
 def test_the_error_for_an_invalid_file_names_it(network, tmp_path, damage):
     path = tmp_path / 'model.npz'
     network.save(path)

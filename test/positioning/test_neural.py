@@ -104,14 +104,9 @@ def test_networks_are_reproducible_by_their_seed(scenario, codebook):
     assert not np.isclose(first.w_in, other.w_in).all()
 
 
-def test_training_stops_when_the_validation_error_does_not_fall(scenario, codebook):
-    epochs = []
-    network = train(scenario, codebook, 40, 0, 64, 2000, lambda *epoch: epochs.append(epoch))
-    assert network.about['epochs'] + 4 <= len(epochs) < 2000
-
-
-def test_batches_grow_when_the_validation_error_does_not_fall(scenario, codebook, monkeypatch):
-    sizes, make = [], neural._regressor
+def test_batches_grow_and_training_stops_when_the_validation_error_does_not_fall(
+        scenario, codebook, monkeypatch):
+    sizes, epochs, make = [], [], neural._regressor
 
     def recorded(*arguments):
         regressor = make(*arguments)
@@ -123,7 +118,8 @@ def test_batches_grow_when_the_validation_error_does_not_fall(scenario, codebook
         regressor.partial_fit = partial_fit
         return regressor
     monkeypatch.setattr(neural, '_regressor', recorded)
-    train(scenario, codebook, 300, 0, 64, 2000)
+    network = train(scenario, codebook, 300, 0, 64, 2000, lambda *epoch: epochs.append(epoch))
+    assert network.about['epochs'] + 4 <= len(epochs) < 2000
     # 210 pairs are for training.
     assert list(dict.fromkeys(sizes)) == [128, 210]
 

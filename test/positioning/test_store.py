@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
-from rhs_isac_ros.positioning import make_estimator, simulate_pairs, store, templates
+from rhs_isac_ros.positioning import store, templates
 from rhs_isac_ros.positioning.alternatives import tabulate_outside
 
 
@@ -125,16 +125,6 @@ def test_surfaces_that_differ_in_their_pose_share_a_table(tmp_path, scenario, mo
     load_table(model, tmp_path)
     load_table(MeasurementModel(placed, model.beams), tmp_path)
     assert computed == [model.beams.id]
-
-
-def test_estimates_with_a_table_from_disk_are_identical(tmp_path, scenario, model):
-    received = simulate_pairs(scenario, model.beams, 10, 0)[1]
-    estimates = [
-        make_estimator('bayes', scenario, model.beams, **options).estimate(received)
-        for options in ({}, {'table_folder': tmp_path}, {'table_folder': tmp_path})]
-    for other in estimates[1:]:
-        np.testing.assert_array_equal(other.mean, estimates[0].mean)
-        np.testing.assert_array_equal(other.covariance, estimates[0].covariance)
 
 
 def test_a_folder_that_cannot_be_written_is_a_warning(tmp_path, model):

@@ -70,15 +70,6 @@ def test_covariances_are_those_of_the_random_process(elapsed_s):
         np.testing.assert_allclose(block, expected, rtol=0.02, atol=1e-9)
 
 
-def test_two_short_predictions_without_a_turn_equal_a_long_one():
-    motion = Motion()
-    once = continued(motion, started(motion), 0.4)
-    twice = continued(motion, continued(motion, started(motion), 0.1), 0.3)
-    np.testing.assert_allclose(twice.log_weights, once.log_weights)
-    np.testing.assert_allclose(twice.means, once.means, atol=1e-9)
-    np.testing.assert_allclose(twice.covariances, once.covariances, rtol=1e-6, atol=1e-12)
-
-
 def test_weights_are_those_of_random_turns():
     motion = Motion(turn_s=2.0)
     weights = np.exp(motion.predict(started(motion), 1.0).log_weights).reshape(-1, 2)
@@ -297,18 +288,6 @@ def test_a_track_finds_a_user_that_is_suddenly_elsewhere(tracker, sample):
     for k in range(15, 35):
         estimate = tracker.update(k * PERIOD_S, sample(elsewhere))
     assert error(estimate, elsewhere) < 0.7
-
-
-def test_a_user_stops_and_goes(tracker, sample):
-    position = START.copy()
-    for k in range(60):
-        if not 20 <= k < 40:
-            position = position + PERIOD_S * VELOCITY
-        estimate = tracker.update(k * PERIOD_S, sample(position))
-        if k == 39:
-            assert np.linalg.norm(estimate.velocity) < 0.5
-    assert error(estimate, position) < 0.4
-    assert estimate.velocity @ VELOCITY > 0.3
 
 
 def test_estimates_are_inside_the_region(tracker, sample):
