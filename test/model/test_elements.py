@@ -121,20 +121,6 @@ def test_the_quadrature_over_the_region_has_converged():
     assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
 
 
-def test_without_errors_the_covariance_is_the_same_everywhere(case):
-    model = MeasurementModel(case.scenario, case.codebook)
-    found = model.covariance_at(case.vectors['positions'])
-    np.testing.assert_array_equal(found, np.broadcast_to(model.covariance(), found.shape))
-
-
-def test_a_known_surface_has_no_error(small):
-    scenario = dataclasses.replace(small.scenario, element_error_rms=0.5)
-    surface = draw_surface(scenario, np.random.default_rng(3))
-    known = MeasurementModel(scenario, small.codebook, surface)
-    exact = MeasurementModel(small.scenario, small.codebook, surface)
-    np.testing.assert_array_equal(known.covariance(), exact.covariance())
-
-
 def test_elements_are_exact_if_their_errors_are_known_or_absent(small, damaged):
     assert draw_surface(damaged, np.random.default_rng(3)).is_exact
     assert DeclaredElements(small.scenario).is_exact
@@ -147,33 +133,18 @@ def test_elements_are_exact_if_their_errors_are_known_or_absent(small, damaged):
                                np.zeros(n)).is_exact == (rank == 0)
 
 
-def test_a_given_surface_is_used(small, damaged):
+def test_both_simulations_use_a_given_surface(small, damaged):
     surface = draw_surface(damaged, np.random.default_rng(9))
-    silent = dataclasses.replace(small.scenario, noise_psd_dbm_hz=-400, multipath_to_los_db=-200)
-    positions = small.scenario.sample_positions(2, np.random.default_rng(10))
-    received = simulate_received(
-        silent, small.codebook, positions, np.random.default_rng(0), surface)
-    model = MeasurementModel(silent, small.codebook, surface)
-    np.testing.assert_allclose(received, model.mean(positions), rtol=1e-6)
-
-
-def test_samples_are_of_the_known_surface(small, damaged):
-    surface = draw_surface(damaged, np.random.default_rng(9))
-    quiet = dataclasses.replace(
-        small.scenario, element_error_rms=0.3, failed_element_share=0.2, noise_psd_dbm_hz=-200,
-        multipath_to_los_db=-100)
+    quiet = dataclasses.replace(damaged, noise_psd_dbm_hz=-200, multipath_to_los_db=-100)
     positions = quiet.sample_positions(2, np.random.default_rng(10))
     model = MeasurementModel(quiet, small.codebook, surface)
     mean = model.mean(positions)
-    received = model.sample(positions, np.random.default_rng(0))
-    assert np.abs(received - mean).max() < 1e-3 * np.abs(mean).max()
+    for received in (model.sample(positions, np.random.default_rng(0)), simulate_received(
+            quiet, small.codebook, positions, np.random.default_rng(0), surface)):
+        assert np.abs(received - mean).max() < 1e-3 * np.abs(mean).max()
 
 
 def test_a_surface_of_another_size_is_an_error(small):
     other = draw_surface(Scenario(), np.random.default_rng(9))
-    positions = small.scenario.sample_positions(2, np.random.default_rng(10))
     with pytest.raises(ValueError, match='^surface: 100 elements, expected N_E = 16 as in '):
         MeasurementModel(small.scenario, small.codebook, other)
-    with pytest.raises(ValueError, match='^surface: 100 elements, expected N_E = 16 as in '):
-        simulate_received(
-            small.scenario, small.codebook, positions, np.random.default_rng(0), other)

@@ -14,7 +14,6 @@ from rhs_isac_ros.link import capacity, steer
 from rhs_isac_ros.model import (
     SPEED_OF_LIGHT_MPS,
     GainPattern,
-    MeasurementModel,
     Scenario,
     ScenarioError,
 )
@@ -22,7 +21,6 @@ from rhs_isac_ros.model.gain_pattern import PatternError
 from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import mean_los_power, multipath_covariance
-from rhs_isac_ros.positioning import store
 from rhs_isac_ros.support import plugins
 
 
@@ -50,21 +48,6 @@ def scenario() -> Scenario:
 @pytest.fixture(scope='module')
 def codebook(scenario, random_beams):
     return random_beams(scenario, np.random.default_rng(3))
-
-
-def test_a_constant_pattern_equals_the_number(case):
-    numbers = dataclasses.replace(case.scenario, element_gain=1.3, user_gain=0.7)
-    patterns = dataclasses.replace(
-        numbers, element_gain=lambda angles: np.full(angles.shape, 1.3),
-        user_gain=lambda angles: np.full(angles.shape, 0.7))
-    positions = case.vectors['positions']
-    for first, second in zip(los_and_derivative(numbers, positions, 0),
-                             los_and_derivative(patterns, positions, 0), strict=True):
-        np.testing.assert_allclose(second, first, rtol=0, atol=1e-12 * np.abs(first).max())
-    np.testing.assert_allclose(
-        multipath_covariance(patterns), multipath_covariance(numbers), rtol=1e-12, atol=0)
-    np.testing.assert_allclose(crlb(patterns, case.codebook, positions),
-                               crlb(numbers, case.codebook, positions), rtol=1e-9)
 
 
 def test_gains_match_the_definition(scenario):
@@ -169,15 +152,6 @@ class TestIdentity:
         assert Scenario(element_gain=other) != Scenario(element_gain=twin)
         assert GainPattern(ripple) != GainPattern(ripple, ripple_slope)
         assert twin != 1.0
-
-    def test_tables_are_keyed_by_the_gains(self, scenario, codebook):
-        def key(**fields):
-            changed = dataclasses.replace(scenario, **fields)
-            return store.table_key(MeasurementModel(changed, codebook), codebook.id)
-        assert key() == key(element_gain=lambda angles: patch(angles))
-        others = {key(), key(element_gain=1.0), key(element_gain=lambda a: 2 * patch(a)),
-                  key(user_gain=1.0)}
-        assert len(others) == 4
 
     def test_a_pattern_with_a_function_of_a_module_can_be_pickled(self):
         copy = pickle.loads(pickle.dumps(GainPattern(np.cosh)))

@@ -6,11 +6,9 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from rhs_isac_ros.model.gaussian import (
-    likelihood_loss,
     log_evidence_of_level,
     marginalise,
     quadratic_form,
-    step_to_maximum,
 )
 
 N = 6
@@ -42,16 +40,6 @@ def test_the_marginal_covariance_is_the_block_of_the_joint_inverse(joint):
         np.linalg.inv(marginal.information), inverse[:, :3, :3], rtol=1e-8)
     np.testing.assert_array_equal(
         marginal.information, np.swapaxes(marginal.information, 1, 2))
-
-
-def test_the_maximum_is_that_of_the_joint_log_likelihood(joint):
-    information, gradient = joint
-    marginal = marginalise(information, gradient)
-    expected = np.linalg.solve(information, gradient[..., None])[..., 0]
-    step = np.linalg.solve(marginal.information, marginal.gradient[..., None])[..., 0]
-    np.testing.assert_allclose(step, expected[:, :3], rtol=1e-8)
-    others = marginal.offset + np.einsum('nqp,np->nq', marginal.regression, step)
-    np.testing.assert_allclose(others, expected[:, 3:], rtol=1e-7)
 
 
 def test_the_regression_follows_the_maximum_over_the_parameters(joint):
@@ -102,12 +90,6 @@ def test_without_parameters_nothing_changes():
     np.testing.assert_array_equal(marginal.log_volume, 0)
 
 
-def test_a_step_leads_to_the_maximum():
-    information, gradient = np.array([[[2.0, 1.0], [1.0, 3.0]]]), np.array([[4.0, 5.0]])
-    step = step_to_maximum(information, gradient)
-    np.testing.assert_allclose(information[0] @ step[0], gradient[0])
-
-
 @pytest.mark.parametrize('median_db', [0.0, -6.0])
 def test_the_evidence_of_a_level_is_the_average_over_it(median_db):
     energy, n, std_db = np.array([0.1, 50.0, 5e3]), 512, 12.0
@@ -118,11 +100,3 @@ def test_the_evidence_of_a_level_is_the_average_over_it(median_db):
         axis=1) + np.log(db[1] - db[0])
     np.testing.assert_allclose(
         log_evidence_of_level(energy, n, std_db, median_db), expected, atol=0.05)
-
-
-def test_the_loss_is_the_quadratic_form():
-    offset = np.array([[1e-3, 0.02, -0.01]])
-    curvature = np.array([[1e6, 2e3, -1e3], [2e3, 1e3, 0.0], [-1e3, 0.0, 1e3]])
-    expected = sum(offset[0, a] * curvature[a, b] * offset[0, b] for a in range(3)
-                   for b in range(3)) / 2
-    np.testing.assert_allclose(likelihood_loss(offset, curvature[None]), [expected])

@@ -40,12 +40,6 @@ def test_positions_and_frequencies_match_the_definition(scenario, plain):
         rtol=1e-14)
 
 
-def test_mean_wavelength_is_that_of_the_bands_not_of_the_mean_frequency():
-    scenario = Scenario(center_frequencies_hz=(1e9, 3e9))
-    interval_m = 0.3 * (0.299792458 + 0.299792458 / 3) / 2
-    assert g.element_intervals_m(scenario) == pytest.approx([interval_m, interval_m])
-
-
 def test_given_feed_positions_are_used():
     positions = ((0.0, -0.1, 0.2), (0.01, 0.1, 0.0), (0.0, 0.0, 0.3))
     scenario = dataclasses.replace(Scenario(), feed_positions_m=positions)
@@ -54,13 +48,6 @@ def test_given_feed_positions_are_used():
 
 def positions_in_front(n, seed):
     return np.random.default_rng(seed).uniform([0.5, -6, -6], [12, 6, 6], (n, 3))
-
-
-def test_points_are_range_and_direction_cosines():
-    for x, y, z in positions_in_front(5, 0):
-        distance = (x * x + y * y + z * z)**0.5
-        point = to_polar(np.array([x, y, z]))
-        np.testing.assert_allclose(point, [distance, y / distance, z / distance], rtol=1e-14)
 
 
 def test_the_conversions_are_inverse_to_each_other():

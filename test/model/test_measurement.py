@@ -16,7 +16,7 @@ from rhs_isac_ros.model.measurement import receive_feeds, received_signal
 from rhs_isac_ros.model.multipath import multipath_covariance
 
 POSITION_METHODS = ('mean', 'mean_and_jacobian')
-N_PHASES = 20_000
+N_PHASES = 1500
 
 
 @pytest.fixture(scope='module')
@@ -51,13 +51,6 @@ def test_covariance_matches_the_definition_for_low_correlation(faded, plain):
             covariance[band], expected, rtol=0, atol=1e-10 * np.abs(expected).max())
 
 
-def test_root_is_the_cholesky_factor_of_the_covariance(model):
-    product = model.root @ np.conj(np.swapaxes(model.root, 1, 2))
-    covariance = model.covariance()
-    np.testing.assert_allclose(product, covariance, rtol=0, atol=1e-12 * np.abs(covariance).max())
-    np.testing.assert_array_equal(np.triu(model.root, 1), 0)
-
-
 def test_whitener_whitens_the_covariance_of_the_vectors(case, model):
     for whitener, covariance in zip(model.whitener, case.vectors['cov'], strict=True):
         white = whitener @ covariance @ whitener.conj().T
@@ -79,13 +72,6 @@ def test_whiten_applies_the_whitener_of_each_band(model, leading):
 def test_mean_matches_the_vectors(case, model):
     mean = model.mean(case.vectors['positions'])
     np.testing.assert_allclose(mean, np.moveaxis(case.vectors['mean'], 0, 1), rtol=1e-8)
-
-
-def test_mean_matches_the_definition(small, plain):
-    p = plain(small.scenario, small.codebook.analog, small.codebook.digital)
-    positions = small.scenario.sample_positions(3, np.random.default_rng(0))
-    mean = MeasurementModel(small.scenario, small.codebook).mean(positions)
-    np.testing.assert_allclose(mean[:, 0], p.mean(positions, 0), rtol=1e-9)
 
 
 @pytest.mark.parametrize('method', POSITION_METHODS)
@@ -160,26 +146,40 @@ def assert_distributed_as_vectors(signals, case):
         whitened.append(np.linalg.solve(np.linalg.cholesky(covariance), deviation.T))
     # Stacking the bands also checks that they are independent.
     white = np.concatenate(whitened)
-    limit = 5.0 / np.sqrt(N_PHASES)
-    assert np.abs(white @ white.conj().T / N_PHASES - np.eye(len(white))).max() < limit
-    assert np.abs(white @ white.T / N_PHASES).max() < limit * np.sqrt(2)
+    n = len(signals)
+    limit = 5.0 / np.sqrt(n)
+    assert np.abs(white @ white.conj().T / n - np.eye(len(white))).max() < limit
+    assert np.abs(white @ white.T / n).max() < limit * np.sqrt(2)
     assert np.abs(white.mean(axis=1)).max() < limit
 
 
-def test_samples_have_the_mean_and_covariance_of_the_vectors(case, model):
+def simulated(case, positions, seed):
+    return simulate_received(
+        case.scenario, case.codebook, positions, np.random.default_rng(seed))
+
+
+def sampled(case, positions, seed):
+    model = MeasurementModel(case.scenario, case.codebook)
+    return model.sample(positions, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize(('draw', 'n'), [(simulated, N_PHASES), (sampled, 20_000)])
+def test_both_simulations_have_the_mean_and_covariance_of_the_vectors(case, draw, n):
     position = case.vectors['positions'][2]
-    signals = model.sample(np.tile(position, (N_PHASES, 1)), np.random.default_rng(4))
-    assert signals.shape == (N_PHASES, *model.shape)
+    signals = draw(case, np.tile(position, (n, 1)), 4)
+    assert signals.shape == (n, *case.vectors['cov'].shape[:2])
     assert_distributed_as_vectors(signals, case)
 
 
-def test_each_sample_belongs_to_its_position(case, model):
+@pytest.mark.parametrize('draw', [simulated, sampled])
+def test_each_drawn_signal_belongs_to_its_position(case, model, draw):
+    """300 positions make two blocks."""
     positions = case.scenario.sample_positions(300, np.random.default_rng(5))
-    signals = model.sample(positions, np.random.default_rng(6))
-    np.testing.assert_array_equal(signals, model.sample(positions, np.random.default_rng(6)))
-    white = model.whiten(signals - model.mean(positions))
+    signals, same, other = (draw(case, positions, seed) for seed in (6, 6, 7))
+    np.testing.assert_array_equal(signals, same)
+    assert not np.isclose(signals, other).any()
+    energy = np.sum(np.abs(model.whiten(signals - model.mean(positions)))**2, axis=(1, 2))
     n = np.prod(model.shape)
-    energy = np.sum(np.abs(white)**2, axis=(1, 2))
     assert energy.mean() == pytest.approx(n, abs=5 * np.sqrt(n / 300))
 
 
@@ -200,17 +200,10 @@ def factorizations(monkeypatch):
     return calls
 
 
-def test_factors_are_computed_once_and_shared(case, factorizations):
-    model = MeasurementModel(case.scenario, case.codebook)
-    for _ in range(2):
-        assert model.whitener is model.whitener
-        model.sample(case.vectors['positions'], np.random.default_rng(7))
-    assert factorizations == ['cholesky', 'inv']
-
-
 def test_prepare_leaves_nothing_to_compute(case, factorizations):
     model = MeasurementModel(case.scenario, case.codebook)
     assert model.prepare() is model
+    model.sample(case.vectors['positions'], np.random.default_rng(7))
     assert factorizations == ['cholesky', 'inv']
     assert '_weights' in vars(model)
 
@@ -228,9 +221,6 @@ def test_beamforming_of_another_size_is_an_error(small):
         MeasurementModel(scenario, small.codebook)
     with pytest.raises(ValueError, match='^digital: shape '):
         MeasurementModel(dataclasses.replace(small.scenario, n_feeds=1), small.codebook)
-
-
-N_PHASES = 1500
 
 
 def test_received_signal_is_the_sum_over_the_elements():
@@ -252,39 +242,6 @@ def test_received_signal_is_the_sum_over_the_elements():
                 np.testing.assert_allclose(direct[n, row], alone, rtol=1e-12)
                 np.testing.assert_allclose(
                     received[n, row], (alone + scattered) * symbol + noise[n, row], rtol=1e-12)
-
-
-def test_simulated_signals_have_the_vectors_mean_and_covariance(case):
-    position = case.vectors['positions'][2]
-    received = simulate_received(
-        case.scenario, case.codebook, np.tile(position, (N_PHASES, 1)), np.random.default_rng(2))
-    n_bands, n_rows = case.vectors['cov'].shape[:2]
-    assert received.shape == (N_PHASES, n_bands, n_rows)
-    assert_distributed_as_vectors(received, case)
-
-
-def test_simulated_noise_alone_has_its_power(small):
-    """With a negligible antenna gain, only the thermal noise remains."""
-    attenuated = dataclasses.replace(small.scenario, user_gain=1e-6)
-    received = simulate_received(
-        attenuated, small.codebook, np.tile([10.0, 0, 0], (N_PHASES, 1)), np.random.default_rng(3))
-    sample = received[:, 0].T @ received[:, 0].conj() / N_PHASES
-    expected = float(small.vectors['noise_power']) * np.eye(6)
-    assert np.abs(sample - expected).max() < 5 / np.sqrt(N_PHASES) * expected[0, 0]
-
-
-def test_simulation_is_reproducible_and_follows_its_positions(small):
-    positions = small.scenario.sample_positions(300, np.random.default_rng(4))
-    one, same, other = (
-        simulate_received(small.scenario, small.codebook, positions, np.random.default_rng(seed))
-        for seed in (5, 5, 6))
-    np.testing.assert_array_equal(one, same)
-    assert not np.isclose(one, other).any()
-    # 300 positions make two blocks; each signal belongs to its own position.
-    mean = MeasurementModel(small.scenario, small.codebook).mean(positions)
-    whitener = np.linalg.inv(np.linalg.cholesky(small.vectors['cov'][0]))
-    energy = np.sum(np.abs((one - mean)[:, 0] @ whitener.T)**2, axis=1)
-    assert energy.mean() == pytest.approx(6, abs=5 * np.sqrt(6 / 300))
 
 
 def test_receive_feeds_combines_every_measurement(small):

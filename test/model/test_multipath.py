@@ -8,7 +8,6 @@ from scipy.integrate import dblquad, tplquad
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model import multipath as mp
-from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
 
 
 def test_covariance_matches_the_vectors(case):
@@ -81,17 +80,6 @@ def rectangle(request) -> Scenario:
                     n_subbands=2, n_frames=1)
 
 
-@pytest.fixture
-def by_convolution(monkeypatch):
-    """Multiply by V as for a surface of many elements."""
-    for cache in (mp.spatial_covariance, mp.declared_covariance, mp.multipath_factors):
-        cache.cache_clear()
-    monkeypatch.setattr(mp, '_MAX_MATRIX', 1)
-    yield
-    for cache in (mp.spatial_covariance, mp.declared_covariance, mp.multipath_factors):
-        cache.cache_clear()
-
-
 def products(scenario: Scenario, weights: np.ndarray) -> list[np.ndarray]:
     spatial = mp.spatial_covariance(scenario)
     return [spatial.scatter(weights), spatial[1].scatter(weights[1])[None],
@@ -149,25 +137,6 @@ def test_two_intervals_are_those_of_the_elements(small):
     np.testing.assert_allclose(
         mp.multipath_covariance(sparse)[0],
         mp.multipath_covariance(dense)[0][np.ix_(chosen, chosen)], rtol=1e-9)
-
-
-def test_the_multipath_from_a_side_is_coherent_with_a_wave_from_there(small):
-    aside = dataclasses.replace(
-        small.scenario, angular_spread_deg=0.05, multipath_direction_deg=(60.0, 0.0))
-    v = mp.multipath_covariance(aside)[0]
-    phases = (2 * np.pi * aside.center_frequencies_hz[0] / 299_792_458
-              * np.sin(np.deg2rad(60)) * element_positions(aside)[:, 1])
-    np.testing.assert_allclose(v[:, 0] / v[0, 0], np.exp(1j * (phases - phases[0])), atol=1e-3)
-
-
-def test_correlations_match_the_vectors(case):
-    scenario, frames = case.scenario, np.arange(case.scenario.n_frames)
-    over_time = mp.time_correlation(
-        scenario, (frames[:, None] - frames) * scenario.frame_duration_s)
-    np.testing.assert_allclose(over_time, case.vectors['K_t'], rtol=1e-10)
-    for band, frequencies in enumerate(subband_frequencies_hz(scenario)):
-        over_frequency = mp.frequency_correlation(scenario, frequencies[:, None] - frequencies)
-        np.testing.assert_allclose(over_frequency, case.vectors['K_f'][band], rtol=1e-10)
 
 
 @pytest.fixture(scope='module')
@@ -256,10 +225,3 @@ def test_complex_normal_is_circular_with_unit_variance():
     assert np.mean(np.abs(z)**4) == pytest.approx(2, abs=SIGMAS * np.sqrt(20 / n))
     # Successive numbers are independent.
     assert abs(np.mean(z[1:] * z[:-1].conj())) < SIGMAS / np.sqrt(n)
-
-
-def test_a_narrow_spread_makes_the_multipath_one_wave(small):
-    """All power arrives from the boresight, so that the elements are coherent."""
-    narrow = dataclasses.replace(small.scenario, angular_spread_deg=0.05)
-    v = mp.multipath_covariance(narrow)[0]
-    np.testing.assert_allclose(v / v[0, 0], 1, atol=1e-4)

@@ -96,13 +96,6 @@ def test_elements_may_have_two_intervals():
     assert len({uneven.id, Scenario().id, Scenario(element_interval_wavelengths=0.4).id}) == 3
 
 
-def test_ids_precede_later_fields():
-    """Files hold the ids of scenarios that leave these fields at their defaults."""
-    assert Scenario().id == 'sc337b8b24c90a1923'
-    assert Scenario(multipath_direction_deg=(0, 0)).id == Scenario().id
-    assert Scenario(multipath_direction_deg=(60, 0)).id != Scenario().id
-
-
 def test_bands_may_touch_but_not_overlap():
     Scenario(center_frequencies_hz=(28e9, 28.4e9), n_subbands=64, subband_width_hz=6.25e6)
     with pytest.raises(ScenarioError, match='^center_frequencies_hz: .* expected at least 4e'):
@@ -196,28 +189,6 @@ def test_values_just_outside_the_bounds_are_errors(field, plugin):
             Scenario(**{field.name: value})
 
 
-@pytest.mark.parametrize(('field', 'value'), [
-    ('n_feeds', 1), ('n_feeds', 256), ('delay_spread_s', 0.0), ('delay_spread_s', 1.0),
-    ('refractive_index', 1.0), ('max_power_w', 1e6), ('noise_psd_dbm_hz', -400.0)])
-def test_bounds_are_inclusive(field, value):
-    assert getattr(Scenario(**{field: value}), field) == value
-
-
-@pytest.mark.parametrize('field', [
-    'failed_element_share', 'blocked_probability', 'outside_probability'])
-def test_probabilities_are_at_most_one(field):
-    assert getattr(Scenario(**{field: 1.0}), field) == 1
-    with pytest.raises(ScenarioError, match=f'^{field}: .*, expected .*0 to 1'):
-        Scenario(**{field: 1.01})
-
-
-@pytest.mark.parametrize(('field', 'value'), [('n_feeds', 10**400), ('max_power_w', 10**400)],
-                         ids=['integer', 'number'])
-def test_an_integer_too_large_for_a_float_is_out_of_range(field, value):
-    with pytest.raises(ScenarioError, match=f'^{field}: '):
-        Scenario(**{field: value})
-
-
 def test_from_yaml_reads_fields_and_keeps_defaults(tmp_path):
     path = tmp_path / 'scenario.yaml'
     # YAML 1.1 reads 28e9 as a string, and 2.8e+10 as a number.
@@ -240,18 +211,13 @@ CHANGES = [
 
 
 @pytest.mark.parametrize('changes', CHANGES, ids=str)
-def test_changes_are_the_differences_from_table_1(changes):
+def test_changes_are_the_differences_from_table_1(tmp_path, changes):
     found = Scenario(**changes).changes()
     assert found == changes
     # Safe YAML has lists, but no tuples.
-    assert yaml.safe_load(yaml.safe_dump(found)) == changes
-
-
-@pytest.mark.parametrize('changes', CHANGES, ids=str)
-def test_changes_written_to_a_file_give_the_same_scenario(tmp_path, changes):
-    path, scenario = tmp_path / 'scenario.yaml', Scenario(**changes)
-    path.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
-    assert Scenario.from_yaml(path) == scenario
+    path = tmp_path / 'scenario.yaml'
+    path.write_text(yaml.safe_dump(found), encoding='utf-8')
+    assert Scenario.from_yaml(path) == Scenario(**changes)
 
 
 def test_paths_are_relative_to_the_folder_of_the_file(tmp_path, monkeypatch):
@@ -273,12 +239,6 @@ def test_a_given_default_is_not_a_change(case):
     assert Scenario(**whole).changes() == {}
     assert Scenario(center_frequencies_hz=['2.5e9', 3e9], max_power_w='1e-3').changes() == {}
     assert Scenario(**case.scenario.changes()) == case.scenario
-
-
-def test_an_empty_file_is_table_1(tmp_path):
-    path = tmp_path / 'scenario.yaml'
-    path.write_text('# nothing\n', encoding='utf-8')
-    assert Scenario.from_yaml(path) == Scenario()
 
 
 @pytest.mark.parametrize(('text', 'words'), [
@@ -307,27 +267,20 @@ def test_from_yaml_message_names_the_file_and_the_fault(tmp_path, text, words):
         assert word in str(caught.value)
 
 
-@pytest.mark.parametrize('content', [None, b'\xff\xfe\x00n'], ids=['missing', 'not text'])
-def test_an_unreadable_file_is_an_error(tmp_path, content):
-    path = tmp_path / 'scenario.yaml'
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(ScenarioError, match='cannot be read'):
-        Scenario.from_yaml(path)
-
-
 def test_the_id_is_a_hash_of_the_content():
     scenario = Scenario()
     assert re.fullmatch('sc[0-9a-f]{16}', scenario.id)
     assert scenario.id == Scenario(center_frequencies_hz=[2.5e9, 3000000000]).id
     others = [Scenario(center_frequencies_hz=(2.6e9, 3.0e9)), Scenario(n_frames=5),
+              Scenario(multipath_direction_deg=(60, 0)),
               Scenario(user_gain=2.0), Scenario(feed_positions_m=[(0, 0, 0)] * 3)]
-    assert len({scenario.id, *(other.id for other in others)}) == 5
+    assert len({scenario.id, *(other.id for other in others)}) == 6
     assert Scenario(**scenario.fields()) == scenario
 
 
 @pytest.mark.parametrize(('changes', 'expected'), [
     ({}, 'sc337b8b24c90a1923'),
+    ({'multipath_direction_deg': (0, 0)}, 'sc337b8b24c90a1923'),
     ({'n_feeds': 2, 'user_gain_std_db': 2.0}, 'scc86c2bbf127e1ffd'),
     ({'center_frequencies_hz': [28e9]}, 'scd6c6596ccd3b8041')], ids=str)
 def test_without_impairments_the_id_is_that_of_existing_files(changes, expected):
@@ -382,14 +335,6 @@ class TestImpairments:
         scenario = Scenario(impairments=value)
         assert scenario.impairments == (('moss', 2.0), ('rust', 0.1))
         assert hash(scenario) == hash(dataclasses.replace(scenario))
-
-    def test_a_file_is_read_and_written(self, plugin, tmp_path):
-        path, scenario = tmp_path / 'scenario.yaml', Scenario(impairments={plugin: 0.1})
-        path.write_text('impairments: {rust: 1e-1}', encoding='utf-8')
-        assert Scenario.from_yaml(path) == scenario
-        path.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
-        assert Scenario.from_yaml(path) == scenario
-        assert Scenario(**scenario.fields()) == scenario
 
     def test_the_id_depends_on_names_and_strengths(self, plugin):
         ids = {Scenario(impairments=value).id

@@ -37,51 +37,6 @@ def test_onboard_matrix_matches_the_definition(odd, plain):
         np.testing.assert_allclose(matrix[index], p.onboard(*index), rtol=1e-10)
 
 
-def test_onboard_gain_matches_the_definition(plain):
-    scenario, rng = Scenario(refractive_index=3.0), np.random.default_rng(1)
-    sources, sinks = rng.normal(size=(2, 4, 3))
-    gains = surface.onboard_gain(scenario, 2.5e9, sources, sinks)
-    for gain, source, sink in zip(gains, sources, sinks, strict=True):
-        expected = plain(scenario).kappa(2.5e9, source, sink)
-        np.testing.assert_allclose(gain, expected, rtol=1e-10)
-
-
-def test_element_signals_add_both_paths_and_carry_the_symbol():
-    los, multipath = complex_array(np.random.default_rng(2), 2, 3, 4)
-    signals = surface.element_signals(los, multipath, 0.5 - 2j)
-    for j in range(3):
-        for m in range(4):
-            assert signals[j, m] == pytest.approx((los[j, m] + multipath[j, m]) * (0.5 - 2j))
-
-
-def test_feed_signals_match_the_definition(odd, plain):
-    scenario, codebook = odd
-    p = plain(scenario)
-    elements = complex_array(np.random.default_rng(3), 3, 9)
-    for band in range(3):
-        for q in range(2):
-            analog = codebook.analog[band, q]
-            feeds = surface.feed_signals(scenario, band, analog, elements)
-            assert feeds.shape == (3, 2)
-            for j in range(3):
-                for k in range(2):
-                    expected = sum(
-                        analog[m] * elements[j, m] * p.onboard(band, j, k, m) for m in range(9))
-                    np.testing.assert_allclose(feeds[j, k], expected, rtol=1e-10)
-
-
-def test_combine_is_the_weighted_sum_plus_noise():
-    rng = np.random.default_rng(4)
-    digital, feeds = complex_array(rng, 2, 5, 3)
-    noise = complex_array(rng, 5)
-    combined = surface.combine(digital, feeds, noise)
-    noiseless = surface.combine(digital, feeds, 0)
-    for j in range(5):
-        expected = sum(digital[j, k] * feeds[j, k] for k in range(3))
-        assert noiseless[j] == pytest.approx(expected, rel=1e-12)
-        assert combined[j] == pytest.approx(expected + noise[j], rel=1e-12)
-
-
 def test_radiation_matrix_matches_the_definition(odd, plain):
     scenario, codebook = odd
     p = plain(scenario, codebook.analog, codebook.digital)
