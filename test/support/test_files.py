@@ -45,11 +45,6 @@ def test_a_failing_write_leaves_only_the_old_file(tmp_path, monkeypatch, failing
     assert os.listdir(tmp_path) == ['file']
 
 
-def test_a_missing_folder_is_an_error(tmp_path):
-    with pytest.raises(FileNotFoundError, match='none'):
-        write_whole(tmp_path / 'none' / 'file', 'x')
-
-
 def test_a_file_in_a_missing_folder_is_not_writable(tmp_path):
     check_writable(tmp_path / 'file')
     path = tmp_path / 'none' / 'file'
@@ -102,12 +97,6 @@ def test_a_flipped_bit_is_an_error_or_changes_no_content(file):
     assert n_errors > len(content) / 2
 
 
-def test_pickled_objects_are_refused(tmp_path):
-    np.savez(tmp_path / 'file.npz', one=np.array([object()]), two=2, about='{"format": 4}')
-    with pytest.raises(ArchiveError, match='cannot be read'):
-        read_archive(tmp_path / 'file.npz', 'thing', 4, NAMES)
-
-
 @pytest.mark.parametrize(('text', 'value'), [
     ('3', 3), ('-3', -3), ('+3', 3), ('0', 0), ('1.5', 1.5), ('-.5e-3', -0.5e-3), ('1.', 1.0),
     ('2.5e9', 2.5e9), ('0.010', 0.01), ('.inf', float('inf')), ('true', True), ('~', None)])
@@ -131,13 +120,6 @@ def test_other_notations_in_yaml_are_text(text):
     ("'n': 1\nn: 2", 'n: repeated in line 2'), ('[1]: 2', 'unhashable key'),
     ('? [1]\n: 2', 'unhashable key')])
 def test_a_key_that_yaml_repeats_is_an_error(tmp_path, text, error):
-    with pytest.raises(ValueError, match=error):
-        parse_yaml(text)
     (tmp_path / 'a.yaml').write_text(text)
     with pytest.raises(ValueError, match=f'a.yaml: cannot be read: .*{error}'):
         read_yaml(tmp_path / 'a.yaml')
-
-
-def test_many_keys_are_read_in_linear_time():
-    content = parse_yaml('\n'.join(f'key{n}: {n}' for n in range(20_000)))
-    assert content['key19999'] == 19_999

@@ -1,11 +1,9 @@
 """Pictures: formats, equal files of repeated runs, style and looks."""
 
-import itertools
 import os
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 from rhs_isac_ros.support.optional import MissingLibraryError
@@ -17,7 +15,6 @@ from rhs_isac_ros.support.pictures import (
     new_figure,
     new_panels,
     paper_style,
-    picture_format,
     write_picture,
 )
 
@@ -56,15 +53,11 @@ def test_the_suffix_selects_the_format(figure, tmp_path, kind):
     assert (tmp_path / f'a.{kind.upper()}').read_bytes().startswith(MAGIC[kind])
 
 
-def test_another_suffix_is_an_error_and_leaves_no_file(figure, tmp_path):
-    with pytest.raises(ValueError, match=r"a\.gif', expected a file name that ends in .png, .pdf"):
-        write_picture(tmp_path / 'a.gif', figure)
+@pytest.mark.parametrize('name', ['a.gif', 'png'])
+def test_another_suffix_is_an_error_and_leaves_no_file(figure, tmp_path, name):
+    with pytest.raises(ValueError, match=f"{name}', expected a file name that ends in .png, .pdf"):
+        write_picture(tmp_path / name, figure)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_name_without_suffix_has_no_format():
-    with pytest.raises(ValueError, match=r"^'png', expected"):
-        picture_format('png')
 
 
 @pytest.mark.slow
@@ -122,22 +115,9 @@ def test_a_legend_above_the_panels_overlaps_none(shape):
     assert all(axes.title.get_window_extent().y1 <= box.y0 for axes in panels[0])
 
 
-def lightness(colour):
-    """Return L* of CIELAB, from 0 (black) to 100 (white)."""
-    from matplotlib.colors import to_rgb
-    rgb = np.array(to_rgb(colour))
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055)**2.4)
-    return 116 * np.cbrt(max(linear @ [0.2126, 0.7152, 0.0722], 0.008856)) - 16
-
-
-def test_looks_differ_in_colour_marker_line_and_hatch_and_neighbours_in_lightness():
-    pytest.importorskip('matplotlib')
+def test_looks_differ_in_colour_marker_line_and_hatch():
     for attribute in zip(*LOOKS, strict=True):
         assert len(set(attribute)) == len(LOOKS)
-    values = [lightness(entry.colour) for entry in LOOKS[:4]]
-    assert min(abs(a - b) for a, b in itertools.combinations(values, 2)) > 9
-    for one, other in itertools.pairwise(LOOKS):
-        assert abs(lightness(one.colour) - lightness(other.colour)) > 3
     assert look(len(LOOKS)) == LOOKS[0]
 
 

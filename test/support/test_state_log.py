@@ -75,11 +75,6 @@ def test_an_event_is_logged_once_and_then_once_a_minute_with_its_number(log):
     assert log.event('dropped', event, 3 * PERIOD_S) == [event]
 
 
-def test_subjects_are_independent(log):
-    for key in ('one', 'two'):
-        assert log.state(key, BEGIN, 0.0) == [BEGIN]
-
-
 def test_a_group_of_states_is_compared_with_the_previous_one(log):
     assert log.update({'role': 'two nodes'}, 0.0) == [Line('two nodes', True)]
     assert log.update({'role': 'two nodes', 'clock': 'slow'}, 1.0) == [Line('slow', True)]

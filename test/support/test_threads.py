@@ -19,6 +19,13 @@ def numbers():
     return [library.get_num_threads() for library in BLAS]
 
 
+def allow(number):
+    for library in BLAS:
+        library.set_num_threads(number)
+        # Otherwise, only this thread could change the setting.
+        getattr(library, 'clear_controlling_thread', lambda: None)()
+
+
 @pytest.fixture(autouse=True)
 def three_threads():
     """A process in which BLAS may use three threads."""
@@ -28,8 +35,7 @@ def three_threads():
         if set(numbers()) != {3}:
             pytest.skip('BLAS cannot use three threads here')
         # The setting now belongs to the test, not to this context.
-        for library in BLAS:
-            getattr(library, 'clear_controlling_thread', lambda: None)()
+        allow(3)
         yield
 
 
@@ -52,9 +58,7 @@ def test_a_block_does_not_search_for_libraries(monkeypatch):
 def test_libraries_that_are_found_in_a_block_are_limited_and_restored():
     one_blas_thread.find_libraries()
     with one_blas_thread:
-        for library in BLAS:
-            library.set_num_threads(3)
-            getattr(library, 'clear_controlling_thread', lambda: None)()
+        allow(3)
         one_blas_thread.find_libraries()
         assert set(numbers()) == {1}
     assert set(numbers()) == {3}
@@ -116,9 +120,7 @@ def test_a_library_with_a_setting_for_each_thread_is_limited_in_the_calling_one(
 
 def test_a_setting_made_in_between_remains():
     with one_blas_thread:
-        for library in BLAS:
-            library.set_num_threads(2)
-            getattr(library, 'clear_controlling_thread', lambda: None)()
+        allow(2)
     assert set(numbers()) == {2}
 
 
