@@ -1,7 +1,10 @@
 """The executable ``demo``: runs each node of a network as a process, and reports on the cycles."""
 
 import argparse
+import collections
 import contextlib
+import functools
+import itertools
 import math
 import os
 import shlex
@@ -9,7 +12,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +25,17 @@ from rhs_isac_ros.codebook.library import Library
 from rhs_isac_ros.frontend import RADIOS, SURFACES
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog, CycleRecord
+from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog, CycleRecord
 from rhs_isac_ros.positioning.site import Site, SiteError
-from rhs_isac_ros.protocol.messages import Phase
+from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.settings import PRIORS, REGION, TRACK
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
-from rhs_isac_ros.ros import parameters
+from rhs_isac_ros.ros import endpoints, parameters
 from rhs_isac_ros.ros.environment import check_environment, private_domain
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.processes import MAX_USER_NODES, Processes
 from rhs_isac_ros.ros.recording import CycleObserver, Recorder, RecordingError
-from rhs_isac_ros.ros.roster import ROSTER
+from rhs_isac_ros.ros.roster import MEMBERS, networks
 from rhs_isac_ros.ros.run import StartError, init, starting
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
@@ -48,7 +51,6 @@ from rhs_isac_ros.support.exits import on_end_signals, print_error
 from rhs_isac_ros.support.pictures import write_picture
 from rhs_isac_ros.tools.command import choose_scenario, text_table
 from rhs_isac_ros.tools.pictures import compose_cycles, prepare_drawing
-from rhs_isac_ros.tools.site_demo import SiteObserver, report, start_others
 
 # Maximum time between two complete cycles [s].
 _CYCLE_TIMEOUT_S = 60.0
@@ -56,10 +58,12 @@ _CYCLE_TIMEOUT_S = 60.0
 _WALKING_MPS = 1.0
 # Period of checks [s].
 _PERIOD_S = 0.5
-_PHASES = (Phase.BEACONING, Phase.POSITIONING, Phase.ESTIMATING, Phase.TRANSMITTING)
+_PHASES = (m.Phase.BEACONING, m.Phase.POSITIONING, m.Phase.ESTIMATING, m.Phase.TRANSMITTING)
 _HEADS = ('cycle', 'user', 'true position [m]', 'estimate [m]', 'error\n[m]', '√CRLB\n[m]',
           'beacon\n[ms]', 'sound\n[ms]', 'locate\n[ms]', 'data\n[ms]', 'capacity\n[Mbit/s]',
           'loss\n[%]')
+# Name of the fusion in tables.
+_FUSED = 'fused'
 
 
 def add_network_options(parser: argparse.ArgumentParser) -> None:
@@ -84,19 +88,21 @@ def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Pa
 
 def start_network(
         processes: Processes, users: int, scenario: Scenario, *, together: bool = False,
-        namespace: str = '', **given: Any) -> None:
-    """Start each node of a network in a separate process; if `together`, the users share a node.
+        surfaces: Collection[str] = (), **given: Any) -> None:
+    """Start each node of a network, or of a site with `surfaces`, in a separate process.
 
-    Users walk at random, by default at the scenario's maximum speed. Each parameter in `given`
-    applies to all nodes that have it; None selects its default. A scenario other than Table I must
-    also be given as ``scenario_file``. With ``first_cycle=1``, the seed determines multipath and
-    noise.
+    If `together`, the users share a node. Users walk at random, by default at the maximum speed of
+    the scenario, which in a site is that of the first surface. Each parameter in `given` applies
+    to all nodes that have it; None selects its default. A scenario other than Table I must also be
+    given as ``scenario_file``, and a site as ``site_file``. With ``first_cycle=1``, the seed
+    determines multipath and noise.
     """
-    for role, member in ROSTER.items():
+    for namespace, role in [(space, role) for space, roles in networks(surfaces)
+                            for role in roles]:
         known = {parameter.name for parameter in parameters.NODES[role]}
         values = {name: value for name, value in given.items()
                   if name in known and value is not None}
-        if member.is_unique:
+        if MEMBERS[role].is_unique:
             processes.start(role, namespace=namespace, **values)
             continue
         for name, first, count in [('users', 1, users)] if together else [
@@ -172,6 +178,88 @@ def _abandoned(given_up: Sequence[CycleRecord]) -> list[str]:
             for record in given_up]
 
 
+class SiteObserver(CycleObserver):
+    """Collects the cycles of the leader, the positions of all, and the carriers of the data.
+
+    With a `recorder`, which the caller closes, it also records the topics of the site.
+    """
+
+    def __init__(self, site: Site, recorder: Recorder | None = None, **options: Any) -> None:
+        super().__init__(receives=(), **options)
+        if recorder:
+            recorder.record_topics(self)
+        endpoints.subscribe_messages(
+            self, RECEIVES, None,
+            lambda message: self.observe(message, time.monotonic()),
+            exchange=endpoints.OBSERVATION, prefix=f'/{site.leader}/')
+        # By cycle, for each surface and for the fusion.
+        self.estimates: dict[str, dict[int, m.PositionEstimate]] = {}
+        # By cycle, the surface that delivered the uplink data.
+        self.carriers: dict[int, str] = {}
+        for name, scenario, prefix in [
+                *((name, one.scenario, f'/{name}/') for name, one in site.surfaces.items()),
+                (_FUSED, None, '/')]:
+            self.estimates[name] = {}
+            endpoints.subscribe_messages(
+                self, [m.PositionEstimate, m.Data], scenario, functools.partial(self._keep, name),
+                on_foreign=lambda message: None, exchange=endpoints.OBSERVATION, prefix=prefix)
+
+    def _keep(self, name: str, message: m.Message) -> None:
+        match message:
+            case m.PositionEstimate():
+                self.estimates[name][message.cycle_id] = message
+            case m.Data(direction=m.Direction.UPLINK, stage=m.Stage.DELIVERED):
+                self.carriers[message.cycle_id] = name
+
+    @property
+    def complete(self) -> Sequence[CompleteCycle]:
+        """Cycles with a position of the fusion, from the first one that all surfaces located."""
+        return list(itertools.dropwhile(
+            lambda cycle: any(cycle.cycle_id not in one for one in self.estimates.values()),
+            (cycle for cycle in self.log.complete
+             if cycle.cycle_id in self.estimates[_FUSED] and cycle.cycle_id in self.carriers)))
+
+    def errors_m(self, cycle: CompleteCycle) -> dict[str, float]:
+        """Return the error of each surface and of the fusion in a cycle [m]; NaN without a fix."""
+        return {name: float(np.linalg.norm(estimates[cycle.cycle_id].position
+                                           - cycle.truth.position))
+                if cycle.cycle_id in estimates else math.nan
+                for name, estimates in self.estimates.items()}
+
+
+def site_lines(observer: SiteObserver) -> Iterator[str]:
+    """Yield a table with a line for each cycle, the errors of each surface, and its data."""
+    cycles = observer.complete
+    errors_m = [observer.errors_m(cycle) for cycle in cycles]
+    names = [*observer.estimates]
+    heads = ('cycle', 'user', 'true position [m]', *(f'{name}\n[m]' for name in names), 'data')
+    yield text_table(heads, (
+        (str(cycle.cycle_id), str(cycle.user),
+         ' '.join(f'{coordinate:6.2f}' for coordinate in cycle.truth.position),
+         *(f'{error_m:.3f}' for error_m in of_cycle.values()),
+         observer.carriers.get(cycle.cycle_id, ''))
+        for cycle, of_cycle in zip(cycles, errors_m, strict=True)), '>' * len(heads))
+    for name in names:
+        found = np.array([of_cycle[name] for of_cycle in errors_m])
+        found = found[np.isfinite(found)]
+        yield (f'{name}: {len(found)} positions, root mean square error '
+               f'{np.sqrt(np.mean(found**2)) if len(found) else math.nan:.3f} m')
+    yield _carriage(observer, cycles)
+
+
+def _carriage(observer: SiteObserver, cycles: Sequence[CompleteCycle]) -> str:
+    """Describe how many cycles each surface carried, and how often users changed the surface."""
+    latest: dict[int, str] = {}
+    n_handovers = 0
+    for cycle in cycles:
+        carrier = observer.carriers[cycle.cycle_id]
+        n_handovers += latest.get(cycle.user, carrier) != carrier
+        latest[cycle.user] = carrier
+    carried = collections.Counter(observer.carriers[cycle.cycle_id] for cycle in cycles)
+    return (f'data: {", ".join(f"{n} over {name}" for name, n in sorted(carried.items()))}; '
+            f'{n_handovers} handover{"s" * (n_handovers != 1)}')
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demonstration, and return its exit code.
 
@@ -208,27 +296,30 @@ def follow(options: argparse.Namespace) -> None:
 
 
 class _Demonstration:
-    """A network with one surface: its processes, observer, recording and report."""
+    """A network with one surface: its parameters, observer, recording and report."""
+
+    surfaces: Collection[str] = ()
 
     def __init__(self, options: argparse.Namespace) -> None:
         if options.follow:
             follow(options)
-        self.scenario, self._codebook_file = load_files(options.config, options.codebook)
+        self.scenario, codebook_file = load_files(options.config, options.codebook)
         if options.follow:
             Library.load(options.follow).check(self.scenario)
+        self.files = {'scenario_file': options.config, 'codebook_file': codebook_file}
         self.options = options
         self.recorder = Recorder(options.record, self.scenario) if options.record else None
         self.board = EmulatedBoard() if options.port == 'emulated' else None
 
     def start(self, processes: Processes, together: bool) -> None:
         """Start all processes."""
-        options = self.options
+        options, port = self.options, self.board.port if self.board else self.options.port
         start_network(
-            processes, options.users, self.scenario, together=together, first_cycle=1,
-            seed=options.seed, scenario_file=options.config, codebook_file=self._codebook_file,
+            processes, options.users, self.scenario, together=together, surfaces=self.surfaces,
+            first_cycle=1, seed=options.seed, **self.files,
             prior=options.prior, library_file=options.follow, calibration_file=options.calibration,
             states_file=options.calibration, surface=options.surface,
-            surface_options=_surface_options(options, self.board),
+            surface_options=f'port={shlex.quote(port)}' if port else None,
             # Other radios have noise of their own.
             radio=options.radio, radio_options=options.radio_options,
             samples_folder=options.samples, receiver_noise=options.radio == 'emulated',
@@ -254,29 +345,25 @@ class _SiteDemonstration(_Demonstration):
 
     def __init__(self, parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
         if other := [name for name in (
-                'config', 'codebook', 'follow', 'record', 'calibration', 'surface', 'port',
-                'radio', 'radio_options', 'samples', 'picture')
+                'config', 'codebook', 'follow', 'calibration', 'surface', 'port', 'radio',
+                'radio_options', 'samples', 'picture')
                 # Defaults of files are texts.
                 if str(getattr(options, name)) != str(parser.get_default(name))]:
             option = other[0].replace('_', '-')
             parser.error(f'argument --{option}: not allowed with --site')
         self._site = Site.from_yaml(options.site)
+        self.surfaces = self._site.surfaces
         self.scenario = self._site.surfaces[self._site.leader].scenario
-        self.options, self.recorder, self.board = options, None, None
-
-    def start(self, processes: Processes, together: bool) -> None:
-        given = {'seed': self.options.seed, 'prior': self.options.prior}
-        start_others(processes, self.options.site, self._site, **given)
-        start_network(
-            processes, self.options.users, self.scenario, together=together, first_cycle=1,
-            namespace=self._site.leader, site_file=self.options.site.resolve(), **given)
+        self.files, self.options, self.board = {'site_file': options.site.resolve()}, options, None
+        self.recorder = (
+            Recorder(options.record, self.scenario, self._site) if options.record else None)
 
     def observer(self, log: CycleLog) -> CycleObserver:
-        self._observer = SiteObserver(self._site, log=log, **WITHOUT_SERVICES)
+        self._observer = SiteObserver(self._site, self.recorder, log=log, **WITHOUT_SERVICES)
         return self._observer
 
     def report(self, log: CycleLog) -> None:
-        for line in [*report(self._observer), *_abandoned(log.given_up)]:
+        for line in [*site_lines(self._observer), *_abandoned(log.given_up)]:
             print(line)
 
 
@@ -307,11 +394,6 @@ def _run(demonstration: _Demonstration, options: argparse.Namespace) -> int:
             with contextlib.suppress(KeyboardInterrupt):
                 code = _report(log, demonstration, options, problem)
     return code
-
-
-def _surface_options(options: argparse.Namespace, board: EmulatedBoard | None) -> str | None:
-    port = board.port if board else options.port
-    return f'port={shlex.quote(port)}' if port else None
 
 
 def _observe(
