@@ -7,6 +7,7 @@ positions.
 
 import argparse
 import dataclasses
+import functools
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -39,15 +40,12 @@ from rhs_isac_ros.positioning.alignment import PoseError, estimate_pose
 from rhs_isac_ros.positioning.site import SiteError, site_text
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.fusion import sighting_of
-from rhs_isac_ros.ros import topics
-from rhs_isac_ros.ros.convert import from_bytes, ros_type
-from rhs_isac_ros.ros.endpoints import EXCHANGE, log_dropped, subscribe, subscribe_messages
+from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import RecordingError
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
-    integer,
     output_file,
     positive_float,
     positive_int,
@@ -68,13 +66,13 @@ Assumption: TypeAlias = Callable[[list[Pilots]], tuple[Scenario, SurfaceEstimate
 
 
 class PilotLog:
-    """Collects codebooks, and signals and true positions of one user, or of all if `user` is 0.
+    """Collects codebooks, signals and true positions.
 
     Unlike `CycleLog`, it keeps cycles without a fix, because a fix may require the calibration.
     """
 
-    def __init__(self, scenario: Scenario, user: int = 0) -> None:
-        self._pose, self._user = scenario.pose, user
+    def __init__(self, scenario: Scenario) -> None:
+        self._pose = scenario.pose
         self._truths: dict[tuple[int, int], list[m.GroundTruth]] = {}
         self._signals: dict[int, m.ReceivedSignals] = {}
         self.codebooks: dict[str, Codebook] = {}
@@ -86,18 +84,13 @@ class PilotLog:
                 self.codebooks[found.id] = found
             case m.GroundTruth() if found.cycle_id:
                 self._truths.setdefault((found.cycle_id, found.user), []).append(found)
-            case m.ReceivedSignals() if self._user in (0, found.user):
+            case m.ReceivedSignals():
                 self._signals.setdefault(found.cycle_id, found)
-
-    def has_pilots(self, n: int) -> bool:
-        """Return whether the positions and codebooks of at least `n` pilots are known."""
-        # Counting the signals is quicker, so it comes first.
-        return len(self._signals) >= n and self.n_pilots >= n
 
     @property
     def n_pilots(self) -> int:
         """Number of pilots whose position and codebook are known."""
-        return sum(len(group.positions) for group in self.pilots())
+        return len(self._known())
 
     @property
     def missing_codebooks(self) -> list[str]:
@@ -108,14 +101,16 @@ class PilotLog:
     def pilots(self) -> list[Pilots]:
         """Return the pilots whose position and codebook are known, grouped by codebook."""
         groups: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-        for signals in self._signals.values():
-            truth = self._truth_of(signals)
-            if truth is not None and signals.codebook_id in self.codebooks:
-                groups.setdefault(signals.codebook_id, []).append(
-                    (self._pose.to_surface(truth.position),
-                     signals.signals.reshape(len(signals.signals), -1)))
+        for signals, truth in self._known():
+            groups.setdefault(signals.codebook_id, []).append(
+                (self._pose.to_surface(truth.position),
+                 signals.signals.reshape(len(signals.signals), -1)))
         return [Pilots(self.codebooks[codebook_id], *map(np.array, zip(*group, strict=True)))
                 for codebook_id, group in groups.items()]
+
+    def _known(self) -> list[tuple[m.ReceivedSignals, m.GroundTruth]]:
+        return [(signals, truth) for signals in self._signals.values()
+                if (truth := self._truth_of(signals)) and signals.codebook_id in self.codebooks]
 
     def _truth_of(self, signals: m.ReceivedSignals) -> m.GroundTruth | None:
         known = self._truths.get((signals.cycle_id, signals.user), [])
@@ -136,16 +131,13 @@ class PosteriorLog:
     """Collects the posteriors of the surfaces of a site, by cycle and user."""
 
     def __init__(self, site: Site) -> None:
-        self._names = {one.scenario.id: name for name, one in site.surfaces.items()}
-        self._site = site
+        self._names = [*site.surfaces]
         self._found: dict[tuple[int, int], dict[str, Sighting]] = {}
 
-    def add(self, message: m.Posterior) -> None:
-        """Add a posterior; drop those of other scenarios."""
-        if name := self._names.get(message.scenario_id):
-            m.check(message, self._site.surfaces[name].scenario)
-            self._found.setdefault((message.cycle_id, message.user), {})[name] = sighting_of(
-                message)
+    def add(self, name: str, message: m.Message) -> None:
+        """Add a posterior of a surface."""
+        assert isinstance(message, m.Posterior)
+        self._found.setdefault((message.cycle_id, message.user), {})[name] = sighting_of(message)
 
     def pairs(self, one: str, other: str) -> tuple[list[Sighting], list[Sighting]]:
         """Return the sightings by both surfaces of users that they located in one cycle."""
@@ -155,7 +147,7 @@ class PosteriorLog:
     @property
     def n_pairs(self) -> int:
         """Smallest number of users that the first surface and another one located together."""
-        first, *others = self._site.surfaces
+        first, *others = self._names
         return min(len(self.pairs(first, other)[0]) for other in others)
 
 
@@ -164,16 +156,20 @@ class AlignerNode(Node):
 
     def __init__(self, log: PosteriorLog, site: Site) -> None:
         super().__init__('calibrator', **WITHOUT_SERVICES)
-        self._log = log
-        for name in site.surfaces:
-            subscribe(self, ros_type(m.Posterior), f'{name}/{topics.NAMES[m.Posterior]}',
-                      self._receive, EXCHANGE, raw=True)
+        for name, one in site.surfaces.items():
+            subscribe_messages(
+                self, [m.Posterior], one.scenario, functools.partial(log.add, name),
+                on_foreign=lambda message: None, prefix=f'{name}/')
 
-    def _receive(self, content: bytes) -> None:
-        try:
-            self._log.add(from_bytes(m.Posterior, content))
-        except m.MessageError as error:
-            log_dropped(self, error)
+
+def _collect(make: Callable[[], Node], count: Callable[[], int], what: str,
+             options: argparse.Namespace, arguments: list[str]) -> None:
+    """Spin a node until `count` has reached the number in the options, or raise ToolError."""
+    end_s = time.monotonic() + options.timeout
+    command.observe(
+        make, arguments, lambda _: count() >= options.cycles or time.monotonic() > end_s)
+    if count() < options.cycles:
+        raise command.none_within(f'{count()} of {options.cycles} {what}', options.timeout)
 
 
 def _align(options: argparse.Namespace, arguments: list[str]) -> int:
@@ -182,12 +178,8 @@ def _align(options: argparse.Namespace, arguments: list[str]) -> int:
     if len(site.surfaces) < 2:
         raise SiteError(f'{options.site}: surfaces: one, expected at least two')
     log = PosteriorLog(site)
-    end_s = time.monotonic() + options.timeout
-    command.observe(lambda: AlignerNode(log, site), arguments,
-                    lambda _: log.n_pairs >= options.cycles or time.monotonic() > end_s)
-    if log.n_pairs < options.cycles:
-        raise command.none_within(
-            f'{log.n_pairs} of {options.cycles} users located by two surfaces', options.timeout)
+    _collect(lambda: AlignerNode(log, site), lambda: log.n_pairs,
+             'users located by two surfaces', options, arguments)
     first, *others = site.surfaces
     poses = {}
     for name in others:
@@ -253,19 +245,14 @@ def _arrays(options: argparse.Namespace) -> Pilots:
 
 def _collected(
         options: argparse.Namespace, scenario: Scenario, arguments: list[str]) -> list[Pilots]:
-    log = PilotLog(scenario, options.user)
+    log = PilotLog(scenario)
     if options.file:
         for found, _ in command.recorded(
                 options.file, options.namespace, scenario, [*RECEIVES, Codebook]):
             log.add(found)
     else:
-        end_s = time.monotonic() + options.timeout
-        command.observe(
-            lambda: CalibratorNode(log, scenario), arguments,
-            lambda _: log.has_pilots(options.cycles) or time.monotonic() > end_s)
-        if not log.has_pilots(options.cycles):
-            raise command.none_within(
-                f'{log.n_pilots} of {options.cycles} pilots', options.timeout)
+        _collect(lambda: CalibratorNode(log, scenario), lambda: log.n_pilots, 'pilots',
+                 options, arguments)
     if options.codebook:
         codebook = Codebook.load(options.codebook)
         codebook.check(scenario)
@@ -357,8 +344,8 @@ def _states(text: str) -> tuple[complex, ...]:
 def _conflict(options: argparse.Namespace) -> str:
     options.output = options.output or (_SITE_OUTPUT if options.site else _OUTPUT)
     others = [name for name in (
-        'file', 'multipath', 'states', 'config', 'codebook', 'calibration', 'user', 'namespace')
-        if getattr(options, name) not in (None, False, 0, '/')]
+        'file', 'multipath', 'states', 'config', 'codebook', 'calibration', 'namespace')
+        if getattr(options, name) not in (None, False, '/')]
     if options.site and others:
         return f'argument --site: not allowed with {", ".join(others)}'
     return ''
@@ -387,8 +374,6 @@ def _parser() -> argparse.ArgumentParser:
     add('--output', type=output_file, metavar='FILE',
         help=f'file to write (default: {_OUTPUT}, or {_SITE_OUTPUT} with --site)')
     command.add_files(parser, 'config', 'codebook', 'calibration')
-    add('--user', type=integer(0), default=0, metavar='ID',
-        help='use only the signals of this user (default: of all users)')
     add('--namespace', default='/', help='namespace of the recorded network (default: /)')
     add('--cycles', type=positive_int, default=_CYCLES, metavar='N',
         help='pilots, or users that two surfaces locate, to collect from a running network '

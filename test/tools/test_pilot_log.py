@@ -38,7 +38,6 @@ def test_signals_are_paired_with_the_position_of_their_cycle(log, codebook):
         log.add(message)
     (pilots,) = log.pilots()
     assert (log.n_pilots, pilots.beams) == (2, codebook)
-    assert log.has_pilots(2) and not log.has_pilots(3)
     np.testing.assert_array_equal(pilots.positions[:, 1], [2, 1])
     np.testing.assert_array_equal(pilots.received[:, 0, 0], [2 + 1j, 1 + 1j])
 
@@ -58,21 +57,11 @@ def test_positions_of_others_do_not_count(log, codebook, message):
     log.add(message)
     log.add(signals(3, codebook.id))
     assert (log.n_pilots, log.pilots()) == (0, [])
-    assert not log.has_pilots(1)
 
 
 def test_repeated_signals_count_once(log, codebook):
     for message in (truth(1), signals(1, codebook.id), signals(1, codebook.id)):
         log.add(message)
-    assert log.n_pilots == 1
-
-
-def test_signals_of_one_user_may_be_selected(codebook):
-    log = PilotLog(Scenario(), user=2)
-    log.add(codebook)
-    for user in (1, 2):
-        log.add(truth(user, user))
-        log.add(signals(user, codebook.id, user))
     assert log.n_pilots == 1
 
 
