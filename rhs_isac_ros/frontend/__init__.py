@@ -72,9 +72,7 @@ def make_surface(name: str, n_elements: int, **options: Any) -> Surface:
     or no such option; and PluginError if a plug-in cannot be loaded, fails, or does not return a
     surface. No hardware is used before the first `apply`.
     """
-    surface = _make(SURFACES, plugins.SURFACES, name, n_elements, **options)
-    if not isinstance(surface, Surface):
-        raise _misfit(plugins.SURFACES, name, surface, 'n_elements, waits, apply and close')
+    surface: Surface = _make(Surface, SURFACES, plugins.SURFACES, name, n_elements, **options)
     if surface.n_elements != n_elements:
         raise ValueError(f'{name}: {surface.n_elements} elements, expected {n_elements}')
     return surface
@@ -90,14 +88,12 @@ def make_radio(name: str, scenario: Scenario, air: Air, **options: Any) -> Radio
     the scenario; and PluginError if a plug-in cannot be loaded, fails, or does not return a radio.
     No hardware is used before the first `capture`.
     """
-    radio = _make(RADIOS, plugins.RADIOS, name, scenario, air, **options)
-    if not isinstance(radio, Radio):
-        raise _misfit(plugins.RADIOS, name, radio, 'waits, modem, time_s, capture and close')
+    radio: Radio = _make(Radio, RADIOS, plugins.RADIOS, name, scenario, air, **options)
     return radio
 
 
-def _make(built_in: Mapping[str, Callable[..., Any]], group: str, name: str, *arguments: Any,
-          **options: Any) -> Any:
+def _make(kind: type, built_in: Mapping[str, Callable[..., Any]], group: str, name: str,
+          *arguments: Any, **options: Any) -> Any:
     if name in built_in:
         try:
             inspect.signature(built_in[name]).bind(*arguments, **options)
@@ -107,9 +103,9 @@ def _make(built_in: Mapping[str, Callable[..., Any]], group: str, name: str, *ar
     installed = plugins.names(group)
     if name not in installed:
         raise ValueError(f'{name!r}, expected one of {sorted({*built_in, *installed})}')
-    return plugins.make(group, name, *arguments, **options)
-
-
-def _misfit(group: str, name: str, found: object, expected: str) -> plugins.PluginError:
-    return plugins.PluginError(f'{plugins.describe(group, name)}: returned {found!r}, expected an '
-                               f'object with {expected}')
+    made = plugins.make(group, name, *arguments, **options)
+    if not isinstance(made, kind):
+        members = ', '.join(member for member in dir(kind) if not member.startswith('_'))
+        raise plugins.PluginError(f'{plugins.describe(group, name)}: returned {made!r}, expected '
+                                  f'an object with {members}')
+    return made

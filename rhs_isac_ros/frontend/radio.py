@@ -11,6 +11,9 @@ from rhs_isac_ros.model.multipath import complex_normal
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.support.fields import finite
 
+# Standard deviation of the offset of the emulated carrier with one clock.
+_CARRIER_STD_HZ = 300.0
+
 
 class RadioFault(Exception):
     """A radio has not measured a frame."""
@@ -151,13 +154,11 @@ class WaveformRadio:
     when the radio opens. With one clock for both ends, the phase at the start of a frame does not
     change from frame to frame.
 
+    If all combining vectors have the same power, the combined signals have the noise of the
+    scenario.
+
     Parameters
     ----------
-    noise_psd_dbm_hz : float or None
-        Noise, by default that of the scenario: if all combining vectors have the same power, the
-        combined signals have the noise of the scenario.
-    carrier_std_hz : float
-        Standard deviation of the offset of the carrier with one clock.
     clock_ppm : float
         Excess of the user's clock over that of the receiver; 0 for one clock. It changes carrier,
         phase and delay.
@@ -165,18 +166,15 @@ class WaveformRadio:
 
     waits, time_s = False, 0.0
 
-    def __init__(self, scenario: Scenario, air: Air, *, noise_psd_dbm_hz: float | None = None,
-                 carrier_std_hz: float = 300.0, clock_ppm: float = 0.0) -> None:
+    def __init__(self, scenario: Scenario, air: Air, *, clock_ppm: float = 0.0) -> None:
         self.modem = Waveform(scenario)
         self._drift = 1e-6 * finite('clock_ppm', clock_ppm)
-        self._air, self._carrier_std_hz = air, 0.0 if self._drift else carrier_std_hz
+        self._air = air
         self._n_frames, self._frame_s = scenario.n_frames, scenario.frame_duration_s
         self._centers_hz = scenario.center_frequencies_hz
-        excess_db = 0.0 if noise_psd_dbm_hz is None else (
-            noise_psd_dbm_hz - scenario.noise_psd_dbm_hz)
         # The mean over the samples of the symbols has the noise of a feed.
-        self._noise_w = (scenario.noise_power_w * 10 ** (excess_db / 10) * scenario.n_subbands
-                         / scenario.max_power_w * N_SYMBOLS * self.modem.n_period)
+        self._noise_w = (scenario.noise_power_w * scenario.n_subbands / scenario.max_power_w
+                         * N_SYMBOLS * self.modem.n_period)
         self._offsets: tuple[float, float] | None = None
 
     def capture(self, band: int, pilot: np.ndarray) -> np.ndarray:
@@ -184,7 +182,9 @@ class WaveformRadio:
         modem, air = self.modem, self._air
         n, rate_hz = modem.n_period, modem.sample_rate_hz
         if self._offsets is None:
-            self._offsets = n * air.rng.uniform(0, 2), self._carrier_std_hz * air.rng.normal()
+            # With two clocks, their drift alone determines the carrier.
+            std_hz = 0.0 if self._drift else _CARRIER_STD_HZ
+            self._offsets = n * air.rng.uniform(0, 2), std_hz * air.rng.normal()
         delay, carrier_hz = self._offsets
         if self._drift:
             self.time_s = (band * self._n_frames + air.frame) * self._frame_s

@@ -157,18 +157,15 @@ class Waveform:
 
 def _check(scenario: Scenario, frame_s: float) -> None:
     """Raise ScenarioError unless a scenario can be measured with frames of a duration [s]."""
-    if scenario.frame_duration_s < frame_s:
-        raise ScenarioError(
-            f'frame_duration_s: {scenario.frame_duration_s:g} s, expected at least {frame_s:g} s '
-            f'with a waveform: {N_SYMBOLS} symbols of 1 / subband_width_hz and a prefix of '
-            f'{_PREFIX_SPREADS:g} delay_spread_s')
     farthest_s = float(np.linalg.norm(
         np.abs(scenario.roi_bounds_m).max(axis=0))) / SPEED_OF_LIGHT_MPS
-    if scenario.timing_std_s < farthest_s:
-        raise ScenarioError(
-            f'timing_std_s: {scenario.timing_std_s:g} s, expected at least {farthest_s:g} s with '
-            'a waveform, whose timing contains the delay from the region')
-    if scenario.n_bands > 1 and scenario.band_phase_std_rad < _UNIFORM_RAD * (1 - 1e-5):
-        raise ScenarioError(
-            f'band_phase_std_rad: {scenario.band_phase_std_rad:g} rad, expected at least '
-            f'{_UNIFORM_RAD:.4f} rad with a waveform, because retuning changes the phase')
+    for name, low, unit, reason in (
+            ('frame_duration_s', frame_s, 's', f': {N_SYMBOLS} symbols of 1 / subband_width_hz '
+             f'and a prefix of {_PREFIX_SPREADS:g} delay_spread_s'),
+            ('timing_std_s', farthest_s, 's',
+             ', whose timing contains the delay from the region'),
+            ('band_phase_std_rad', _UNIFORM_RAD * (scenario.n_bands > 1), 'rad',
+             ', because retuning changes the phase')):
+        if (value := getattr(scenario, name)) < low * (1 - 1e-5):
+            raise ScenarioError(f'{name}: {value:g} {unit}, expected at least {low:.5g} {unit} '
+                                f'with a waveform{reason}')

@@ -45,14 +45,19 @@ class Recording:
             raise error
 
 
-def sounding():
-    return Sounding(1, 0, np.arange(3), np.ones((3, 2, 1)), 1, np.zeros(3))
+def front_end(surface, radio):
+    return FrontEnd(surface, radio, Air(SCENARIO, np.random.default_rng(0)))
+
+
+def sound(parts):
+    """Measure a band with a surface and radio."""
+    return front_end(parts, parts).sound(
+        CONFIGURATIONS, Sounding(1, 0, np.arange(3), np.ones((3, 2, 1)), 1, np.zeros(3)))
 
 
 def test_each_frame_is_measured_while_its_configuration_is_shown():
     parts = Recording()
-    front_end = FrontEnd(parts, parts, Air(SCENARIO, np.random.default_rng(0)))
-    assert front_end.sound(CONFIGURATIONS, sounding()).shape == (3, 2, 1)
+    assert sound(parts).shape == (3, 2, 1)
     # The last confirmation covers the last capture.
     assert parts.calls == ['show 0', 'capture 0 0', 'show 1', 'capture 0 1', 'show 2',
                            'capture 0 2', 'show 2']
@@ -63,30 +68,26 @@ def test_each_frame_is_measured_while_its_configuration_is_shown():
 def test_nothing_is_measured_after_a_fault(fails, kind, n):
     parts = Recording(fails)
     with pytest.raises(kind):
-        FrontEnd(parts, parts, Air(SCENARIO, np.random.default_rng(0))).sound(
-            CONFIGURATIONS, sounding())
+        sound(parts)
     assert len(parts.calls) == n
 
 
 @pytest.mark.parametrize('capture', [
     np.ones((1, 1)), np.full((2, 1), np.nan), np.ones((0, 1))])
 def test_captures_of_another_size_are_a_fault_of_the_radio(capture):
-    parts = Recording(capture=capture)
     with pytest.raises(RadioFault, match='expected finite'):
-        FrontEnd(parts, parts, Air(SCENARIO, np.random.default_rng(0))).sound(
-            CONFIGURATIONS, sounding())
+        sound(Recording(capture=capture))
 
 
 def test_both_parts_are_released_even_if_one_fails():
     surface, radio = Recording('close'), Recording()
     with pytest.raises(OSError, match='gone'):
-        FrontEnd(surface, radio, Air(SCENARIO, np.random.default_rng(0))).close()
+        front_end(surface, radio).close()
     assert radio.calls == ['close']
 
 
 def test_only_parts_of_hardware_need_a_thread():
-    air = Air(SCENARIO, np.random.default_rng(0))
-    emulated = EmulatedSurface(4), EmulatedRadio(SCENARIO, air)
-    assert not FrontEnd(*emulated, air).waits
-    assert FrontEnd(Recording(), emulated[1], air).waits
-    assert FrontEnd(emulated[0], Recording(), air).waits
+    surface, radio = EmulatedSurface(4), EmulatedRadio(SCENARIO, None)
+    assert not front_end(surface, radio).waits
+    assert front_end(Recording(), radio).waits
+    assert front_end(surface, Recording()).waits

@@ -6,8 +6,6 @@ import threading
 import time
 from pathlib import Path
 
-import pytest
-
 from rhs_isac_ros.frontend.opensourceris import OpenSourceRis
 from rhs_isac_ros.frontend.opensourceris_emulator import BANNER, EmulatedBoard, Firmware
 
@@ -75,13 +73,3 @@ def test_an_unplugged_board_leaves_nothing():
     assert not os.path.lexists(board.port)
     assert not os.path.exists(os.path.dirname(board.port))
     assert (threading.active_count(), sorted(os.listdir('/proc/self/fd'))) == before
-
-
-@pytest.mark.parametrize('fault', ['closed', 'occupied'])
-def test_a_board_is_plugged_again_after_a_fault(board, driver, fault):
-    board.faults = {0: fault}
-    with pytest.raises(Exception, match='cannot be used'):
-        driver.apply([1] * 256)
-    board.plug()
-    driver.apply([1] * 256)
-    assert board.configuration.all()

@@ -15,6 +15,7 @@ from rhs_isac_ros.frontend import (
     RadioFault,
     SampleRecorder,
     Sounding,
+    Waveform,
     WaveformRadio,
     make_radio,
 )
@@ -69,11 +70,15 @@ def record(folder, order, radio=WaveformRadio, scenario=SCENARIO):
     return sent, feeds
 
 
+def playback(path, scenario=SCENARIO):
+    """Return the radio that plays a recording, and its air."""
+    air = Air(scenario, np.random.default_rng(1))
+    return make_radio('sigmf', scenario, air, path=str(path)), air
+
+
 def player(path):
     """Return a function that plays a band of a cycle, with other signals and symbols."""
-    air, rng = Air(SCENARIO, np.random.default_rng(1)), np.random.default_rng(2)
-    radio = make_radio('sigmf', SCENARIO, air, path=str(path))
-    front_end = FrontEnd(EmulatedSurface(16), radio, air)
+    front_end, rng = FrontEnd(EmulatedSurface(16), *playback(path)), np.random.default_rng(2)
     return front_end, lambda cycle_id, band: front_end.sound(
         configurations(0), sounding(rng, cycle_id, band))
 
@@ -160,22 +165,20 @@ def test_a_folder_may_contain_several_recordings(tmp_path):
     ({'user_gain': 2.0}, 'user_gain: .*, expected 2.0')])
 def test_a_recording_of_another_scenario_is_refused(tmp_path, changes, text):
     record(tmp_path, cycles(1))
-    other = dataclasses.replace(SCENARIO, **changes)
     with pytest.raises(ScenarioError, match=text):
-        make_radio('sigmf', other, Air(other, np.random.default_rng(0)), path=str(tmp_path))
+        playback(tmp_path, dataclasses.replace(SCENARIO, **changes))
 
 
 def test_files_that_are_no_recording_are_refused(tmp_path):
-    air = Air(SCENARIO, np.random.default_rng(0))
     with pytest.raises(ValueError, match='no collections, expected files'):
-        make_radio('sigmf', SCENARIO, air, path=str(tmp_path))
+        playback(tmp_path)
     with pytest.raises(ValueError, match='missing: cannot be read: '):
-        make_radio('sigmf', SCENARIO, air, path=str(tmp_path / 'missing'))
+        playback(tmp_path / 'missing')
     record(tmp_path, cycles(1))
     data = tmp_path / 'part-000001-feed0.sigmf-data'
     data.write_bytes(bytes([data.read_bytes()[0] ^ 1]) + data.read_bytes()[1:])
     with pytest.raises(ValueError, match='cannot be read: Calculated file hash does not match'):
-        make_radio('sigmf', SCENARIO, air, path=str(tmp_path))
+        playback(tmp_path)
 
 
 def test_a_failed_recording_ends_and_measurement_continues(tmp_path):
@@ -193,16 +196,14 @@ def test_a_failed_recording_ends_and_measurement_continues(tmp_path):
 
 
 def test_a_radio_without_samples_cannot_be_recorded(tmp_path):
-    radio = EmulatedRadio(SCENARIO, Air(SCENARIO, np.random.default_rng(0)))
     with pytest.raises(ValueError, match='modem EmulatedRadio, expected a radio with the modem'):
-        SampleRecorder(tmp_path, SCENARIO, radio.modem, pytest.fail)
+        SampleRecorder(tmp_path, SCENARIO, EmulatedRadio(SCENARIO, None), pytest.fail)
 
 
 def test_a_missing_library_is_named_with_its_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, 'sigmf', None)
-    air = Air(SCENARIO, np.random.default_rng(0))
     hint = r"needs sigmf, which is not installed \(pip install 'rhs_isac_ros\[samples\]'; in a"
     with pytest.raises(ValueError, match=f'recording samples {hint}'):
-        SampleRecorder(tmp_path, SCENARIO, WaveformRadio(SCENARIO, air).modem, pytest.fail)
+        SampleRecorder(tmp_path, SCENARIO, Waveform(SCENARIO), pytest.fail)
     with pytest.raises(ValueError, match=f'radio sigmf {hint}'):
-        make_radio('sigmf', SCENARIO, air, path=str(tmp_path))
+        playback(tmp_path)

@@ -24,19 +24,30 @@ def response(scenario, delay_s, rng):
     return phases * np.exp(-2j * np.pi * offsets_hz * delay_s)[:, None]
 
 
-def captured(scenario, signals, snr_db, rng, symbols=None, radio=None):
-    """Return the modem, and the captures of the frames of a band with an SNR in a sub-band."""
-    air = Air(scenario, rng)
-    if radio is None:
-        plain = 10 * np.log10(scenario.noise_power_w * scenario.n_subbands / scenario.max_power_w)
-        radio = WaveformRadio(
-            scenario, air, noise_psd_dbm_hz=scenario.noise_psd_dbm_hz - snr_db - plain)
-        radio.air = air
+def with_snr(scenario, snr_db):
+    """Return a scenario whose sub-bands of unit power have an SNR at a feed."""
+    plain = 10 * np.log10(scenario.noise_power_w * scenario.n_subbands / scenario.max_power_w)
+    return dataclasses.replace(
+        scenario, noise_psd_dbm_hz=scenario.noise_psd_dbm_hz - snr_db - plain)
+
+
+def captured(radio, signals, symbols=None):
+    """Return the captures of the frames of a band."""
     symbols = np.ones(len(signals)) if symbols is None else symbols
     captures = []
     for radio.air.signals, symbol in zip(signals, symbols, strict=True):
         captures.append(radio.capture(0, radio.modem.pilot(symbol)))
-    return radio, np.stack(captures)
+    return np.stack(captures)
+
+
+def radio_of(scenario, rng, **options):
+    air = Air(scenario, rng)
+    radio = WaveformRadio(scenario, air, **options)
+    radio.air = air
+    return radio
+
+
+LAB_60_DB = with_snr(LAB, 60)
 
 
 def received(radio, captures, cycle_id=1, symbols=1.0, band=0, times_s=0.0):
@@ -64,8 +75,8 @@ def test_errors_and_measured_noise_are_those_of_theory(snr_db, n_subbands):
     errors, noise, carriers = [], [], []
     for cycle_id in range(40):
         signals = response(scenario, 0.3e-6, rng)
-        radio, captures = captured(scenario, signals, snr_db, rng)
-        found = received(radio, captures, cycle_id)
+        radio = radio_of(with_snr(scenario, snr_db), rng)
+        found = received(radio, captured(radio, signals), cycle_id)
         errors.append(np.mean(np.abs(without_phase_and_delay(found, signals) - signals)**2))
         noise.append(radio.modem.noise_power)
         carriers.append(radio.modem.synchronisation.carrier_hz - radio._offsets[1])
@@ -81,8 +92,8 @@ def test_a_band_without_noise_is_recovered_exactly():
     rng = np.random.default_rng(1)
     signals = response(LAB, 0.3e-6, rng)
     symbols = np.exp(2j * np.pi * rng.random(16))
-    radio, captures = captured(LAB, signals, 200, rng, symbols)
-    found = received(radio, captures, symbols=symbols)
+    radio = radio_of(with_snr(LAB, 200), rng)
+    found = received(radio, captured(radio, signals, symbols), symbols=symbols)
     np.testing.assert_allclose(
         without_phase_and_delay(found, signals), signals, atol=1e-3)
 
@@ -91,10 +102,9 @@ def test_the_difference_of_the_delays_of_two_bands_survives():
     """It contains the range; it would vanish if the timing was estimated for each band."""
     rng = np.random.default_rng(RNG_SEED)
     first, second = (response(LAB, delay_s, rng) for delay_s in DELAYS_S)
-    radio, captures = captured(LAB, first, 60, rng)
-    slopes = []
-    for frames in captures, captured(LAB, second, 60, rng, radio=radio)[1]:
-        found = received(radio, frames, 7)
+    radio, slopes = radio_of(LAB_60_DB, rng), []
+    for signals in first, second:
+        found = received(radio, captured(radio, signals), 7)
         slopes.append(np.angle(np.sum(found[:, 1:] * np.conj(found[:, :-1]))))
     delays_s = -np.array(slopes) / (2 * np.pi * 125e3)
     assert delays_s[1] - delays_s[0] == pytest.approx(np.diff(DELAYS_S)[0], abs=5e-9)
@@ -104,14 +114,14 @@ def test_the_difference_of_the_delays_of_two_bands_survives():
 def test_the_next_cycle_is_synchronised_again():
     rng = np.random.default_rng(RNG_SEED)
     signals = response(LAB, 0.2e-6, rng)
-    radio, captures = captured(LAB, signals, 60, rng)
+    radio = radio_of(LAB_60_DB, rng)
     assert radio.modem.status() == {}
-    received(radio, captures, 7)
+    received(radio, captured(radio, signals), 7)
     first = radio.modem.synchronisation
     assert float(radio.modem.status()['radio.carrier_hz']) == pytest.approx(
         radio._offsets[1], abs=5)
     radio.close()
-    received(radio, captured(LAB, signals, 60, rng, radio=radio)[1], 8)
+    received(radio, captured(radio, signals), 8)
     assert radio.modem.synchronisation != first
 
 
@@ -119,12 +129,10 @@ def test_the_next_cycle_is_synchronised_again():
 def test_the_drift_of_two_clocks_is_turned_back_in_all_bands(clock_ppm):
     scenario = dataclasses.replace(LAB, center_frequencies_hz=(5.25e9, 5.75e9))
     rng = np.random.default_rng(RNG_SEED)
-    air = Air(scenario, rng)
-    radio = WaveformRadio(scenario, air, clock_ppm=clock_ppm)
-    ratios = []
+    radio, ratios = radio_of(scenario, rng, clock_ppm=clock_ppm), []
     for band in range(2):
         signals, captures, times_s = response(scenario, 0.2e-6, rng), [], []
-        for air.frame, air.signals in enumerate(signals):
+        for radio.air.frame, radio.air.signals in enumerate(signals):
             captures.append(radio.capture(band, radio.modem.pilot(1.0)))
             times_s.append(radio.time_s)
         ratio = received(radio, np.stack(captures), band=band, times_s=times_s) / signals
