@@ -49,6 +49,7 @@ class SnapshotNode(Node):
             self._drawable_s = min(self._drawable_s, now_s)
 
     def _on_mismatch(self, error: m.MessageError) -> None:
+        self._began_s = min(self._began_s, time.monotonic())
         self.mismatch = str(error)
 
     def is_ready(self, wait_s: float) -> bool:

@@ -2,15 +2,52 @@
 
 import contextlib
 import subprocess
+import types
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
+from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.processes import Processes
+from rhs_isac_ros.ros.recording import CycleObserver, Recorder
 from rhs_isac_ros.tools.command import Session
 
 CONFIG = Path(__file__).parents[2] / 'config'
 TIMEOUT_S = 60.0
+CYCLES = 4
+
+
+@pytest.fixture(scope='session')
+def make_cycles():
+    """Function that returns served cycles of users in turn, who walk through the region.
+
+    The errors are 0.5 m, and their bounds 0.2 m.
+    """
+    def make(n, n_users=2, first=2):
+        cycles = []
+        for k in range(n):
+            about = {'cycle_id': first + k, 'user': 1 + k % n_users}
+            truth = np.array([6.0 + 8 * k / n, 3.0 - about['user'] % 5, 0.5])
+            cycles.append(CompleteCycle(
+                **about,
+                state=m.ProtocolState(
+                    **about, phase=m.Phase.BEACONING, outcome='served',
+                    began_s=np.array([0, 0.01, 0.03, 0.06]), elapsed_s=0.1),
+                truth=m.GroundTruth(**about, position=truth, velocity=np.zeros(3)),
+                signals=m.ReceivedSignals(
+                    **about, codebook_id='cb', signals=np.zeros((2, 8, 4), complex)),
+                estimate=m.PositionEstimate(
+                    **about, codebook_id='cb', position=truth + [0.3, 0.4, 0],
+                    covariance_m2=np.array([[0.6, 0.2, 0.05], [0.2, 0.3, 0.0], [0.05, 0.0, 0.1]]),
+                    crlb_m2=0.04, estimator='bayes', latency_s=0.01),
+                capacity=m.Capacity(
+                    **about, codebook_id='cb', band=0, expected_bps=1e6, at_estimate_bps=1e6,
+                    actual_bps=1e6, perfect_bps=1e6, loss_bps=0.0, loss_percent=0.0)))
+        return cycles
+    return make
 
 
 @pytest.fixture(scope='module')
@@ -35,6 +72,31 @@ def shared_session(network):
         assert session.spin_until(present, TIMEOUT_S)
         session.discover(TIMEOUT_S)
         yield session
+
+
+@pytest.fixture(scope='module')
+def spin_until(shared_session):
+    """Function that spins a node until a condition holds, and then destroys it."""
+    def spin(node, condition):
+        shared_session._executor.add_node(node)
+        try:
+            assert shared_session.spin_until(condition, TIMEOUT_S)
+        finally:
+            shared_session._executor.remove_node(node)
+            node.destroy_node()
+    return spin
+
+
+@pytest.fixture(scope='module')
+def run(spin_until, tmp_path_factory):
+    """A recording of some cycles of two users, and the cycles as they were observed live."""
+    pytest.importorskip('mcap', reason='mcap is not installed')
+    path = tmp_path_factory.mktemp('recording') / 'run.mcap'
+    recorder = Recorder(path, Scenario.from_yaml(CONFIG / 'quick.yaml'))
+    observer = CycleObserver(recorder)
+    spin_until(observer, lambda: len(observer.complete) >= CYCLES)
+    recorder.close()
+    return types.SimpleNamespace(path=path, cycles=observer.complete)
 
 
 @pytest.fixture

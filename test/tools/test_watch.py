@@ -55,12 +55,19 @@ def test_watch_exits_when_the_reader_closes_the_pipe(network, run_script):
     assert run_script(f'{{ {SCRIPT}; echo $? >&3; }} 3>&1 >&1 | head -n 1; true')
 
 
-def test_once_without_a_network_is_an_error(built_scripts):
+@pytest.mark.parametrize(('arguments', 'missing'), [
+    (['watch', '--once'], 'no complete cycle'), (['snapshot'], 'no user found'),
+    (['calibrate'], '0 of 200 pilots'),
+    (['calibrate', '--site', ROOT / 'config' / 'site.yaml'],
+     '0 of 200 users located by two surfaces')])
+def test_a_command_without_a_network_is_an_error(built_scripts, tmp_path, arguments, missing):
     done = subprocess.run(
-        [SCRIPT, '--once', '--timeout', '0.3', '--ros-args', '-r', '__ns:=/nobody'],
-        capture_output=True, text=True, timeout=30, check=False)
+        [SCRIPT.with_name(arguments[0]), *arguments[1:], '--timeout', '0.3', '--ros-args', '-r',
+         '__ns:=/nobody'], capture_output=True, text=True, cwd=tmp_path, timeout=60, check=False)
     assert (done.returncode, done.stdout) == (1, '')
-    assert done.stderr.startswith('watch: error: no complete cycle within 0.3 s, in the domain ')
+    assert done.stderr.startswith(
+        f'{arguments[0]}: error: {missing} within 0.3 s, in the domain ')
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_missing_library_is_named(monkeypatch, capsys):
