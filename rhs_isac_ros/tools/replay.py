@@ -380,31 +380,25 @@ def errors_m(
     return np.array(errors)
 
 
-@dataclasses.dataclass
 class _Answers:
     """What a surface of a site, or their fusion, has sent, by cycle and user."""
 
-    signals: dict[_Key, m.ReceivedSignals] = dataclasses.field(default_factory=dict)
-    positions: _Positions = dataclasses.field(default_factory=dict)
-    truths: dict[_Key, list[m.GroundTruth]] = dataclasses.field(default_factory=dict)
-    codebooks: dict[str, Codebook] = dataclasses.field(default_factory=dict)
-
-    @classmethod
-    def of(cls, path: Path, namespace: str, scenario: Scenario) -> '_Answers':
-        """Read the messages of a namespace."""
-        answers = cls()
+    def __init__(self, path: Path, namespace: str, scenario: Scenario) -> None:
+        self.signals: dict[_Key, m.ReceivedSignals] = {}
+        self.positions: _Positions = {}
+        self.truths: list[m.GroundTruth] = []
+        self.codebooks: dict[str, Codebook] = {}
         for found, _ in command.recorded(path, namespace, scenario, [
                 m.ReceivedSignals, m.PositionEstimate, m.GroundTruth, Codebook]):
             match found:
                 case m.ReceivedSignals():
-                    answers.signals[found.cycle_id, found.user] = found
+                    self.signals[found.cycle_id, found.user] = found
                 case m.PositionEstimate():
-                    answers.positions[found.cycle_id, found.user] = found.position
+                    self.positions[found.cycle_id, found.user] = found.position
                 case m.GroundTruth():
-                    answers.truths.setdefault((found.cycle_id, found.user), []).append(found)
+                    self.truths.append(found)
                 case Codebook():
-                    answers.codebooks[found.id] = found
-        return answers
+                    self.codebooks[found.id] = found
 
 
 class SiteRecording:
@@ -418,15 +412,15 @@ class SiteRecording:
         self._path, self._networks = path, networks
         leader = next(iter(networks.surfaces))
         self._answers = {
-            name: _Answers.of(path, f'{namespace.rstrip("/")}/{name}',
-                              networks.surfaces[name or leader])
+            name: _Answers(path, f'{namespace.rstrip("/")}/{name}',
+                           networks.surfaces[name or leader])
             for name in (*networks.surfaces, '')}
         self.live = {name: one.positions for name, one in self._answers.items()}
         self.truths = {
-            key: truth.position for key in self.live['']
-            for truth in self._answers[leader].truths.get(key, ())
-            if any(m.same_instance(truth.sender, one.signals[key].user_instance)
-                   for one in self._answers.values() if key in one.signals)}
+            key: truth.position for truth in self._answers[leader].truths
+            if (key := (truth.cycle_id, truth.user)) in self.live['']
+            and any(m.same_instance(truth.sender, one.signals[key].user_instance)
+                    for one in self._answers.values() if key in one.signals)}
         if not self.truths:
             raise RecordingError(f'{path}: no position of the fusion in the namespace '
                                  f'{namespace}; see --namespace')
