@@ -27,15 +27,6 @@ def test_roots_and_quantiles(squares):
     assert np.mean(np.sqrt(squares) <= value) == pytest.approx(0.95, abs=0.005)
 
 
-@pytest.mark.parametrize('name', MEASURES)
-def test_the_label_states_the_statistic(name):
-    measure = MEASURES[name]
-    label = measure.label
-    assert measure.quantile == (0.5 if 'median' in label else 0.95 if '95th' in label else None)
-    assert measure.root == ('root' in label or 'error,' in label or 'median error' in label)
-    assert measure.share == (measure.unit == '%')
-
-
 def test_the_interval_includes_the_codebooks(squares):
     one = measured(MEASURES['mse'], squares)
     three = measured(MEASURES['mse'], squares * [[0.5], [1.0], [1.5]])

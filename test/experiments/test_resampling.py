@@ -16,16 +16,13 @@ def test_statistics_without_resampling_are_those_of_the_results():
     assert middle.minus(quarter).values[0] == middle.values[0] - quarter.values[0]
 
 
-@pytest.mark.parametrize('results', [
-    np.ones(3), np.ones((0, 3)), np.ones((2, 0)), np.full((2, 3), np.nan)])
-def test_results_without_a_value_are_an_error(results):
-    with pytest.raises(ValueError, match=r'^results: shape .*, expected \[members, cases\]'):
-        replicate(results, 0)
-
-
-def test_quantiles_out_of_range_are_an_error():
-    with pytest.raises(ValueError, match=r'^quantiles: \(0.5, 1.5\), expected 0 to 1$'):
-        replicate(np.ones((2, 3)), 0, (0.5, 1.5))
+@pytest.mark.parametrize(('results', 'quantiles', 'error'), [
+    *((results, (), r'results: shape .*, expected \[members, cases\]') for results in (
+        np.ones(3), np.ones((0, 3)), np.ones((2, 0)), np.full((2, 3), np.nan))),
+    (np.ones((2, 3)), (0.5, 1.5), r'quantiles: \(0.5, 1.5\), expected 0 to 1')])
+def test_results_without_a_value_and_other_quantiles_are_errors(results, quantiles, error):
+    with pytest.raises(ValueError, match=f'^{error}'):
+        replicate(results, 0, quantiles)
 
 
 def test_cases_that_a_member_did_not_serve_do_not_count():

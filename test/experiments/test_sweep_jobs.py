@@ -55,17 +55,6 @@ def test_results_are_those_of_the_library(case, codebook):
     json.dumps(result)
 
 
-def test_settings_share_their_positions(case, monkeypatch):
-    seen = []
-    monkeypatch.setattr(sweep_jobs, 'crlb', lambda world, book, positions: seen.append(
-        positions) or positions[:, 0])
-    evaluate('crlb', **case, first=0, n=4)
-    evaluate('crlb', **case | {'scenario': {**SMALL, 'multipath_to_los_db': -20.0}}, first=0, n=4)
-    evaluate('crlb', **case | {'seed': 6}, first=0, n=4)
-    assert np.array_equal(seen[0], seen[1])
-    assert not np.array_equal(seen[0], seen[2])
-
-
 def test_a_position_without_fix_counts_with_the_region(case, monkeypatch):
     class Nothing:
         name = 'nothing'
