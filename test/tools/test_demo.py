@@ -1,18 +1,26 @@
 """The demonstration: its command line, the nodes that it starts, and its report."""
 
+import dataclasses
 import signal
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.monitoring.cycle_log import CycleRecord
 from rhs_isac_ros.positioning import Site
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.recording import read_networks
 from rhs_isac_ros.ros.roster import FOLLOWING, ROSTER
 from rhs_isac_ros.tools import demo
-from rhs_isac_ros.tools.demo import SiteObserver, main, site_lines, start_network
+from rhs_isac_ros.tools.demo import (
+    SiteObserver,
+    main,
+    site_lines,
+    start_network,
+    summary,
+    table,
+)
 
 SITE = Path(__file__).parents[2] / 'config' / 'site.yaml'
 
@@ -74,39 +82,40 @@ def test_a_site_has_users_at_the_first_surface_and_one_fusion():
     assert {values['site_file'] for values in nodes.values()} == {'x.yaml'}
 
 
-def test_the_report_of_a_site_has_the_errors_of_each_surface_and_the_handovers(bench):
-    site = Site.from_yaml(SITE)
-    observer = bench.add(SiteObserver, site)
-    for cycle_id in (1, 2, 3, 4):
-        about = {'cycle_id': cycle_id, 'user': 1 + cycle_id % 2}
-        estimates = [
-            m.PositionEstimate(
-                **about, codebook_id='cb', position=np.array([9.0, error_m, 0.0]),
-                covariance_m2=np.eye(3), crlb_m2=0.04, estimator='bayes', latency_s=0.01)
-            for error_m in (1.0, 2.0, 0.5)]
-        for message in (
-                m.Beacon(cycle_id=cycle_id, attempt=0),
-                m.GroundTruth(**about, position=np.array([9.0, 0, 0]), velocity=np.zeros(3)),
-                m.ReceivedSignals(**about, codebook_id='cb', signals=np.zeros((2, 8, 4), complex)),
-                estimates[0],
-                m.Capacity(**about, codebook_id='cb', band=0, expected_bps=1e6,
-                           at_estimate_bps=1e6, actual_bps=1e6, perfect_bps=1e6, loss_bps=0.0,
-                           loss_percent=0.0),
-                m.ProtocolState(**about, phase=m.Phase.BEACONING, outcome='served',
-                                began_s=np.zeros(4), elapsed_s=0.0)):
+def test_the_report_has_a_line_for_each_cycle_and_statistics(make_cycles):
+    rows = [row.split() for row in table(make_cycles(3)).splitlines()[2:]]
+    numbers = ['0.50', '0.20', '10.0', '20.0', '30.0', '40.0', '1.000', '0.000']
+    assert [(row[0], row[1], row[8:]) for row in rows] == [
+        ('2', '1', numbers), ('3', '2', numbers), ('4', '1', numbers)]
+    assert rows[0][2:8] == ['6.00', '2.00', '0.50', '6.30', '2.40', '0.50']
+    assert summary(make_cycles(3), [CycleRecord(9, 4, outcome='user_gone')]).splitlines() == [
+        '3 cycles of 2 users served, 1 given up; codebooks: 1',
+        'position error: median 0.50 m, root mean square 0.50 m; median √CRLB 0.20 m',
+        'cycle: median 100.0 ms; estimator: median 10.0 ms',
+        'capacity: median 1.00 Mbit/s; loss: median 0.000 %, worst 0.000 %',
+        'cycle 9 of user 4 given up: user_gone']
+
+
+def test_the_report_of_a_site_has_the_errors_of_each_surface_and_the_handovers(
+        bench, make_cycles):
+    observer = bench.add(SiteObserver, Site.from_yaml(SITE))
+    for cycle in make_cycles(4, first=1):
+        for message in (m.Beacon(cycle_id=cycle.cycle_id, attempt=0), cycle.truth, cycle.signals,
+                        cycle.estimate, cycle.capacity, cycle.state):
             observer.observe(message, 0.0)
         # The side has no position in the first cycle, which is not reported, and in the third.
-        for name, estimate in zip(('front', 'side', 'fused'), estimates, strict=True):
-            if name != 'side' or cycle_id in (2, 4):
-                observer._keep(name, estimate)
-        observer._keep('side' if cycle_id == 4 else 'front', m.Data(
-            **about, direction=m.Direction.UPLINK, stage=m.Stage.DELIVERED,
-            duration_s=0.1, bits=1.0))
-    table, *lines = site_lines(observer)
-    assert [row.split() for row in table.splitlines()[2:]] == [
-        [cycle, user, '9.00', '0.00', '0.00', '1.000', side, '0.500', carrier]
-        for cycle, user, side, carrier in (
-            ('2', '1', '2.000', 'front'), ('3', '2', 'nan', 'front'), ('4', '1', '2.000', 'side'))]
+        for name, offset_m in (('front', 1.0), ('side', 2.0), ('fused', 0.5)):
+            if name != 'side' or cycle.cycle_id in (2, 4):
+                observer._keep(name, dataclasses.replace(
+                    cycle.estimate, position=cycle.truth.position + [0, offset_m, 0]))
+        observer._keep('side' if cycle.cycle_id == 4 else 'front', m.Data(
+            cycle_id=cycle.cycle_id, user=cycle.user, direction=m.Direction.UPLINK,
+            stage=m.Stage.DELIVERED, duration_s=0.1, bits=1.0))
+    text, *lines = site_lines(observer)
+    assert [row.split() for row in text.splitlines()[2:]] == [
+        ['2', '2', '8.00', '1.00', '0.50', '1.000', '2.000', '0.500', 'front'],
+        ['3', '1', '10.00', '2.00', '0.50', '1.000', 'nan', '0.500', 'front'],
+        ['4', '2', '12.00', '1.00', '0.50', '1.000', '2.000', '0.500', 'side']]
     assert lines == [
         'front: 3 positions, root mean square error 1.000 m',
         'side: 2 positions, root mean square error 2.000 m',

@@ -1,8 +1,5 @@
 """The entries of a view in a file of Rerun, read back with its own reader."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -13,6 +10,7 @@ from rhs_isac_ros.monitoring.shapes import (
     Ellipsoids,
     Entry,
     Lines,
+    Mesh,
     Number,
     Picture,
     Points,
@@ -25,6 +23,7 @@ from rhs_isac_ros.tools.rerun_stream import RerunStream, blueprint
 rerun = pytest.importorskip('rerun', reason='rerun-sdk is not installed (scripts/setup view)')
 PLACES = np.array([[9.0, 1.0, 0.5], [8.0, 2.0, 0.0]])
 COLOURS = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.0]])
+SIZES = np.array([[1.0, 2.0, 3.0], [0.1, 0.2, 0.3]])
 QUATERNIONS = np.array([[0.0, 0.0, 0.6, 0.8], [0.0, 0.0, 0.0, 1.0]])
 
 
@@ -44,36 +43,40 @@ def read(tmp_path):
     return columns
 
 
-@pytest.mark.parametrize('n_coordinates', [2, 3])
-def test_points_keep_position_colour_radius_and_label(read, n_coordinates):
-    places = PLACES[:, :n_coordinates]
-    found = read('a', Points(places, COLOURS, np.array([0.1, 0.2]), ('one', 'two')))
-    assert found['cycle'] == [1]
-    (positions,) = found[f'Position{n_coordinates}D']
-    assert np.array(positions) == pytest.approx(places)
-    assert found['Color'] == [[0xff0080ff, 0x00ff00ff]]
-    assert found['Radius'] == [pytest.approx([0.1, 0.2])]
-    assert found['Text'] == [['one', 'two']]
-
-
-def test_ellipsoids_and_boxes_keep_their_sizes(read):
-    sizes = np.array([[1.0, 2.0, 3.0], [0.1, 0.2, 0.3]])
-    found = read('a', Ellipsoids(PLACES, sizes, QUATERNIONS, COLOURS))
-    assert np.array(found['HalfSize3D'][0]) == pytest.approx(sizes)
-    assert np.array(found['PoseRotationQuat'][0]) == pytest.approx(QUATERNIONS)
-    assert np.array(found['PoseTranslation3D'][0]) == pytest.approx(PLACES)
-    modes = {solid: read('a', Boxes(PLACES, sizes, COLOURS, solid))['FillMode']
-             for solid in (False, True)}
-    assert modes[False] != modes[True]
-
-
-def test_lines_of_different_lengths_keep_their_points(read):
-    strips = (PLACES, np.vstack([PLACES, PLACES + 1]))
-    found = read('a', Lines(strips, (1.0, 0.0, 0.0), 3.0))
-    for shown, strip in zip(found['LineStrip3D'][0], strips, strict=True):
-        assert np.array(shown) == pytest.approx(strip)
+@pytest.mark.parametrize(('entity', 'expected'), [
+    *((Points(places, COLOURS, np.array([0.1, 0.2]), ('one', 'two')), {
+        f'Position{places.shape[1]}D': places, 'Color': [0xff0080ff, 0x00ff00ff],
+        'Radius': [0.1, 0.2]}) for places in (PLACES[:, :2], PLACES)),
+    (Ellipsoids(PLACES, SIZES, QUATERNIONS, COLOURS), {
+        'HalfSize3D': SIZES, 'PoseRotationQuat': QUATERNIONS, 'PoseTranslation3D': PLACES}),
+    (Boxes(PLACES, SIZES, COLOURS, True), {'HalfSize3D': SIZES, 'PoseTranslation3D': PLACES}),
     # A negative radius is in points of the screen.
-    assert found['Radius'] == [pytest.approx([-1.5])]
+    (Lines((PLACES, PLACES + 1), (1.0, 0.0, 0.0), 3.0), {
+        'LineStrip3D': (PLACES, PLACES + 1), 'Radius': [-1.5]}),
+    # Every second row and column of the grid.
+    (Mesh(np.stack([PLACES, 0 * PLACES]), (1.0, 1.0, 1.0)), {
+        'LineStrip3D': (PLACES, PLACES * [[1], [0]])}),
+    (Series('dots', (1.0, 1.0, 1.0), dots=True), {'MarkerSize': [4.0]}),
+    (Series('line', (1.0, 1.0, 1.0)), {'StrokeWidth': [2.0]})])
+def test_an_entity_keeps_its_numbers(read, entity, expected):
+    found = read('a', entity)
+    assert found['cycle'] == [1]
+    for name, values in expected.items():
+        assert np.array(found[name][0]) == pytest.approx(np.array(values))
+
+
+def test_labels_and_texts_are_kept(read):
+    found = read('a', Points(PLACES, COLOURS, np.array([0.1, 0.2]), ('one', 'two')))
+    assert found['Text'] == [['one', 'two']]
+    found = read('log', Text('served'), Text('given up', warning=True))
+    assert (found['Text'], found['TextLogLevel']) == ([['served'], ['given up']],
+                                                      [['INFO'], ['WARN']])
+
+
+def test_boxes_are_filled_or_outlined(read):
+    one, other = (read('a', Boxes(PLACES, SIZES, COLOURS, solid))['FillMode']
+                  for solid in (False, True))
+    assert one != other
 
 
 def test_numbers_are_on_the_time_line_of_the_cycles(read):
@@ -93,14 +96,6 @@ def test_nothing_ends_what_was_shown(read):
     found = read('a', Number(0.5), Clear(), Number(0.25))
     assert found['cycle'] == [1, 2, 3]
     assert found['Scalar'] == [[0.5], [], [0.25]]
-
-
-def test_texts_and_styles_are_accepted(read):
-    found = read('log', Text('served'), Text('given up', warning=True))
-    assert (found['Text'], found['TextLogLevel']) == ([['served'], ['given up']],
-                                                      [['INFO'], ['WARN']])
-    assert read('a', Series('dots', (1.0, 1.0, 1.0), dots=True))['MarkerSize']
-    assert read('a', Series('line', (1.0, 1.0, 1.0)))['StrokeWidth']
 
 
 def test_an_entry_of_cycle_zero_is_shown_at_all_times(tmp_path):
@@ -136,27 +131,6 @@ def test_another_release_is_named_in_one_line(monkeypatch):
 def test_a_file_that_cannot_be_written_is_an_error(tmp_path):
     with pytest.raises(OSError, match='missing'):
         RerunStream().save(tmp_path / 'missing' / 'view.rrd')
-
-
-def test_serving_does_not_block():
-    """Threads of Rerun free arrays, for which they wait for the global interpreter lock."""
-    program = (
-        'import socket\n'
-        'from rhs_isac_ros.tools.rerun_stream import RerunStream\n'
-        'for _ in range(5):\n'
-        '    while True:\n'
-        '        with socket.socket() as one, socket.socket() as two:\n'
-        '            one.bind(("", 0))\n'
-        '            port = one.getsockname()[1]\n'
-        '            try:\n'
-        '                two.bind(("", port + 1))\n'
-        '                break\n'
-        '            except OSError:\n'
-        '                pass\n'
-        '    stream = RerunStream()\n'
-        '    stream.serve(port, "127.0.0.1")\n'
-        '    stream.close()\n')
-    subprocess.run([sys.executable, '-c', program], timeout=60, check=True)
 
 
 def test_a_discarded_file_leaves_nothing(tmp_path):

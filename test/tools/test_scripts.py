@@ -9,13 +9,6 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / 'scripts'
-NAMES = ('watch', 'record', 'replay', 'calibrate', 'snapshot', 'view', 'topic', 'param')
-
-
-@pytest.mark.parametrize('name', NAMES)
-def test_every_script_leads_to_a_module(name):
-    assert (SCRIPTS / name).resolve() == SCRIPTS / '_tool'
-    assert (ROOT / 'rhs_isac_ros' / 'tools' / f'{name}.py').is_file()
 
 
 def test_another_name_is_rejected(tmp_path):

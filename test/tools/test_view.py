@@ -13,18 +13,13 @@ import pytest
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring import network_view
-from rhs_isac_ros.ros.recording import (
-    CycleObserver,
-    Recorder,
-    RecordingError,
-    read,
-)
-from rhs_isac_ros.tools.replay import load
+from rhs_isac_ros.ros.recording import RecordingError, read
 from rhs_isac_ros.tools.view import ViewNode, entries, main
 
 CONFIG = Path(__file__).parents[2] / 'config'
 SCRIPT = CONFIG.parent / 'scripts' / 'view'
-CYCLES = 4
+SCENARIO = Scenario.from_yaml(CONFIG / 'quick.yaml')
+OTHER = dataclasses.replace(SCENARIO, refractive_index=2.0)
 TIMEOUT_S = 120.0
 # Components of the entities that change with the cycles.
 CONTENTS = ('Scalar', 'Position3D', 'HalfSize3D', 'LineStrip2D', 'LineStrip3D', 'ImageBuffer',
@@ -47,7 +42,6 @@ def test_without_rerun_one_line_names_the_command_that_installs_it(monkeypatch, 
     (['missing.mcap'], 'argument file: ')])
 def test_an_invalid_argument_is_named(arguments, reason, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / 'run.mcap').touch()
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 2
@@ -59,19 +53,9 @@ def rerun():
     return pytest.importorskip('rerun', reason='rerun-sdk is not installed (scripts/setup view)')
 
 
-@pytest.fixture(scope='module')
-def recording(rerun, shared_session, tmp_path_factory):
-    """A recording of some cycles of two users."""
-    pytest.importorskip('mcap', reason='mcap is not installed')
-    path = tmp_path_factory.mktemp('recording') / 'run.mcap'
-    recorder = Recorder(path, Scenario.from_yaml(CONFIG / 'quick.yaml'))
-    observer = CycleObserver(recorder)
-    shared_session._executor.add_node(observer)
-    assert shared_session.spin_until(lambda: len(observer.log.complete) >= CYCLES, TIMEOUT_S)
-    shared_session._executor.remove_node(observer)
-    observer.destroy_node()
-    recorder.close()
-    return path
+@pytest.fixture
+def recording(rerun, run):
+    return run.path
 
 
 @pytest.fixture
@@ -90,43 +74,25 @@ def paths(rerun):
     return of
 
 
-def test_a_running_network_is_shown(shared_session):
-    found = {}
-
-    def write(entries):
-        found.update((entry.path, entry.entity) for entry in entries)
-    scenario = Scenario.from_yaml(CONFIG / 'quick.yaml')
-    node = ViewNode(scenario, write)
-    shared_session._executor.add_node(node)
+def test_a_running_network_is_shown(spin_until):
+    found = set()
+    node = ViewNode(SCENARIO, lambda entries: found.update(entry.path for entry in entries))
     expected = {
         f'{network_view.MODES}/found', 'capacity/actual', 'drops/all',
         network_view.LOG, network_view.POSITIONING, network_view.TRANSMISSION, *(
             f'{network_view.WORLD}/{part}' for part in (
                 'surface/region', 'surface/board', 'surface/beam', 'user_1/truth',
                 'user_2/estimate/ellipsoid', 'user_1/modes'))}
-    try:
-        assert shared_session.spin_until(lambda: expected <= found.keys(), TIMEOUT_S), (
-            expected - found.keys())
-    finally:
-        shared_session._executor.remove_node(node)
-        node.destroy_node()
+    spin_until(node, lambda: expected <= found)
     assert not node.mismatch
 
 
-def test_a_network_of_another_scenario_is_not_shown(shared_session):
+def test_a_network_of_another_scenario_is_not_shown(spin_until):
     """Even if its messages have the sizes of the expected ones."""
-    scenario = dataclasses.replace(
-        Scenario.from_yaml(CONFIG / 'quick.yaml'), refractive_index=2.0)
     paths = set()
-    node = ViewNode(
-        scenario, lambda entries: paths.update(entry.path for entry in entries))
-    shared_session._executor.add_node(node)
-    try:
-        assert shared_session.spin_until(lambda: node.mismatch, TIMEOUT_S)
-    finally:
-        shared_session._executor.remove_node(node)
-        node.destroy_node()
-    assert f'expected {scenario.id}' in node.mismatch
+    node = ViewNode(OTHER, lambda entries: paths.update(entry.path for entry in entries))
+    spin_until(node, lambda: node.mismatch)
+    assert f'expected {OTHER.id}' in node.mismatch
     assert 'capacity/actual' not in paths
 
 
@@ -142,14 +108,14 @@ def test_the_cycles_of_a_running_network_are_written(
     assert {path.partition('/')[0] for path in shown} >= {'error', 'capacity', 'latency'}
 
 
-def test_a_recording_is_shown_with_modes(recording, paths, tmp_path, capsys):
+def test_a_recording_is_shown_with_modes(recording, run, paths, tmp_path, capsys):
     file = tmp_path / 'view.rrd'
     assert main([str(recording), '--save', str(file)]) == 0
     assert capsys.readouterr() == (f'{file}\n', '')
     shown = paths(file)
     n_posteriors = sum(1 for _ in read(recording, ['/posterior']))
-    assert shown[f'{network_view.MODES}/found'] == n_posteriors >= CYCLES
-    assert shown['error/crlb'] == len(load(recording).cycles)
+    assert shown[f'{network_view.MODES}/found'] == n_posteriors
+    assert shown['error/crlb'] == len(run.cycles) <= n_posteriors
 
 
 def test_a_recording_without_the_namespace_is_an_error(recording, tmp_path, capsys):
@@ -174,10 +140,8 @@ def test_without_a_network_the_view_names_domain_and_namespace_and_writes_no_fil
 
 
 def test_a_recording_of_another_scenario_is_named(recording):
-    scenario = dataclasses.replace(
-        Scenario.from_yaml(CONFIG / 'quick.yaml'), refractive_index=2.0)
-    with pytest.raises(RecordingError, match=f'recorded with scenario .*, expected {scenario.id}'):
-        list(entries(recording, '/', scenario))
+    with pytest.raises(RecordingError, match=f'recorded with scenario .*, expected {OTHER.id}'):
+        list(entries(recording, '/', OTHER))
 
 
 def is_free(port):

@@ -23,22 +23,16 @@ def text_of(overview, now_s, width=80):
     return page.export_text()
 
 
-def ended(cycle_id):
+def ended(cycle_id, user, outcome):
     return m.ProtocolState(
-        cycle_id=cycle_id, user=1, phase=m.Phase.BEACONING, outcome='served',
+        cycle_id=cycle_id, user=user, phase=m.Phase.BEACONING, outcome=outcome,
         began_s=np.zeros(4), elapsed_s=0.0)
-
-
-def test_the_view_of_an_empty_overview():
-    assert 'waiting for a base station' in text_of(Overview(), 1.0)
 
 
 def test_the_view_shows_faults_and_silent_nodes_within_80_columns():
     overview = Overview()
     overview.add(m.Beacon(cycle_id=1795288682616, attempt=0), 1.0)
-    overview.add(m.ProtocolState(
-        cycle_id=1795288682616, user=12, phase=m.Phase.BEACONING, outcome='rhs_silent',
-            began_s=np.zeros(4), elapsed_s=0.0), 2.0)
+    overview.add(ended(1795288682616, 12, 'rhs_silent'), 2.0)
     overview.add(m.Beacon(cycle_id=1795288682617, attempt=0), 3.0)
     overview.add_report('lab/bs', Report(True, 'waiting for positioner', {
         'phase': 'waiting', 'dropped.late_ack': '3', 'cycles.no_fix': '2'}), 1.0)
@@ -51,7 +45,8 @@ def test_the_view_shows_faults_and_silent_nodes_within_80_columns():
     assert '…' not in text
 
 
-def test_users_keep_their_rows(network_class, scenario, codebooks, places):
+def test_users_keep_their_rows_which_fit_into_80_columns(
+        network_class, scenario, codebooks, places):
     net = network_class(scenario, codebooks[0], {user: places[user - 1] for user in (1, 2, 3)})
     net.run_cycles(5)
     overview, rows = Overview(), []
@@ -61,20 +56,11 @@ def test_users_keep_their_rows(network_class, scenario, codebooks, places):
             rows.append(re.findall(r'^ +(\d+) ', text_of(overview, sent.time_s), re.MULTILINE))
     assert rows[-1] == ['1', '2', '3']
     assert all(row == sorted(row) for row in rows)
-
-
-def test_probabilities_fit_into_80_columns(network_class, scenario, codebooks, places):
-    net = network_class(scenario, codebooks[0], {1: places[0]})
-    net.run_cycles(1)
-    overview = Overview()
-    for sent in net.log:
-        if isinstance(sent.message, RECEIVES):
-            overview.add(sent.message, sent.time_s)
     cycle = overview.users[1]
     far = {'position': np.array([-10.34, -12.2, 1.1]), 'outside_probability': 0.123}
     overview.users[12] = dataclasses.replace(
         cycle, estimate=dataclasses.replace(cycle.estimate, **far))
-    text = text_of(overview, cycle.ended_s)
+    text = text_of(overview, net.log[-1].time_s)
     assert re.search(r'^ +12 +-10.34 -12.20   1.10 +[.\d]+ +[.\d]+ +12/0 ', text, re.MULTILINE)
     assert 'out/blk: probability of being outside of the region/blocked' in text
     assert '…' not in text
@@ -82,21 +68,20 @@ def test_probabilities_fit_into_80_columns(network_class, scenario, codebooks, p
 
 def test_the_view_shows_a_pause():
     overview = Overview()
+    assert text_of(overview, 0.0).startswith('waiting for a base station')
     paused = Report(False, 'paused', {'phase': 'paused'})
     overview.add_report('bs', paused, 1.0)
     assert text_of(overview, 2.0).startswith('paused')
     overview.add(m.Beacon(cycle_id=1, attempt=0), 3.0)
     assert text_of(overview, 4.0).startswith('beaconing for 1.00 s')
-    overview.add(ended(1), 5.0)
+    overview.add(ended(1, 1, 'served'), 5.0)
     overview.add_report('bs', paused, 6.0)
     assert text_of(overview, 7.0).startswith('paused for 2.00 s, cycle 1')
 
 
 def test_received_strings_are_neither_markup_nor_control_sequences():
     overview = Overview()
-    overview.add(m.ProtocolState(
-        cycle_id=1, user=2, phase=m.Phase.BEACONING, outcome='\x1b[2J[/red]',
-            began_s=np.zeros(4), elapsed_s=0.0), 1.0)
+    overview.add(ended(1, 2, '\x1b[2J[/red]'), 1.0)
     overview.add_report('a[/b]\x1b[31m', Report(True, '[bold]\n[/x]', {
         'phase': '[/', 'dropped.[/]\x07': '3', 'dropped.long': '9' * 5000}), 1.0)
     text = text_of(overview, 2.0, width=120)
