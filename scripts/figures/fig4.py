@@ -43,7 +43,6 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import make_estimator, simulate_pairs
 from rhs_isac_ros.positioning.neural import INPUTS, train
 from rhs_isac_ros.support.arguments import integer
-from rhs_isac_ros.support.optional import optional_import
 
 CONFIG = Path(__file__).parents[2] / 'config'
 TRIALS, QUICK_TRIALS = 50, 3
@@ -217,9 +216,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add('--conditions', nargs='+', type=condition, metavar='NAME:DB',
         help='estimators with the level of the multipath relative to the direct path [dB]; NAME '
              'is bayes or an input of the network, as in magnitudes:-30 bayes:0')
-    add('--ros', action='store_true',
-        help='measure (b) in a running network with the default codebook instead, and compare it '
-             'with the library; --positions is the number of cycles')
 
 
 def complete(options: argparse.Namespace) -> None:
@@ -234,21 +230,9 @@ def complete(options: argparse.Namespace) -> None:
             Condition(*reading, level) for reading in readings for level in LEVELS_DB]
 
 
-def over_ros(options: argparse.Namespace) -> None:
-    """Measure (b) in a running network; only this needs ROS."""
-    with optional_import('measuring over ROS'):
-        from parts import fig4_ros
-    options.output.mkdir(parents=True, exist_ok=True)
-    cycles = (options.positions if options.positions != POSITIONS else
-              fig4_ros.QUICK_CYCLES if options.quick else fig4_ros.CYCLES)
-    fig4_ros.compare(CONFIG / 'codebook.yaml', cycles, options.output)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = parse_options(__doc__, 'fig4', TRIALS, QUICK_TRIALS, arguments, add_options)
-    if options.ros:
-        return run_command(lambda: over_ros(options))
     complete(options)
     return run_command(lambda: reproduce(options))
 
