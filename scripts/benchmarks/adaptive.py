@@ -19,11 +19,6 @@ The intervals of ratios are from resampling positions or walks. The 95 % region 
 the covariance that contains 95 % of a Gaussian.
 """
 
-import os
-
-# One thread, as in the positioner node. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import argparse
 import functools
 import time
@@ -45,8 +40,6 @@ from rhs_isac_ros.protocol.positioner import Positioner
 from rhs_isac_ros.protocol.settings import TRACK, PositionerSettings
 from rhs_isac_ros.support.arguments import input_file, integer
 
-PLANS = {'table1': ('table1.yaml', 'codebook.yaml'),
-         'bandplan': ('bandplan.yaml', 'codebook_bandplan.yaml')}
 STD_M = 0.2
 WRONG_M = (1.0, 2.0, 3.0)
 PERIOD_S, N_CYCLES, WARM_UP_S = 0.1, 40, 2.0
@@ -69,18 +62,16 @@ def main() -> None:
     """Run the benchmark."""
     parser = frame.benchmark_parser('adaptive', __doc__, positions=2000)
     parser.add_argument('--library', nargs=2, action='append', required=True,
-                        metavar=('PLAN', 'FILE'), help=f'one of {", ".join(PLANS)}, and a file of '
-                        'python3 -m rhs_isac_ros.codebook library')
+                        metavar=('PLAN', 'FILE'), help=f'one of {", ".join(frame.SYSTEMS)}, and '
+                        'a file of python3 -m rhs_isac_ros.codebook library')
     parser.add_argument('--walks', type=integer(0, 10**5), default=200,
                         help='number of walks, and of jumps')
     options = parser.parse_args()
     results = {}
     for name, file in options.library:
-        if name not in PLANS:
-            parser.error(f'argument --library: {name}, expected one of {sorted(PLANS)}')
-        config, codebook = PLANS[name]
-        world = World(Scenario.from_yaml(frame.CONFIG / config),
-                      Codebook.load(frame.CONFIG / codebook), Library.load(input_file(file)))
+        if name not in frame.SYSTEMS:
+            parser.error(f'argument --library: {name}, expected one of {sorted(frame.SYSTEMS)}')
+        world = World(*frame.system(name), Library.load(input_file(file)))
         world.library.check(world.scenario)
         print(f'\n{name}: {len(world.library.codebooks)} codebooks, {options.positions} '
               f'positions, {options.walks} walks, seed {options.seed}\n')
@@ -90,8 +81,9 @@ def main() -> None:
 
 def measure(world: World, options: argparse.Namespace) -> dict:
     """Measure one plan."""
-    table = frame.Table('codebook', 'mean squared error [m^2]', 'median [m]',
-                        'in the 95 % region [%]', 'CPU time of an estimate [ms]')
+    table = frame.Table(['codebook'], {
+        'mean squared error [m^2]': ('mse_m2', 4), 'median [m]': ('median_m', 3),
+        'in the 95 % region [%]': ('covered', 1), 'CPU time of an estimate [ms]': ('time_ms', 1)})
     draw, noise, wrong, walks = map(
         np.random.default_rng, np.random.SeedSequence(options.seed).spawn(4))
     scenario, n = world.scenario, options.positions
@@ -99,22 +91,16 @@ def measure(world: World, options: argparse.Namespace) -> dict:
     positions = np.concatenate([
         Cell(tuple(centre), STD_M).positions(scenario, scenario.sample_positions(1, draw))
         for centre in centres])
-    fixes = {}
+    fixes, results = {}, {}
     for name, codebook_at in (('whole region', lambda _: world.fixed),
                               ('cell', world.codebook_at)):
         fixes[name], time_s = locate(
             world, positions, centres, codebook_at, noise, new_estimator)
-        row(table, name, fixes[name], time_s)
-    found, reference = fixes['cell'], fixes['whole region']
-    ratio, *interval = ratio_interval(found.squared, reference.squared)
-    results = {
-        'ratio': ratio, 'ratio_interval': interval,
-        'median_m': np.median(found.squared)**0.5,
-        'median_fixed_m': np.median(reference.squared)**0.5,
-        'in_region': found.covered, 'in_region_fixed': reference.covered,
-        'normalised_error': found.normalised.mean(),
-        'wrong': wrong_predictions(world, table, n // 6, wrong)}
-    print(f'\nratio {ratio:.3f} [{interval[0]:.3f}, {interval[1]:.3f}]\n')
+        results[name] = table.row(name, **fixes[name].figures(), time_ms=1e3 * time_s)
+    results['ratio'] = frame.mean_interval(
+        fixes['cell'].squared, relative_to=fixes['whole region'].squared)
+    results['wrong'] = wrong_predictions(world, table, n // 6, wrong)
+    print(f'\nratio {frame.shown(results["ratio"], 3)}\n')
     if options.walks:
         results['tracked'] = tracked(world, options.walks, walks)
         results |= jumps(world, options.walks, walks)
@@ -151,12 +137,7 @@ def wrong_predictions(world: World, table: frame.Table, n: int, rng: np.random.G
                              ('prediction', 'wrong cell, prior: prediction', True)):
         fixes, time_s = locate(
             world, positions, centres, world.codebook_at, rng, known_estimator, knows)
-        row(table, name, fixes, time_s)
-        results[key] = {
-            'mse_m2': frame.mean_interval(fixes.squared), 'in_region': fixes.covered,
-            'without_fix': fixes.without_fix,
-            'in_region_by_distance': [
-                100 * float(part.mean()) for part in np.array_split(fixes.inside, len(WRONG_M))]}
+        results[key] = table.row(name, **fixes.figures(), time_ms=1e3 * time_s)
     return results
 
 
@@ -181,8 +162,9 @@ def tracked(world: World, n: int, rng: np.random.Generator) -> dict:
     for _ in range(n):
         walk = RandomWalk(world.scenario, 1.0, rng)
         paths.append(np.array([walk.state(time_s)[0] for time_s in times_s]))
-    table = frame.Table('tracks', 'rms error [m]', 'in the 95 % region [%]', 'normalised error',
-                        'without a fix [%]')
+    table = frame.Table(['tracks'], {
+        'rms error [m]': ('rms_m', 3), 'in the 95 % region [%]': ('covered', 1),
+        'normalised error': ('nees', 2), 'without a fix [%]': ('without_fix', 2)})
     counted = times_s >= WARM_UP_S
     walk_of = np.repeat(np.arange(n), counted.sum())
     results, squared = {}, {}
@@ -193,15 +175,12 @@ def tracked(world: World, n: int, rng: np.random.Generator) -> dict:
             frame.stacked(estimates), np.concatenate([path[counted] for path in paths]))
         walk = walk_of[fixes.fix]
         squared[name] = np.bincount(walk, fixes.squared) / np.bincount(walk)
-        rms = [value**0.5 for value in frame.mean_interval(fixes.squared, walk)]
-        covered = frame.mean_interval(100.0 * fixes.inside, walk)
-        table.row(name, frame.shown(rms, 3), frame.shown(covered, 1),
-                  frame.shown(fixes.normalised.mean(), 2), frame.shown(fixes.without_fix, 2))
-        results |= {'rms_m' if follows else 'rms_fixed_m': rms,
-                    'in_region' if follows else 'in_region_fixed': covered}
-    ratio = np.sqrt(ratio_interval(squared['following'], squared['fixed'])).tolist()
-    print(f'\nratio of the rms errors {frame.shown(ratio, 3)}')
-    return results | {'ratio': ratio}
+        results[name] = table.row(name, **fixes.figures(walk) | {
+            'covered': frame.mean_interval(100.0 * fixes.inside, walk)})
+    results['ratio'] = np.sqrt(frame.mean_interval(
+        squared['following'], relative_to=squared['fixed'])).tolist()
+    print(f'\nratio of the rms errors {frame.shown(results["ratio"], 3)}')
+    return results
 
 
 def track(world: World, path: np.ndarray, times_s: np.ndarray, follows: bool,
@@ -261,21 +240,6 @@ def model_of(scenario: Scenario, codebook: Codebook) -> MeasurementModel:
 def around(centre: np.ndarray) -> Mixture:
     """Return the prior of a prediction; the pose of the surface is that of the site."""
     return Mixture(np.zeros(1), centre[None], STD_M**2 * np.eye(3)[None])
-
-
-def row(table: frame.Table, name: str, fixes: frame.Fixes, time_s: float) -> None:
-    """Print a row of the table."""
-    table.row(name, frame.shown(frame.mean_interval(fixes.squared), 4),
-              frame.shown(np.median(fixes.squared)**0.5, 3), frame.shown(fixes.covered, 1),
-              frame.shown(1e3 * time_s, 1))
-
-
-def ratio_interval(first: np.ndarray, second: np.ndarray) -> frame.Interval:
-    """Return the ratio of two means of N samples, which are resampled together."""
-    picks = np.random.default_rng(0).integers(len(first), size=(2000, len(first)))
-    ratios = first[picks].mean(axis=1) / second[picks].mean(axis=1)
-    low, high = np.percentile(ratios, (2.5, 97.5))
-    return float(first.mean() / second.mean()), float(low), float(high)
 
 
 if __name__ == '__main__':

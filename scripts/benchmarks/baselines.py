@@ -20,14 +20,161 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from parts.array_receiver import ArrayReceiver, posterior_means
-from parts.frame import CONFIG, Table, benchmark_parser, run, shown, write_results
+from parts import frame
 
+from rhs_isac_ros.bounds.fisher import inverse_information
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.codebook.unoptimised import SCANS
-from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.surface import radiation_matrix
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.gaussian import quadratic_form
+from rhs_isac_ros.model.los import los_and_derivative, los_gain
+from rhs_isac_ros.model.multipath import (
+    complex_normal,
+    measurement_correlation,
+    multipath_covariance,
+)
+from rhs_isac_ros.model.surface import AppliedBeams, radiation_matrix
+from rhs_isac_ros.positioning.grid import TemplateTable
+from rhs_isac_ros.positioning.lattice import Resolution
+from rhs_isac_ros.positioning.likelihood import Likelihood, NuisancePrior, Signals
+from rhs_isac_ros.positioning.posterior import WeightedSamples, draw_samples
+from rhs_isac_ros.positioning.search import find_modes
+from rhs_isac_ros.positioning.templates import tabulate
+
+# Positions whose mean signals determine the subspace of all mean signals, and its accuracy: the
+# largest whitened amplitude outside of it.
+_N_SUBSPACE, _TOLERANCE = 2000, 1e-3
+_BLOCK = 128
+
+
+def _slopes(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
+    return los_and_derivative(scenario, positions, band)[1]
+
+
+class ArrayReceiver:
+    """Whitened signals of a receiver, reduced to the subspace of its mean signals.
+
+    The reduction keeps everything that the signals contain about the position. It has the
+    interface of `MeasurementModel` that the search for modes needs.
+
+    Parameters
+    ----------
+    weights
+        Weights of the elements in the M outputs of every sub-band, complex128
+        [N_B, N_SB or 1, M, N_E] [sqrt(W)].
+    frames
+        Frame of each output, int [M].
+    averaged
+        Number of frames over which each output is averaged, which divides the power of the noise.
+    """
+
+    def __init__(self, scenario: Scenario, weights: np.ndarray, frames: np.ndarray,
+                 averaged: int = 1) -> None:
+        # The outputs combine the sub-bands, so that the search sees one with the same width.
+        self._scenario, self.scenario = scenario, dataclasses.replace(
+            scenario, n_subbands=1,
+            subband_width_hz=scenario.n_subbands * scenario.subband_width_hz)
+        n_elements, n_rows = scenario.n_elements, scenario.n_subbands * len(frames)
+        weights = np.broadcast_to(weights, (
+            scenario.n_bands, scenario.n_subbands, len(frames), n_elements))
+        rows = (np.arange(scenario.n_subbands)[:, None] * scenario.n_frames + frames).ravel()
+        whiteners = []
+        for band, (spatial, correlation) in enumerate(zip(
+                multipath_covariance(scenario), measurement_correlation(scenario), strict=True)):
+            radiation = weights[band].reshape(n_rows, n_elements)
+            covariance = correlation[np.ix_(rows, rows)] * (
+                radiation @ spatial @ radiation.conj().T)
+            covariance += scenario.noise_power_w / averaged * np.eye(n_rows)
+            whiteners.append(np.linalg.inv(np.linalg.cholesky(covariance)))
+        # Whitened response to the gains of the elements, [N_SB N_E, rows] for each band.
+        self._responses = [self._response(scenario, whitener, weights[band])
+                           for band, whitener in enumerate(whiteners)]
+        positions = scenario.sample_positions(_N_SUBSPACE, np.random.default_rng(0))
+        bases = [np.linalg.svd(
+            self._gains(los_gain, positions, band) @ response, full_matrices=False)[1:]
+            for band, response in enumerate(self._responses)]
+        rank = max(int(np.sum(values > _TOLERANCE)) for values, _ in bases)
+        self._responses = [response @ basis[:rank].conj().T for response, (_, basis) in zip(
+            self._responses, bases, strict=True)]
+        self.shape = len(whiteners), min(rank, *(len(basis) for _, basis in bases))
+        # The signals are white.
+        self.whitener = np.tile(np.eye(self.shape[1]), (len(whiteners), 1, 1))
+
+    @staticmethod
+    def _response(scenario: Scenario, whitener: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        by_subband = whitener.reshape(len(whitener), scenario.n_subbands, -1)
+        return np.einsum('rjm,jme->jer', by_subband, weights).reshape(-1, len(whitener))
+
+    def _gains(self, function: Callable[[Scenario, np.ndarray, int], np.ndarray],
+               positions: np.ndarray, band: int) -> np.ndarray:
+        gains = function(self._scenario, positions, band)
+        return gains.reshape(*gains.shape[:-2], -1)
+
+    def mean(self, positions: np.ndarray) -> np.ndarray:
+        """Compute mean signals, complex128 [N, N_B, r], at positions [N, 3] [m]."""
+        return np.stack([self._gains(los_gain, positions, band) @ response
+                         for band, response in enumerate(self._responses)], axis=1)
+
+    def mean_and_jacobian(
+            self, positions: np.ndarray, by_coordinate: np.ndarray | None = None, *,
+            whitened: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """Compute mean signals and their derivative, [N, N_B, r] and [N, 3, N_B, r] [1/m].
+
+        The signals are white in any case; `by_coordinate` is as in `MeasurementModel`.
+        """
+        jacobian = np.stack(
+            [self._gains(_slopes, positions, band) @ response
+             for band, response in enumerate(self._responses)], axis=2)
+        if by_coordinate is not None:
+            jacobian = np.einsum('nxq,nx...->nq...', by_coordinate, jacobian)
+        return self.mean(positions), jacobian
+
+    def crlb(self, positions: np.ndarray) -> np.ndarray:
+        """Compute the Cramer-Rao bound at positions, float64 [N] [m^2]."""
+        bounds = []
+        for start in range(0, len(positions), _BLOCK):
+            _, slopes = self.mean_and_jacobian(positions[start:start + _BLOCK])
+            information = quadratic_form(slopes.reshape(len(slopes), 3, -1))
+            bounds.append(np.trace(inverse_information(information), axis1=1, axis2=2))
+        return np.concatenate(bounds)
+
+    def simulate(self, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Draw signals of independent positioning phases, complex128 [N, N_B, r]."""
+        means = np.concatenate([self.mean(positions[start:start + _BLOCK])
+                                for start in range(0, len(positions), _BLOCK)])
+        return means + complex_normal(means.shape, rng)
+
+
+class ArrayLikelihood(Likelihood):
+    """The likelihood of a receiver's signals, which are white, without impairments."""
+
+    def __init__(self, receiver: ArrayReceiver) -> None:
+        self.scenario = scenario = receiver.scenario
+        self.model = receiver
+        dark = AppliedBeams(
+            np.zeros((scenario.n_bands, scenario.n_frames, scenario.n_elements)),
+            np.zeros((scenario.n_bands, scenario.n_subbands, scenario.n_frames,
+                      scenario.n_feeds)))
+        # The prior of no parameters is the same for all beams.
+        self.nuisance = NuisancePrior(MeasurementModel(scenario, dark))
+        self.resolution = Resolution.of(scenario)
+
+
+def posterior_means(receiver: ArrayReceiver, received: np.ndarray) -> np.ndarray:
+    """Compute the posterior means of positioning phases as `bayes` does, float64 [N, 3] [m].
+
+    Every mode of the likelihood contributes with the mass of its Gaussian inside the region.
+    """
+    likelihood = ArrayLikelihood(receiver)
+    grid = TemplateTable(receiver.scenario, tabulate(receiver))
+    means = []
+    for start in range(0, len(received), _BLOCK):
+        signals = received[start:start + _BLOCK]
+        modes = find_modes(
+            likelihood, grid, Signals(signals, signals), np.zeros((len(signals), 0)))
+        samples = draw_samples(modes, grid.normal, receiver.scenario.roi_bounds_m)
+        means.append(WeightedSamples.of(samples, modes).moments()[0])
+    return np.concatenate(means)
 
 
 def all_elements(scenario: Scenario) -> ArrayReceiver:
@@ -63,7 +210,7 @@ def phased_array(scenario: Scenario, chains: int, rng: np.random.Generator | Non
 
 def surface(scenario: Scenario, name: str) -> ArrayReceiver:
     """Observe the elements through the surface with a codebook of config/."""
-    radiation = radiation_matrix(scenario, Codebook.load(CONFIG / f'{name}.yaml'))
+    radiation = radiation_matrix(scenario, Codebook.load(frame.CONFIG / f'{name}.yaml'))
     shape = scenario.n_bands, scenario.n_subbands, scenario.n_frames, scenario.n_elements
     return ArrayReceiver(scenario, radiation.reshape(shape), np.arange(scenario.n_frames))
 
@@ -94,29 +241,24 @@ def receivers(scenario: Scenario, seed: int) -> dict[str, Callable[[], ArrayRece
 
 def main() -> None:
     """Run the benchmark."""
-    parser = benchmark_parser('baselines', __doc__, 1000)
-    parser.add_argument('--multipath', type=float, default=0.0, metavar='DB',
-                        help='level of the multipath [dB]')
-    options = parser.parse_args()
-    scenario = Scenario(multipath_to_los_db=options.multipath)
+    options = frame.benchmark_parser('baselines', __doc__, 1000).parse_args()
+    scenario = Scenario()
     positions = scenario.sample_positions(
         options.positions, np.random.default_rng(options.seed))
-    print(f'{options.positions} positions, seed {options.seed}, posterior mean, multipath '
-          f'{options.multipath:g} dB\n')
-    table = Table('receiver', 'average CRLB [m²]', 'mean squared error [m²]', 'standard error',
-                  'median')
+    print(f'{options.positions} positions, seed {options.seed}, posterior mean\n')
+    table = frame.Table(['receiver'], {
+        'average CRLB [m²]': ('average_crlb_m2', 4), 'mean squared error [m²]': ('mse_m2', 4),
+        'standard error': ('standard_error_m2', 4), 'median': ('median_m2', 4)})
     figures = {}
     for name, make in receivers(scenario, options.seed).items():
         receiver = make()
         received = receiver.simulate(positions, np.random.default_rng(options.seed + 1))
         errors = np.sum((posterior_means(receiver, received) - positions)**2, axis=1)
-        figures[name] = {
-            'average_crlb_m2': receiver.crlb(positions).mean(), 'mse_m2': errors.mean(),
-            'standard_error_m2': errors.std() / np.sqrt(len(errors)),
-            'median_m2': np.median(errors)}
-        table.row(name, *(shown(value, 4) for value in figures[name].values()))
-    write_results(options.json, figures)
+        figures[name] = table.row(
+            name, average_crlb_m2=receiver.crlb(positions).mean(), mse_m2=errors.mean(),
+            standard_error_m2=errors.std() / np.sqrt(len(errors)), median_m2=np.median(errors))
+    frame.write_results(options.json, figures)
 
 
 if __name__ == '__main__':
-    run(main)
+    frame.run(main)

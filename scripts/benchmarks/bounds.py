@@ -9,74 +9,64 @@ independent random numbers.
 """
 
 import argparse
-import sys
 import time
 from collections.abc import Iterator
 
 import numpy as np
-from parts.frame import CONFIG, add_plans, benchmark_parser, run, write_results
+from parts import frame
 
 from rhs_isac_ros.bounds import crlb, global_bound
 from rhs_isac_ros.codebook import Codebook, directional_codebook, optimize, random_codebook
-from rhs_isac_ros.experiments import markdown_table
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import make_estimator, simulate_pairs
 from rhs_isac_ros.support import streams
-from rhs_isac_ros.support.arguments import integer, positive_int
+from rhs_isac_ros.support.arguments import integer
 
 PLANS = {'equal': (2.5e9, 2.667e9, 2.833e9, 3.0e9), 'unequal': (2.5e9, 2.55e9, 2.7e9, 3.0e9)}
 # Update steps and positions of the optimisations: seconds for the bound, a minute for ambiguity.
 STEPS, POSITIONS = {'crlb': 300, 'ambiguity': 150}, {'crlb': 256, 'ambiguity': 64}
-HEADER = ('plan', 'codebook', 'MSE [m²]', '±', 'CRLB [m²]', 'bound [m²]', '±', 'MSE / CRLB',
-          'MSE / bound', 'time of the bound [s]')
 
 
 def main() -> None:
     """Run the benchmark."""
-    parser = benchmark_parser('bounds', __doc__, 2000)
+    parser = frame.benchmark_parser('bounds', __doc__, 2000)
     parser.add_argument('--phases', type=integer(2), default=2048,
                         help='positioning phases of the bound')
-    parser.add_argument('--steps', type=positive_int, help='steps of the optimisations')
-    add_plans(parser)
     options = parser.parse_args()
     print(f'{options.positions} positions, {options.phases} phases for the bound, seed '
           f'{options.seed}\n')
-    figures, rows = [], []
-    for plan, name, scenario, codebook in pairs(options):
-        figures.append({'plan': plan, 'codebook': name,
-                        **compare(scenario, codebook, options)})
-        numbers = [value for value in figures[-1].values() if isinstance(value, float)]
-        rows.append([plan, name, *(f'{value:.3g}' for value in numbers)])
-        print('  '.join(rows[-1]), file=sys.stderr, flush=True)
-    print(markdown_table(HEADER, rows))
+    table = frame.Table(['plan', 'codebook'], {
+        'MSE [m²]': ('mse_m2', 3), '± of it': ('mse_interval_m2', 3),
+        'CRLB [m²]': ('average_crlb_m2', 4), 'bound [m²]': ('bound_m2', 3),
+        '± of the bound': ('bound_interval_m2', 3), 'MSE / CRLB': ('mse_to_crlb', 1),
+        'MSE / bound': ('mse_to_bound', 3), 'time of the bound [s]': ('bound_seconds', 1)})
+    figures = [
+        {'plan': plan, 'codebook': name,
+         **table.row(plan, name, **compare(scenario, codebook, options))}
+        for plan, name, scenario, codebook in pairs(options)]
     ratios = [entry['mse_to_bound'] for entry in figures]
     print(f'\nMSE / bound from {min(ratios):.3f} to {max(ratios):.3f} over {len(ratios)} pairs')
-    write_results(options.json, figures)
+    frame.write_results(options.json, figures)
 
 
 def pairs(options: argparse.Namespace) -> Iterator[tuple[str, str, Scenario, Codebook]]:
     """Yield the names of plan and codebook, with both."""
-    if not options.only_plans:
-        scenario = Scenario()
-        rng = streams.generator(options.seed, streams.START)
-        codebooks = {
-            'ambiguity': Codebook.load(CONFIG / 'codebook_ambiguity.yaml'),
-            'crlb': Codebook.load(CONFIG / 'codebook_crlb.yaml'),
-            'directional, width': directional_codebook(scenario),
-            'directional, grid': directional_codebook(scenario, scan='grid'),
-            'random': random_codebook(scenario, rng)}
-        for name, codebook in codebooks.items():
-            yield 'Table I', name, scenario, codebook
-        for plan, centers in PLANS.items():
-            scenario = Scenario(center_frequencies_hz=centers, n_frames=2)
-            for objective, steps in STEPS.items():
-                result = optimize(
-                    scenario, objective=objective, max_steps=options.steps or steps,
-                    n_positions=POSITIONS[objective], seed=options.seed)
-                yield plan, objective, scenario, result.codebook
-    for scenario_file, codebook_file in options.plan:
-        scenario = Scenario.from_yaml(scenario_file)
-        yield scenario_file.stem, codebook_file.stem, scenario, Codebook.load(codebook_file)
+    scenario = Scenario()
+    codebooks = {
+        'ambiguity': Codebook.load(frame.CONFIG / 'codebook_ambiguity.yaml'),
+        'crlb': Codebook.load(frame.CONFIG / 'codebook_crlb.yaml'),
+        'directional, width': directional_codebook(scenario),
+        'directional, grid': directional_codebook(scenario, scan='grid'),
+        'random': random_codebook(scenario, streams.generator(options.seed, streams.START))}
+    for name, codebook in codebooks.items():
+        yield 'Table I', name, scenario, codebook
+    for plan, centers in PLANS.items():
+        scenario = Scenario(center_frequencies_hz=centers, n_frames=2)
+        for objective, steps in STEPS.items():
+            result = optimize(
+                scenario, objective=objective, max_steps=steps,
+                n_positions=POSITIONS[objective], seed=options.seed)
+            yield plan, objective, scenario, result.codebook
 
 
 def compare(
@@ -101,4 +91,4 @@ def compare(
 
 
 if __name__ == '__main__':
-    run(main)
+    frame.run(main)

@@ -17,7 +17,6 @@ The folder contains empty_test.npz, hall_test.npz and hall_survey.npz with propa
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,8 +30,6 @@ from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.support.arguments import positive_int, share
 
-SYSTEMS = {'table1': ('table1.yaml', 'codebook.yaml'),
-           'bandplan': ('bandplan.yaml', 'codebook_bandplan.yaml')}
 # Assumed share of blocked users.
 PRIOR = 0.1
 
@@ -58,12 +55,13 @@ def main() -> None:
     add('--blocked', type=share, nargs='+', default=[], metavar='SHARE',
         help='also measure with this share of users without direct path, from 0 to 1')
     options = parser.parse_args()
-    table = frame.Table('hall', 'system', 'survey', 'fix [%]', 'in the 95 % region [%]',
-                  'range over surveys [%]', 'confidently wrong [%]', 'rms error [m]')
+    table = frame.Table(['hall', 'system', 'survey'], {
+        'fix [%]': ('fix', 1), 'in the 95 % region [%]': ('in_region', 1),
+        'range over surveys [%]': ('range', 1), 'confidently wrong [%]': ('wrong', 1),
+        'rms error [m]': ('rms_m', 3)})
     figures: dict[str, dict] = {'hall': {}, 'empty': {}}
-    for name, (scenario_file, codebook_file) in SYSTEMS.items():
-        scenario = Scenario.from_yaml(frame.CONFIG / scenario_file)
-        codebook = Codebook.load(frame.CONFIG / codebook_file)
+    for name in frame.SYSTEMS:
+        scenario, codebook = frame.system(name)
         rng = np.random.default_rng(options.seed)
         empty, hall, known = (
             dataclasses.replace(scenario, channel=options.folder / f'{file}.npz')
@@ -126,44 +124,29 @@ def measure(scenario: Scenario, codebook: Codebook, received: Received) -> dict[
         users[chosen]) for name, chosen in groups.items() if chosen.any()}
 
 
-def shares_of(fixes: frame.Fixes) -> dict[str, float]:
-    """Return shares of users with a fix, of fixes in the region, of users outside; and error."""
-    n, inside = len(fixes.fix), int(fixes.inside.sum())
-    n_fixes = len(fixes.squared)
-    return {'fix': n_fixes / n, 'in_region': inside / max(n_fixes, 1),
-            'wrong': (n_fixes - inside) / n,
-            'rms_m': float(fixes.squared.mean()**0.5) if n_fixes else np.nan}
-
-
-def mean_share(pairs: Sequence[tuple[int, int]]) -> str:
-    """Return a mean share over surveys, with the interval of one, because they share the users."""
-    return frame.shown(np.mean([share_percent(*pair) for pair in pairs], axis=0).tolist(), 1)
-
-
 def report(table: frame.Table, hall: str, system: str, known: str,
-           results: list[dict[str, frame.Fixes]]) -> dict[str, dict[str, float | list]]:
-    """Print a row for each group of users, and return its figures.
-
-    They are means, and the worst share in the region.
-    """
-    figures: dict[str, dict[str, float | list]] = {}
+           results: list[dict[str, frame.Fixes]]) -> dict[str, dict]:
+    """Print a row for each group of users, and return its figures: means over the surveys."""
+    figures = {}
     for users in results[0]:
         found = [result[users] for result in results]
-        shares = [shares_of(fixes) for fixes in found]
-        covered = [one['in_region'] for one in shares]
-        counts = [(len(one.fix), len(one.squared), int(one.inside.sum())) for one in found]
-        rms_m = float(np.mean([one['rms_m'] for one in shares]))
-        table.row(
-            f'{hall}: {users}' if users else hall, system, known,
-            mean_share([(fixes, n) for n, fixes, _ in counts]),
-            mean_share([(inside, max(fixes, 1)) for _, fixes, inside in counts]),
-            f'{100 * min(covered):.1f} to {100 * max(covered):.1f}',
-            mean_share([(fixes - inside, n) for n, fixes, inside in counts]),
-            '' if np.isnan(rms_m) else f'{rms_m:.3f}')
-        figures[users] = {
-            'fix': float(np.mean([one['fix'] for one in shares])), 'in_region': min(covered),
-            'wrong': max(one['wrong'] for one in shares), 'rms_m': rms_m, 'each': shares}
+        counts = np.array([(len(one.fix), len(one.squared), one.inside.sum()) for one in found])
+        n, n_fixes, inside = counts.T
+        covered = 100 * inside / np.maximum(n_fixes, 1)
+        errors_m = [one.squared.mean()**0.5 for one in found if len(one.squared)]
+        figures[users] = table.row(
+            f'{hall}: {users}' if users else hall, system, known, fix=mean_share(n_fixes, n),
+            in_region=mean_share(inside, np.maximum(n_fixes, 1)),
+            range=f'{covered.min():.1f} to {covered.max():.1f}',
+            wrong=mean_share(n_fixes - inside, n),
+            rms_m=np.mean(errors_m) if len(errors_m) == len(found) else None)
     return figures
+
+
+def mean_share(counts: np.ndarray, totals: np.ndarray) -> list[float]:
+    """Return a mean share over surveys, with the interval of one, because they share the users."""
+    shares = [share_percent(int(n), int(total)) for n, total in zip(counts, totals, strict=True)]
+    return np.mean(shares, axis=0).tolist()
 
 
 if __name__ == '__main__':

@@ -6,35 +6,40 @@ bound is a ping-pong with as many hops, between a bare publisher and subscriptio
 executor, measured in the same run. If the nodes of the network are processes, it runs between two
 processes; otherwise, between two nodes of one process. Messages that need no estimate and no beam
 are also compared with as many hops. Unlike a cycle, a ping-pong keeps its processes in the cache.
-The messages of a cycle between bare processes, with the same receivers and pauses, therefore show
-how much of a cycle is not due to the nodes. The 10th percentile is less sensitive than the median
-to other programs on the machine.
+The 10th percentile is less sensitive than the median to other programs on the machine.
 """
 
+import collections
 import faulthandler
+import itertools
+import multiprocessing
 import os
-import sys
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import rclpy
-from parts.bare_cycle import bare_cycles
-from parts.chain import ChainObserver, Cycle
-from parts.frame import benchmark_parser, run, write_results
-from parts.hops import CHAIN, ping_pong
-from parts.serializers import SERIALIZERS
+from parts import frame
 from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 from system.trial_processes import TrialProcesses
 
+from rhs_isac_msgs.msg import FeedSignals
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE, OBSERVATION, subscribe
 from rhs_isac_ros.ros.environment import check_environment, private_domain, use_discovery_profile
-from rhs_isac_ros.ros.processes import MAX_USER_NODES
-from rhs_isac_ros.support.arguments import integer, positive_int
+from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.support.arguments import positive_int
 from rhs_isac_ros.tools.demo import start_network
 
+LAYOUTS = {'processes': 'one process per node', 'composed': 'all nodes in one process'}
+USERS, ROUND_TRIPS = 2, 2000
 # Pause between cycles, so that the report of one does not compete with the next for the cores.
 REST_S = 0.05
 # Links of the chain that consist of computations.
@@ -46,145 +51,246 @@ TIMEOUT_S = 60.0
 # Maximum time of a measurement, and what a cycle adds to it. Fast DDS 2.14 can wait for itself for
 # ever when an endpoint is destroyed; the program then ends with the place where it waits.
 HANG_S, HANG_CYCLE_S = 150.0, 0.5
-WHERE = {'processes': 'one process per node', 'composed': 'all nodes in one process'}
+# The messages of the chain, with their senders unless these depend on the content. Others are sent
+# in parallel with them.
+SENDERS = {
+    m.Beacon: 'bs', m.Ack: 'user', m.RhsCommand: 'bs', m.RhsConfiguration: 'rhs_controller',
+    m.PilotRequest: 'bs', m.Pilot: 'user', m.FeedSignals: 'channel', m.ReceivedSignals: 'bs',
+    m.PositionEstimate: 'positioner', m.Beam: 'transmission', m.Data: '', m.ProtocolState: 'bs'}
 
 
-def main() -> int:
+def main() -> None:
     """Run the benchmark."""
-    parser = benchmark_parser('cycle', __doc__, default_seed=None)
-    parser.add_argument('--users', type=integer(1, MAX_USER_NODES), default=2,
-                        help='number of users, each a process')
+    parser = frame.benchmark_parser('cycle', __doc__, default_seed=None)
     parser.add_argument('--cycles', type=positive_int, default=300, help='number of cycles')
-    parser.add_argument('--layout', choices=WHERE, action='append',
-                        help='only this arrangement of the nodes; by default both')
-    parser.add_argument('--serializer', choices=SERIALIZERS,
-                        help='convert the messages of the nodes with this library')
     options = parser.parse_args()
     check_environment(parser)
     os.environ.update(private_domain())
     use_discovery_profile()
     results = {}
-    for layout in options.layout or WHERE:
-        results[layout] = measure(
-            options.users, options.cycles, layout == 'composed', options.serializer)
-        report(results[layout], layout)
-    write_results(options.json, results)
-    return 0
+    for layout, where in LAYOUTS.items():
+        print(f'{where}, {USERS} users, {options.cycles} cycles\n', flush=True)
+        cycles, hops_s, cpu_s = measure(options.cycles, layout == 'composed')
+        table = frame.Table(['time'], {
+            'median': ('median', 2), '10th percentile': ('p10', 2), '99th percentile': ('p99', 2)})
+        results[layout] = {
+            name: table.row(name, **row) for name, row in figures(cycles, hops_s).items()}
+        print(f'\nCPU time of all nodes, for each cycle and its pause: {1e3 * cpu_s:.2f} ms\n')
+    frame.write_results(options.json, results)
 
 
-def measure(users: int, cycles: int, composed: bool, serializer: str | None) -> dict:
-    """Run ping-pong, the network, and ping-pong again; return the figures."""
+def measure(n_cycles: int, composed: bool) -> tuple[list['Cycle'], np.ndarray, float]:
+    """Run ping-pong, the network, and ping-pong again.
+
+    Returns the cycles, the times of bare hops, float64 [N] [s], and the CPU time of a cycle [s].
+    """
     scenario = Scenario()
-    faulthandler.dump_traceback_later(HANG_S + HANG_CYCLE_S * cycles, exit=True)
+    faulthandler.dump_traceback_later(HANG_S + HANG_CYCLE_S * n_cycles, exit=True)
     rclpy.init(args=[])
     try:
         before_s = ping_pong(scenario, composed)
-        chains, cpu_s = run_cycles(scenario, users, cycles, composed, serializer)
-        bare_s = None if composed else np.median(bare_cycles(REST_S))
+        cycles, cpu_s = run_cycles(scenario, n_cycles, composed)
         after_s = ping_pong(scenario, composed)
     finally:
         rclpy.try_shutdown()
         faulthandler.cancel_dump_traceback_later()
-    hops_s = np.concatenate([before_s, after_s]) / 2
-    hop_s, n_hops = float(np.median(hops_s)), len(CHAIN)
-    cycles_s = np.array([chain.duration_s for chain in chains])
-    messages_s = np.array([sum(link.elapsed_s for link in chain.links()
-                               if link.name not in COMPUTED) for chain in chains])
-    n_messages = n_hops - len(COMPUTED)
-    quick_s, quick_hop_s = np.percentile(cycles_s, 10), np.percentile(hops_s, 10)
-    cycle_s, floor_s = float(np.median(cycles_s)), n_hops * hop_s
-    return {
-        'users': users, 'cycles': len(chains), 'hops': n_hops, 'hop_us': 1e6 * hop_s,
-        'hop_p99_us': 1e6 * np.percentile(hops_s, 99), 'floor_ms': 1e3 * floor_s,
-        'cycle_ms': 1e3 * cycle_s, 'cycle_p99_ms': 1e3 * np.percentile(cycles_s, 99),
-        'ratio': cycle_s / floor_s, 'messages': n_messages,
-        'messages_ms': 1e3 * np.median(messages_s),
-        'messages_ratio': np.median(messages_s) / (n_messages * hop_s),
-        'messages_ratio_p10': np.percentile(messages_s, 10) / (n_messages * quick_hop_s),
-        'bare_ms': bare_s and 1e3 * bare_s, 'cpu_ms': 1e3 * cpu_s,
-        'cycle_p10_ms': 1e3 * quick_s, 'hop_p10_us': 1e6 * quick_hop_s,
-        'ratio_p10': quick_s / (n_hops * quick_hop_s),
-        'phases_ms': {phase.name.lower(): value for phase, value in zip(
-            m.Phase, 1e3 * np.median([np.diff(chain.began_s()) for chain in chains], axis=0),
-            strict=True)},
-        'links': links(chains, hop_s),
-    }
+    return cycles, np.concatenate([before_s, after_s]) / 2, cpu_s
 
 
-def run_cycles(
-        scenario: Scenario, users: int, cycles: int, composed: bool, serializer: str | None
-) -> tuple[list[Cycle], float]:
+def figures(cycles: list['Cycle'], hops_s: np.ndarray) -> dict[str, dict[str, float]]:
+    """Return percentiles of the times of cycles, hops, and each message of the chain."""
+    def percentiles(times_s: Sequence[float]) -> dict[str, float]:
+        middle, low, high = np.percentile(times_s, (50, 10, 99))
+        return {'median': 1e3 * middle, 'p10': 1e3 * low, 'p99': 1e3 * high}
+
+    chains = [cycle.links() for cycle in cycles]
+    of_link = collections.defaultdict(list)
+    for link in itertools.chain(*chains):
+        of_link[f'{link.name} from {link.sender} [ms]'].append(link.elapsed_s)
+    hop = percentiles(hops_s)
+    found = {'bare hop [ms]': hop}
+    n_hops = int(np.median([*map(len, chains)]))
+    for name, n, times_s in (
+            ('cycle', n_hops, [cycle.duration_s for cycle in cycles]),
+            ('cycle without estimate and beam', n_hops - len(COMPUTED), [
+                sum(link.elapsed_s for link in chain if link.name not in COMPUTED)
+                for chain in chains])):
+        found[f'{name} [ms]'] = own = percentiles(times_s)
+        found[f'{name}, relative to {n} hops'] = {
+            key: value / n / hop[key] for key, value in own.items()}
+    # After the previous message of the chain.
+    return found | {name: percentiles(times_s) for name, times_s in of_link.items()
+                    if len(times_s) > len(chains) / 2}
+
+
+def run_cycles(scenario: Scenario, n_cycles: int, composed: bool) -> tuple[list['Cycle'], float]:
     """Run the network and return its cycles, and the CPU time of all nodes for each [s]."""
     observer, executor = ChainObserver(), EventsExecutor()
     executor.add_node(observer)
-    with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
-        prefix = [sys.executable, '-m', 'parts.serializers', serializer] if serializer else []
-        paths = os.pathsep.join([str(Path(__file__).parent), os.environ.get('PYTHONPATH', '')])
-        with TrialProcesses(Path(logs), {'ROS_LOG_DIR': logs, 'PYTHONPATH': paths},
-                            lambda name: prefix) as processes:
-            if composed:
-                processes.start('network', users=users, rest_s=REST_S, mobility='random_walk',
-                                speed_mps=scenario.max_user_speed_mps)
-            else:
-                start_network(processes, users, scenario, first_cycle=1, rest_s=REST_S)
-            served, end_s, before_s = 0, time.monotonic() + TIMEOUT_S, 0.0
-            while observer.served < WARM_UP + cycles:
-                executor.spin_once(timeout_sec=0.5)
-                if observer.served != served:
-                    if observer.served == WARM_UP:
-                        before_s = sum(processes.cpu_s().values())
-                    served, end_s = observer.served, time.monotonic() + TIMEOUT_S
-                if processes.ended() or time.monotonic() > end_s:
-                    name = next(iter(processes.ended()), 'network' if composed else 'bs')
-                    raise RuntimeError(f'{served} cycles; log of {name}:\n{processes.log(name)}')
-            cpu_s = (sum(processes.cpu_s().values()) - before_s) / cycles
+    with (tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs,
+          TrialProcesses(Path(logs), {'ROS_LOG_DIR': logs}) as processes):
+        if composed:
+            processes.start('network', users=USERS, rest_s=REST_S, mobility='random_walk',
+                            speed_mps=scenario.max_user_speed_mps)
+        else:
+            start_network(processes, USERS, scenario, first_cycle=1, rest_s=REST_S)
+        served, end_s, before_s = 0, time.monotonic() + TIMEOUT_S, 0.0
+        while observer.served < WARM_UP + n_cycles:
+            executor.spin_once(timeout_sec=0.5)
+            if observer.served != served:
+                if observer.served == WARM_UP:
+                    before_s = sum(processes.cpu_s().values())
+                served, end_s = observer.served, time.monotonic() + TIMEOUT_S
+            if processes.ended() or time.monotonic() > end_s:
+                name = next(iter(processes.ended()), 'network' if composed else 'bs')
+                raise RuntimeError(f'{served} cycles; log of {name}:\n{processes.log(name)}')
+        cpu_s = (sum(processes.cpu_s().values()) - before_s) / n_cycles
     executor.shutdown()
     observer.destroy_node()
     return observer.cycles()[WARM_UP:], cpu_s
 
 
-def links(chains: list[Cycle], hop_s: float) -> list[dict]:
-    """Return percentiles of the time between each message of the chain and the previous one."""
-    times_s: dict[tuple[str, str], list[float]] = {}
-    places: dict[tuple[str, str], list[int]] = {}
-    for chain in chains:
-        for place, link in enumerate(chain.links()):
-            times_s.setdefault((link.name, link.sender), []).append(link.elapsed_s)
-            places.setdefault((link.name, link.sender), []).append(place)
-    ordered = sorted(times_s, key=lambda key: np.mean(places[key]))
-    return [{'message': name, 'sender': sender, 'ms': 1e3 * np.median(values),
-             'p10_ms': 1e3 * np.percentile(values, 10), 'p99_ms': 1e3 * np.percentile(values, 99),
-             'beyond_hop_ms': 1e3 * (np.median(values) - hop_s)}
-            for name, sender in ordered
-            if len(values := times_s[name, sender]) > len(chains) / 2]
+class Link(NamedTuple):
+    """A message of the chain, its sender, and the time since the previous message was sent [s]."""
+
+    name: str
+    sender: str
+    elapsed_s: float
 
 
-def report(figures: dict, layout: str) -> None:
-    """Print the figures of an arrangement of the nodes."""
-    print(f'{WHERE[layout]}, {figures["users"]} users, {figures["cycles"]} cycles')
-    print(f'cycle     {figures["cycle_ms"]:7.2f} ms  median; 10th percentile '
-          f'{figures["cycle_p10_ms"]:.2f} ms, 99th {figures["cycle_p99_ms"]:.2f} ms')
-    print(f'floor     {figures["floor_ms"]:7.2f} ms  {figures["hops"]} hops of '
-          f'{figures["hop_us"]:.0f} us; 10th percentile {figures["hop_p10_us"]:.0f} us, 99th '
-          f'{figures["hop_p99_us"]:.0f} us')
-    print(f'ratio     {figures["ratio"]:7.2f}     of the medians; of the 10th percentiles '
-          f'{figures["ratio_p10"]:.2f}')
-    print(f'messages  {figures["messages_ms"]:7.2f} ms  {figures["messages"]} hops, those without '
-          'estimate and beam')
-    print(f'ratio     {figures["messages_ratio"]:7.2f}     of the medians; of the 10th '
-          f'percentiles {figures["messages_ratio_p10"]:.2f}')
-    if figures['bare_ms']:
-        print(f'bare      {figures["bare_ms"]:7.2f} ms  all messages of the cycle between bare '
-              'processes, with the same receivers and pauses')
-    print(f'CPU time  {figures["cpu_ms"]:7.2f} ms  of all nodes, for each cycle and its pause')
-    for phase, value in figures['phases_ms'].items():
-        print(f'  {phase:12s}{value:7.2f} ms')
-    print('time since the previous message was sent: median, beyond a bare hop, percentiles')
-    for link in figures['links']:
-        print(f'  {link["message"]:24s} {link["sender"]:15s}{link["ms"]:7.2f} ms '
-              f'{link["beyond_hop_ms"]:7.2f} ms; 10th {link["p10_ms"]:.2f} ms, 99th '
-              f'{link["p99_ms"]:.2f} ms')
+class ChainObserver(Node):
+    """Stores the messages of the chain with as little work as possible.
+
+    It would otherwise compete with the network for the cores.
+
+    Attributes
+    ----------
+    served
+        Number of cycles that were served.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('chain_observer')
+        self.served = 0
+        # With the time of arrival of each [s]: stamps are those of measurements.
+        self._stored: dict[type[m.Message], list[tuple[bytes, float]]] = {}
+        for kind in SENDERS:
+            self._stored[kind] = []
+            subscribe(self, convert.ros_type(kind), topics.NAMES[kind], self._store(kind),
+                      OBSERVATION, raw=True)
+
+    def _store(self, kind: type[m.Message]) -> Callable[[bytes], None]:
+        stored, ends = self._stored[kind], kind is m.ProtocolState
+
+        def store(content: bytes) -> None:
+            stored.append((content, time.monotonic()))
+            # The outcome is text on the wire.
+            self.served += ends and b'served' in content
+        return store
+
+    def cycles(self) -> list['Cycle']:
+        """Return the cycles that were served and are complete, in order."""
+        cycles: dict[int, Cycle] = {}
+        for kind, stored in self._stored.items():
+            for content, arrived_s in stored:
+                message = convert.from_bytes(kind, content)
+                cycles.setdefault(message.cycle_id, Cycle([])).sent.append((arrived_s, message))
+        return [cycle for _, cycle in sorted(cycles.items()) if cycle.is_served]
+
+
+class Cycle(NamedTuple):
+    """The messages of a cycle with the times at which they arrived [s]."""
+
+    sent: list[tuple[float, m.Message]]
+
+    @property
+    def is_served(self) -> bool:
+        """Whether the user was served."""
+        return any(getattr(message, 'outcome', '') == 'served' for _, message in self.sent)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the beacon to the end, on the clock of the base station."""
+        return max(message.elapsed_s for _, message in self.sent
+                   if isinstance(message, m.ProtocolState))
+
+    def links(self) -> list[Link]:
+        """Return the messages of the chain in the order in which they were sent.
+
+        Of several messages that are sent in response to the same one, the last counts.
+        """
+        last: dict[tuple[str, str], float] = {}
+        for sent_s, message in self.sent:
+            if step := step_of(message):
+                last[step] = max(sent_s, last.get(step, 0.0))
+        ordered = sorted((sent_s, step) for step, sent_s in last.items())
+        return [Link(*step, sent_s - before_s) for (before_s, _), (sent_s, step) in zip(
+            ordered, ordered[1:], strict=False)]
+
+
+def step_of(message: m.Message) -> tuple[str, str] | None:
+    """Return the step of the chain to which a message belongs, and its sender; or None."""
+    name, sender = topics.NAMES[type(message)], SENDERS[type(message)]
+    match message:
+        case m.ProtocolState():
+            return ('end', sender) if message.outcome else None
+        case m.RhsConfiguration(mode=m.Mode.TRANSMISSION):
+            return f'{name} (beam)', sender
+        case m.RhsCommand() | m.RhsConfiguration() if message.band > 0:
+            # Sent in parallel with those of the first band.
+            return None
+        case m.Data():
+            delivered = message.stage is m.Stage.DELIVERED
+            offers = 'bs' if message.direction is m.Direction.DOWNLINK else 'user'
+            return (f'{name} {message.direction.name.lower()} {message.stage.name.lower()}',
+                    'channel' if delivered else offers)
+    return name, sender
+
+
+def ping_pong(scenario: Scenario, composed: bool) -> np.ndarray:
+    """Measure round trips between nodes of one process or of two, float64 [N] [s]."""
+    feeds = np.ones((scenario.n_frames, scenario.n_subbands, scenario.n_feeds), complex)
+    message = deserialize_message(convert.to_bytes(
+        m.FeedSignals(cycle_id=1, user=1, band=0, signals=feeds), 0), FeedSignals)
+    times_s: list[float] = []
+    node = Node('ping')
+    publisher = node.create_publisher(FeedSignals, 'benchmark/ping', EXCHANGE)
+
+    def send() -> None:
+        times_s.append(time.perf_counter())
+        publisher.publish(message)
+
+    subscribe(node, FeedSignals, 'benchmark/pong', lambda _: send(), EXCHANGE)
+    executor = EventsExecutor()
+    nodes = [node, *make_pong()] if composed else [node]
+    for each in nodes:
+        executor.add_node(each)
+    other = multiprocessing.get_context('spawn').Process(target=run, args=(make_pong, []))
+    if not composed:
+        other.start()
+    try:
+        while not (publisher.get_subscription_count() and node.count_publishers('benchmark/pong')):
+            executor.spin_once(timeout_sec=0.1)
+        send()
+        while len(times_s) <= ROUND_TRIPS:
+            executor.spin_once(timeout_sec=1.0)
+    finally:
+        if not composed:
+            other.terminate()
+            other.join()
+        executor.shutdown()
+        for each in nodes:
+            each.destroy_node()
+    return np.diff(times_s)[ROUND_TRIPS // 10:]
+
+
+def make_pong() -> list[Node]:
+    """Return a node that echoes each message."""
+    node = Node('pong')
+    publisher = node.create_publisher(FeedSignals, 'benchmark/pong', EXCHANGE)
+    subscribe(node, FeedSignals, 'benchmark/ping', publisher.publish, EXCHANGE)
+    return [node]
 
 
 if __name__ == '__main__':
-    run(main)
+    frame.run(main)

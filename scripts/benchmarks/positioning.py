@@ -1,4 +1,4 @@
-"""Accuracy and time of an estimator.
+"""Accuracy and time of the estimator `bayes`.
 
 Problem: a user is at a uniformly random position in the region of interest. The base station
 receives the signals of a positioning phase with a codebook, by Eq. (8). How large is the error of
@@ -10,10 +10,6 @@ Gaussian. With --reference N, the posterior is evaluated at 2^N points; N = 22 t
 minutes.
 """
 
-import argparse
-import resource
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -24,32 +20,29 @@ from parts import frame
 from parts.exhaustive_posterior import exhaustive_posterior
 
 from rhs_isac_ros.bounds import crlb
-from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.positioning import ESTIMATORS, Estimate, make_estimator, simulate_pairs
-from rhs_isac_ros.support.arguments import input_file, integer
+from rhs_isac_ros.codebook import Codebook, default_codebook_file
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.positioning import Estimate, make_estimator, simulate_pairs
+from rhs_isac_ros.support.arguments import integer
 
 
 def main() -> None:
     """Run the benchmark."""
-    options = parse_options()
-    scenario, codebook = frame.scenario_of(options.scenario), Codebook.load(options.codebook)
-    settings: dict[str, Any] = {
-        name: value for name in ('model_file', 'table_folder')
-        if (value := getattr(options, name))}
+    parser = frame.benchmark_parser('positioning', __doc__, 1000)
+    parser.add_argument('--reference', type=integer(0, 24), default=0, metavar='N',
+                        help='compare with the posterior mean over 2^N points; 0 to omit')
+    options = parser.parse_args()
+    scenario, codebook = Scenario(), Codebook.load(default_codebook_file())
     begin = time.perf_counter()
-    estimator = make_estimator(options.estimator, scenario, codebook, **settings)
+    estimator = make_estimator('bayes', scenario, codebook)
     ready_s = time.perf_counter() - begin
-    if options.only_load:
-        print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
-        return
     positions, received = simulate_pairs(scenario, codebook, options.positions, options.seed)
     estimate, times_s = frame.estimate_singly(estimator, received)
     begin, busy = time.perf_counter(), time.process_time()
     together = estimator.estimate(received)
     batch_s = np.array([time.perf_counter() - begin, time.process_time() - busy])
     deviation = np.nanmax(np.abs(together.mean - estimate.mean), initial=0.0)
-    print(f'estimator {options.estimator}, codebook {codebook.id}, {options.positions} positions, '
-          f'seed {options.seed}')
+    print(f'codebook {codebook.id}, {options.positions} positions, seed {options.seed}')
     figures = accuracy(frame.Fixes.of(estimate, positions))
     figures['average_crlb_m2'] = crlb(scenario, codebook, positions).mean()
     print(f'average CRLB         {figures["average_crlb_m2"]:.4f} m^2')
@@ -65,26 +58,14 @@ def main() -> None:
     print(f'rate of one call     {rates[0]:.1f} times that of single fixes, {rates[1]:.1f} times '
           f'by CPU time; positions differ by up to {deviation:.0e} m')
     print(f'time to create       {ready_s:.1f} s, including its tables')
-    print_loading(settings)
+    with tempfile.TemporaryDirectory() as folder:
+        for what in ('builds its tables', 'loads its tables'):
+            begin = time.perf_counter()
+            peak_mib = frame.in_new_process(create, codebook, Path(folder))
+            print(f'a process that {what}: {time.perf_counter() - begin:.1f} s, '
+                  f'{peak_mib:.0f} MiB peak memory')
     frame.write_results(options.json, figures | {
         'fix_ms': wall_ms, 'fix_cpu_ms': busy_ms, 'rate_of_one_call': rates.tolist()})
-
-
-def parse_options() -> argparse.Namespace:
-    """Parse the command line."""
-    parser = frame.benchmark_parser('positioning', __doc__, 1000)
-    add = parser.add_argument
-    add('--estimator', choices=sorted(ESTIMATORS), default='bayes', help='estimator')
-    add('--model', type=input_file, dest='model_file', metavar='FILE',
-        help='trained model of the estimator neural')
-    add('--codebook', type=input_file, default=frame.CONFIG / 'codebook.yaml',
-        help='codebook file')
-    add('--scenario', type=input_file, help='YAML file of the scenario')
-    add('--reference', type=integer(0, 24), default=0, metavar='N',
-        help='compare with the posterior mean over 2^N points; 0 to omit')
-    add('--table-folder', type=Path, help=argparse.SUPPRESS)
-    add('--only-load', action='store_true', help=argparse.SUPPRESS)
-    return parser.parse_args()
 
 
 def accuracy(fixes: frame.Fixes) -> dict[str, Any]:
@@ -112,19 +93,10 @@ def ratio(reference: Estimate, estimate: Estimate, positions: np.ndarray) -> dic
     return {'mse_to_reference': value, 'mse_to_reference_standard_error': spread}
 
 
-def print_loading(settings: dict[str, Any]) -> None:
-    """Print time and peak memory of processes that only create the estimator."""
-    arguments = sys.argv[1:]
-    with tempfile.TemporaryDirectory() as folder:
-        extra = ['--only-load'] if settings.get('model_file') else [
-            '--only-load', '--table-folder', folder]
-        for what in ('builds its tables', 'loads its tables'):
-            begin = time.perf_counter()
-            done = subprocess.run(
-                [sys.executable, __file__, *arguments, *extra], check=True,
-                stdout=subprocess.PIPE, text=True)
-            print(f'a process that {what}: {time.perf_counter() - begin:.1f} s, '
-                  f'{float(done.stdout):.0f} MiB peak memory')
+def create(codebook: Codebook, folder: Path) -> float:
+    """Create an estimator, with its tables in a folder; return the peak memory [MiB]."""
+    make_estimator('bayes', Scenario(), codebook, table_folder=folder)
+    return frame.peak_mib()
 
 
 if __name__ == '__main__':

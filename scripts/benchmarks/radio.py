@@ -67,8 +67,9 @@ def main() -> None:
             radios[f'waveform, {ppm:g} ppm {name}'] = functools.partial(
                 free_clocks, clock_ppm=ppm, corrects=corrects)
     print(f'{options.positions} positions, seed {options.seed}\n')
-    table = frame.Table('radio', 'mean squared error [m²]', 'median error [m]', 'without fix [%]',
-                        'in the 95 % region [%]')
+    table = frame.Table(['radio'], {
+        'mean squared error [m²]': ('mse_m2', 3), 'median error [m]': ('median_m', 3),
+        'without fix [%]': ('without_fix', 1), 'in the 95 % region [%]': ('covered', 1)})
     positions = scenario.sample_positions(
         options.positions, np.random.default_rng(options.seed))
     estimator = make_estimator('bayes', scenario, codebook, surface=states)
@@ -76,12 +77,7 @@ def main() -> None:
     for name, make in radios.items():
         received = measured(scenario, codebook, states, make, positions, options.seed)
         fixes = frame.Fixes.of(estimator.estimate(received), positions)
-        figures[name] = row = {
-            'mse_m2': frame.mean_interval(fixes.squared),
-            'median_m': np.median(fixes.squared)**0.5 if len(fixes.squared) else None,
-            'without_fix': fixes.without_fix, 'covered': fixes.covered}
-        table.row(name, frame.shown(row['mse_m2'], 3), frame.shown(row['median_m'], 3),
-                  frame.shown(row['without_fix'], 1), frame.shown(row['covered'], 1))
+        figures[name] = table.row(name, **fixes.figures())
     frame.write_results(options.json, figures)
 
 

@@ -9,7 +9,7 @@ held-out Sobol points.
 import time
 
 import numpy as np
-from parts.frame import Table, benchmark_parser, run, shown, write_results
+from parts import frame
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import optimize
@@ -26,13 +26,14 @@ SEEDS, STEPS = 5, 600
 
 def main() -> None:
     """Run the benchmark."""
-    parser = benchmark_parser('sampling', __doc__, default_seed=None)
-    options = parser.parse_args()
+    options = frame.benchmark_parser('sampling', __doc__, default_seed=None).parse_args()
     scenario = Scenario()
     held_out = sobol(scenario, HELD_OUT, streams.generator(HELD_OUT_SEED, streams.HELD_OUT))
     print(f'average CRLB on {HELD_OUT} held-out points after {STEPS} steps of L-BFGS, '
           f'{SEEDS} seeds\n')
-    table = Table('samples', 'mean [m²]', 'standard deviation [m²]', 'time per run [s]')
+    table = frame.Table(['samples'], {
+        'mean [m²]': ('mean_m2', 5), 'standard deviation [m²]': ('std_m2', 5),
+        'time per run [s]': ('time_s', 1)})
     figures = {}
     for sampling, n in CHOICES:
         begin = time.thread_time()
@@ -41,12 +42,11 @@ def main() -> None:
         time_s = (time.thread_time() - begin) / SEEDS
         bounds = [np.mean([crlb(scenario, codebook, part).mean()
                            for part in np.split(held_out, 16)]) for codebook in codebooks]
-        figures[f'{n} {sampling}'] = {
-            'mean_m2': np.mean(bounds), 'std_m2': np.std(bounds, ddof=1), 'time_s': time_s}
-        table.row(f'{n} {sampling}', shown(np.mean(bounds), 5), shown(np.std(bounds, ddof=1), 5),
-                  shown(time_s, 1))
-    write_results(options.json, figures)
+        name = f'{n} {sampling}'
+        figures[name] = table.row(
+            name, mean_m2=np.mean(bounds), std_m2=np.std(bounds, ddof=1), time_s=time_s)
+    frame.write_results(options.json, figures)
 
 
 if __name__ == '__main__':
-    run(main)
+    frame.run(main)

@@ -12,14 +12,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from parts.frame import benchmark_parser, run, scenario_of, write_results
+from parts import frame
 from scipy.optimize import minimize
 
 from rhs_isac_ros.link import Beam, capacity, choose_beam, steer
 from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.link.steering import steer_bands
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.support.arguments import input_file
 
 # Standard deviations of the estimates around the true position [m].
 SPREADS_M = (0.01, 0.1, 0.3, 1.0, 3.0)
@@ -36,10 +35,8 @@ PAIRS = 2000
 
 def main() -> None:
     """Run the benchmark."""
-    parser = benchmark_parser('steer', __doc__, 300)
-    parser.add_argument('--scenario', type=input_file, help='YAML file of the scenario')
-    options = parser.parse_args()
-    scenario = scenario_of(options.scenario)
+    options = frame.benchmark_parser('steer', __doc__, 300).parse_args()
+    scenario = Scenario()
     bands = range(scenario.n_bands)
     rng = np.random.default_rng(options.seed)
     positions = scenario.sample_positions(options.positions, rng)
@@ -55,7 +52,7 @@ def main() -> None:
         row['to_long_percent'] = compare_with_long(
             scenario, band, positions[:N_LONG], found, rng)
         row['losses_percent'] = compare_with_estimates(scenario, band, rng)
-    write_results(options.json, figures)
+    frame.write_results(options.json, figures)
 
 
 def compare_times(scenario: Scenario, bands: Sequence[int], positions: np.ndarray
@@ -167,7 +164,8 @@ def compare_with_estimates(
         position = scenario.sample_positions(1, rng)[0]
         perfect = rate_bps(scenario, steer(scenario, position, band), position)
         for spread, lost in losses.items():
-            estimate = position + rng.normal(scale=spread, size=3)
+            # As those of an estimator, in the region.
+            estimate = np.clip(position + rng.normal(scale=spread, size=3), *scenario.roi_bounds_m)
             actual = rate_bps(scenario, steer(scenario, estimate, band), position)
             lost.append(100 * (perfect - actual) / perfect)
     for spread, lost in losses.items():
@@ -180,4 +178,4 @@ def compare_with_estimates(
 
 
 if __name__ == '__main__':
-    run(main)
+    frame.run(main)

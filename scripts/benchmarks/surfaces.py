@@ -23,41 +23,31 @@ region is the ellipsoid of the covariance that contains 95 % of a Gaussian. The 
 (NEES) is 3 for a Gaussian with the right covariance.
 """
 
-import os
-
-# One thread, as in the positioner node. This must be set before NumPy is imported.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import argparse
 import dataclasses
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from parts.frame import benchmark_parser, run, write_results
+from parts import frame
 from scipy.stats import chi2
 
 from rhs_isac_ros.bounds import site_crlb
 from rhs_isac_ros.codebook import Codebook, optimize
 from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
-from rhs_isac_ros.positioning import BayesEstimator, Sighting, fuse
+from rhs_isac_ros.positioning import BayesEstimator, Estimate, Sighting, fuse
 from rhs_isac_ros.positioning.agreement import WINDOW, PoseTest, pair_agreements
 from rhs_isac_ros.positioning.alignment import estimate_pose
 from rhs_isac_ros.positioning.fusion import Fuser
 from rhs_isac_ros.positioning.posterior import Posterior
 
-CONFIG = Path(__file__).parents[2] / 'config'
-PLANS = {'table1': ('table1.yaml', 'codebook_ambiguity.yaml'),
-         'bandplan': ('bandplan.yaml', 'codebook_bandplan.yaml')}
 EXACT, DECLARED = (0.0, 0.0), (0.02, 0.2)
 POSES = {'front': Pose(uncertainty=EXACT),
          'side': Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.0, 1.0), EXACT),
          'opposite': Pose((20.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), EXACT)}
 SITES = {'front': ['front'], 'front_side': ['front', 'side'],
          'front_opposite': ['front', 'opposite'], 'three': ['front', 'side', 'opposite']}
-CASES = (*SITES, 'front_side_pose', 'half_frames', 'wrong_pose',
-         'estimated_pose')
+CASES = (*SITES, 'front_side_pose', 'half_frames', 'wrong_pose', 'estimated_pose')
 PAIR = ('front', 'side')
 # Errors of the pose of the side surface: shifts [m] and turns [rad] in the frame of the site.
 WRONG = {'x_0.3m': (0.3, 0, 0, 0, 0, 0), 'y_0.3m': (0, 0.3, 0, 0, 0, 0),
@@ -87,29 +77,31 @@ class World(NamedTuple):
 
 def main() -> None:
     """Run the benchmark."""
-    parser = benchmark_parser('surfaces', __doc__, positions=3000)
-    parser.add_argument('--plan', choices=PLANS, action='append', help='leave out other plans')
-    parser.add_argument('--case', choices=CASES, action='append', help='leave out other cases')
+    parser = frame.benchmark_parser('surfaces', __doc__, positions=3000)
+    add = parser.add_argument
+    add('--plan', choices=frame.SYSTEMS, action='append', help='leave out other plans')
+    add('--case', choices=CASES, action='append', help='leave out other cases')
     options = parser.parse_args()
     results = {}
-    for name in options.plan or PLANS:
-        print(f'\n{name}: {options.positions} positions, seed {options.seed}\n\n'
-              '| surfaces | mean squared error [m^2] | median error [m] | 95 % region | NEES | '
-              'average CRLB [m^2] | fusion [ms] |\n|---|---|---|---|---|---|---|', flush=True)
-        results[name] = measure(*PLANS[name], options)
-    write_results(options.json, results)
+    for name in options.plan or frame.SYSTEMS:
+        print(f'\n{name}: {options.positions} positions, seed {options.seed}\n')
+        results[name] = measure(*frame.system(name), options)
+    frame.write_results(options.json, results)
 
 
-def measure(config: str, codebook_file: str, options: argparse.Namespace) -> dict:
+def measure(scenario: Scenario, codebook: Codebook, options: argparse.Namespace) -> dict:
     """Measure all cases with one plan."""
-    scenario = Scenario.from_yaml(CONFIG / config)
+    table = frame.Table(['surfaces'], {
+        'mean squared error [m^2]': ('mse_m2', 4), 'median error [m]': ('median_m', 3),
+        'in the 95 % region [%]': ('covered', 1), 'NEES': ('nees', 2),
+        'average CRLB [m^2]': ('crlb_m2', 4), 'fusion [ms]': ('time_ms', 1)})
     # The random numbers of a case do not depend on the other cases.
     draw, *of_surface, pose_errors, windows, half_frames, starts = map(
         np.random.default_rng, np.random.SeedSequence(options.seed).spawn(5 + len(POSES)))
     positions = scenario.sample_positions(options.positions, draw)
     n, pair = len(positions), [POSES[name] for name in SITES['front_side']]
     cases, results = options.case or CASES, {}
-    world = make_world(scenario, Codebook.load(CONFIG / codebook_file), positions)
+    world = make_world(scenario, codebook, positions)
     needed = {name for case in cases for name in SITES.get(case, POSES)
               if case in (*SITES, 'wrong_pose', 'estimated_pose')}
     found = {name: world.posteriors([POSES[name]] * n, rng)
@@ -117,21 +109,19 @@ def measure(config: str, codebook_file: str, options: argparse.Namespace) -> dic
     for case, names in SITES.items():
         if case not in cases:
             continue
-        results[case] = compare(
-            case, positions, [found[name] for name in names],
-            [POSES[name] for name in names], [world.model] * len(names), scenario)
+        results[case] = table.row(case, **compare(
+            world, [found[name] for name in names], [POSES[name] for name in names]))
     if 'front_side_pose' in cases:
         poses = [dataclasses.replace(pose, uncertainty=DECLARED) for pose in pair]
         displaced = [world.posteriors([pose.displaced(pose_errors.multivariate_normal(
             np.zeros(6), pose.covariance)) for _ in range(n)], pose_errors) for pose in poses]
-        results['front_side_pose'] = compare(
-            'front_side_pose', positions, displaced, poses, [world.model] * 2, scenario)
+        results['front_side_pose'] = table.row(
+            'front_side_pose', **compare(world, displaced, poses))
     if 'half_frames' in cases:
         half = dataclasses.replace(scenario, n_frames=scenario.n_frames // 2)
-        world = make_world(half, optimize(half, objective='error').codebook, positions)
-        shared = [world.posteriors([pose] * n, half_frames) for pose in pair]
-        results['half_frames'] = compare(
-            'half_frames', positions, shared, pair, [world.model] * 2, half)
+        half_world = make_world(half, optimize(half, objective='error').codebook, positions)
+        shared = [half_world.posteriors([pose] * n, half_frames) for pose in pair]
+        results['half_frames'] = table.row('half_frames', **compare(half_world, shared, pair))
     if 'wrong_pose' in cases:
         results['wrong_pose'] = wrong_poses(found, scenario, windows)
     if 'estimated_pose' in cases:
@@ -153,28 +143,23 @@ def sightings_of(found: list[list[Posterior]], poses: list[Pose], position: int
     return [one for one in both if one is not None]
 
 
-def compare(case: str, positions: np.ndarray, found: list[list[Posterior]], poses: list[Pose],
-            models: list[MeasurementModel], scenario: Scenario) -> dict:
-    """Fuse the posteriors of all positions, and print and return the statistics."""
-    squares, distances, times_s = np.empty((3, len(positions)))
-    for number, place in enumerate(positions):
+def compare(world: World, found: list[list[Posterior]], poses: list[Pose]) -> dict:
+    """Fuse the posteriors of all positions, and return the figures."""
+    n = len(world.positions)
+    means, covariances, times_s = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n)
+    for number in range(n):
         sightings = sightings_of(found, poses, number)
         begin = time.process_time()
-        mean, covariance = fuse(sightings, scenario.roi_bounds_m).mixture.moments()
+        means[number], covariances[number] = fuse(
+            sightings, world.scenario.roi_bounds_m).mixture.moments()
         times_s[number] = time.process_time() - begin
-        error = mean - place
-        squares[number] = error @ error
-        distances[number] = error @ np.linalg.solve(covariance, error)
-    margin = 1.96 * squares.std() / np.sqrt(len(squares))
-    result = {
-        'mse_m2': squares.mean(), 'low_m2': squares.mean() - margin,
-        'high_m2': squares.mean() + margin, 'median_m': np.median(squares)**0.5,
-        'in_region': np.mean(distances <= chi2.ppf(0.95, 3)), 'nees': distances.mean(),
-        'crlb_m2': site_crlb(zip(models, poses, strict=True), positions).mean(),
-        'time_ms': 1e3 * np.median(times_s)}
-    print('| {} | {mse_m2:.4f} [{low_m2:.4f}, {high_m2:.4f}] | {median_m:.3f} | {in_region:.3f} | '
-          '{nees:.2f} | {crlb_m2:.4f} | {time_ms:.1f} |'.format(case, **result), flush=True)
-    return result
+    fixes = frame.Fixes.of(Estimate(means, covariances), world.positions)
+    mse = fixes.squared.mean()
+    margin = 1.96 * fixes.squared.std() / np.sqrt(n)
+    models = [world.model] * len(poses)
+    return {**fixes.figures(), 'mse_m2': [mse, mse - margin, mse + margin],
+            'crlb_m2': site_crlb(zip(models, poses, strict=True), world.positions).mean(),
+            'time_ms': 1e3 * np.median(times_s)}
 
 
 def wrong_poses(found: dict[str, list[Posterior]], scenario: Scenario,
@@ -194,8 +179,10 @@ def wrong_poses(found: dict[str, list[Posterior]], scenario: Scenario,
     # The references are for other positions than those of the windows.
     references = right[n:]
     of_pair = [{PAIR: cycle[PAIR]} for cycle in references if PAIR in cycle]
-    print(f'\n| error of the pose | noticed by two surfaces in {WINDOW} cycles | '
-          'named by three |\n|---|---|---|')
+    print()
+    table = frame.Table(['error of the pose'], {
+        f'noticed by two surfaces in {WINDOW} cycles': ('noticed', 3),
+        'named by three': ('named', 3)})
     results = {}
     for name, error in {'none': (0.0,) * 6, **WRONG}.items():
         pool = right[:n] if name == 'none' else cycles(error, range(n))
@@ -208,8 +195,7 @@ def wrong_poses(found: dict[str, list[Posterior]], scenario: Scenario,
                 three.add(cycle)
             noticed += bool(two.suspects())
             named += three.suspects() == (('side',) if name != 'none' else ())
-        results[name] = {'noticed': noticed / WINDOWS, 'named': named / WINDOWS}
-        print(f'| {name} | {noticed / WINDOWS:.3f} | {named / WINDOWS:.3f} |', flush=True)
+        results[name] = table.row(name, noticed=noticed / WINDOWS, named=named / WINDOWS)
     return results
 
 
@@ -241,4 +227,4 @@ def estimated_poses(found: dict[str, list[Posterior]], scenario: Scenario,
 
 
 if __name__ == '__main__':
-    run(main)
+    frame.run(main)

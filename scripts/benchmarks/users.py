@@ -1,8 +1,7 @@
 """Cycle rate and waiting times with few users and with many.
 
 Problem: a cycle serves one user. How much do other users slow it down, in separate processes or in
-one process? Networks with many users are compared with a network of few users, and with the hops
-of a cycle in bare rclpy, measured in the same run.
+one process? Networks with many users are compared with a network of few users.
 """
 
 import os
@@ -12,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
-from parts.frame import benchmark_parser, run, write_results
-from parts.hops import CHAIN, ping_pong
+from parts import frame
 from system.observer import NetworkObserver
 from system.trial_processes import TrialProcesses
 
@@ -30,9 +28,9 @@ MIN_CYCLES = 200
 FEW, SEPARATE = 2, 25
 
 
-def main() -> int:
+def main() -> None:
     """Run the benchmark."""
-    parser = benchmark_parser('users', __doc__, default_seed=None)
+    parser = frame.benchmark_parser('users', __doc__, default_seed=None)
     parser.add_argument('--users', type=positive_int, default=1000,
                         help='number of users that share one process')
     parser.add_argument('--rounds', type=positive_int, default=2, help='cycles for each user')
@@ -49,19 +47,20 @@ def main() -> int:
         many = {name: run_network(scenario, users, options.rounds, together)
                 for name, (users, together) in networks.items()}
         few.append(run_network(scenario, FEW, options.rounds, False))
-        hop_s = np.median(ping_pong(scenario)) / 2
     finally:
         rclpy.try_shutdown()
-    hops = len(CHAIN)
     rate_hz = np.mean([one['rate_hz'] for one in few])
     for one in many.values():
         one['rate_ratio'] = one['rate_hz'] / rate_hz
+    table = frame.Table(['users'], {
+        'cycles/s': ('rate_hz', 2), 'relative to few users': ('rate_ratio', 2),
+        'cycle [ms]': ('cycle_ms', 1), 'CPU time of a cycle [ms]': ('cpu_ms', 1),
+        'given up': ('given_up', 0), 'longest wait [cycles]': ('longest_wait_cycles', 0),
+        'longest wait [s]': ('longest_wait_s', 2)})
     for one in (*few, *many.values()):
-        print(describe(one))
-    print(f'bare rclpy: {1e3 * hops * hop_s:.2f} ms for the {hops} hops of a cycle')
-    write_results(options.json, {
-        'hop_us': 1e6 * hop_s, 'floor_ms': 1e3 * hops * hop_s, 'few': few, **many})
-    return 0
+        where = 'in one process' if one['together'] else 'as processes'
+        table.row(f'{one["users"]} {where}', **one)
+    frame.write_results(options.json, {'few': few, **many})
 
 
 def run_network(scenario: Scenario, users: int, rounds: int, together: bool) -> dict:
@@ -93,19 +92,7 @@ def run_network(scenario: Scenario, users: int, rounds: int, together: bool) -> 
         'cycle_ms': 1e3 * np.median([end.ended_s - end.began_s for end in served]),
         # Other programs hardly affect it, unlike the rate.
         'cpu_ms': 1e3 * cpu_s / len(ends),
-        'longest_wait_cycles': longest, 'longest_wait_s': longest_s, 'fair': longest <= users,
-    }
-
-
-def describe(run: dict) -> str:
-    """Return a line about a run of a network."""
-    where = 'in one process' if run['together'] else 'as processes'
-    ratio = f' ({run["rate_ratio"]:.2f} of that of few)' if 'rate_ratio' in run else ''
-    fair = 'at most one round' if run['fair'] else 'MORE THAN ONE ROUND'
-    return (f'{run["users"]:4d} users {where}: {run["rate_hz"]:.2f} cycles/s{ratio}, cycle '
-            f'{run["cycle_ms"]:.1f} ms, CPU time {run["cpu_ms"]:.1f} ms, {run["given_up"]} given '
-            f'up; longest wait {run["longest_wait_cycles"]} cycles, {run["longest_wait_s"]:.2f} '
-            f's: {fair}')
+        'longest_wait_cycles': longest, 'longest_wait_s': longest_s}
 
 
 def wait_until(observer: NetworkObserver, done: Callable[[], bool], goal: str) -> None:
@@ -130,4 +117,4 @@ def longest_wait(order: list[int], ended_s: np.ndarray) -> tuple[int, float]:
 
 
 if __name__ == '__main__':
-    run(main)
+    frame.run(main)

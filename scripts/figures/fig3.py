@@ -26,21 +26,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from parts.options import parse_options, write_results
+from parts import frame
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import optimize
 from rhs_isac_ros.codebook.optimize import INTERRUPTED
-from rhs_isac_ros.experiments import (
-    Job,
-    markdown_table,
-    run_command,
-    run_jobs,
-)
+from rhs_isac_ros.experiments import Job, markdown_table, run_command, run_jobs
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import streams
-from rhs_isac_ros.support.arguments import positive_int
 from rhs_isac_ros.support.pictures import PAGE_IN, look, new_panels, paper_style
 
 BANDS = (1, 2, 4, 8)
@@ -66,8 +60,6 @@ def trial(method: str, n_bands: int, seed: int, samples: int, held_out: int,
     optimize(scenario, **settings, max_evaluations=1)
     # The time of this thread, so that other load on the machine does not count.
     begin = time.thread_time()
-    if method == 'lbfgs':
-        max_steps = max_steps or LBFGS_STEPS
     result = optimize(scenario, **settings, max_steps=max_steps)
     seconds = time.thread_time() - begin
     if result.reason == INTERRUPTED:  # the result is not that of the complete method
@@ -82,11 +74,12 @@ def trial(method: str, n_bands: int, seed: int, samples: int, held_out: int,
             'codebook': result.codebook.id}
 
 
-def make_jobs(trials: int, max_steps: int | None) -> list[Job]:
+def make_jobs(trials: int) -> list[Job]:
     """List the jobs, with the methods of a trial adjacent so that they run under similar load."""
     return [Job(f'{method}-{n_bands}-bands-trial-{seed}',
                 {'method': method, 'n_bands': n_bands, 'seed': seed, 'samples': SAMPLES,
-                 'held_out': HELD_OUT, 'max_steps': max_steps})
+                 'held_out': HELD_OUT,
+                 'max_steps': LBFGS_STEPS if method == 'lbfgs' else None})
             for seed in range(trials) for n_bands in BANDS for method in METHODS]
 
 
@@ -194,7 +187,7 @@ def picture(summary: Summary) -> Any:
 
 def reproduce(options: argparse.Namespace) -> None:
     """Run the jobs that have no results yet, print the report and write the files."""
-    trials, jobs = options.trials, make_jobs(options.trials, options.steps)
+    trials, jobs = options.trials, make_jobs(options.trials)
     results = run_jobs(trial, jobs, options.output / 'jobs', options.jobs, options.dask)
     entries = [{**job.arguments, **result} for job, result in zip(jobs, results, strict=True)]
     summary = Summary(entries)
@@ -203,8 +196,9 @@ def reproduce(options: argparse.Namespace) -> None:
         f'held-out positions. Time is CPU time on one core, normalised to {PROPOSED} with '
         f'N_B = {BANDS[0]}.',
         summary.table(), *summary.claims()])
-    write_results(options, 'fig3', 'Fig. 3', report, picture(summary), {'fig3.json': json.dumps(
-        {'version': __version__, 'trials': entries}, indent=1) + '\n'})
+    data = json.dumps({'version': __version__, 'trials': entries}, indent=1) + '\n'
+    frame.write_report(
+        options, 'fig3', 'Fig. 3', report, picture(summary), {'fig3.json': data})
 
 
 def mean_and_std(values: Sequence[float]) -> tuple[float, float]:
@@ -233,10 +227,7 @@ def plus_minus(mean: float, std: float, digits: int = 3) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
-    options = parse_options(
-        __doc__, 'fig3', TRIALS, QUICK_TRIALS, arguments, lambda parser: parser.add_argument(
-            '--steps', type=positive_int, metavar='N',
-            help="limit of update steps (default: each method's own)"))
+    options = frame.experiment_options('fig3', __doc__, TRIALS, QUICK_TRIALS, arguments)
     return run_command(lambda: reproduce(options))
 
 

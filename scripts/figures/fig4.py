@@ -27,13 +27,11 @@ Duration on two cores: four minutes with --quick, about six hours without.
 
 import argparse
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from parts import fig4_report
+from parts import fig4_report, frame
 from parts.fig4_results import NEURAL, ROWS, Condition, Results, codebook_of
-from parts.options import parse_options
 
 from rhs_isac_ros.codebook import Codebook, directional_codebook, optimize
 from rhs_isac_ros.codebook.optimize import INTERRUPTED
@@ -42,9 +40,8 @@ from rhs_isac_ros.link import capacity, steer
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import make_estimator, simulate_pairs
 from rhs_isac_ros.positioning.neural import INPUTS, train
-from rhs_isac_ros.support.arguments import integer
+from rhs_isac_ros.support.arguments import ArgumentParser, integer
 
-CONFIG = Path(__file__).parents[2] / 'config'
 TRIALS, QUICK_TRIALS = 50, 3
 # Random codebooks are drawn at least this often.
 MIN_DRAWS = 5
@@ -152,7 +149,7 @@ class Experiment:
                 for key in keys if key[0] == 'algorithm-1'}
         optimised = self._run(optimise, list(jobs.values()))
         return {key: optimised[jobs[key].name] if key in jobs else
-                as_json(codebook_of(key[0], worlds[key[1]], key[2], CONFIG)) for key in keys}
+                as_json(codebook_of(key[0], worlds[key[1]], key[2])) for key in keys}
 
     def results(self, conditions: Sequence[Condition]) -> Results:
         """Return the estimates in all conditions."""
@@ -203,7 +200,7 @@ def reproduce(options: argparse.Namespace) -> None:
     fig4_report.write(results, options)
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
+def add_options(parser: ArgumentParser) -> None:
     """Add the options of this experiment."""
     add = parser.add_argument
     add('--pairs', type=integer(20, 10**7), metavar='N',
@@ -232,7 +229,8 @@ def complete(options: argparse.Namespace) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
-    options = parse_options(__doc__, 'fig4', TRIALS, QUICK_TRIALS, arguments, add_options)
+    options = frame.experiment_options(
+        'fig4', __doc__, TRIALS, QUICK_TRIALS, arguments, add_options)
     complete(options)
     return run_command(lambda: reproduce(options))
 

@@ -13,19 +13,22 @@ Duration on two cores: three minutes with --quick, about half an hour without.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-from parts.options import parse_options, write_results
-from parts.plans import SEED, Plan, add_plan_options, read_plans
+from parts import frame
 
 from rhs_isac_ros.experiments import markdown_table, run_command
-from rhs_isac_ros.experiments.sweep import BLOCK, Point, Sweep, run_sweep, table
+from rhs_isac_ros.experiments.sweep import BLOCK, OPTIMIZE, Point, Sweep, run_sweep, table
 from rhs_isac_ros.experiments.sweep_picture import add_legend, draw_panel
 from rhs_isac_ros.experiments.sweep_settings import FIELDS, Axis, Setting
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.support.arguments import ArgumentParser, positive_int
 from rhs_isac_ros.support.pictures import PAGE_IN, new_panels, paper_style
 
+# Seed of all positions, signals and codebooks.
+SEED = 1
 TRIALS, QUICK_TRIALS = 20, 1
 STEPS, QUICK_STEPS = 600, 100
 CURVES: Mapping[str, Sequence[float]] = {
@@ -34,6 +37,29 @@ CURVES: Mapping[str, Sequence[float]] = {
     'carrier_offset_std_hz': (0, 300, 1000, 3000, 10_000)}
 PLAN = 'plan'
 MEASURES = ('mse', 'error_median', 'rmse')
+
+
+class Plan(NamedTuple):
+    """A plan: its deviations from Table I, and the file of its codebook unless it is optimised."""
+
+    changes: Mapping[str, Any]
+    codebook: str = OPTIMIZE
+
+
+PLANS = {
+    '2 bands (Table I)': Plan({}),
+    '4 equally spaced': Plan({
+        'center_frequencies_hz': [2.5e9, 2.5e9 + 5e8 / 3, 2.5e9 + 1e9 / 3, 3.0e9],
+        'n_frames': 2}),
+    # Many different distances.
+    '4 unequally spaced': Plan({
+        'center_frequencies_hz': [2.5e9, 2.55e9, 2.7e9, 3.0e9], 'n_frames': 2})}
+
+
+def read_plans(files: Mapping[str, tuple[Path, Path]]) -> dict[str, Plan]:
+    """Return the built-in plans and those of pairs of a scenario and a codebook file."""
+    return PLANS | {name: Plan(Scenario.from_yaml(scenario).changes(), str(codebook))
+                    for name, (scenario, codebook) in files.items()}
 
 
 def sweep_of(plans: Mapping[str, Plan], trials: int, steps: int) -> Sweep:
@@ -110,18 +136,24 @@ def picture(points: Sequence[Point], plans: Sequence[str]) -> Any:
     return figure
 
 
+def add_options(parser: ArgumentParser) -> None:
+    """Add the options for further plans and for the optimisation."""
+    frame.add_plans(parser, [*PLANS])
+    parser.add_argument('--steps', type=positive_int, metavar='N', help='steps of an optimisation '
+                        f'(default: {STEPS}, quick {QUICK_STEPS})')
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
-    options = parse_options(
-        __doc__, 'synchronisation', TRIALS, QUICK_TRIALS, arguments,
-        lambda parser: add_plan_options(parser, STEPS, QUICK_STEPS))
+    options = frame.experiment_options(
+        'synchronisation', __doc__, TRIALS, QUICK_TRIALS, arguments, add_options)
     plans = read_plans(options.plan)
     sweep = sweep_of(plans, options.trials,
                      options.steps or (QUICK_STEPS if options.quick else STEPS))
 
     def reproduce() -> None:
         points = run_sweep(sweep, options.output / 'jobs', options.jobs, options.dask)
-        write_results(
+        frame.write_report(
             options, 'synchronisation', 'Synchronisation', report_of(points, list(plans)),
             picture(points, list(plans)), {'synchronisation.csv': table(sweep, points)})
 

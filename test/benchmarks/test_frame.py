@@ -1,25 +1,13 @@
 """The frame of the benchmarks: errors of estimates, intervals and tables."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
+from parts import frame
 
 from rhs_isac_ros.positioning import Estimate
 
-FILE = Path(__file__).parents[2] / 'scripts' / 'benchmarks' / 'parts' / 'frame.py'
 
-
-@pytest.fixture(scope='module')
-def frame():
-    spec = importlib.util.spec_from_file_location('frame', FILE)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_errors_are_those_of_the_fixes(frame):
+def test_errors_are_those_of_the_fixes():
     mean = np.array([[1.0, 0, 0], [np.nan] * 3, [0, 6.0, 0]])
     covariance = np.stack([np.eye(3), np.full((3, 3), np.nan), 4 * np.eye(3)])
     fixes = frame.Fixes.of(Estimate(mean, covariance, ('', 'residual', '')), np.zeros((3, 3)))
@@ -28,11 +16,18 @@ def test_errors_are_those_of_the_fixes(frame):
     np.testing.assert_allclose(fixes.normalised, [1.0, 9.0])
     # The 95 % quantile of the distribution chi-square with three degrees of freedom is 7.81.
     assert fixes.inside.tolist() == [True, False]
-    assert fixes.without_fix[0] == pytest.approx(100 / 3)
-    assert fixes.covered[0] == 50.0
+    figures = fixes.figures()
+    assert figures['without_fix'][0] == pytest.approx(100 / 3)
+    assert figures['fix'][0] == pytest.approx(200 / 3)
+    assert (figures['covered'][0], figures['nees'][0]) == (50.0, 5.0)
+    assert figures['mse_m2'][0] == figures['rms_m'][0]**2 == 18.5
+    none = frame.Fixes(np.zeros(2, bool), np.empty(0), np.empty(0)).figures()
+    assert none.pop('fix')[0] == 0
+    assert none.pop('without_fix')[0] == 100
+    assert set(none.values()) == {None}
 
 
-def test_the_interval_of_a_mean_covers_it_and_resamples_groups(frame):
+def test_the_interval_of_a_mean_covers_it_and_resamples_groups():
     rng = np.random.default_rng(0)
     group = np.repeat(np.arange(100), 10)
     samples = rng.normal(size=100)[group]
@@ -44,12 +39,19 @@ def test_the_interval_of_a_mean_covers_it_and_resamples_groups(frame):
     _, low, high = frame.mean_interval(samples)
     assert high - low < 0.2
     assert frame.mean_interval(samples[:0]) is None
+    ratio, low, high = frame.mean_interval(2 * samples**2, relative_to=samples**2)
+    assert (ratio, low, high) == pytest.approx((2.0, 2.0, 2.0))
 
 
-def test_a_table_shows_numbers_and_intervals(frame, capsys):
-    table = frame.Table('name', 'value')
-    table.row('a', frame.shown(1.25, 1))
-    table.row('b', frame.shown((1.0, 0.5, 1.75), 2))
-    table.row('c', frame.shown(None, 2))
+def test_a_table_shows_numbers_texts_and_intervals(capsys):
+    table = frame.Table(['name'], {'value': ('v', 1), 'other': ('o', 2)})
+    assert table.row('a', v=1.25, unseen=1) == {'v': 1.25, 'unseen': 1}
+    table.row('b', v='text', o=(1.0, 0.5, 1.75))
     assert capsys.readouterr().out.splitlines() == [
-        '| name | value |', '|---|---|', '| a | 1.2 |', '| b | 1.00 [0.50, 1.75] |', '| c | - |']
+        '| name | value | other |', '| --- | --- | --- |', '| a | 1.2 | - |',
+        '| b | text | 1.00 [0.50, 1.75] |']
+
+
+def test_a_function_runs_in_a_new_process():
+    assert frame.in_new_process(pow, 2, 5) == 32
+    assert frame.peak_mib() > 1

@@ -12,18 +12,13 @@ from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import streams
 
-pytest.importorskip('pymoo')
-pytest.importorskip('joblib')
-pytest.importorskip('matplotlib')
+for library in ('pymoo', 'joblib', 'matplotlib'):
+    pytest.importorskip(library)
+from figures import fig3  # noqa: E402
 
 
 @pytest.fixture(scope='module')
-def fig3(load_figure):
-    return load_figure('fig3')
-
-
-@pytest.fixture(scope='module')
-def entries(fig3):
+def entries():
     """Synthetic trials in which all claims of the paper hold."""
     level = {'alternating': 1.0, 'direct': 2.0, 'genetic': 3.0, 'lbfgs': 0.5}
     return [{'method': method, 'n_bands': n, 'seed': seed, 'seconds': level[method],
@@ -36,7 +31,7 @@ def verdicts(summary):
     return ['does not hold' not in claim for claim in summary.claims()]
 
 
-def test_all_claims_hold_for_the_synthetic_trials(fig3, entries):
+def test_all_claims_hold_for_the_synthetic_trials(entries):
     assert verdicts(fig3.Summary(entries)) == [True] * 4
 
 
@@ -44,13 +39,13 @@ def test_all_claims_hold_for_the_synthetic_trials(fig3, entries):
     ({'crlb_m2': 5.0}, [False, True, False, False]),
     ({'seconds': 2.5}, [True, False, True, True])])
 def test_one_number_of_bands_can_refute_a_claim(
-        fig3, entries, changes, expected):
+        entries, changes, expected):
     changed = [entry | changes if (entry['method'], entry['n_bands']) == ('alternating', 4)
                else entry for entry in entries]
     assert verdicts(fig3.Summary(changed)) == expected
 
 
-def test_a_relative_lead_may_grow_while_the_absolute_one_shrinks(fig3):
+def test_a_relative_lead_may_grow_while_the_absolute_one_shrinks():
     own = dict(zip(fig3.BANDS, (1.0, 0.6, 0.3, 0.1), strict=True))
     lead = dict(zip(fig3.BANDS, (0.5, 0.4, 0.3, 0.2), strict=True))
     trials = [{'method': method, 'n_bands': n, 'seed': 0, 'seconds': 1.0,
@@ -61,7 +56,7 @@ def test_a_relative_lead_may_grow_while_the_absolute_one_shrinks(fig3):
     assert 'relative to the rival: holds over direct, 33, 40, 50, 67 %' in claim
 
 
-def test_the_table_has_a_row_for_each_method_and_number_of_bands(fig3, entries):
+def test_the_table_has_a_row_for_each_method_and_number_of_bands(entries):
     rows = fig3.Summary(entries).table().splitlines()[2:]
     assert len(rows) == len(fig3.METHODS) * len(fig3.BANDS)
     first = [cell.strip() for cell in rows[0].strip('|').split('|')]
@@ -69,7 +64,7 @@ def test_the_table_has_a_row_for_each_method_and_number_of_bands(fig3, entries):
                      '1.00 ± 0.00']
 
 
-def test_a_trial_optimises_with_its_arguments(fig3):
+def test_a_trial_optimises_with_its_arguments():
     result = fig3.trial('lbfgs', 2, 5, samples=6, held_out=50, max_steps=3)
     assert (result['steps'], result['reason']) == (3, 'max_steps reached')
     scenario = Scenario(center_frequencies_hz=(2.5e9, 3.0e9), n_frames=4)
@@ -80,7 +75,7 @@ def test_a_trial_optimises_with_its_arguments(fig3):
 
 
 def test_the_command_writes_all_files_and_repeats_no_finished_trial(
-        fig3, tmp_path, monkeypatch, capsys):
+        tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(fig3, 'METHODS', ('alternating', 'direct', 'genetic'))
     monkeypatch.setattr(fig3, 'BANDS', (1, 2))
     made = []
@@ -107,14 +102,14 @@ def test_the_command_writes_all_files_and_repeats_no_finished_trial(
     assert np.all([entry['samples'] == 10 for entry in figures['trials']])
 
 
-def test_mean_and_std_are_those_of_a_sample(fig3):
+def test_mean_and_std_are_those_of_a_sample():
     mean, std = fig3.mean_and_std([1.0, 2.0, 6.0])
     assert mean == 3.0
     assert std == pytest.approx(math.sqrt((4 + 1 + 9) / 2))
 
 
 @pytest.mark.parametrize('values', [[2.0], [1.0, math.inf], [math.inf, math.inf]])
-def test_an_undefined_deviation_is_nan(fig3, values):
+def test_an_undefined_deviation_is_nan(values):
     mean, std = fig3.mean_and_std(values)
     assert mean == np.mean(values)
     assert math.isnan(std)
@@ -123,5 +118,5 @@ def test_an_undefined_deviation_is_nan(fig3, values):
 @pytest.mark.parametrize(('mean', 'std', 'text'), [
     (0.04057, 0.00123, '0.0406 ± 0.0012'), (12.345, 0.5, '12.3 ± 0.5'), (1234.5, 7.0, '1234 ± 7'),
     (0.0, 0.0, '0.00 ± 0.00'), (-0.0512, math.nan, '-0.0512'), (math.inf, math.nan, 'inf')])
-def test_mean_and_deviation_have_the_same_places(fig3, mean, std, text):
+def test_mean_and_deviation_have_the_same_places(mean, std, text):
     assert fig3.plus_minus(mean, std) == text

@@ -7,35 +7,26 @@ import os
 
 import numpy as np
 import pytest
+from parts import fig4_report
 
 from rhs_isac_ros.model import Scenario
 
-pytest.importorskip('sklearn')
-pytest.importorskip('joblib')
-pytest.importorskip('matplotlib')
+for library in ('sklearn', 'joblib', 'matplotlib'):
+    pytest.importorskip(library)
+from figures import fig4  # noqa: E402
+
 # Mean squared errors of the synthetic results [m^2]: 50 % below scan-width, 70 % below random.
 LEVELS = {'algorithm-1': 3.0, 'crlb': 3.0, 'ambiguity': 1.5, 'scan-width': 6.0,
           'scan-per-band': 5.18, 'scan-grid': 4.0, 'random': 10.0}
 
 
 @pytest.fixture(scope='module')
-def fig4(load_figure):
-    return load_figure('fig4')
-
-
-@pytest.fixture(scope='module')
-def claims(fig4):
-    from parts import fig4_claims
-    return fig4_claims
-
-
-@pytest.fixture(scope='module')
-def results(fig4):
+def results():
     """Synthetic results of a network: errors and losses of every row at 10 000 positions."""
-    return synthetic(fig4, 10_000, 3)
+    return synthetic(10_000, 3)
 
 
-def synthetic(fig4, n, trials, losses=60):
+def synthetic(n, trials, losses=60):
     rng = np.random.default_rng(0)
     truth, condition = rng.uniform(size=(n, 3)), fig4.Condition('neural', 'parts', 0.0)
     errors, results = rng.normal(size=(n, 3)) / np.sqrt(3), fig4.Results(truth)
@@ -52,41 +43,33 @@ def cells(row):
     return [cell.strip() for cell in row.strip('|').split('|')]
 
 
-def test_a_verdict_follows_from_the_interval_alone(claims):
-    for interval, expected in (((43, 50), 'holds'), ((42, 50), 'holds'), ((40, 44), 'undecided'),
-                               ((30, 41), 'does not hold'), ((-9, -2), 'does not hold')):
-        assert claims.verdict(42, *interval, 10_000, 2) == expected
-
-
-def test_there_is_no_verdict_on_few_positions_or_a_single_training(claims):
-    assert claims.verdict(42, 43, 50, 9_999, 2) == 'too few positions'
-    assert claims.verdict(42, 43, 50, 10_000, 1) == 'too few trainings'
+@pytest.mark.parametrize(('interval', 'positions', 'trainings', 'expected'), [
+    ((43, 50), 10_000, 2, 'holds'), ((42, 50), 10_000, 2, 'holds'),
+    ((40, 44), 10_000, 2, 'undecided'), ((30, 41), 10_000, 2, 'does not hold'),
+    ((43, 50), 9_999, 2, 'too few positions'), ((43, 50), 10_000, 1, 'too few trainings')])
+def test_a_verdict_follows_from_the_interval_of_enough_results(
+        interval, positions, trainings, expected):
+    assert fig4_report.verdict(42, *interval, positions, trainings) == expected
 
 
 @pytest.mark.slow
-def test_the_claims_have_the_measured_reductions(results, claims):
-    found = {(f.quantity, f.own, f.benchmark): f for f in claims.findings(
-        results, results.conditions[0])}
-    for benchmark, percent, expected in (
-            ('scan-width', 50, 'holds'), ('scan-per-band', 42, 'undecided'),
-            ('scan-grid', 25, 'does not hold'), ('random', 70, 'holds')):
-        error = found['error', 'algorithm-1', benchmark]
+def test_the_claims_have_the_measured_reductions(results):
+    (condition,) = results.conditions
+    for benchmark, claimed, percent, expected in (
+            ('scan-width', 42, 50, 'holds'), ('scan-per-band', 42, 42, 'undecided'),
+            ('scan-grid', 42, 25, 'does not hold'), ('random', 69, 70, 'holds')):
+        error = fig4_report.finding(
+            results, condition, 'error', 'algorithm-1', benchmark, claimed)
         assert error.percent == pytest.approx(percent, abs=0.3)
         assert error.low < error.percent < error.high
         assert error.verdict == expected
-        assert found['median loss', 'algorithm-1', benchmark].verdict == 'too few positions'
-    assert found['median loss', 'ambiguity', 'random'].percent == pytest.approx(85, abs=1)
-    assert len(found) == 3 * 3 * 4
-
-
-def test_the_summary_has_the_verdicts_of_each_claim_by_condition(results, claims):
-    header, _, *rows = map(cells, claims.summary(results).splitlines())
-    assert header == ['claim about algorithm-1', 'network, re/im, 0 dB']
-    verdicts = {row[0]: row[1].rpartition(', ')[2] for row in rows}
-    assert verdicts['mean squared error 42 % below scan-width'] == 'holds'
-    assert verdicts['mean squared error 42 % below scan-per-band'] == 'undecided'
-    assert verdicts['mean squared error 42 % below scan-grid'] == 'does not hold'
-    assert verdicts['median capacity loss 86 % below random'] == 'too few positions'
+    loss = fig4_report.finding(results, condition, 'median loss', 'ambiguity', 'random', 86)
+    assert loss.percent == pytest.approx(85, abs=1)
+    assert loss.verdict == 'too few positions'
+    header, _, *rows = map(cells, fig4_report.claims_table(
+        results, {'one': (condition, 'crlb'), 'other': (condition, 'ambiguity')}).splitlines())
+    assert header == ['claim', 'one', 'other']
+    assert ['median capacity loss 86 % below random', str(loss)] in [row[::2] for row in rows]
     assert len(rows) == 12
 
 
@@ -101,7 +84,7 @@ def test_the_best_training_is_that_of_the_smallest_validation_error(results):
             best[trial::3], results.estimates[condition, 'random'][trial, trial::3])
 
 
-def test_trials_may_share_the_positions(fig4):
+def test_trials_may_share_the_positions():
     truth, condition = np.zeros((25, 3)), fig4.Condition('bayes', '', 0.0)
     results = fig4.Results(truth)
     for trial, size in enumerate((13, 12)):
@@ -116,9 +99,9 @@ def test_trials_may_share_the_positions(fig4):
 
 
 @pytest.mark.slow
-def test_the_report_has_tables_picture_and_data(fig4, results, tmp_path, capsys):
+def test_the_report_has_tables_picture_and_data(results, tmp_path, capsys):
     options = argparse.Namespace(trials=3, pairs=7, output=tmp_path, format='png')
-    fig4.fig4_report.write(results, options)
+    fig4_report.write(results, options)
     out = capsys.readouterr().out
     assert '10000 test positions; 3 trainings with 7 pairs' in out
     tables = [cells(line) for line in out.splitlines() if line.startswith('| scan-grid ')]
@@ -134,7 +117,7 @@ def test_the_report_has_tables_picture_and_data(fig4, results, tmp_path, capsys)
 
 
 @pytest.mark.parametrize('text', ['bayes', 'ml:0', 'parts:', 'parts:nan', 'parts:x'])
-def test_an_invalid_condition_is_refused(fig4, text, capsys):
+def test_an_invalid_condition_is_refused(text, capsys):
     with pytest.raises(SystemExit):
         fig4.main(['--conditions', text])
     assert (f"argument --conditions: '{text}', expected magnitudes, parts or bayes, a colon and"
@@ -147,7 +130,7 @@ def test_an_invalid_condition_is_refused(fig4, text, capsys):
     (['--conditions', 'bayes:-20'], ['bayes--20dB']),
     (['--conditions', 'magnitudes:-30', 'bayes:0'], ['magnitudes--30dB', 'bayes-+0dB']),
     (['--quick'], ['parts-+0dB', 'magnitudes--30dB', 'bayes-+0dB', 'bayes--30dB'])])
-def test_options_select_the_conditions(fig4, monkeypatch, arguments, conditions):
+def test_options_select_the_conditions(monkeypatch, arguments, conditions):
     seen = []
     monkeypatch.setattr(fig4, 'reproduce', seen.append)
     assert fig4.main(arguments) == 0
@@ -155,7 +138,7 @@ def test_options_select_the_conditions(fig4, monkeypatch, arguments, conditions)
 
 
 @pytest.mark.slow
-def test_the_command_writes_all_files_and_repeats_no_job(fig4, tmp_path, monkeypatch, capsys):
+def test_the_command_writes_all_files_and_repeats_no_job(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(fig4, 'optimize', functools.partial(fig4.optimize, max_steps=8))
     monkeypatch.setattr(fig4, 'SAMPLES', 4)
     monkeypatch.setattr(fig4, 'MIN_DRAWS', 2)
@@ -175,7 +158,7 @@ def test_the_command_writes_all_files_and_repeats_no_job(fig4, tmp_path, monkeyp
     assert jobs == {path.name: path.stat().st_mtime_ns for path in (tmp_path / 'jobs').iterdir()}
 
 
-def test_trials_of_bayes_locate_their_share_of_the_positions(fig4):
+def test_trials_of_bayes_locate_their_share_of_the_positions():
     world = Scenario(multipath_to_los_db=-30.0)
     book = fig4.as_json(fig4.directional_codebook(world))
     located = fig4.locate('bayes', '', world.changes(), book, 0, 0, 6, 1, 2)
@@ -184,7 +167,7 @@ def test_trials_of_bayes_locate_their_share_of_the_positions(fig4):
     np.testing.assert_allclose(located['means'], truth[1::2], atol=0.2)
 
 
-def test_capacity_losses_depend_on_the_estimates(fig4):
+def test_capacity_losses_depend_on_the_estimates():
     world = Scenario()
     truth, _ = fig4.simulate_pairs(world, fig4.directional_codebook(world), 2, fig4.TEST_SEED, 3)
     losses = fig4.capacity_losses({}, 3, {

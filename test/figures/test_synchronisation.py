@@ -9,13 +9,9 @@ from rhs_isac_ros.codebook import default_codebook_file, random_codebook
 from rhs_isac_ros.experiments import sweep
 from rhs_isac_ros.model import Scenario
 
-pytest.importorskip('joblib')
-pytest.importorskip('matplotlib')
-
-
-@pytest.fixture(scope='module')
-def figure(load_figure):
-    return load_figure('synchronisation')
+for library in ('joblib', 'matplotlib'):
+    pytest.importorskip(library)
+from figures import synchronisation as figure  # noqa: E402
 
 
 @pytest.fixture
@@ -32,21 +28,21 @@ def located(monkeypatch):
     return made
 
 
-def test_plans_have_the_same_spectrum_and_pilots(figure):
-    for plan in figure.read_plans([]).values():
+def test_plans_have_the_same_spectrum_and_pilots():
+    for plan in figure.PLANS.values():
         scenario = Scenario(**plan.changes)
         assert scenario.n_bands * scenario.n_frames == 8
         assert 2.5e9 == min(scenario.center_frequencies_hz)
         assert 3.0e9 == max(scenario.center_frequencies_hz)
 
 
-def test_the_error_doubles_between_the_values(figure):
+def test_the_error_doubles_between_the_values():
     assert figure.doubling((0, 1, 2), (1.0, 1.5, 2.5)) == 1.5
     assert figure.doubling((0, 1), (1.0, 1.9)) == np.inf
 
 
-def test_codebooks_are_optimised_without_the_errors(figure):
-    planned = figure.sweep_of(figure.read_plans([]), 1, 10)
+def test_codebooks_are_optimised_without_the_errors():
+    planned = figure.sweep_of(figure.PLANS, 1, 10)
     designs = {job.name for setting in planned.settings for job in planned.designs(setting)}
     assert len(designs) == 3
     for setting in planned.settings:
@@ -55,7 +51,7 @@ def test_codebooks_are_optimised_without_the_errors(figure):
 
 
 @pytest.mark.slow
-def test_the_command_gives_advice_and_repeats_no_job(figure, located, tmp_path, capsys):
+def test_the_command_gives_advice_and_repeats_no_job(located, tmp_path, capsys):
     call = ['--quick', '--jobs', '1', '--output', str(tmp_path)]
     assert figure.main(call) == 0
     out = capsys.readouterr().out
@@ -77,7 +73,7 @@ def test_the_command_gives_advice_and_repeats_no_job(figure, located, tmp_path, 
     ([('codebook', 'codebook')], 'codebook.yaml: /**/optimizer: unknown field'),
     ([('bandplan', 'quick')], 'quick.yaml: expected ros__parameters'),
     ([('bandplan', 'codebook_bandplan')] * 2, 'bandplan more than once')])
-def test_a_plan_is_checked_before_anything_runs(figure, plans, expected, capsys):
+def test_a_plan_is_checked_before_anything_runs(plans, expected, capsys):
     config = default_codebook_file().parent
     options = [part for plan in plans for part in (
         '--plan', *(str(config / f'{name}.yaml') for name in plan))]

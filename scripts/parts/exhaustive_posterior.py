@@ -1,40 +1,34 @@
 """The posterior over the whole region of interest: a slow reference for all estimators.
 
 The likelihood is that of the estimators, evaluated at points of a Sobol sequence instead of modes.
-Without impairments, moments are sums over all points. Otherwise, each phase draws some of the
+Without impairments, moments are sums over all points. Otherwise, each shot draws some of the
 points, with probabilities that follow from a cheap profile over the nuisance parameters. The
 likelihood at these points is divided by the probability of the draw, so that sums keep their
 expectation, and integrated over the parameters numerically where it matters.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.elements import ElementErrors
 from rhs_isac_ros.model.geometry import to_polar
 from rhs_isac_ros.positioning.estimate import Estimate, checked_received
-from rhs_isac_ros.positioning.estimators import BayesEstimator
-from rhs_isac_ros.positioning.failures import FailedElements, FailureSearch, can_enumerate
 from rhs_isac_ros.positioning.likelihood import (
     Alignment,
     Conditional,
     DispersedLikelihood,
     Likelihood,
-    Signals,
 )
 from rhs_isac_ros.positioning.neural import stack_parts
 from rhs_isac_ros.positioning.posterior import BandPhases
-from rhs_isac_ros.positioning.search import Modes, marginal_at
+from rhs_isac_ros.positioning.search import marginal_at
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.templates import tabulate
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Points evaluated at a time.
 _BLOCK = 4096
-# Expected number of points that a phase draws, with one covariance everywhere and with another one
+# Expected number of points that a shot draws, with one covariance everywhere and with another one
 # at each position. Their probability follows from the profile, raised to a power so that points
 # which it misjudges are drawn, too.
 _N_DRAWN = 2048
@@ -50,16 +44,15 @@ _SPREAD = 1.2
 @one_blas_thread
 def exhaustive_posterior(
         scenario: Scenario, codebook: Codebook, received: np.ndarray, log2_points: int = 22, *,
-        surface: ElementErrors | None = None, seed: int = 0) -> Estimate:
+        seed: int = 0) -> Estimate:
     """Compute mean and covariance of the posterior from points all over the region of interest.
 
-    The prior is uniform on the region. All phases share the 2^log2_points points of a Sobol
+    The prior is uniform on the region. All shots share the 2^log2_points points of a Sobol
     sequence, scrambled with the seed; the default number takes minutes. Signals are complex128
     [N, N_B, N_SB F] for an estimate of N positions.
 
-    Impairments that the scenario declares are integrated out at every point. Element errors and
-    failures are treated as Gaussian, with their covariance at every point, unless `surface`
-    contains them: no estimator without this knowledge has a lower mean squared error.
+    Impairments that the scenario declares are integrated out at every point. Element errors are
+    treated as Gaussian, with their covariance at every point.
 
     Raises
     ------
@@ -70,7 +63,7 @@ def exhaustive_posterior(
 
     codebook.check(scenario)
     batch = checked_received(codebook, received)
-    posterior = _Posterior(scenario, codebook, batch, surface)
+    posterior = _Posterior(scenario, codebook, batch)
     low, high = scenario.roi_bounds_m
     sequence, total = qmc.Sobol(3, seed=seed), 2**log2_points
     points = np.empty((total, 3))
@@ -79,17 +72,16 @@ def exhaustive_posterior(
         block = slice(done, min(done + _BLOCK, total))
         points[block] = sequence.random(block.stop - done) * (high - low) + low
         profile[:, block] = posterior.profile(points[block])
-    moments = [posterior.moments(phase, points, profile[phase]) for phase in range(len(batch))]
+    moments = [posterior.moments(shot, points, profile[shot]) for shot in range(len(batch))]
     means, covariances = map(np.stack, zip(*moments, strict=True))
     return Estimate(means, covariances)
 
 
 class _Posterior:
-    """The likelihood of N phases, as a cheap profile of all points and exactly at a few."""
+    """The likelihood of N shots, as a cheap profile of all points and exactly at a few."""
 
-    def __init__(self, scenario: Scenario, codebook: Codebook, received: np.ndarray,
-                 surface: ElementErrors | None) -> None:
-        self._likelihood = likelihood = Likelihood(scenario, codebook, surface)
+    def __init__(self, scenario: Scenario, codebook: Codebook, received: np.ndarray) -> None:
+        self._likelihood = likelihood = Likelihood(scenario, codebook)
         self._dispersed = DispersedLikelihood.of(likelihood)
         self._signals, self._phases = likelihood.signals(received), BandPhases(likelihood)
         alignment = Alignment(likelihood, tabulate(likelihood.model)['spread'])
@@ -115,9 +107,9 @@ class _Posterior:
             means = np.swapaxes(means, 0, 1)
         return doubled - np.sum(np.abs(means)**2, axis=(1, 2))
 
-    def moments(self, phase: int, points: np.ndarray, profile: np.ndarray
+    def moments(self, shot: int, points: np.ndarray, profile: np.ndarray
                 ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute mean and covariance of the posterior of a phase over points [P, 3]."""
+        """Compute mean and covariance of the posterior of a shot over points [P, 3]."""
         value = profile.astype(float)
         if len(self._likelihood.nuisance) or self._dispersed:
             n_drawn = _N_DISPERSED if self._dispersed else _N_DRAWN
@@ -127,46 +119,46 @@ class _Posterior:
                 share[:] = 0.0
             (drawn,) = np.nonzero(np.log(self._rng.uniform(size=len(share))) < share)
             points = points[drawn]
-            value = self._exact(phase, to_polar(points)) - np.minimum(share[drawn], 0.0)
+            value = self._exact(shot, to_polar(points)) - np.minimum(share[drawn], 0.0)
         weights = np.exp(value - value.max())
         weights /= weights.sum()
         mean = weights @ points
         offsets = points - mean
         return mean, (weights[:, None] * offsets).T @ offsets
 
-    def _exact(self, phase: int, points: np.ndarray) -> np.ndarray:
+    def _exact(self, shot: int, points: np.ndarray) -> np.ndarray:
         """Log-likelihood of points [P, 3], with the parameters integrated out, [P]."""
         likelihood = self._likelihood
         conditional: Conditional = self._dispersed or likelihood
         prior, value = likelihood.nuisance, np.empty(len(points))
-        values = np.repeat(self._aligned[phase][None], len(points), axis=0)
-        outputs = likelihood.outputs(points, values, select(self._signals, [phase]))
+        values = np.repeat(self._aligned[shot][None], len(points), axis=0)
+        outputs = likelihood.outputs(points, values, select(self._signals, [shot]))
         values += prior.start(outputs.T, np.zeros(len(points))) if len(prior) else 0.0
         for start in range(0, len(points), _BLOCK):
             block = slice(start, start + _BLOCK)
             value[block], values[block] = marginal_at(
                 conditional, likelihood, points[block], values[block],
-                select(self._signals, [phase]))
+                select(self._signals, [shot]))
         if not len(prior):
             return value
         (near,) = np.nonzero(value >= value.max() - _MARGIN)
-        value[near] = self._integrated(conditional, points[near], values[near], phase)
+        value[near] = self._integrated(conditional, points[near], values[near], shot)
         if self._phases.is_informative:
-            signals = select(self._signals, [phase])
+            signals = select(self._signals, [shot])
             outputs = likelihood.outputs(points, values, signals)
             turned = outputs * np.exp(1j * values @ prior.phases.T)
             value += self._phases.factors(turned.T)[0]
         return value
 
     def _integrated(self, conditional: Conditional, points: np.ndarray, values: np.ndarray,
-                    phase: int) -> np.ndarray:
+                    shot: int) -> np.ndarray:
         """Integrate over the parameters by importance sampling around their best values."""
         from scipy.special import ndtri
         from scipy.stats import qmc
 
         n_values = values.shape[1]
         normal = ndtri(qmc.Sobol(n_values, seed=0).random(_N_VALUES))
-        signals = select(self._signals, [phase])
+        signals = select(self._signals, [shot])
         among = conditional.local(points, values, signals).information[:, 3:, 3:]
         roots = np.linalg.cholesky(among)
         value = np.empty((len(points), _N_VALUES))
@@ -179,66 +171,3 @@ class _Posterior:
         average = highest + np.log(np.mean(np.exp(value - highest[:, None]), axis=1))
         return (average + n_values * np.log(_SPREAD)
                 - np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1))
-
-
-def posterior_with_truth(
-        scenario: Scenario, codebook: Codebook, received: np.ndarray,
-        surfaces: Sequence[ElementErrors], positions: np.ndarray) -> Estimate:
-    """Compute the posterior with failed elements if the search cannot miss the truth.
-
-    A sum over all sets and positions is not tractable. With the true set and position and the
-    sets next to it among the hypotheses, the mixture differs from that of the estimator by what
-    its search misses. Both approximate the amplitudes of stuck elements by a Gaussian.
-
-    Parameters
-    ----------
-    received
-        Signals, complex128 [N, N_B, N_SB F].
-    surfaces, positions
-        The N surfaces, and the positions of the users, float64 [N, 3] [m].
-
-    Raises
-    ------
-    ValueError
-        If the scenario does not declare failures whose sets can be searched.
-    """
-    if not can_enumerate(scenario):
-        raise ValueError(f'failed_element_share: {scenario.failed_element_share:g}, expected '
-                         'few failures, so that their sets can be searched')
-    estimator = _InformedEstimator(scenario, codebook)
-    estimates = [
-        estimator.estimate_with(signals, surface, position)
-        for signals, surface, position in zip(received, surfaces, positions, strict=True)]
-    return Estimate(np.stack([one.mean for one in estimates]),
-                    np.stack([one.covariance for one in estimates]))
-
-
-class _InformedFailures(FailedElements):
-    """The search with a hypothesis that it cannot miss."""
-
-    truth: tuple[tuple[int, ...], np.ndarray]
-
-    def _search(self, modes: Modes, signals: Signals) -> FailureSearch:
-        search = super()._search(modes, signals)
-        failed, point = self.truth
-        _, values = marginal_at(
-            self._model.failed_set(failed), self._likelihood, point[None],
-            search.sites[search.best[1]].values[None], signals)
-        (key,) = search.add(point[None], values, failed)
-        search.try_neighbours(key)
-        return search
-
-
-class _InformedEstimator(BayesEstimator):
-    """An estimator whose search includes the true hypothesis."""
-
-    def __init__(self, scenario: Scenario, codebook: Codebook) -> None:
-        super().__init__(scenario, codebook)
-        self._informed = _InformedFailures(self._likelihood, self._region.table)
-        self._region = self._region._replace(failures=self._informed)
-
-    def estimate_with(self, received: np.ndarray, surface: ElementErrors,
-                      position: np.ndarray) -> Estimate:
-        (failed,) = np.nonzero(~np.isnan(surface.stuck))
-        self._informed.truth = tuple(failed.tolist()), to_polar(position)
-        return self.estimate(received)

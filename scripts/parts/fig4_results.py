@@ -2,10 +2,10 @@
 
 import zlib
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from parts.frame import CONFIG
 
 from rhs_isac_ros.codebook import Codebook, directional_codebook, random_codebook
 from rhs_isac_ros.experiments.resampling import Replicates, replicate
@@ -20,13 +20,13 @@ ROWS = ('algorithm-1', 'crlb', 'ambiguity', *SCANS, 'random')
 QUARTILES = (0.25, 0.5, 0.75)
 
 
-def codebook_of(row: str, scenario: Scenario, trial: int, config: Path) -> Codebook:
+def codebook_of(row: str, scenario: Scenario, trial: int) -> Codebook:
     """Return the codebook of a row that needs no optimisation."""
     if row in SCANS:
         return directional_codebook(scenario, scan=SCANS[row])
     if row == 'random':
         return random_codebook(scenario, streams.generator(trial, streams.START))
-    return Codebook.load(config / f'codebook_{row}.yaml')
+    return Codebook.load(CONFIG / f'codebook_{row}.yaml')
 
 
 class Condition(NamedTuple):

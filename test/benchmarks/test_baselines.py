@@ -1,10 +1,8 @@
 """Receivers of the benchmark `baselines`: their bound and their posterior mean."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
+from benchmarks.baselines import ArrayReceiver, posterior_means
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.model import Scenario, simulate_received
@@ -15,15 +13,6 @@ from rhs_isac_ros.positioning import make_estimator
 SCENARIO = Scenario(
     n_subbands=2, n_frames=4, elements_per_side=4, angular_spread_deg=2.0, roi_center_m=(3, 0, 0),
     roi_size_m=(1, 1, 0.5))
-FILE = Path(__file__).parents[2] / 'scripts' / 'benchmarks' / 'parts' / 'array_receiver.py'
-
-
-@pytest.fixture(scope='module')
-def array_receiver():
-    spec = importlib.util.spec_from_file_location('array_receiver', FILE)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope='module')
@@ -38,8 +27,8 @@ def weights(codebook):
 
 
 @pytest.fixture(scope='module')
-def surface(array_receiver, weights):
-    return array_receiver.ArrayReceiver(SCENARIO, weights, np.arange(4))
+def surface(weights):
+    return ArrayReceiver(SCENARIO, weights, np.arange(4))
 
 
 def test_the_bound_of_the_surface_is_that_of_the_library(surface, codebook):
@@ -48,10 +37,10 @@ def test_the_bound_of_the_surface_is_that_of_the_library(surface, codebook):
         surface.crlb(positions), crlb(SCENARIO, codebook, positions), rtol=1e-4)
 
 
-def test_the_posterior_mean_is_as_accurate_as_bayes(array_receiver, surface, codebook):
+def test_the_posterior_mean_is_as_accurate_as_bayes(surface, codebook):
     positions = SCENARIO.sample_positions(150, np.random.default_rng(1))
     received = surface.simulate(positions, np.random.default_rng(2))
-    own = np.sum((array_receiver.posterior_means(surface, received) - positions)**2, axis=1)
+    own = np.sum((posterior_means(surface, received) - positions)**2, axis=1)
     signals = simulate_received(SCENARIO, codebook, positions, np.random.default_rng(3))
     estimate = make_estimator('bayes', SCENARIO, codebook).estimate(signals)
     other = np.sum((estimate.mean - positions)[estimate.fix]**2, axis=1)
@@ -60,9 +49,8 @@ def test_the_posterior_mean_is_as_accurate_as_bayes(array_receiver, surface, cod
     assert own.mean() < 0.5 * np.sum(np.array(SCENARIO.roi_size_m)**2) / 12
 
 
-def test_all_elements_have_a_lower_bound_than_any_of_their_combinations(
-        array_receiver, surface, weights):
-    everything = array_receiver.ArrayReceiver(
+def test_all_elements_have_a_lower_bound_than_any_of_their_combinations(surface, weights):
+    everything = ArrayReceiver(
         SCENARIO, np.abs(weights).max() * np.eye(16), np.zeros(16, int), 4)
     positions = SCENARIO.sample_positions(20, np.random.default_rng(1))
     assert (everything.crlb(positions) < surface.crlb(positions)).all()
