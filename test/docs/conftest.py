@@ -40,11 +40,11 @@ def site(build):
 
 
 @pytest.fixture(scope='session')
-def outputs(build):
-    """Callable that returns the outputs of a notebook of one type, such as ``stream``."""
-    def of(name, kind):
+def printed(build):
+    """Callable that returns all that a notebook prints."""
+    def of(name):
         path = build / 'jupyter_execute' / 'notebooks' / f'{name}.ipynb'
         cells = json.loads(path.read_text(encoding='utf-8'))['cells']
-        return [output for cell in cells for output in cell.get('outputs', ())
-                if output['output_type'] == kind]
+        return ''.join(line for cell in cells for output in cell.get('outputs', ())
+                       if output['output_type'] == 'stream' for line in output['text'])
     return of
