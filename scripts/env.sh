@@ -52,10 +52,9 @@ _rhs_env() {
   return "$code"
 }
 
-# Inside an `if` condition, a failing command does not end a shell that has `set -e`.
-if _rhs_env; then
-  unset -f _rhs_prepend _rhs_load _rhs_env
-else
+# Before `||`, a failing command does not end a shell that has `set -e`.
+_rhs_env || {
   unset -f _rhs_prepend _rhs_load _rhs_env
   return 1
-fi
+}
+unset -f _rhs_prepend _rhs_load _rhs_env
