@@ -13,8 +13,6 @@ from rhs_isac_ros.support.pictures import PAGE_IN, look, new_panels, paper_style
 
 # Whiskers of the box plots [%].
 WHISKERS = (5, 95)
-
-
 # Reductions that the paper claims for its codebook, by quantity and benchmark [%].
 CLAIMS = {'error': {'directional': 42, 'random': 69},
           'median loss': {'directional': 82, 'random': 86},
@@ -25,8 +23,6 @@ QUANTITIES = {'error': 'mean squared error', 'median loss': 'median capacity los
 OWN = ('algorithm-1', 'crlb', 'ambiguity')
 # Verdicts need as many positions, and several trainings of a network.
 MIN_POSITIONS, MIN_TRAININGS = 10_000, 2
-HOLDS, FAILS, OPEN = 'holds', 'does not hold', 'undecided'
-TOO_FEW = 'too few positions'
 
 
 class Finding(NamedTuple):
@@ -49,10 +45,10 @@ def verdict(claimed: float, low: float, high: float, positions: int, trainings: 
     the whole interval is below it.
     """
     if positions < MIN_POSITIONS:
-        return TOO_FEW
+        return 'too few positions'
     if trainings < MIN_TRAININGS:
         return 'too few trainings'
-    return HOLDS if low >= claimed else FAILS if high < claimed else OPEN
+    return 'holds' if low >= claimed else 'does not hold' if high < claimed else 'undecided'
 
 
 def claims_of(results: Results) -> Iterator[tuple[str, str, int]]:
