@@ -52,6 +52,27 @@ def test_a_table_shows_numbers_texts_and_intervals(capsys):
         '| b | text | 1.00 [0.50, 1.75] |']
 
 
+def test_options_are_those_with_a_default():
+    options = frame.benchmark_parser('name', 'About.', positions=20).parse_args(['--seed', '3'])
+    assert (options.positions, options.seed, options.json) == (20, 3, None)
+    bare = frame.benchmark_parser('name', 'About.', default_seed=None).parse_args([])
+    assert vars(bare) == {'json': None}
+
+
+def test_single_estimates_are_stacked():
+    class Shifted:
+        def estimate(self, received):
+            return Estimate(received + 1, 2 * np.eye(3), 'no' * int(received[0]), 4.0, 5.0)
+
+    received = np.array([[0.0, 1, 2], [1.0, 2, 3]])
+    estimate, times_s = frame.estimate_singly(Shifted(), received)
+    np.testing.assert_array_equal(estimate.mean, received + 1)
+    np.testing.assert_array_equal(estimate.covariance, [2 * np.eye(3)] * 2)
+    assert estimate.reason == ('', 'no')
+    assert (estimate.residual.tolist(), estimate.expected_residual.tolist()) == ([4, 4], [5, 5])
+    assert times_s.shape == (2, 2)
+
+
 def test_a_function_runs_in_a_new_process():
     assert frame.in_new_process(pow, 2, 5) == 32
     assert frame.peak_mib() > 1

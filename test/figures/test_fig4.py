@@ -104,6 +104,7 @@ def test_the_report_has_tables_picture_and_data(results, tmp_path, capsys):
     fig4_report.write(results, options)
     out = capsys.readouterr().out
     assert '10000 test positions; 3 trainings with 7 pairs' in out
+    assert out.count('## Claims about ') == out.count('## Claims about algorithm-1\n') == 1
     tables = [cells(line) for line in out.splitlines() if line.startswith('| scan-grid ')]
     assert [row[0] for row in tables] == ['scan-grid']
     assert float(tables[0][1].split()[0]) == pytest.approx(4.0, rel=0.05)
@@ -135,6 +136,7 @@ def test_options_select_the_conditions(monkeypatch, arguments, conditions):
     monkeypatch.setattr(fig4, 'reproduce', seen.append)
     assert fig4.main(arguments) == 0
     assert [condition.slug for condition in seen[0].conditions] == conditions
+    assert seen[0].rows == (fig4.QUICK_ROWS if '--quick' in arguments else fig4.ROWS)
 
 
 @pytest.mark.slow
