@@ -51,7 +51,7 @@ SUBSCRIPTIONS = {name: role.RECEIVES for name, role in ROLES.items()}
 PEERS = {name: ROSTER[name].requires for name in ('bs', 'user')}
 USE_CODEBOOKS = tuple(name for name, member in MEMBERS.items() if member.has_codebook)
 LATENCY_S = 1e-3
-DATA_DURATION_S = 1e-3
+BEACON_TIMEOUT_S = 3.0
 # A model file that does not match any codebook.
 UNFIT = 'unfit'
 
@@ -113,25 +113,35 @@ def on_time(message: m.Message, recipient: str) -> list[tuple[float, m.Message]]
     return [(LATENCY_S, message)]
 
 
-def matches(message: m.Message, kind: type[m.Message], fields: dict[str, Any]) -> bool:
-    return isinstance(message, kind) and all(
-        getattr(message, name) == value for name, value in fields.items())
+class Fault:
+    """Affects the first `n` messages of a class to a recipient, which have the given fields.
 
+    They arrive once after each of the delays, or not at all; `alter` changes those that arrive.
+    """
 
-class LosesFirst:
-    """Loses the first message of a class to one recipient, or to all."""
+    def __init__(self, kind: type[m.Message], recipient: str, *delays_s: float, n: float = np.inf,
+                 alter: Callable[[Any], m.Message] = lambda message: message,
+                 **fields: Any) -> None:
+        self.kind, self.recipient, self.delays_s, self.alter = kind, recipient, delays_s, alter
+        self.n, self.fields, self.n_affected = n, fields, 0
 
-    def __init__(
-            self, kind: type[m.Message], fields: dict[str, Any], recipient: str = '') -> None:
-        self.kind, self.fields, self.recipient = kind, fields, recipient
-        self.lost: m.Message | None = None
+    def affects(self, message: m.Message, recipient: str) -> bool:
+        return (self.n_affected < self.n and recipient == self.recipient
+                and isinstance(message, self.kind) and all(
+                    getattr(message, name) == value for name, value in self.fields.items()))
 
     def __call__(self, message: m.Message, recipient: str) -> list[tuple[float, m.Message]]:
-        if matches(message, self.kind, self.fields) and recipient.startswith(self.recipient):
-            self.lost = self.lost or message
-            if message is self.lost:
-                return []
-        return [(1e-3, message)]
+        if not self.affects(message, recipient):
+            return on_time(message, recipient)
+        self.n_affected += 1
+        return [(delay_s, self.alter(message)) for delay_s in self.delays_s]
+
+
+def faults(*each: Fault) -> Transport:
+    """Return a transport in which the first fault that affects a message applies."""
+    return lambda message, recipient: next(
+        (fault for fault in each if fault.affects(message, recipient)), on_time)(
+        message, recipient)
 
 
 def emulated_front_end(scenario: Scenario, surface: Surface | None = None) -> FrontEnd:
@@ -177,21 +187,19 @@ class Noisy:
 class Network:
     """The roles, coupled by a bus.
 
-    `users` maps user numbers to positions or mobilities; `make` builds the estimator of a
+    `users` maps user numbers to positions or mobilities; `settings` are those of the base station,
+    by default without repetitions and without a limit of acks; `make` builds the estimator of a
     codebook, which takes `make_s`; `ordered` keeps the order of messages of a class from one role
     to another. `plain_beams` replaces the optimisation of beams, which takes most of a cycle, by a
     simple function. The roles have the `library`, except for those in `without_library`.
     """
 
     def __init__(
-            self, scenario: Scenario, codebook, users, *, policy: str = 'round_robin',
-            seed: int = 0, step_timeout_s: float = 1.0, ack_timeout_s: float = 0.1,
-            rest_s: float = 0.1, transport: Transport = on_time, ordered: bool = True, make=None,
-            make_s: float = 0.0, absent: Iterable[str] = (),
-            begin_s: float = 0.0, retries: int = 0, beacon_timeout_s: float = 3.0,
-            allowed_users: str = '', ack_rate_hz: float = np.inf,
-            plain_beams: bool = False, positioner=None, library=EMPTY,
-            without_library: Iterable[str] = ()) -> None:
+            self, scenario: Scenario, codebook, users, *, seed: int = 0,
+            transport: Transport = on_time, ordered: bool = True, make=None, make_s: float = 0.0,
+            absent: Iterable[str] = (), begin_s: float = 0.0, plain_beams: bool = True,
+            positioner=None, library=EMPTY, without_library: Iterable[str] = (),
+            **settings: Any) -> None:
         self._positioner, self._library = positioner, library
         self._without_library = frozenset(without_library)
         self.scenario, self.seed = scenario, seed
@@ -199,11 +207,7 @@ class Network:
         self.transport, self.ordered = transport, ordered
         self.now_s = begin_s
         self.front_end = emulated_front_end(scenario)
-        self.settings = BaseStationSettings(
-            policy=policy, ack_timeout_s=ack_timeout_s, step_timeout_s=step_timeout_s,
-            retries=retries, rest_s=rest_s, data_duration_s=DATA_DURATION_S,
-            allowed_users=allowed_users, ack_rate_hz=ack_rate_hz)
-        self._beacon_timeout_s = beacon_timeout_s
+        self.settings = BaseStationSettings(**{'retries': 0, 'ack_rate_hz': np.inf} | settings)
         # Whether the base station adds noise, by cycle.
         self._noise: dict[int, bool] = {}
         self.log: list[Sent] = []
@@ -390,6 +394,10 @@ class Network:
         """Return cycle, user and outcome of the cycles that have ended."""
         return list(self._ends)
 
+    def ends(self) -> list[str]:
+        """Return the outcomes of the cycles that have ended."""
+        return [outcome for *_, outcome in self._ends]
+
     def served(self) -> list[int]:
         return [user for _, user, outcome in self.outcomes() if outcome == 'served']
 
@@ -474,7 +482,7 @@ class Network:
                 return RhsController(library)
             case 'user':
                 return user_role.User(
-                    self._mobilities[name], step_s, self._beacon_timeout_s,
+                    self._mobilities[name], step_s, BEACON_TIMEOUT_S,
                     self.instances[name], pose=scenario.pose)
             case 'channel':
                 # Two channels differ in their multipath. Without memory, the expected signals
@@ -503,11 +511,6 @@ class Network:
                 self.dispatch(name, PeersChanged(missing))
 
 
-@pytest.fixture
-def plain_beams() -> None:
-    """Request networks with plain beams."""
-
-
 @pytest.fixture(scope='session')
 def scenario() -> Scenario:
     """A small scenario; a cycle takes milliseconds."""
@@ -527,36 +530,13 @@ def places(scenario) -> np.ndarray:
 
 
 @pytest.fixture
-def network(request, scenario, codebooks, places):
+def network(scenario, codebooks, places):
     """Function that returns a network; `users` is a number of users or a mapping."""
-    plain_beams = 'plain_beams' in request.fixturenames
-
     def make(users=1, codebook=codebooks[0], **options) -> Network:
         if isinstance(users, int):
             users = {user: places[user - 1] for user in range(1, users + 1)}
-        return Network(scenario, codebook, users, plain_beams=plain_beams, **options)
+        return Network(scenario, codebook, users, **options)
     return make
-
-
-@pytest.fixture(scope='session')
-def network_class() -> type[Network]:
-    return Network
-
-
-@pytest.fixture(scope='session')
-def noisy() -> type[Noisy]:
-    return Noisy
-
-
-@pytest.fixture(scope='session')
-def roles() -> dict[str, type]:
-    """The classes of the roles by name."""
-    return ROLES
-
-
-@pytest.fixture(scope='session')
-def subscriptions() -> dict[str, tuple[type[m.Message], ...]]:
-    return SUBSCRIPTIONS
 
 
 @pytest.fixture(scope='session')

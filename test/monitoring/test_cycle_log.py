@@ -38,6 +38,12 @@ def test_durations_match_the_messages_of_the_phases(network):
     net = network(rest_s=0.5)
     net.run_cycles(2)
     record = log_of(net).complete[1]
+    late = CycleLog()
+    for sent in net.log:
+        if isinstance(sent.message, RECEIVES):
+            # The observer receives all messages of a busy machine together.
+            late.add(sent.message, 99.0)
+    assert late.complete[1].durations_s() == record.durations_s()
     times = {type(s.message): s.time_s for s in reversed(net.log) if s.message.cycle_id == 2}
     durations = record.durations_s()
     assert list(durations) == [
@@ -49,19 +55,6 @@ def test_durations_match_the_messages_of_the_phases(network):
     assert durations[m.Phase.ESTIMATING] == pytest.approx(estimating_s)
     assert sum(durations.values()) == pytest.approx(record.duration_s)
     assert record.duration_s == pytest.approx(record.ended_s - record.began_s)
-
-
-def test_durations_do_not_depend_on_when_messages_arrive(network):
-    net = network(rest_s=0.5)
-    net.run_cycles(2)
-    prompt, late = log_of(net), CycleLog()
-    for sent in net.log:
-        if isinstance(sent.message, RECEIVES):
-            # The observer receives all messages of a busy machine together.
-            late.add(sent.message, 99.0)
-    for one, other in zip(prompt.complete, late.complete, strict=True):
-        assert one.durations_s() == other.durations_s()
-        assert one.duration_s == other.duration_s > 0
 
 
 def test_a_cycle_begins_with_the_last_beacon_before_its_grant(network, places):
@@ -130,19 +123,6 @@ def test_the_order_of_topics_does_not_matter(network):
         assert log.given_up == []
 
 
-def test_cycle_numbers_may_repeat_after_a_restart(network):
-    before = network()
-    before.run_cycles(2)
-    before.run_to(State.STEERING)
-    again = network(begin_s=before.now_s)
-    again.run_cycles(2)
-    log = log_of(before, again)
-    assert [r.cycle_id for r in log.complete] == [1, 2, 1, 2]
-    for record in log.complete:
-        assert all(duration >= 0 for duration in record.durations_s().values())
-        assert record.ended_s - record.began_s < 0.1
-
-
 @pytest.mark.parametrize('state', [State.CONFIGURING, State.ESTIMATING, State.TRANSMITTING])
 def test_an_interrupted_cycle_is_not_mixed_with_the_next_one_of_its_number(network, state):
     before = network()
@@ -156,19 +136,6 @@ def test_an_interrupted_cycle_is_not_mixed_with_the_next_one_of_its_number(netwo
     assert all(duration >= 0 for duration in record.durations_s().values())
     assert record.truth is net.sent(m.GroundTruth)[-1]
     assert record.estimate is net.sent(m.PositionEstimate)[-1]
-
-
-def test_a_cycle_that_is_given_up_keeps_nothing_of_an_interrupted_one(network):
-    before = network()
-    before.run_to(State.TRANSMITTING)
-    net = network(begin_s=before.now_s)
-    net.run_to(State.SOUNDING)
-    net.remove('positioner', noticed=False)
-    net.run_cycles(1)
-    (record,) = log_of(before, net).given_up
-    assert (record.cycle_id, record.outcome) == (1, 'positioner_silent')
-    assert record.estimate is record.capacity is None
-    assert m.Phase.TRANSMITTING not in record.durations_s()
 
 
 def test_messages_outside_a_known_cycle_create_no_record(example):
@@ -188,13 +155,3 @@ def test_old_cycles_without_an_end_are_discarded(example):
     for cycle_id in (1, 50, 99, 100):
         log.add(example(m.ProtocolState, cycle_id=cycle_id, outcome='user_gone'), 200.0)
     assert [record.cycle_id for record in log.given_up] == [99, 100]
-
-
-def test_clearing_keeps_the_running_cycle(network):
-    net = network()
-    net.run_cycles(2)
-    log = log_of(net)
-    open_before = dict(log._open)
-    log.clear()
-    assert log.complete == log.ended == log.given_up == []
-    assert log._open == open_before

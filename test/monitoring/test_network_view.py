@@ -211,10 +211,3 @@ def test_cycles_of_further_users_are_in_the_charts(watched, scenario):
     assert len([entity for _, entity in on(entries, 'error/others')
                 if isinstance(entity, Number)]) == N_CYCLES / 2
     assert not any(path.startswith(f'{network_view.WORLD}/user_2') for _, path, _ in entries)
-
-
-def test_the_number_of_users_is_bounded(scenario):
-    view = NetworkView(scenario)
-    shown = [user for user in range(1, 200) if view.add(m.GroundTruth(
-        cycle_id=0, user=user, position=np.ones(3), velocity=np.zeros(3)), 0.0)]
-    assert shown == list(range(1, 65))

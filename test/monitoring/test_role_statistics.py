@@ -108,22 +108,3 @@ def test_faults_are_summarised(reports):
         assert report.fault == bool(expected)
         assert report.summary == (expected or phase or 'no fault')
         assert report.values.items() >= status.items()
-
-
-def test_statistics_of_a_base_station_match_its_messages(network):
-    net = network(transport=lambda message, recipient: [] if isinstance(
-        message, m.ReceivedSignals) and message.cycle_id == 2 else [(1e-3, message)])
-    statistics, role = RoleStatistics(), net['bs']
-    handle = role.handle
-
-    def recorded(event, now_s):
-        actions = handle(event, now_s)
-        statistics.record(event, actions, 0.0)
-        return actions
-    role.handle = recorded
-    net.run_cycles(4)
-    values = statistics.report(role.state.value, role.counters).values
-    assert values['phase'] == 'resting'
-    assert (values['cycles.served'], values['cycles.positioner_silent']) == ('3', '1')
-    assert int(values['sent.Beacon']) == len(net.sent(m.Beacon)) - 1
-    assert 10 < float(values['cycle_ms.p50']) < 50

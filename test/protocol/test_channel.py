@@ -29,8 +29,8 @@ from rhs_isac_ros.protocol.settings import Impairments
 PLACE = np.array([8.0, -2.0, 0.5])
 
 
-def truth_of(cycle_id, user=1):
-    return m.GroundTruth(cycle_id=cycle_id, user=user, position=PLACE, velocity=np.zeros(3))
+def truth_of(cycle_id, user=1, place=PLACE):
+    return m.GroundTruth(cycle_id=cycle_id, user=user, position=place, velocity=np.zeros(3))
 
 
 def configured(cycle_id, analog):
@@ -38,9 +38,15 @@ def configured(cycle_id, analog):
                               codebook_id='x', analog=analog)
 
 
-def pilots_of(scenario, cycle_id, user):
-    return m.Pilot(cycle_id=cycle_id, user=user, band=0,
-                   symbols=np.ones(scenario.n_frames, complex))
+def pilots_of(cycle_id, user=1, symbol=1 + 0j):
+    return m.Pilot(cycle_id=cycle_id, user=user, band=0, symbols=np.full(2, symbol))
+
+
+def signals_of(channel, analog, cycle_id=3, user=1, place=PLACE, symbol=1 + 0j):
+    """Return the feed signals of the first band in a cycle, [F, N_SB, K]."""
+    ((feeds,),) = feed(channel, [truth_of(cycle_id, user, place), configured(cycle_id, analog),
+                                 pilots_of(cycle_id, user, symbol)])[-1:]
+    return feeds.signals
 
 
 @pytest.fixture
@@ -49,8 +55,8 @@ def configuration(codebooks):
 
 
 @pytest.fixture
-def pilots(scenario):
-    return pilots_of(scenario, 3, 1)
+def pilots():
+    return pilots_of(3)
 
 
 @pytest.fixture
@@ -76,44 +82,18 @@ def test_the_channel_answers_pilots_for_any_order_of_messages(
 
 
 def test_feed_signals_follow_the_configuration_and_are_those_of_unit_symbols(
-        scenario, truth, configuration, pilots):
-    def signals(analog, symbol):
-        pilot = m.Pilot(cycle_id=3, user=1, band=0, symbols=np.full(2, symbol))
-        (feeds,) = feed(Channel(scenario, 0), [truth, configured(3, analog), pilot])[-1]
-        return feeds.signals
+        scenario, configuration):
+    def signals(analog, symbol=1 + 0j):
+        return signals_of(Channel(scenario, 0), analog, symbol=symbol)
 
     analog = configuration.analog
-    plain = signals(analog, 1 + 0j)
+    plain = signals(analog)
     for symbol in (0.6 - 0.8j, -1j, 1.005 + 0j):
         np.testing.assert_allclose(signals(analog, symbol), plain, rtol=1e-14)
-    np.testing.assert_allclose(signals(analog / 2, 1 + 0j), plain / 2)
-    assert (signals(0 * analog, 1 + 0j) == 0).all()
+    np.testing.assert_allclose(signals(analog / 2), plain / 2)
     # Element by element: the path, including on-board propagation.
-    single = [signals(np.eye(16)[m_][None] * np.ones((2, 1)), 1 + 0j) for m_ in range(16)]
-    np.testing.assert_allclose(signals(np.ones((2, 16)), 1 + 0j), sum(single))
-
-
-def test_the_multipath_has_zero_mean_and_the_line_of_sight_is_1(scenario, configuration, pilots):
-    sums, n = 0, 400
-    for cycle_id in range(1, n + 1):
-        events = [truth_of(cycle_id), configured(cycle_id, np.ones((2, 16))),
-                  pilots_of(scenario, cycle_id, 1)]
-        ((feeds,),) = feed(Channel(scenario, 0), events)[-1:]
-        first = feeds.signals[0]
-        sums = sums + np.array([first, np.abs(first)**2])
-    mean, power = sums / n
-    los = los_gain(scenario, PLACE[None], 0)[0]
-    expected = np.einsum('jm,jkm->jk', los, onboard_matrix(scenario)[0])
-    spread = np.sqrt(np.maximum(power.real - np.abs(mean)**2, 0) / n)
-    assert (spread > 0).all()
-    assert (np.abs(mean - expected) < 4 * spread).all()
-
-
-def test_a_pilot_of_another_user_is_not_answered(scenario, truth, configuration, example):
-    channel = Channel(scenario, 0)
-    pilot = example(m.Pilot, cycle_id=3, user=2)
-    assert feed(channel, [truth, configuration, pilot]) == [[], [], []]
-    assert channel.counters == {'wrong_user': 1}
+    single = [signals(np.tile(element, (2, 1))) for element in np.eye(16)]
+    np.testing.assert_allclose(signals(np.ones((2, 16))), sum(single))
 
 
 def test_a_pilot_of_another_node_with_the_number_is_not_answered(
@@ -138,20 +118,10 @@ def test_the_first_beam_of_a_cycle_stands(scenario, truth, beam, applied, downli
     assert channel.counters == {'wrong_instance': 1}
 
 
-@pytest.mark.parametrize('cycle_id', [2, 4])
-def test_a_pilot_of_another_cycle_is_discarded_with_the_next_cycle(
-        scenario, truth, configuration, example, cycle_id):
-    channel = Channel(scenario, 0)
-    pilot = example(m.Pilot, cycle_id=cycle_id, user=1)
-    assert feed(channel, [truth, configuration, pilot, truth_of(5)]) == [[]] * 4
-    assert channel.counters == {'stale': 1}
-
-
 def test_a_pilot_of_the_next_cycle_waits_for_it(scenario, truth, configuration, codebooks):
     channel = Channel(scenario, 0)
     sent = feed(channel, [
-        truth, configuration, pilots_of(scenario, 4, 1), configured(4, configuration.analog),
-        truth_of(4)])
+        truth, configuration, pilots_of(4), configured(4, configuration.analog), truth_of(4)])
     assert sent[:4] == [[]] * 4
     assert [f.cycle_id for f in sent[4]] == [4]
 
@@ -171,18 +141,12 @@ def test_the_channel_delivers_the_capacity_at_the_true_position(
     ((delivered,),) = feed(channel, [downlink])
     assert delivered.bits == math.floor(rate * 1e-3)
     assert (delivered.direction, delivered.stage) == (m.Direction.DOWNLINK, m.Stage.DELIVERED)
-    few = m.Data(
-        cycle_id=3, user=1, direction=m.Direction.UPLINK, stage=m.Stage.OFFERED, duration_s=1e-3,
-        bits=10.0)
-    ((delivered,),) = feed(channel, [few])
+    ((delivered,),) = feed(channel, [dataclasses.replace(
+        downlink, direction=m.Direction.UPLINK, bits=10.0)])
     assert (delivered.direction, delivered.bits) == (m.Direction.UPLINK, 10.0)
-
-
-def test_the_channel_uses_the_reported_configuration_of_the_surface(
-        scenario, truth, beam, downlink):
-    off = m.RhsConfiguration(
-        cycle_id=3, mode=m.Mode.TRANSMISSION, band=0, codebook_id='x', analog=np.zeros((1, 16)))
-    (_, _, _, (delivered,)) = feed(Channel(scenario, 0), [truth, beam, off, downlink])
+    # The surface may report another configuration than that of the beam.
+    off = dataclasses.replace(applied, analog=np.zeros((1, 16)))
+    (*_, (delivered,)) = feed(Channel(scenario, 0), [truth, beam, off, downlink])
     assert delivered.bits == 0
 
 
@@ -209,13 +173,12 @@ def test_no_answer_precedes_the_confirmation_of_its_configurations(
 
 
 def test_elements_have_the_coefficients_of_known_states(
-        scenario, truth, configuration, pilots, beam, applied, downlink):
-    switched = dataclasses.replace(configuration, analog=np.rint(configuration.analog))
+        scenario, truth, configuration, beam, applied, downlink):
+    switched = np.rint(configuration.analog)
     states = known_states(scenario, 1, -1).surface
-    (feeds,) = feed(Channel(scenario, 0, None, states), [truth, switched, pilots])[-1]
-    plain = [feed(Channel(scenario, 0), [truth, configured(3, analog), pilots])[-1][0].signals
-             for analog in (switched.analog, 1 - switched.analog)]
-    np.testing.assert_allclose(feeds.signals, plain[1] - plain[0], rtol=1e-9)
+    plain = [signals_of(Channel(scenario, 0), analog) for analog in (switched, 1 - switched)]
+    np.testing.assert_allclose(signals_of(Channel(scenario, 0, None, states), switched),
+                               plain[1] - plain[0], rtol=1e-9)
     events = [truth, beam, applied, downlink]
     ((known,), (unknown,)) = (feed(channel, events)[-1] for channel in (
         Channel(scenario, 0, None, states), Channel(scenario, 0)))
@@ -229,8 +192,8 @@ def test_signals_are_those_of_the_configurations_that_were_shown(
     (request,) = handle_all(channel, [truth, configuration, pilots])
     handle_all(channel, [configured(3, 1 - configuration.analog)])
     (feeds,) = channel.handle(apply_patterns(emulated_front_end(scenario), request), 0.0)
-    (expected,) = feed(Channel(scenario, 0), [truth, configuration, pilots])[-1]
-    np.testing.assert_array_equal(feeds.message.signals, expected.signals)
+    np.testing.assert_array_equal(
+        feeds.message.signals, signals_of(Channel(scenario, 0), configuration.analog))
 
 
 def test_configurations_that_are_confirmed_in_another_cycle_are_not_measured(
@@ -259,16 +222,17 @@ def test_a_fault_of_the_front_end_is_counted_and_logged_and_sends_nothing(
     assert 'warning.front_end' not in channel.status()
 
 
-class Refusing(EmulatedSurface):
-    """A surface that fails at its second configuration."""
+class Faulty(EmulatedSurface):
+    """A surface that fails at configurations of given numbers, from 1."""
 
-    def __init__(self, error):
-        super().__init__(16)
-        self.error, self.n = error, 0
+    def __init__(self, n_elements, faults, error=None):
+        super().__init__(n_elements)
+        self.faults, self.n = faults, 0
+        self.error = error or SurfaceFault('silence', 'no answer')
 
     def apply(self, configuration):
         self.n += 1
-        if self.n == 2:
+        if self.n in self.faults:
             raise self.error
         super().apply(configuration)
 
@@ -281,7 +245,7 @@ class Refusing(EmulatedSurface):
     (RadioFault('no samples'), 'radio', 'radio: no samples')])
 @pytest.mark.parametrize('measured', [False, True])
 def test_the_first_fault_ends_a_series_of_configurations(scenario, error, kind, text, measured):
-    surface = Refusing(error)
+    surface = Faulty(16, {2}, error)
     front_end = emulated_front_end(scenario, surface)
     request = ApplyPatterns((1, 2), np.eye(16)[:3], Sounding(
         1, 0, np.ones(3), np.ones((3, 3, 2)), 1, np.zeros(3)) if measured else None)
@@ -293,27 +257,13 @@ def test_the_first_fault_ends_a_series_of_configurations(scenario, error, kind, 
     assert np.argmax(surface.applied) == 2
 
 
-class Faulty(EmulatedSurface):
-    """A surface that fails at configurations of given numbers, from 1."""
-
-    def __init__(self, n_elements, faults):
-        super().__init__(n_elements)
-        self.faults, self.n = faults, 0
-
-    def apply(self, configuration):
-        self.n += 1
-        if self.n in self.faults:
-            raise SurfaceFault('silence', 'no answer')
-        super().apply(configuration)
-
-
 def test_a_cycle_is_served_in_spite_of_a_fault_or_given_up(network):
     net = network(1, retries=1, rest_s=0.0)
     # The first cycle repeats both bands; the second fails in both attempts and both bands.
     net.front_end = emulated_front_end(
         net.scenario, Faulty(net.scenario.n_elements, {2, *range(14, 18)}))
     net.run_cycles(3)
-    assert [outcome for _, _, outcome in net.outcomes()] == ['served', 'channel_silent', 'served']
+    assert net.ends() == ['served', 'channel_silent', 'served']
     assert net['channel'].counters['surface_silence'] == 5
     assert len(net.sent(m.PositionEstimate)) == 2
     assert net.logged('channel').count('surface: no answer') == 5
@@ -343,15 +293,6 @@ DEVIATING = {
     'failed_element_share': 0.3}
 
 
-def received(channel, codebook, user, cycle_id):
-    """Feed signals of the first band in a cycle without multipath memory, [F, N_SB, K]."""
-    ((feeds,),) = feed(channel, [
-        truth_of(cycle_id, user), configured(cycle_id, codebook.analog[0]),
-        m.Pilot(cycle_id=cycle_id, user=user, band=0,
-                symbols=np.ones(len(codebook.analog[0]), complex))])[-1:]
-    return feeds.signals
-
-
 def make_deviating(scenario, **impairments):
     """Return a channel without multipath."""
     silent = dataclasses.replace(scenario, multipath_to_los_db=-200.0)
@@ -360,29 +301,20 @@ def make_deviating(scenario, **impairments):
 
 @pytest.mark.parametrize('name', DEVIATING)
 def test_a_deviation_changes_the_signals_and_can_be_switched_off(scenario, codebooks, name):
-    plain = received(make_deviating(scenario), codebooks[0], 1, 1)
+    analog = codebooks[0].analog[0]
+    plain = signals_of(make_deviating(scenario), analog, 1)
     impaired = make_deviating(scenario, **{name: DEVIATING[name]})
-    assert not np.allclose(received(impaired, codebooks[0], 1, 1), plain, rtol=1e-3)
+    assert not np.allclose(signals_of(impaired, analog, 1), plain, rtol=1e-3)
     declared = make_deviating(dataclasses.replace(scenario, **{name: DEVIATING[name]}))
     # The little multipath that is left differs.
     np.testing.assert_allclose(
-        received(declared, codebooks[0], 1, 2), received(impaired, codebooks[0], 1, 2), rtol=1e-6)
+        signals_of(declared, analog, 2), signals_of(impaired, analog, 2), rtol=1e-6)
     for channel in (impaired, declared):
         channel.handle(SettingsOffered(Impairments(**{name: 0.0})), 0.0)
-        np.testing.assert_allclose(received(channel, codebooks[0], 1, 3), plain, rtol=1e-6)
-    impaired.handle(SettingsOffered(Impairments()), 0.0)
-    declared.handle(SettingsOffered(Impairments()), 0.0)
-    np.testing.assert_allclose(received(impaired, codebooks[0], 1, 4), plain, rtol=1e-6)
-    assert not np.allclose(received(declared, codebooks[0], 1, 4), plain, rtol=1e-3)
-
-
-def test_a_new_deviation_applies_from_the_next_cycle(scenario, codebooks):
-    channel = make_deviating(scenario)
-    before = received(channel, codebooks[0], 1, 1)
-    channel.handle(SettingsOffered(Impairments(phase_std_rad=7.0)), 0.0)
-    ((again,),) = feed(channel, [pilots_of(scenario, 1, 1)])
-    np.testing.assert_array_equal(again.signals, before)
-    assert not np.allclose(received(channel, codebooks[0], 1, 2), before, rtol=1e-3)
+        np.testing.assert_allclose(signals_of(channel, analog), plain, rtol=1e-6)
+        channel.handle(SettingsOffered(Impairments()), 0.0)
+    np.testing.assert_allclose(signals_of(impaired, analog, 4), plain, rtol=1e-6)
+    assert not np.allclose(signals_of(declared, analog, 4), plain, rtol=1e-3)
 
 
 @pytest.mark.parametrize(('name', 'same_user', 'same_surface'), [
@@ -392,7 +324,7 @@ def test_a_new_deviation_applies_from_the_next_cycle(scenario, codebooks):
 def test_deviations_belong_to_the_surface_the_user_or_the_cycle(
         scenario, codebooks, name, same_user, same_surface):
     channel = make_deviating(scenario, **{name: DEVIATING[name]})
-    first, again, other = (received(channel, codebooks[0], user, cycle_id)
+    first, again, other = (signals_of(channel, codebooks[0].analog[0], cycle_id, user)
                            for user, cycle_id in ((1, 1), (1, 2), (2, 3)))
     assert np.allclose(again, first, rtol=1e-6) == same_user
     assert np.allclose(other, first, rtol=1e-6) == same_surface
@@ -410,40 +342,25 @@ def test_gain_and_element_errors_change_the_capacity(scenario, truth, beam, appl
     assert bits(failed_element_share=1.0) < bits()
 
 
-def test_a_channel_file_takes_the_place_of_fading(scenario, truth, configuration, pilots):
+def test_a_channel_file_takes_the_place_of_fading(scenario, configuration):
     """Two users at one traced position have the same signals, and so have two cycles."""
     users = np.array([PLACE + [0.3, 0, 0], PLACE + [1, 0, 0]])
     distance = np.linalg.norm(users, axis=1)[:, None]
     paths = PathChannel(users, 299_792_458 / (4 * np.pi * 2.75e9 * distance) + 0j,
                         users[:, None], np.zeros((2, 1), int), 2.75e9)
     traced = dataclasses.replace(scenario, channel=paths)
-    signals = []
-    for seed in (0, 1):
-        channel = Channel(traced, seed)
-        ((answer,),) = feed(channel, [truth, configuration, pilots])[-1:]
-        signals.append(answer.signals)
+    signals = [signals_of(Channel(traced, seed), configuration.analog) for seed in (0, 1)]
     np.testing.assert_array_equal(*signals)
     expected = np.einsum('jm,fm,jkm->fjk', los_gain(scenario, users[:1], 0)[0],
                          configuration.analog, onboard_matrix(scenario)[0])
-    expected = expected * pilots.symbols[:, None, None]
     np.testing.assert_allclose(signals[0], expected, rtol=1e-9)
-
-
-def signals_at(scenario, place, **impairments):
-    """Return what the channel sends for the pilots of a user at a place."""
-    pilot = pilots_of(scenario, 3, 1)
-    return feed(Channel(scenario, 0, Impairments(**impairments)), [
-        m.GroundTruth(cycle_id=3, user=1, position=place, velocity=np.zeros(3)),
-        configured(3, np.ones((2, 16))), pilot])[-1]
 
 
 def test_a_user_behind_the_surface_has_no_signals(scenario):
     """Another surface of the site may have the user in sight."""
     channel = Channel(scenario, 0)
-    behind = m.GroundTruth(
-        cycle_id=3, user=1, position=np.array([-1.0, 0.0, 0.0]), velocity=np.zeros(3))
-    assert feed(channel, [behind, configured(3, np.ones((2, 16))), pilots_of(scenario, 3, 1)]
-                ) == [[], [], []]
+    behind = truth_of(3, place=np.array([-1.0, 0.0, 0.0]))
+    assert feed(channel, [behind, configured(3, np.ones((2, 16))), pilots_of(3)]) == [[], [], []]
     assert channel.counters == {'behind': 1}
 
 
@@ -454,6 +371,8 @@ def test_a_user_behind_the_surface_has_no_signals(scenario):
 def test_a_surface_may_hang_elsewhere_than_its_pose_says(scenario, pose, impairments, undone):
     place = np.array([4.0, 3.0, 0.5])
     posed = dataclasses.replace(scenario, pose=pose)
-    (moved,) = signals_at(posed, pose.to_site(place), **impairments)
-    (expected,) = signals_at(posed, pose.to_site(undone(place)))
-    np.testing.assert_allclose(moved.signals, expected.signals, rtol=1e-9)
+    moved, expected = (
+        signals_of(Channel(posed, 0, Impairments(**deviation)), np.ones((2, 16)),
+                   place=pose.to_site(at))
+        for deviation, at in ((impairments, place), ({}, undone(place))))
+    np.testing.assert_allclose(moved, expected, rtol=1e-9)

@@ -16,14 +16,6 @@ def test_the_first_cycle_is_the_draw_of_its_seed_and_without_memory_each_is(scen
         fading.gains(7, 1, 0.02, memory=False), first)
 
 
-def test_the_same_times_give_the_same_gains(scenario):
-    one, same = Fading(scenario, 2), Fading(scenario, 2)
-    for cycle_id, now_s in ((1, 0.0), (2, 1e-3), (5, 4e-3)):
-        np.testing.assert_array_equal(
-            one.gains(3, cycle_id, now_s, memory=True),
-            same.gains(3, cycle_id, now_s, memory=True))
-
-
 def test_gains_do_not_change_without_time_and_forget_over_a_long_time(scenario):
     fading, fresh = Fading(scenario, 3), Fading(scenario, 3)
     first = fading.gains(1, 1, 0.0, memory=True)

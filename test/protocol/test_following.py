@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from in_memory_network import LATENCY_S, LosesFirst, Network
+from in_memory_network import LATENCY_S, Fault, Network
 
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.codebook.library import Library, Plan
@@ -46,7 +46,7 @@ def estimator(scenario, region):
 def net(scenario, region, library, estimator):
     def make(place=PLACE, **options):
         return Network(scenario, region, {1: place}, library=library, positioner=TRACK,
-                       make=lambda codebook: estimator, plain_beams=True, **options)
+                       make=lambda codebook: estimator, **options)
     return make
 
 
@@ -100,57 +100,41 @@ def test_a_user_that_jumps_is_found_within_three_cycles(net, library, region):
         assert np.linalg.norm(error) < 1.5
 
 
-def without_fix(cycle_id):
-    """Return a transport that replaces the estimate of a cycle by a report without one."""
-    def transport(message, recipient):
-        if isinstance(message, m.PositionEstimate) and message.cycle_id == cycle_id:
-            message = m.derive(m.NoFix, message, reason='none')
-            return [(LATENCY_S, message)] if recipient == 'bs' else []
-        return [(LATENCY_S, message)]
-    return transport
-
-
-@pytest.mark.parametrize(('transport', 'outcome'), [
-    (without_fix(6), 'no_fix'), (LosesFirst(m.Beam, {'cycle_id': 6}), 'transmission_silent')],
-    ids=['no_fix', 'lost'])
+@pytest.mark.parametrize(('fault', 'outcome'), [
+    (Fault(m.PositionEstimate, 'bs', LATENCY_S, cycle_id=6,
+           alter=lambda estimate: m.derive(m.NoFix, estimate, reason='none')), 'no_fix'),
+    (Fault(m.Beam, 'rhs_controller', cycle_id=6), 'transmission_silent')])
 def test_a_cycle_without_service_is_followed_by_one_for_the_whole_region(
-        net, library, region, transport, outcome):
-    network = net(transport=transport, step_timeout_s=0.1)
+        net, library, region, fault, outcome):
+    network = net(transport=fault, step_timeout_s=0.1)
     network.run_cycles(8)
-    assert [end for _, _, end in network.outcomes()][5:] == [outcome, 'served', 'served']
+    assert network.ends()[5:] == [outcome, 'served', 'served']
     assert used(network)[5] in library.by_id
     assert used(network)[6] == region.id
     assert used(network)[7] in library.by_id
 
 
-def test_a_proposal_expires(net, library, region):
-    network = net()
-    network.run_cycles(5)
+def pause(network):
     network.dispatch('bs', PauseRequested())
     network.run(limit_s=3.0)
     network.dispatch('bs', ResumeRequested())
-    network.run_cycles(1)
-    assert used(network)[4] in library.by_id
-    assert used(network)[-1] == region.id
 
 
-def test_a_restarted_user_begins_with_the_codebook_of_the_region(net, library, region):
+@pytest.mark.parametrize('interrupt', [pause, lambda network: network.restart('user1')],
+                         ids=['pause', 'restart of the user'])
+def test_a_proposal_ends_with_time_and_with_its_user(net, library, region, interrupt):
     network = net()
     network.run_cycles(5)
-    network.restart('user1')
+    interrupt(network)
     network.run_cycles(1)
     assert used(network)[4] in library.by_id
     assert used(network)[-1] == region.id
 
 
-def test_a_positioner_without_the_library_proposes_nothing(net, region):
-    network = net(without_library=['positioner'])
-    network.run_cycles(5)
-    assert used(network) == [region.id] * 5
-
-
-def test_a_base_station_without_the_library_uses_the_codebook_of_the_region(net, region):
-    network = net(without_library=['bs'])
+@pytest.mark.parametrize('role', ['positioner', 'bs'])
+def test_a_positioner_or_base_station_without_the_library_uses_the_codebook_of_the_region(
+        net, region, role):
+    network = net(without_library=[role])
     network.run_cycles(5)
     assert used(network) == [region.id] * 5
 
@@ -158,10 +142,8 @@ def test_a_base_station_without_the_library_uses_the_codebook_of_the_region(net,
 def test_a_controller_without_the_library_rejects_its_codebooks(net, region):
     network = net(without_library=['rhs_controller'])
     network.run_cycles(6)
-    outcomes = [end for _, _, end in network.outcomes()]
     # After the long interval, the next prediction is too uncertain for a codebook.
-    assert outcomes == [
-        'served', 'served', 'rhs_silent', 'served', 'served', 'rhs_silent']
+    assert network.ends() == ['served', 'served', 'rhs_silent'] * 2
     assert set(used(network)) == {region.id}
     assert 'library: none' in network.logged('rhs_controller')[0]
 

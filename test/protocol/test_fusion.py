@@ -110,10 +110,9 @@ def test_the_bound_is_that_of_the_surfaces_with_a_position(fusion, site, answer,
         expected = site_crlb([models[name] for name in names], estimate.position[None])
         assert estimate.crlb_m2 == pytest.approx(expected[0])
     assert both.crlb_m2 < 0.7 * alone.crlb_m2
-
-
-def test_signals_with_a_codebook_of_which_the_site_does_not_know_have_no_bound(fusion, answer):
-    *_, (estimate, _) = at_once(fusion, [answer('front'), answer('side', codebook_id='other')])
+    # The site has no other codebooks.
+    *_, (estimate, _) = at_once(
+        fusion, [answer('front', 3), answer('side', 3, codebook_id='other')])
     assert np.isnan(estimate.crlb_m2)
 
 
@@ -190,18 +189,6 @@ def test_a_silent_surface_is_named_and_costs_no_time(fusion, answer):
     assert estimate.estimator == 'fusion of front, side'
 
 
-def test_a_surface_without_a_position_is_not_waited_for(fusion, answer, no_fix):
-    nothing, (estimate, _) = at_once(fusion, [no_fix('side'), answer('front')])
-    assert nothing == []
-    assert estimate.estimator == 'fusion of front'
-
-
-def test_without_any_position_there_is_no_fix(fusion, no_fix):
-    *_, (message,) = at_once(fusion, [no_fix('side'), no_fix('front')])
-    assert (message.cycle_id, message.user) == (1, 2)
-    assert message.reason == 'front: too weak; side: too weak'
-
-
 def test_cycles_of_several_users_do_not_mix(fusion, answer):
     other = PLACE + [3.0, 0.0, 0.0]
     *nothing, (first, _), (second, _) = at_once(fusion, [
@@ -213,29 +200,26 @@ def test_cycles_of_several_users_do_not_mix(fusion, answer):
     assert np.linalg.norm(second.position - other) < 0.1
 
 
-def test_an_answer_counts_once_and_only_from_a_surface_of_the_site(fusion, answer):
-    assert at_once(fusion, [answer('front'), answer('front'),
-                         answer('front', scenario_id='other'), answer('front', scenario_id='')]
-                ) == [[], [], [], []]
-    assert fusion.counters == {'duplicate': 1, 'wrong_scenario': 2}
-
-
-def test_a_surface_that_answers_again_gets_the_same_position_and_a_late_one_none(
+def test_an_answer_counts_once_and_a_repeated_one_gets_the_same_position(
         fusion, answer, no_fix):
-    *_, (estimate, _) = at_once(fusion, [answer('front'), answer('side')])
+    *before, (estimate, posterior) = at_once(fusion, [
+        answer('front'), answer('front'), answer('side', scenario_id='other'),
+        answer('side', scenario_id=''), answer('side')])
+    assert before == [[]] * 4
+    assert fusion.counters == {'duplicate': 1, 'wrong_scenario': 2}
     fusion.handle(answer('front', 2), 0.0)
     (late, _) = sent(fusion.handle(Timeout(), WAIT_S))
-    assert at_once(fusion, [answer('front'), answer('front', 2), answer('side', 2)]) == [
-        [estimate], [late], []]
-    *_, (nothing,) = at_once(fusion, [no_fix('front', 3), no_fix('side', 3)])
-    assert at_once(fusion, [no_fix('side', 3)]) == [[nothing]]
-    assert fusion.counters == {'duplicate': 3, 'stale': 1, 'no_fix': 1}
-
-
-def test_a_position_of_the_site_names_no_codebook_of_a_single_surface(fusion, answer, no_fix):
-    *_, (estimate, posterior) = at_once(fusion, [answer('front'), answer('side')])
-    *_, (nothing,) = at_once(fusion, [no_fix('front', 2), no_fix('side', 2)])
+    *_, (nothing,) = at_once(fusion, [no_fix('side', 3), no_fix('front', 3)])
+    assert (nothing.cycle_id, nothing.user) == (3, 2)
+    assert nothing.reason == 'front: too weak; side: too weak'
+    assert at_once(fusion, [answer('front'), answer('front', 2), no_fix('side', 3),
+                            answer('side', 2)]) == [[estimate], [late], [nothing], []]
+    assert fusion.counters == {'duplicate': 4, 'wrong_scenario': 2, 'stale': 1, 'no_fix': 1}
+    # A position of the site names no codebook of a single surface.
     assert {one.codebook_id for one in (estimate, posterior, nothing)} == {''}
+    # A surface without a position is not waited for.
+    _, (alone, _) = at_once(fusion, [no_fix('side', 4), answer('front', 4)])
+    assert alone.estimator == 'fusion of front'
 
 
 def test_a_mixture_that_cannot_be_located_is_dropped_and_logged(fusion, answer):

@@ -5,7 +5,7 @@ import types
 
 import numpy as np
 import pytest
-from in_memory_network import SUBSCRIPTIONS, Network, plain_choice
+from in_memory_network import SUBSCRIPTIONS, Fault, Network, faults, plain_choice
 
 from rhs_isac_ros.link import CapacityReport
 from rhs_isac_ros.model import Pose
@@ -160,18 +160,13 @@ def test_data_go_over_the_surface_with_the_largest_expected_capacity(make_networ
 
 def test_every_surface_steers_to_the_position_of_the_site(make_network):
     net = make_network('front', 'side')
-    net.cycles_at(NEAR['side'])
+    net.cycles_at(NEAR['side'], 3)
     (estimate, *_), beams = (net.sent(kind, cycle_id=net['bs']._cycle.cycle_id)
                              for kind in (m.PositionEstimate, m.Beam))
     assert estimate.estimator == 'fusion of front, side'
     assert {net.ids[beam.scenario_id]: beam.expected_bps for beam in beams} == pytest.approx({
         name: 1e7 / np.linalg.norm(POSES[name].to_surface(estimate.position))
         for name in ('front', 'side')})
-
-
-def test_each_surface_reports_the_capacity_of_its_own_beams(make_network):
-    net = make_network('front', 'side')
-    net.cycles_at(NEAR['side'], 3)
     reports = net.sent(m.Capacity)
     assert {net.ids[one.scenario_id] for one in reports} == {'front', 'side'}
     for report in reports:
@@ -217,13 +212,12 @@ def test_a_surface_that_does_not_answer_delays_one_cycle(make_network, role):
 
 @pytest.mark.parametrize('rest_s', [0.0, 0.1])
 def test_a_surface_that_is_always_slower_takes_part(make_network, rest_s):
-    def slow_side(message, recipient):
-        late = isinstance(message, m.Beam) and net.ids[message.scenario_id] == 'side'
-        return [(0.05 if late else 1e-3, message)]
     net = make_network('front', 'side', rest_s=rest_s)
     net.remove('side/transmission')
     net.cycles_at(NEAR['side'], 3)
-    net.transport = slow_side
+    (side,) = [surface for surface, name in net.ids.items() if name == 'side']
+    net.transport = faults(Fault(m.Beam, 'side/rhs_controller', 0.05),
+                           Fault(m.Beam, 'bs', 0.05, scenario_id=side))
     net.add('side/transmission')
     net.cycles_at(NEAR['side'], 3)
     assert net.cycles_at(NEAR['side'], 3) == ['side'] * 3
@@ -245,12 +239,8 @@ def test_data_that_a_surface_does_not_deliver_go_over_another_one_in_the_same_cy
 def test_data_under_way_during_a_handover_arrive(make_network):
     net = make_network('front', 'side')
     net.cycles_at(NEAR['side'], 2)
-
-    def slow_from_side(message, recipient):
-        late = isinstance(message, m.Data) and net.ids[message.scenario_id] == 'side' and (
-            message.stage is m.Stage.OFFERED) and message.direction is m.Direction.UPLINK
-        return [(0.3 if late else 1e-3, message)]
-    net.transport, net.walker.position = slow_from_side, NEAR['side']
+    net.transport = Fault(m.Data, 'side/channel', 0.3, stage=m.Stage.OFFERED, **UP)
+    net.walker.position = NEAR['side']
     before = len(net.log)
     net.run_cycles(1)
     net.run(limit_s=0.05)
@@ -262,28 +252,13 @@ def test_data_under_way_during_a_handover_arrive(make_network):
     assert net['bs'].state is State.RESTING
 
 
-def test_without_the_fusion_no_cycle_is_served(make_network):
-    net = make_network('front', 'side')
-    net.remove('fusion')
-    net.run_cycles(2)
-    assert [outcome for *_, outcome in net.outcomes()[-2:]] == ['positioner_silent'] * 2
-    net.add('fusion')
-    assert net.cycles_at(NEAR['front'], 1) == ['front']
-
-
 @pytest.mark.parametrize('kind', [m.PositionEstimate, m.Beam])
 @pytest.mark.parametrize('recipient', ['bs', 'transmission', 'side/transmission'])
 def test_one_lost_message_ends_no_cycle(make_network, kind, recipient):
-    net, lost = make_network('front', 'side'), []
-
-    def loses_once(message, to):
-        if not lost and to == recipient and isinstance(message, kind):
-            lost.append(message)
-            return []
-        return [(1e-3, message)]
-    net.transport = loses_once
+    net = make_network('front', 'side')
+    net.transport = lost = Fault(kind, recipient, n=1)
     net.cycles_at(NEAR['side'], 4)
-    assert bool(lost) == (kind in SUBSCRIPTIONS[net._kind(recipient)])
+    assert bool(lost.n_affected) == (kind in SUBSCRIPTIONS[net._kind(recipient)])
     assert net.served() == [1] * len(net.outcomes())
 
 
@@ -296,16 +271,6 @@ def test_a_position_behind_a_surface_has_no_beam_of_it(example, scenario):
 
 def beams(**capacities):
     return {name: types.SimpleNamespace(expected_bps=bps) for name, bps in capacities.items()}
-
-
-def test_a_user_keeps_its_surface_up_to_a_ratio_of_capacities():
-    carriers = Carriers()
-    assert carriers.choose(1, beams(a=1.0, b=1.05), 1.1, 0.0) == 'b'
-    carriers.deliver(1, 'a')
-    assert carriers.choose(1, beams(a=1.0, b=1.05), 1.1, 0.0) == 'a'
-    assert carriers.choose(2, beams(a=1.0, b=1.05), 1.1, 0.0) == 'b'
-    assert carriers.choose(1, beams(a=1.0, b=1.2), 1.1, 0.0) == 'b'
-    assert carriers.choose(1, beams(b=0.5), 1.1, 0.0) == 'b'
 
 
 def test_a_surface_that_loses_data_is_avoided_for_some_time_or_until_it_delivers():

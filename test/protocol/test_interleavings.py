@@ -8,6 +8,7 @@ import pytest
 from hypothesis import example as explicit
 from hypothesis import given
 from hypothesis import strategies as st
+from in_memory_network import Network, Noisy, on_time
 
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
@@ -99,15 +100,14 @@ NOISE = st.fixed_dictionaries({
 
 
 @pytest.fixture(scope='module')
-def make_network(network_class, scenario, codebooks):
+def make_network(scenario, codebooks):
     """Function that returns a network of two fast users."""
     def make(transport, ordered, retries):
         users = {user: mobility.RandomWalk(scenario, 50.0, np.random.default_rng(user))
                  for user in (1, 2)}
-        return network_class(
+        return Network(
             scenario, codebooks[0], users, transport=transport, ordered=ordered,
-            step_timeout_s=STEP_S, ack_timeout_s=ACK_S, rest_s=REST_S, retries=retries,
-            plain_beams=True)
+            step_timeout_s=STEP_S, ack_timeout_s=ACK_S, rest_s=REST_S, retries=retries)
     return make
 
 
@@ -126,7 +126,7 @@ def run_and_check(codebooks):
             net.run(limit_s=at_s - net.now_s)
             act()
         net.run(limit_s=max(FAULTS_END_S - net.now_s, 0.0))
-        net.transport = lambda message, recipient: [(1e-3, message)]
+        net.transport = on_time
         # Other policies do not guarantee service to every user.
         net.change('bs', policy='round_robin')
         check_end(net)
@@ -197,5 +197,5 @@ def test_guarantees_hold_under_single_faults_and_crashes(
           crashes=[Crash(0.0, 'rhs_controller', 0.0, False), Crash(0.0, 'channel', 0.0, False)],
           offers=[], changes=[], ordered=False, retries=0)
 def test_guarantees_hold_under_random_faults_and_crashes(
-        make_network, run_and_check, noisy, noise, crashes, offers, changes, ordered, retries):
-    run_and_check(make_network(noisy(**noise), ordered, retries), crashes, offers, changes)
+        make_network, run_and_check, noise, crashes, offers, changes, ordered, retries):
+    run_and_check(make_network(Noisy(**noise), ordered, retries), crashes, offers, changes)

@@ -75,30 +75,6 @@ def test_a_message_takes_the_fields_of_its_cycle_from_another():
     assert m.derive(m.Pilot, request, band=0, symbols=pilot.symbols).band == 0
 
 
-# Sizes of the small scenario: N_B = 2, N_SB = 3, F = 2, N_E = 16, K = 2.
-SHAPES = [
-    (m.RhsConfiguration, 'analog', [(2, 15), (16,), (0, 16)], '[FRAMES = 2, N_E = 16]'),
-    (m.Pilot, 'symbols', [(3,)], '[F = 2]'),
-    (m.FeedSignals, 'signals', [(3, 2), (3, 3, 2)], '[F = 2, N_SB = 3, K = 2]'),
-    (m.ReceivedSignals, 'signals', [(2, 3), (2, 2, 3), (0,)], '[N_B = 2, N_SB = 3, F = 2]'),
-    (m.PositionEstimate, 'position', [(2,)], '[3]'),
-    (m.PositionEstimate, 'covariance_m2', [(3,), (3, 2)], '[3, 3]'),
-    (m.Beam, 'analog', [(1, 16)], '[N_E = 16]'),
-    (m.Beam, 'digital', [(3, 3)], '[N_SB = 3, K = 2]'),
-    (m.CapacityStatistics, 'actual_bps', [(2,)], '[3]'),
-    (m.CapacityStatistics, 'loss_percent', [(3, 1)], '[3]'),
-    (m.GroundTruth, 'position', [()], '[3]'),
-    (m.GroundTruth, 'velocity', [(4,)], '[3]'),
-]
-
-
-@pytest.mark.parametrize(('kind', 'field', 'shapes', 'expected'), SHAPES)
-def test_a_wrong_shape_is_named(error_of, kind, field, shapes, expected):
-    for shape in shapes:
-        assert error_of(kind, **{field: np.zeros(shape)}) == (
-            f'{field}: shape {list(shape)}, expected {expected}')
-
-
 @pytest.mark.parametrize('frames', [0, 1, 2, 7])
 @pytest.mark.parametrize(('mode', 'right'), [(m.Mode.POSITIONING, 2), (m.Mode.TRANSMISSION, 1)])
 def test_a_surface_reports_all_frames_or_the_one_of_the_beam(error_of, mode, right, frames):
@@ -111,6 +87,13 @@ def fields_of(predicate):
     return pytest.mark.parametrize(('kind', 'field'), [
         (kind, field) for kind in KINDS for field in dataclasses.fields(kind)
         if predicate(field)], ids=name_of)
+
+
+@fields_of(lambda field: 'dims' in field.metadata)
+def test_a_wrong_shape_is_named(error_of, kind, field):
+    shape = (1,) * (len(field.metadata['dims']) + 1)
+    assert error_of(kind, **{field.name: np.zeros(shape)}).startswith(
+        f'{field.name}: shape {list(shape)}, expected [')
 
 
 @fields_of(lambda field: 'dims' in field.metadata and field.metadata['declared'].kind is not int)
@@ -142,12 +125,6 @@ def test_bands_are_indices(error_of, kind, field):
 @fields_of(lambda field: 'declared' in field.metadata and 'dims' not in field.metadata)
 def test_a_number_out_of_range_is_named(error_of, kind, field):
     declared = field.metadata['declared']
-    if field.name == 'user':
-        assert declared.low == (0 if kind is m.ProtocolState else 1)
-    if field.name in ('duration_s', 'latency_s', 'bits', 'expected_bps', 'at_estimate_bps'):
-        assert declared.low == 0
-    if field.name == 'bits':
-        assert declared.high == 1e15
     for good in (declared.low, declared.high):
         assert error_of(kind, **{field.name: field.type(good)}) == ''
     for bad in (field.type(declared.low - 1), field.type(declared.high + 1)):
@@ -161,8 +138,11 @@ VALID += [(kind, {'position': np.array([1e6, -1e6, 0])})
           for kind in (m.PositionEstimate, m.GroundTruth)]
 VALID += [(kind, {'analog': sets(1.0, 0.0)}) for kind in (m.RhsConfiguration, m.Beam)]
 MALFORMED = [
+    (m.FeedSignals, {'signals': np.zeros((3, 3, 2))},
+     'shape [3, 3, 2], expected [F = 2, N_SB = 3, K = 2]'),
+    (m.PositionEstimate, {'covariance_m2': np.zeros((3, 2))}, 'expected [3, 3]'),
     *((m.PilotRequest, {'n_frames': n}, f'n_frames: {n}, expected F = 2')
-      for n in (0, 1, 3, 2**31)),
+      for n in (0, 2**31)),
     *((m.Pilot, {'symbols': SYMBOLS[size]}, 'expected 0.99 to 1.01')
       for size in (0.0, 0.98, 1.02)),
     *((kind, {'analog': sets(low, high)}, f'analog: {text}, expected 0 to 1')

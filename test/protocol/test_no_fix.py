@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from in_memory_network import LosesFirst
+from in_memory_network import Fault
 
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
@@ -43,9 +43,9 @@ def test_without_a_fix_the_cycle_ends_at_once_without_a_position(network):
 
 
 def test_a_lost_no_fix_costs_the_timeout_of_one_step(network):
-    net = network(make=lambda codebook: NoFixInCycles({2}), transport=LosesFirst(m.NoFix, {}))
+    net = network(make=lambda codebook: NoFixInCycles({2}), transport=Fault(m.NoFix, 'bs', n=1))
     net.run_cycles(3)
-    assert net.transport.lost is not None
+    assert net.transport.n_affected
     assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'positioner_silent'), (3, 1, 'served')]
     net.verify()
 

@@ -23,6 +23,8 @@ from rhs_isac_ros.protocol.fusion import sighting_of
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PRIORS, PositionerSettings
 
+NOTHING = np.full(3, np.nan), np.full((3, 3), np.nan)
+
 
 @pytest.fixture
 def positioner(scenario):
@@ -32,48 +34,51 @@ def positioner(scenario):
 
 
 @pytest.fixture
-def signals(codebooks, example):
-    """Function that returns received signals of a cycle with one of the codebooks."""
-    def make(cycle_id, number=0):
-        return example(m.ReceivedSignals, cycle_id=cycle_id, user=2,
-                       codebook_id=codebooks[number].id)
-    return make
+def offer(positioner, codebooks):
+    """Function that offers codebooks; return the ids of those whose estimators are requested."""
+    def offer(*numbers):
+        return requested(positioner, *(CodebookOffered(codebooks[number]) for number in numbers))
+    return offer
 
 
-def ready(codebook, estimator=None):
-    return EstimatorBuilt(codebook, estimator or Fixed(codebook), 1.5)
+@pytest.fixture
+def locate(positioner, codebooks, example):
+    """Function that returns the answers to the signals of cycles with one of the codebooks."""
+    def locate(*cycle_ids, number=0):
+        return [message for messages in feed(positioner, [
+            example(m.ReceivedSignals, cycle_id=cycle_id, user=2,
+                    codebook_id=codebooks[number].id)
+            for cycle_id in cycle_ids]) for message in messages]
+    return locate
 
 
-def requested(actions):
+def ready(codebook, estimate=None):
+    """Return the event that an estimator is built; `estimate` takes the place of its method."""
+    estimator = Fixed(codebook)
+    estimator.estimate = estimate or estimator.estimate
+    return EstimatorBuilt(codebook, estimator, 1.5)
+
+
+def requested(positioner, *events):
     """Return the ids of the codebooks for which estimators are requested."""
-    return [action.codebook.id for action in actions if isinstance(action, BuildEstimator)]
+    return [action.codebook.id for event in events for action in positioner.handle(event, 0.0)
+            if isinstance(action, BuildEstimator)]
 
 
 def test_the_codebook_of_the_signals_selects_the_estimator(
-        positioner, scenario, codebooks, signals):
-    for codebook in codebooks[:2]:
-        assert requested(positioner.handle(CodebookOffered(codebook), 0.0)) == [codebook.id]
+        positioner, scenario, codebooks, offer, locate):
+    for number, codebook in enumerate(codebooks[:2]):
+        assert offer(number) == [codebook.id]
         assert positioner.handle(ready(codebook), 0.0) == [
             LogMessage(f'fixed {codebook.id} is ready for codebook {codebook.id} after 1.5 s')]
     for number in (0, 1, 0, 1):
         codebook = codebooks[number]
-        ((estimate,),) = feed(positioner, [signals(5, number)])
-        assert (estimate.cycle_id, estimate.user) == (5, 2)
-        assert estimate.codebook_id == codebook.id
-        assert estimate.estimator == f'fixed {codebook.id}'
+        (estimate,) = locate(5, number=number)
+        assert (estimate.cycle_id, estimate.user, estimate.codebook_id, estimate.estimator,
+                estimate.latency_s) == (5, 2, codebook.id, f'fixed {codebook.id}', 1.0)
         assert (estimate.position == PLACE).all()
         assert (estimate.covariance_m2 == 4 * np.eye(3)).all()
         assert estimate.crlb_m2 == pytest.approx(crlb(scenario, codebook, PLACE[None])[0])
-        assert estimate.latency_s == 1.0
-
-
-class Observers:
-    """Whether anyone receives posteriors."""
-
-    present = False
-
-    def __call__(self):
-        return self.present
 
 
 @pytest.fixture(scope='module')
@@ -88,11 +93,10 @@ def located(beside, codebooks):
     """Function that locates signals of a user, with or without observers of the posterior."""
     def locate(observed, scenario=beside, codebook=codebooks[0], **settings):
         received = simulate_received(scenario, codebook, PLACE[None], np.random.default_rng(1))
-        observers = Observers()
-        role = Positioner(scenario, lambda: 0.0, PositionerSettings(**settings), observers)
+        role = Positioner(
+            scenario, lambda: 0.0, PositionerSettings(**settings), lambda: observed)
         feed(role, [CodebookOffered(codebook),
-                    ready(codebook, BayesEstimator(scenario, codebook))])
-        observers.present = observed
+                    EstimatorBuilt(codebook, BayesEstimator(scenario, codebook))])
         message = m.ReceivedSignals(
             cycle_id=3, user=2, user_instance=7, codebook_id=codebook.id, stamp_ns=5,
             signals=received[0].reshape(codebook.shape[:3]))
@@ -104,7 +108,7 @@ def located(beside, codebooks):
 def test_a_posterior_is_sent_only_to_observers(located, prior):
     (estimate,) = located(False, prior=prior)
     again, posterior = located(True, prior=prior)
-    assert m.same(dataclasses.replace(again, latency_s=estimate.latency_s), estimate)
+    assert m.same(again, estimate)
     assert isinstance(posterior, m.Posterior)
     assert (posterior.cycle_id, posterior.user, posterior.user_instance, posterior.stamp_ns,
             posterior.codebook_id) == (3, 2, 7, 5, estimate.codebook_id)
@@ -137,117 +141,95 @@ def test_a_posterior_contains_all_that_the_fusion_needs(located, beside):
     assert deviation_m == pytest.approx(np.sqrt(np.trace(estimate.covariance_m2)), rel=0.1)
 
 
-def test_an_estimator_without_modes_has_no_posterior(positioner, codebooks, signals):
-    positioner._is_observed = lambda: True
-    feed(positioner, [CodebookOffered(codebooks[0]), ready(codebooks[0])])
-    (sent,) = feed(positioner, [signals(5)])
-    assert [type(message) for message in sent] == [m.PositionEstimate]
-
-
 def test_duplicate_signals_are_answered_twice_and_estimated_once(
-        positioner, codebooks, signals):
-    feed(positioner, [CodebookOffered(codebooks[0]), ready(codebooks[0])])
-    (first,), (again,), (other,) = feed(positioner, [signals(5), signals(5), signals(6)])
+        positioner, codebooks, offer, locate):
+    # An estimator without modes has no posterior.
+    positioner._is_observed = lambda: True
+    offer(0)
+    positioner.handle(ready(codebooks[0]), 0.0)
+    first, again, other = locate(5, 5, 6)
     assert again is first
     assert other.cycle_id == 6
     assert positioner.counters == {'duplicate': 1}
 
 
-def test_the_positioner_drops_signals_of_an_unknown_codebook(
-        positioner, codebooks, signals):
-    assert feed(positioner, [signals(1)]) == [[]]
-    feed(positioner, [CodebookOffered(codebooks[1]), ready(codebooks[1])])
-    assert feed(positioner, [signals(1)]) == [[]]
-    assert positioner.counters == {'wrong_codebook': 2}
-
-
-def test_the_positioner_requests_one_estimator_for_a_codebook(positioner, codebooks):
-    offers = [positioner.handle(CodebookOffered(codebooks[0]), 0.0) for _ in range(3)]
-    assert list(map(requested, offers)) == [[codebooks[0].id], [], []]
-    positioner.handle(ready(codebooks[0]), 0.0)
-    assert positioner.handle(CodebookOffered(codebooks[0]), 0.0) == []
-
-
 def test_the_old_estimator_is_used_while_the_new_one_is_built(
-        positioner, codebooks, signals):
-    feed(positioner, [CodebookOffered(codebooks[0]), ready(codebooks[0]),
-                      CodebookOffered(codebooks[1])])
-    (old,), nothing, (old_again,), (new,) = feed(
-        positioner, [signals(1), signals(2, 1), signals(3), ready(codebooks[1])])
-    assert nothing == []
-    assert [e.cycle_id for e in (old, old_again, new)] == [1, 3, 2]
+        positioner, codebooks, offer, locate):
+    assert locate(1) == []
+    offer(0)
+    # The latest of waiting signals are used.
+    assert locate(2, 3) == []
+    ((waited,),) = feed(positioner, [ready(codebooks[0])])
+    offer(1)
+    (old,) = locate(4)
+    assert locate(5, number=1) == []
+    (old_again,) = locate(6)
+    ((new,),) = feed(positioner, [ready(codebooks[1])])
+    assert [e.cycle_id for e in (waited, old, old_again, new)] == [3, 4, 6, 5]
     assert new.codebook_id == codebooks[1].id
-    assert positioner.counters == {}
-
-
-def test_the_latest_of_waiting_signals_are_used(positioner, codebooks, signals):
-    *before, (estimate,), after = feed(
-        positioner, [CodebookOffered(codebooks[0]), signals(1), signals(2), ready(codebooks[0]),
-                     CodebookOffered(codebooks[0])])
-    assert before == [[], [], []]
-    assert estimate.cycle_id == 2
-    assert after == []
+    assert locate(7, number=2) == []
+    assert positioner.counters == {'wrong_codebook': 2}
 
 
 def test_estimators_are_built_one_at_a_time_the_latest_next(
-        positioner, codebooks, signals):
-    first, second, third = codebooks
-    offers = [requested(positioner.handle(CodebookOffered(codebook), 0.0))
-              for codebook in codebooks]
-    assert offers == [[first.id], [], []]
-    positioner.handle(signals(7, 2), 0.0)
-    assert requested(positioner.handle(ready(first), 0.0)) == [third.id]
+        positioner, codebooks, offer, locate):
+    first, _, third = codebooks
+    assert offer(0, 0, 1, 2) == [first.id]
+    assert locate(7, number=2) == []
+    assert requested(positioner, ready(first)) == [third.id]
     ((estimate,),) = feed(positioner, [ready(third)])
     assert (estimate.cycle_id, estimate.codebook_id) == (7, third.id)
-    assert feed(positioner, [signals(8, 1)]) == [[]]
+    assert locate(8, number=1) == []
     assert positioner.counters == {'wrong_codebook': 1}
+    assert offer(0, 2) == []
 
 
-def test_no_estimator_is_built_for_a_codebook_replaced_meanwhile(positioner, codebooks):
-    first, second, _ = codebooks
-    feed(positioner, [CodebookOffered(c) for c in (first, second, first)])
-    assert requested(positioner.handle(ready(first), 0.0)) == []
+def test_no_estimator_is_built_for_a_codebook_replaced_meanwhile(positioner, codebooks, offer):
+    offer(0, 1, 0)
+    assert requested(positioner, ready(codebooks[0])) == []
 
 
-def test_the_old_estimator_is_kept_if_the_new_one_cannot_be_built(positioner, codebooks, signals):
-    feed(positioner, [CodebookOffered(codebooks[0]), ready(codebooks[0]),
-                      CodebookOffered(codebooks[1]), signals(4, 1)])
+def test_the_old_estimator_is_kept_if_the_new_one_cannot_be_built(
+        positioner, codebooks, offer, locate):
+    offer(0)
+    positioner.handle(ready(codebooks[0]), 0.0)
+    offer(1)
+    locate(4, number=1)
     assert positioner.handle(EstimatorBuilt(codebooks[1], None, failure='no model'), 0.0) == [
         LogMessage(f'no estimator for codebook {codebooks[1].id}: no model', warning=True)]
-    assert [len(sent) for sent in feed(positioner, [signals(5), signals(6, 1)])] == [1, 0]
+    assert len(locate(5)) == 1
+    assert locate(6, number=1) == []
     assert positioner.counters == {'wrong_codebook': 2}
     # The codebook may be offered again.
-    assert requested(positioner.handle(CodebookOffered(codebooks[1]), 0.0)) == [codebooks[1].id]
+    assert offer(1) == [codebooks[1].id]
 
 
-class WithoutFix(Fixed):
-    """An estimator that returns no fix, or raises an error."""
-
-    def __init__(self, codebook, error=False):
-        super().__init__(codebook)
-        self._error = error
-
-    def estimate(self, received):
-        if self._error:
-            raise SignalError('received: all wrong')
-        return Estimate(np.full(3, np.nan), np.full((3, 3), np.nan), 'received: all wrong')
+def raises(received):
+    raise SignalError('received: all wrong')
 
 
-@pytest.mark.parametrize('error', [False, True])
-def test_without_a_fix_the_positioner_reports_the_reason(positioner, codebooks, signals, error):
-    lost = WithoutFix(codebooks[0], error)
-    feed(positioner, [CodebookOffered(codebooks[0]), ready(codebooks[0], lost)])
-    send, note = positioner.handle(signals(9), 0.0)
+@pytest.mark.parametrize(('estimate', 'reason'), [
+    (raises, 'received: all wrong'),
+    (lambda received: Estimate(*NOTHING, 'received: all wrong'), 'received: all wrong'),
+    # A plug-in may return any position.
+    (lambda received: Estimate(PLACE * [-1, 1, 1], np.eye(3)),
+     'position: x = -8 m, expected x > 0')])
+def test_without_a_fix_the_positioner_reports_the_reason(
+        positioner, codebooks, example, offer, estimate, reason):
+    offer(0)
+    positioner.handle(ready(codebooks[0], estimate), 0.0)
+    signals = example(m.ReceivedSignals, cycle_id=9, user=2, codebook_id=codebooks[0].id)
+    send, note = positioner.handle(signals, 0.0)
     assert isinstance(send.message, m.NoFix)
-    assert (send.message.cycle_id, send.message.user) == (9, 2)
-    assert send.message.codebook_id == codebooks[0].id
-    assert send.message.reason == 'received: all wrong'
+    assert (send.message.cycle_id, send.message.user, send.message.codebook_id) == (
+        9, 2, codebooks[0].id)
+    assert send.message.reason.startswith(reason)
     assert note == LogMessage(
-        'cycle 9: no fix of user 2: received: all wrong', warning=True, key='signals of user 2',
-        holds=True)
+        f'cycle 9: no fix of user 2: {send.message.reason}', warning=True,
+        key='signals of user 2', holds=True)
     assert positioner.counters == {'no_fix': 1}
     # The answer may be lost, but not the line of the log.
-    assert positioner.handle(signals(9), 0.0) == [send]
+    assert positioner.handle(signals, 0.0) == [send]
 
 
 @pytest.mark.parametrize('error', [ValueError('bad model'), OSError('disk full'), MemoryError()])
@@ -255,8 +237,7 @@ def test_an_error_while_an_estimator_is_built_is_an_event(codebooks, error):
     def make(codebook):
         raise error
     event = build_estimator(codebooks[0], make, lambda: 0.0)
-    assert event.estimator is None
-    assert event.codebook is codebooks[0]
+    assert (event.codebook, event.estimator) == (codebooks[0], None)
     assert event.failure == (str(error) or 'MemoryError')
 
 
@@ -265,14 +246,3 @@ def test_a_built_estimator_is_returned_with_its_duration(codebooks):
     event = build_estimator(codebooks[0], Fixed, lambda: next(watch))
     assert (event.codebook, event.elapsed_s) == (codebooks[0], 2.5)
     assert event.estimator.name == f'fixed {codebooks[0].id}'
-
-
-def test_a_plug_in_that_returns_a_position_behind_the_surface_gives_no_fix(
-        positioner, signals, codebooks):
-    class Behind(Fixed):
-        def estimate(self, received):
-            return Estimate(PLACE * [-1, 1, 1], np.eye(3))
-    *_, (sent,) = feed(positioner, [
-        CodebookOffered(codebooks[0]), ready(codebooks[0], Behind(codebooks[0])), signals(1)])
-    assert isinstance(sent, m.NoFix)
-    assert sent.reason.startswith('position: x = -8 m, expected x > 0')

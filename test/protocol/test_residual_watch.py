@@ -11,8 +11,6 @@ from rhs_isac_ros.protocol.events import SettingsOffered
 from rhs_isac_ros.protocol.positioner import ResidualWatch
 from rhs_isac_ros.protocol.settings import PositionerSettings
 
-pytestmark = pytest.mark.usefixtures('plain_beams')
-
 EXPECTED = 62.5
 PLACE = np.array([10.0, 0.0, 0.0])
 
@@ -27,15 +25,12 @@ def add(watch, user, n, factor):
         user, estimate(factor))) != ('', False)]
 
 
-def test_residuals_of_the_model_are_shown_without_a_warning():
+def test_a_deviation_is_logged_when_it_begins_and_when_it_ends():
     watch = ResidualWatch()
     assert add(watch, 1, 2 * WINDOW, 1.0) == []
     assert watch.status() == {'residual.ratio': '1.000', 'residual.spread': '0.000',
                               'residual.fixes': str(WINDOW)}
-
-
-def test_a_deviation_is_logged_when_it_begins_and_when_it_ends():
-    watch = ResidualWatch()
+    watch.clear()
     (begin,) = add(watch, 1, WINDOW, 2.0)
     text, is_warning = begin
     assert is_warning

@@ -92,13 +92,6 @@ def test_a_gap_ends_a_track(locate):
     assert len(locate.tracks._tracks) == 1
 
 
-def test_more_than_64_users_have_tracks(locate):
-    for n in range(70):
-        locate(n, user=1 + n, now_s=0.1 + n / 1000)
-    assert len(locate.tracks._tracks) == 70
-    assert locate(70, user=1, now_s=0.3).n_phases == 2
-
-
 def test_the_number_of_tracks_is_bounded(monkeypatch, locate):
     monkeypatch.setattr(locate.tracks._tracks, 'max_size', 2)
     counts = [locate(n, user=user, now_s=n / 10).n_phases
@@ -112,7 +105,7 @@ def tracked(scenario, codebook, estimator):
     """Function that runs a network with the prior ``track``."""
     def make(users, **options):
         network = Network(scenario, codebook, users, make=lambda codebook: estimator,
-                          rest_s=0.02, ack_timeout_s=0.01, plain_beams=True, **options)
+                          rest_s=0.02, ack_timeout_s=0.01, **options)
         network.change('positioner', prior='track')
         return network
     return make
@@ -131,33 +124,6 @@ def test_users_that_share_the_cycles_have_tracks_that_the_beam_uses(tracked):
         first, last = (np.trace(track.estimate.covariance) for track in (tracks[0], tracks[-1]))
         assert last < first / 2
     assert network['positioner'].status()['parameter.prior'] == 'track'
-
-
-def test_users_that_leave_and_return(tracked):
-    """A user that returns as another instance starts a new track; the others continue."""
-    network = tracked({1: PLACE, 2: PLACE - 1.0})
-    network.run_cycles(10)
-    network.remove('user1')
-    network.run(limit_s=1.0)
-    network.add('user1')
-    seen = len(network.tracks)
-    network.run_cycles(10)
-    again = [track.estimate.n_phases for track in network.tracks[seen:] if track.user == 1]
-    assert again == list(range(1, len(again) + 1))
-    others = [track.estimate.n_phases for track in network.tracks if track.user == 2]
-    assert others == list(range(1, len(others) + 1))
-    assert len(others) > len(again) > 2
-
-
-def test_a_restarted_positioner_has_no_tracks(tracked):
-    network = tracked({1: PLACE})
-    network.run_cycles(10)
-    assert network.tracks[-1].estimate.n_phases > 5
-    network.restart('positioner', noticed=True)
-    network.change('positioner', prior='track')
-    seen = len(network.tracks)
-    network.run_cycles(5)
-    assert network.tracks[seen].estimate.n_phases == 1
 
 
 def test_the_prior_region_ends_all_tracks(tracked):

@@ -8,11 +8,8 @@ from rhs_isac_ros.protocol.user_registry import (
     POLICIES,
     SILENT_S,
     UserRegistry,
-    join_users,
     parse_users,
 )
-
-pytestmark = pytest.mark.usefixtures('plain_beams')
 
 # Number of users that a beacon invites, and of seniors.
 INVITED = 8
@@ -106,34 +103,15 @@ def test_the_selection_waits_for_registered_users(
         assert registry.is_complete_with(last) == is_complete
 
 
-@pytest.mark.parametrize('order', [(1, 2, 3), (3, 2, 1)])
-def test_a_user_lost_in_each_of_its_cycles_delays_the_others_by_at_most_one_turn(
-        make, order):
-    registry = make()
-    served = []
-    for _ in range(30):
-        served.append(cycle(registry, *order))
-        if served[-1] == 1:
-            registry.remove(1)
-    for user in (2, 3):
-        turns = [n for n, other in enumerate(served) if other == user]
-        assert max(np.diff([-1, *turns])) <= 3
-
-
 def test_random_is_uniform_and_reproducible(make):
     registry = make('random')
     served = [cycle(registry, 1, 2, 3) for _ in range(3000)]
     for user in (1, 2, 3):
         assert 900 < served.count(user) < 1100
+    assert {cycle(registry, 2, 3) for _ in range(50)} == {2, 3}
     again, other = make('random'), make('random', seed=1)
     assert [cycle(again, 1, 2, 3) for _ in range(20)] == served[:20]
     assert [cycle(other, 1, 2, 3) for _ in range(20)] != served[:20]
-
-
-def test_random_serves_only_users_that_answered(make):
-    registry = make('random')
-    cycle(registry, 1, 2, 3)
-    assert {cycle(registry, 2, 3) for _ in range(50)} == {2, 3}
 
 
 def served_in_turn(registry, present, n):
@@ -153,15 +131,6 @@ def served_in_turn(registry, present, n):
         registry.remove_absent()
         served.append(registry.select())
     return served
-
-
-@pytest.mark.parametrize('n', [0, 1, INVITED])
-def test_few_users_are_invited_together(make, n):
-    registry = make()
-    for user in range(1, n + 1):
-        registry.register(3 * user)
-    assert registry.invite(0) == (1, LAST_NUMBER)
-    assert registry.all_invited
 
 
 @pytest.mark.parametrize('policy', POLICIES)
@@ -212,21 +181,6 @@ def test_a_user_that_is_always_late_does_not_delay_the_users_of_other_ranges(mak
         assert max(np.diff([-1, *turns, len(served)])) <= len(others) + 1
 
 
-def test_new_users_between_many_are_served_within_two_rounds(make):
-    registry = make()
-    served_in_turn(registry, range(2, 202, 2), 100)
-    served = served_in_turn(registry, range(1, 211), 210 + 100)
-    assert set(served) == {*range(1, 211)}
-
-
-def test_users_that_leave_together_delay_the_others_by_few_beacons(make):
-    registry = make()
-    served_in_turn(registry, range(1, 1001), 300)
-    served = served_in_turn(registry, range(501, 1001), 600)
-    assert len(registry) == 500
-    assert set(served) == {*range(501, 1001)}
-
-
 def test_only_invited_users_miss_a_beacon(make):
     registry = make()
     served_in_turn(registry, range(1, 101), 100)
@@ -269,31 +223,18 @@ def next_users(registry, n, now_s=11.0):
     return users
 
 
-def test_without_failures_all_users_take_turns(crowd):
-    assert sorted(next_users(crowd, 28)) == [*SENIORS, *OTHERS]
-
-
 def test_seniors_are_served_first_for_as_long_as_the_cycle_of_another_user_took(crowd):
+    # That of a senior changes nothing.
+    fail(crowd, 1)
+    assert sorted(next_users(crowd, 28)) == [*SENIORS, *OTHERS]
     fail(crowd, OTHERS[3])
+    assert cycle(crowd, *OTHERS) in OTHERS
     assert {*next_users(crowd, 10, now_s=11.9)} == {*SENIORS}
     assert {*next_users(crowd, 1, now_s=12.0)} <= {*SENIORS}
     assert {*next_users(crowd, 19, now_s=12.1)} <= {*OTHERS}
-
-
-def test_others_are_served_if_no_senior_answers(crowd):
-    fail(crowd, OTHERS[3])
-    assert cycle(crowd, *OTHERS) in OTHERS
-
-
-def test_a_request_precedes_the_seniors(crowd):
     crowd.request(OTHERS[5])
     fail(crowd, OTHERS[3])
     assert next_users(crowd, 1) == [OTHERS[5]]
-
-
-def test_incomplete_cycles_of_a_senior_do_not_change_the_turns(crowd):
-    fail(crowd, 1)
-    assert sorted(next_users(crowd, 28)) == [*SENIORS, *OTHERS]
 
 
 def test_three_incomplete_cycles_in_a_row_end_the_rank_of_a_senior(crowd):
@@ -322,7 +263,6 @@ def test_a_senior_that_has_left_keeps_its_place_until_another_user_is_served(cro
 # The nodes that own the numbers
 
 FIRST, SECOND = 1_700_000_000 * 10**9, 1_800_000_000 * 10**9
-SILENT = 10.0 + SILENT_S
 
 
 @pytest.fixture
@@ -333,45 +273,28 @@ def instances(make):
     return result
 
 
-@pytest.mark.parametrize('other', [SECOND, FIRST - 1, 0])
-def test_the_first_owns_the_number(instances, other):
-    assert instances.owner(2) == FIRST
-    assert instances.is_taken(2, other, 10.0)
-    assert not instances.is_taken(2, FIRST, 10.0)
-    assert not instances.is_taken(3, other, 10.0)
-    assert instances.owner(3) == 0
-
-
-@pytest.mark.parametrize(('missed', 'now_s', 'taken'), [
-    (3, SILENT, False), (2, SILENT, True), (3, SILENT - 0.01, True), (2, 1000.0, True)])
-def test_the_owner_changes_after_a_second_and_three_beacons_without_its_answer(
-        instances, missed, now_s, taken):
-    for _ in range(missed):
-        assert instances.is_taken(2, SECOND, now_s)
-        instances.reject(2)
-    assert instances.is_taken(2, SECOND, now_s) == taken
-
-
-def test_an_owner_that_answers_in_between_keeps_the_number(instances):
-    for now_s in range(20, 40):
+def test_a_number_belongs_to_the_first_node_until_it_has_missed_three_beacons_and_a_second(
+        instances):
+    for now_s in range(20, 30):
         instances.reject(2)
         instances.reject(2)
-        assert instances.is_taken(2, SECOND, now_s)
+        for other in (SECOND, FIRST - 1, 0):
+            assert instances.is_taken(2, other, now_s)
+        # The owner answers in between.
+        assert not instances.is_taken(2, FIRST, now_s)
         instances.register(2, FIRST, now_s)
-    assert instances.owner(2) == FIRST
-
-
-def test_the_next_owner_has_the_rights_of_the_first(instances):
     for _ in range(3):
+        assert instances.is_taken(2, SECOND, 1000.0)
         instances.reject(2)
-    assert instances.register(2, SECOND, SILENT) == ''
+    assert instances.is_taken(2, SECOND, 29.0 + SILENT_S - 0.01)
+    assert not instances.is_taken(2, SECOND, 29.0 + SILENT_S)
+    assert instances.owner(2) == FIRST
+    assert instances.register(2, SECOND, 31.0) == ''
     assert instances.owner(2) == SECOND
-    assert instances.is_taken(2, FIRST, SILENT)
-
-
-def test_a_number_that_was_released_has_no_owner(instances):
+    assert instances.is_taken(2, FIRST, 31.0)
     instances.remove(2)
-    assert not instances.is_taken(2, SECOND, 10.0)
+    assert not instances.is_taken(2, FIRST, 31.0)
+    assert instances.owner(2) == 0
 
 
 def test_a_conflict_is_logged_once_until_it_has_ended(instances):
@@ -391,24 +314,14 @@ def test_a_conflict_is_logged_once_until_it_has_ended(instances):
 
 
 @pytest.mark.parametrize(('text', 'users'), [
-    ('', []), ('  ', []), ('3', [3]), ('1, 4,10 - 12', [1, 4, 10, 11, 12]),
-    ('7-7,4294967295', [7, 4294967295])])
+    ('  ', []), ('1, 4,10 - 12', [1, 4, 10, 11, 12]), ('7-7,4294967295', [7, 4294967295])])
 def test_lists_of_users_are_parsed(text, users):
     assert [user for numbers in parse_users(text) for user in numbers] == users
 
 
 @pytest.mark.parametrize(('text', 'part'), [
-    ('0', "'0'"), ('1,', "''"), ('1,x', "'x'"), ('5-3', "'5-3'"), ('-2', "'-2'"),
-    ('1;2', "'1;2'"), ('4294967296', "'4294967296'"), ('1.5', "'1.5'")])
+    ('0', "'0'"), ('1,', "''"), ('1,x', "'x'"), ('5-3', "'5-3'"), ('4294967296', "'4294967296'")])
 def test_a_malformed_part_is_an_error_that_names_it(text, part):
     with pytest.raises(ValueError, match=r'expected numbers from 1 to 4294967295') as raised:
         parse_users(text)
     assert str(raised.value).startswith(part)
-
-
-@pytest.mark.parametrize(('users', 'text'), [
-    ([], ''), ([4], '4'), ([4, 9], '4, 9'), (range(1, 9), '1, 2, 3, 4, 5, 6, 7, 8'),
-    (range(1, 10), '1, 2, 3, 4, 5, 6, 7, 8 and 1 other'),
-    (range(1, 21), '1, 2, 3, 4, 5, 6, 7, 8 and 12 others')])
-def test_a_list_names_few_users_and_counts_the_others(users, text):
-    assert join_users(users) == text

@@ -4,12 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from in_memory_network import matches
+from in_memory_network import LATENCY_S, Fault
 
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
-
-pytestmark = pytest.mark.usefixtures('plain_beams')
 
 POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
 DOWN = {'direction': m.Direction.DOWNLINK}
@@ -17,19 +15,16 @@ UP = {'direction': m.Direction.UPLINK}
 OFFERED, DELIVERED = {'stage': m.Stage.OFFERED}, {'stage': m.Stage.DELIVERED}
 
 
-class Adds:
+class Adds(Fault):
     """Sends an altered copy after, or before, the first message of a class to a recipient."""
 
-    def __init__(self, kind, fields, recipient, alter, before=False):
-        self.kind, self.fields, self.recipient = kind, fields, recipient
-        self.alter, self.before, self.done = alter, before, False
+    before = False
 
     def __call__(self, message, recipient):
-        arriving = [(1e-3, message)]
-        if not self.done and recipient == self.recipient and matches(
-                message, self.kind, self.fields):
-            self.done = True
-            arriving.insert(0 if self.before else 1, (1e-3, self.alter(message)))
+        arriving = [(LATENCY_S, message)]
+        if self.affects(message, recipient):
+            self.n_affected = 1
+            arriving.insert(0 if self.before else 1, (LATENCY_S, self.alter(message)))
         return arriving
 
 
@@ -108,12 +103,12 @@ WRONG_IDS = ['-'.join([kind.__name__, *map(str, fields.values()), recipient,
 def test_altered_messages_are_dropped_and_counted(
         network, places, kind, fields, recipient, changes, counter, before):
     """The cycle continues as if the altered copy had not arrived."""
-    net = network(
-        transport=Adds(kind, fields, recipient, replace(**changes), before), seed=5)
-    plain = network(seed=5)
+    adds = Adds(kind, recipient, n=1, alter=replace(**changes), **fields)
+    adds.before = before
+    net, plain = network(transport=adds, seed=5), network(seed=5)
     for other in (net, plain):
         other.run_cycles(2)
-    assert net.transport.done
+    assert adds.n_affected
     assert net.outcomes() == plain.outcomes() == [(1, 1, 'served'), (2, 1, 'served')]
     net.run(limit_s=0.05)
     assert net.counters() == ({recipient: {counter: 1}} if counter else {})
@@ -128,11 +123,7 @@ def test_altered_messages_are_dropped_and_counted(
 
 @pytest.mark.parametrize(('late_s', 'counter'), [(2.5e-3, 'duplicate'), (0.05, 'stale_command')])
 def test_a_duplicate_command_is_answered_again_unless_it_is_stale(network, late_s, counter):
-    def doubles(message, recipient):
-        again = recipient == 'rhs_controller' and matches(message, m.RhsCommand, {'band': 1})
-        return [(1e-3, message), *([(late_s, message)] if again else [])]
-
-    net = network(transport=doubles)
+    net = network(transport=Fault(m.RhsCommand, 'rhs_controller', 1e-3, late_s, band=1))
     net.run_cycles(2)
     net.run(limit_s=0.06)
     assert net.served()[:2] == [1, 1]
@@ -143,12 +134,8 @@ def test_a_duplicate_command_is_answered_again_unless_it_is_stale(network, late_
 @pytest.mark.parametrize('late_s', [0.03, 0.11])
 def test_a_late_duplicate_grant_changes_no_position(network, scenario, late_s):
     """The user has finished the cycle, and the channel has begun the next one."""
-    def doubles(message, recipient):
-        again = [(late_s, message)] if isinstance(message, m.Grant) else []
-        return [(1e-3, message), *again]
-
     walk = mobility.RandomWalk(scenario, 50.0, np.random.default_rng(0))
-    net = network({1: walk}, transport=doubles, ordered=False)
+    net = network({1: walk}, transport=Fault(m.Grant, 'user1', 1e-3, late_s), ordered=False)
     net.run_cycles(4)
     assert net.served() == [1] * 4
     assert [truth.cycle_id for truth in net.sent(m.GroundTruth)] == [1, 2, 3, 4]

@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from in_memory_network import Network
 
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES
 from rhs_isac_ros.monitoring.network_state import Overview
@@ -45,9 +46,8 @@ def test_the_view_shows_faults_and_silent_nodes_within_80_columns():
     assert '…' not in text
 
 
-def test_users_keep_their_rows_which_fit_into_80_columns(
-        network_class, scenario, codebooks, places):
-    net = network_class(scenario, codebooks[0], {user: places[user - 1] for user in (1, 2, 3)})
+def test_users_keep_their_rows_which_fit_into_80_columns(scenario, codebooks, places):
+    net = Network(scenario, codebooks[0], {user: places[user - 1] for user in (1, 2, 3)})
     net.run_cycles(5)
     overview, rows = Overview(), []
     for sent in net.log:

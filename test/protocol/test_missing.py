@@ -1,12 +1,10 @@
-"""Roles that crash, restart or are missing at first."""
+"""Roles and users that crash, restart, or are missing at first."""
 
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user as user_role
 from rhs_isac_ros.protocol.base_station import State
-
-pytestmark = pytest.mark.usefixtures('plain_beams')
 
 ROLE_FAULTS = [
     ('rhs_controller', State.CONFIGURING, 'rhs_silent'),
@@ -79,15 +77,6 @@ def test_the_base_station_waits_for_a_role_and_logs_it_once(network, role):
         assert net.logged('user1')[1:] == ['no beacon for 3 s', 'beacons resumed']
 
 
-def test_a_role_missing_briefly_between_cycles_costs_no_cycle(network):
-    net = network()
-    net.run_cycles(1)
-    net.restart('positioner', noticed=True)
-    net.run_cycles(2)
-    assert net.served() == [1, 1, 1]
-    assert net.logged('bs') == []
-
-
 def test_a_user_without_a_base_station_waits_and_logs_it_once(network):
     net = network(absent=['bs'])
     net.run(limit_s=30.0)
@@ -115,3 +104,66 @@ def test_a_base_station_without_acks_detects_a_missing_role(network):
     net.add('positioner')
     net.run(limit_s=2.0)
     assert net['bs'].state is State.BEACONING
+
+
+def test_a_late_user_is_waited_for_in_the_next_cycle(network):
+    """The first ack ends the beaconing of the first cycle; later acks register their users."""
+    net = network(2)
+    net.run_cycles(1)
+    assert net.served() == [1]
+    assert net['bs'].counters == {'late_ack': 1}
+    net.run_cycles(4)
+    assert net.served() == [1, 2, 1, 2, 1]
+    assert net['bs'].counters == {'late_ack': 1}
+
+
+def beacon_to_grant_s(network, cycle_id):
+    times = {type(s.message): s.time_s for s in network.log
+             if s.message.cycle_id == cycle_id and isinstance(s.message, m.Beacon | m.Grant)}
+    return times[m.Grant] - times[m.Beacon]
+
+
+def test_a_user_lost_while_positioning_is_not_waited_for(network):
+    net = network(2)
+    net.run_cycles(2)
+    net.run_to(State.SOUNDING)
+    assert net.sent(m.Grant)[-1].user == 1
+    net.remove('user1')
+    net.run_cycles(3)
+    assert net.outcomes()[2:] == [(3, 1, 'user_gone'), (4, 2, 'served'), (5, 2, 'served')]
+    assert net['bs'].counters['user_gone'] == 1
+    assert beacon_to_grant_s(net, 4) < 0.01
+    net.add('user1')
+    net.run_cycles(3)
+    assert net.served()[-3:].count(1) >= 1
+    net.verify()
+
+
+def test_a_user_lost_between_cycles_is_waited_for_three_times(network):
+    net = network(2)
+    net.run_cycles(4)
+    net.remove('user2')
+    net.run_cycles(6)
+    assert net.served()[4:] == [1] * 6
+    waits = [beacon_to_grant_s(net, cycle_id) > 0.09 for cycle_id in range(5, 11)]
+    assert waits == [True] * 3 + [False] * 3
+
+
+def test_waiting_for_a_missing_user_ends_no_cycle_of_another_user(network):
+    """The time to wait for acks may exceed the time that a user waits for its grant."""
+    net = network(2, ack_timeout_s=3.0)
+    net.run_cycles(4)
+    net.remove('user2')
+    net.run_cycles(5)
+    assert set(net.ends()) == {'served'}
+    assert net['user1'].counters == {'not_granted': 3}
+
+
+@pytest.mark.parametrize('state', [State.ESTIMATING, State.STEERING, State.TRANSMITTING])
+def test_a_user_lost_after_positioning_loses_only_its_data(network, state):
+    net = network(2)
+    net.run_cycles(2)
+    net.run_to(state)
+    net.remove('user1')
+    net.run_cycles(2)
+    assert net.outcomes()[2:] == [(3, 1, 'data_lost'), (4, 2, 'served')]

@@ -1,18 +1,16 @@
-"""New settings take effect with the next cycle, and no cycle mixes two."""
+"""New settings and codebooks take effect with the next cycle, and no cycle mixes two."""
 
-import dataclasses
 
 import pytest
+from in_memory_network import on_time
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station import STEPS, State
 from rhs_isac_ros.protocol.events import PeersChanged, StoodBy
-from rhs_isac_ros.protocol.settings import Impairments, PositionerSettings
+from rhs_isac_ros.protocol.settings import PositionerSettings
 
-pytestmark = pytest.mark.usefixtures('plain_beams')
-
-IN_A_CYCLE = [State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
-              State.TRANSMITTING]
+WITH_ID = (m.RhsCommand, m.RhsConfiguration, m.ReceivedSignals, m.PositionEstimate, m.Beam,
+           m.Capacity)
 UNFIT = {'estimator': 'neural', 'model_file': 'unfit'}
 
 
@@ -20,6 +18,13 @@ def status_of(net, role, prefix):
     """Return the status values of a role whose names have a prefix."""
     return {name: value for name, value in net[role].status().items()
             if name.startswith(prefix)}
+
+
+def ids(network, cycle_id):
+    """Return the codebook ids in the messages of a cycle."""
+    found = [message for kind in WITH_ID for message in network.sent(kind, cycle_id=cycle_id)]
+    assert {type(message) for message in found} == set(WITH_ID)
+    return {message.codebook_id for message in found}
 
 
 def estimators(net):
@@ -30,12 +35,16 @@ def estimators(net):
     return found
 
 
-@pytest.mark.parametrize('state', [*IN_A_CYCLE, State.RESTING, State.BEACONING],
-                         ids=lambda state: state.value)
-def test_noise_does_not_change_within_a_cycle(network, state):
-    net = network()
+each_state = pytest.mark.parametrize(
+    'state', [State.RESTING, State.BEACONING, *STEPS], ids=lambda state: state.value)
+
+
+@each_state
+def test_codebook_and_settings_take_effect_with_the_next_cycle(network, codebooks, state):
+    net = network(2)
     net.run_cycles(2)
     net.run_to(state)
+    net.offer(codebooks[1])
     net.change('bs', receiver_noise=False)
     waits = state is not State.RESTING
     assert status_of(net, 'bs', 'pending') == (
@@ -43,28 +52,16 @@ def test_noise_does_not_change_within_a_cycle(network, state):
     assert status_of(net, 'bs', 'parameter.receiver') == {
         'parameter.receiver_noise': str(waits).lower()}
     net.run_cycles(3)
-    assert [outcome for _, _, outcome in net.outcomes()] == ['served'] * 5
+    assert net.ends() == ['served'] * 5
     assert status_of(net, 'bs', 'pending') == {}
     assert net.logged('bs') == ["settings applied: receiver_noise 'false'"]
+    assert not any('wrong' in reason for c in net.counters().values() for reason in c)
     # The reference signals use the noise setting at the time of the grant.
     net.verify()
     first = 4 if waits else 3
-    assert [net._noise[cycle_id] for cycle_id in range(1, 6)] == [
-        cycle_id < first for cycle_id in range(1, 6)]
-
-
-def test_a_policy_takes_effect_with_the_next_cycle_and_keeps_the_turns(network):
-    net = network(3)
-    net.run_cycles(2)
-    net.run_to(State.SOUNDING)
-    net.change('bs', policy='first')
-    net.run_cycles(3)
-    # The rest of the current cycle, then the first user to answer; all answer at once.
-    first = net.sent(m.Ack, cycle_id=4)[0].user
-    assert net.served() == [1, 2, 3, first, first]
-    net.change('bs', policy='round_robin')
-    net.run_cycles(2)
-    assert set(net.served()[-2:]) == {1, 2, 3} - {first}
+    for cycle_id in range(1, 6):
+        assert ids(net, cycle_id) == {codebooks[cycle_id >= first].id}
+        assert net._noise[cycle_id] == (cycle_id < first)
 
 
 def test_a_list_of_users_without_any_present_user_can_be_corrected(network):
@@ -92,22 +89,18 @@ def test_settings_take_effect_when_no_cycle_follows(network, options, state, eve
     assert status_of(net, 'bs', 'parameter.policy') == {'parameter.policy': 'random'}
 
 
-def test_a_long_pause_ends_when_it_is_shortened(network):
-    net = network(rest_s=3000.0)
-    net.run_cycles(1)
-    net.run(limit_s=1.0)
-    net.change('bs', rest_s=0.1)
-    net.run_cycles(2, limit_s=3.0)
-
-
-def test_a_pause_set_in_a_cycle_applies_after_it(network):
+def test_a_rest_set_in_a_cycle_applies_after_it_and_can_be_shortened(network):
     net = network(rest_s=0.1)
-    net.run_to(State.STEERING)
-    net.change('bs', rest_s=30.0)
-    net.run_cycles(1)
-    end_s = net.now_s
-    net.run_to(State.BEACONING)
-    assert net.now_s == pytest.approx(end_s + 30.0, abs=0.01)
+    for rest_s in (30.0, 3000.0):
+        net.run_to(State.STEERING)
+        net.change('bs', rest_s=rest_s)
+        net.run_cycles(1)
+        end_s = net.now_s
+        if rest_s == 3000.0:
+            net.run(limit_s=1.0)
+            net.change('bs', rest_s=29.0)
+        net.run_to(State.BEACONING)
+        assert net.now_s == pytest.approx(end_s + 30.0, abs=0.01)
 
 
 def test_retries_change_after_the_cycle(network):
@@ -118,7 +111,7 @@ def test_retries_change_after_the_cycle(network):
     net.run_cycles(1)
     assert net.outcomes() == [(1, 1, 'user_gone')]
     assert not net.sent(m.PilotRequest)[1:]
-    net.transport = lambda message, recipient: [(1e-3, message)]
+    net.transport = on_time
     net.run_to(State.SOUNDING)
     net.transport = lambda message, recipient: []
     before = len(net.sent(m.PilotRequest))
@@ -126,8 +119,7 @@ def test_retries_change_after_the_cycle(network):
     assert len(net.sent(m.PilotRequest)) == before + 3
 
 
-@pytest.mark.parametrize('state', [*IN_A_CYCLE, State.RESTING, State.BEACONING],
-                         ids=lambda state: state.value)
+@each_state
 @pytest.mark.parametrize('make_s', [0.0, 0.8])
 def test_an_estimator_changes_between_cycles_and_none_is_lost(network, state, make_s):
     net = network(make_s=make_s, step_timeout_s=2.0, begin_s=0.0)
@@ -138,7 +130,7 @@ def test_an_estimator_changes_between_cycles_and_none_is_lost(network, state, ma
     assert status_of(net, 'positioner', 'pending') == waiting
     net.run(lambda: not status_of(net, 'positioner', 'pending'))
     net.run_cycles(2)
-    assert {outcome for _, _, outcome in net.outcomes()} == {'served'}
+    assert set(net.ends()) == {'served'}
     names = list(estimators(net).values())
     assert names[:2] == ['centre'] * 2
     assert names == sorted(names) and names[-1] == 'ml'
@@ -153,7 +145,7 @@ def test_the_old_estimator_is_kept_if_the_new_one_cannot_be_built(network, make_
     net.run_cycles(2)
     net.change('positioner', **UNFIT)
     net.run_cycles(10)
-    assert {outcome for _, _, outcome in net.outcomes()} == {'served'}
+    assert set(net.ends()) == {'served'}
     assert set(estimators(net).values()) == {'centre'}
     assert net.kept == [PositionerSettings()]
     assert net.logged('positioner')[1:] == [
@@ -199,7 +191,7 @@ def test_estimator_and_codebook_change_together(network, codebooks, codebook_fir
     for act in acts if codebook_first else acts[::-1]:
         act()
     net.run_cycles(15)
-    assert {outcome for _, _, outcome in net.outcomes()} == {'served'}
+    assert set(net.ends()) == {'served'}
     last = net.sent(m.PositionEstimate)[-1]
     assert last.codebook_id == codebooks[1].id
     assert last.estimator == ('ml' if changed is not UNFIT else 'centre')
@@ -229,14 +221,64 @@ def test_impairments_change_when_a_cycle_begins(network):
     net.run_cycles(1)
     # Two bands and the data.
     assert net.now_s - begin_s > 0.6
-    shown = {f'parameter.{name}': str(value).lower()
-             for name, value in dataclasses.asdict(
-                 Impairments(multipath_memory=False, delay_s=0.2)).items()}
-    assert status_of(net, 'channel', 'p') == shown
+    assert status_of(net, 'channel', 'parameter.delay_s') == {'parameter.delay_s': '0.2'}
+    assert status_of(net, 'channel', 'pending') == {}
+    net.change('channel', loss_probability=1.0)
+    net.run_cycles(1)
+    assert net.ends() == ['served'] * 3 + ['channel_silent']
+
+
+# Codebooks
+
+
+@pytest.mark.parametrize(('before', 'state', 'offered', 'used'), [
+    # Of two codebooks in one cycle, the last takes effect, even if it is the one in use.
+    *(((), state, (1, 2), (0, 0, 2)) for state in (State.BEACONING, *STEPS)),
+    ((), State.SOUNDING, (1, 0), (0, 0, 0)), ((1,), State.BEACONING, (2,), (0, 1, 2))])
+def test_the_last_codebook_that_was_offered_takes_effect(
+        network, codebooks, before, state, offered, used):
+    net = network()
+    net.run_cycles(1)
+    for number in before:
+        net.offer(codebooks[number])
+    net.run_to(state)
+    for number in offered:
+        net.offer(codebooks[number])
+    net.run_cycles(2)
     assert net.served() == [1, 1, 1]
-    net.change('channel', loss_probability=1.0, delay_s=0.0)
+    assert [ids(net, cycle_id) for cycle_id in (1, 2, 3)] == [
+        {codebooks[number].id} for number in used]
+    net.verify()
+
+
+@pytest.mark.parametrize('role', ['rhs_controller', 'positioner', 'transmission'])
+def test_a_role_that_receives_the_codebook_late_costs_one_cycle(network, codebooks, role):
+    reasons = {'rhs_controller': 'rhs_silent', 'positioner': 'positioner_silent',
+               'transmission': 'transmission_silent'}
+    net = network()
+    net.run_cycles(1)
+    handle = net[role].handle
+    net[role].handle = lambda event, now_s: []
+    net.offer(codebooks[1])
+    net[role].handle = handle
+    net.run_cycles(1)
+    assert net.outcomes()[1:] == [(2, 1, reasons[role])]
+    # The controller receives a command for each band.
+    assert net[role].counters == {'wrong_codebook': 2 if role == 'rhs_controller' else 1}
+    net.offer(codebooks[1])
+    net.run_cycles(1)
+    assert net.outcomes()[2:] == [(3, 1, 'served')]
+    net.verify()
+
+
+def test_a_codebook_offered_while_nobody_answers_costs_no_cycle(network, codebooks, places):
+    """Beaconing without users may last for hours, with a new codebook meanwhile."""
+    net = network(0)
+    net.run(limit_s=1.0)
+    net.offer(codebooks[1])
+    net.run(limit_s=1.0)
+    net.add_user(1, places[0])
     net.run_cycles(2)
-    assert net.outcomes()[3:] == [(4, 1, 'channel_silent'), (5, 1, 'channel_silent')]
-    net.change('channel', loss_probability=0.0)
-    net.run_cycles(2)
-    assert net.served()[3:] == [1, 1]
+    assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'served')]
+    assert ids(net, 1) == ids(net, 2) == {codebooks[1].id}
+    net.verify()
