@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+import functools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -14,8 +15,8 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Event, LogMessage, Outcome, Timeout
-from rhs_isac_ros.protocol.receiver import Reception
-from rhs_isac_ros.protocol.role import ANY, Drops, Row, StateMachine, on
+from rhs_isac_ros.protocol.receiver import Combine, Reception, SignalCollector
+from rhs_isac_ros.protocol.role import ANY, AnyRow, Drops, Row, on
 from rhs_isac_ros.protocol.settings import BaseStationSettings, PendingSettings
 from rhs_isac_ros.protocol.transmission import Carriers, Steering
 from rhs_isac_ros.protocol.user_registry import (
@@ -79,14 +80,13 @@ def reply(success: bool, text: str) -> Callable[['BaseStation', Event], None]:
 reply_resumed = reply(True, 'resumed{waiting}')
 
 
-class BaseStation(StateMachine):
+class BaseStation(SignalCollector):
     """The role that runs the cycles: it invites, selects, locates and serves users.
 
     Parameters
     ----------
     receiver
-        Callable that takes (codebook, feeds [N_B, F, N_SB, K], user, cycle_id, whether to add
-        noise) and returns the received signals, complex128 [N_B, N_SB, F].
+        Combines the signals at the feeds.
     first_cycle_id
         Id of the first cycle. After a restart, it must exceed all earlier ids, so that messages
         still in transit are recognised as stale.
@@ -102,13 +102,13 @@ class BaseStation(StateMachine):
     BLOCKED_STATES = frozenset({State.WAITING})
     WORLD_STATES = frozenset({State.RESTING})
 
+    _cycle: Cycle
+
     def __init__(
             self, scenario: Scenario, settings: BaseStationSettings, rng: np.random.Generator,
-            receiver: Callable[[Codebook, np.ndarray, int, int, bool], np.ndarray],
-            first_cycle_id: int = 1, library: Library = EMPTY) -> None:
-        super().__init__(State.WAITING)
-        self._scenario, self._receiver = scenario, receiver
-        self._bands = frozenset(range(scenario.n_bands))
+            receiver: Combine, first_cycle_id: int = 1, library: Library = EMPTY) -> None:
+        super().__init__(State.WAITING, scenario, receiver, Cycle(first_cycle_id - 1))
+        self._scenario = scenario
         self._users = UserRegistry(settings.policy, rng)
         self._settings = PendingSettings(settings)
         self._admission = _admission(settings)
@@ -117,7 +117,6 @@ class BaseStation(StateMachine):
         self._proposals = Proposals(library)
         # Roles that are missing; None before the first report.
         self._missing: tuple[str, ...] | None = None
-        self._cycle = Cycle(first_cycle_id - 1)
         self._carriers = Carriers()
         self._service = ServiceLog()
 
@@ -187,21 +186,8 @@ class BaseStation(StateMachine):
     def _may_retry(self, event: Timeout) -> bool:
         return self.repeats < self._settings.in_use.retries
 
-    def _wrong_cycle(self, event: m.Message) -> bool:
-        return event.cycle_id != self._cycle.cycle_id
-
-    def _wrong_user(self, event: Any) -> bool:
-        return bool(event.user != self._cycle.user)
-
-    def _wrong_instance(self, event: m.FeedSignals) -> bool:
-        return not (m.same_instance(event.user_instance, self._cycle.user_instance)
-                    and m.same_instance(event.sender, self._cycle.channel))
-
     def _wrong_codebook(self, event: Any) -> bool:
         return event.codebook_id not in ('', self._cycle.codebook_id)
-
-    def _duplicate_signals(self, event: m.FeedSignals) -> bool:
-        return event.band in self._cycle.signals
 
     def _not_delivered_uplink(self, event: m.Data) -> bool:
         return event.stage is m.Stage.OFFERED or event.direction is m.Direction.DOWNLINK
@@ -225,9 +211,6 @@ class BaseStation(StateMachine):
         """Return whether the channel is missing, or has not answered all pilots of the user."""
         return ('channel' in (self._missing or ())
                 or not self._cycle.piloted <= self._cycle.signals.keys())
-
-    def _last_signals(self, event: m.FeedSignals) -> bool:
-        return self._cycle.signals.keys() | {event.band} == self._bands
 
     def _for_positioning(self, event: m.RhsConfiguration) -> bool:
         return event.mode is m.Mode.POSITIONING
@@ -271,7 +254,7 @@ class BaseStation(StateMachine):
     def _store_settings(self, event: events.SettingsOffered) -> None:
         self._settings.latest = event.settings
 
-    def _apply_settings(self, event: Event) -> None:
+    def _apply_settings(self, event: Event | None = None) -> None:
         if changes := self._settings.apply():
             self.log(changes)
             settings = self._settings.in_use
@@ -357,30 +340,27 @@ class BaseStation(StateMachine):
                      key=f'lost {lost[0]} {instances[lost[0]]}' if len(lost) == 1 else 'lost')
 
     def _command_bands(self, event: Event) -> None:
-        for band in sorted(self._bands - self._cycle.configured):
-            self._send(m.RhsCommand, band=band)
+        self._command(sorted(self._bands - self._cycle.configured))
 
     def _command_silent_bands(self, event: Event) -> None:
-        for band in sorted(self._bands - self._cycle.signals.keys()):
+        self._command(self._silent_bands())
+
+    def _command(self, bands: Iterable[int]) -> None:
+        for band in bands:
             self._send(m.RhsCommand, band=band)
 
     def _store_configured(self, event: m.RhsConfiguration) -> None:
         self._cycle.configured.add(event.band)
 
     def _request_pilots(self, event: Event) -> None:
-        first = min(self._bands - self._cycle.signals.keys())
-        self._send(m.PilotRequest, band=first, last_band=max(self._bands),
+        self._send(m.PilotRequest, band=self._silent_bands()[0], last_band=max(self._bands),
                    n_frames=self._scenario.n_frames)
 
     def _store_piloted(self, event: m.Pilot) -> None:
         self._cycle.piloted.add(event.band)
 
-    def _store_signals(self, event: m.FeedSignals) -> None:
-        self._cycle.store(event)
-
     def _send_signals(self, event: m.FeedSignals) -> None:
-        received = self._cycle.combined(
-            self._receiver, self._settings.in_use.receiver_noise)
+        received = self._cycle.combined(self._combine, self._settings.in_use.receiver_noise)
         self._cycle.received = received
         self.send(received)
         self._announce(m.Phase.ESTIMATING)
@@ -432,11 +412,15 @@ class BaseStation(StateMachine):
         self._end_cycle('served')
 
     def _end_cycle(self, outcome: str) -> None:
-        """Report the end of a cycle; a cycle without a fix counts as completed by its user."""
+        """Report the end of a cycle, and apply the settings for the next one.
+
+        A cycle without a fix counts as completed by its user.
+        """
         self._users.end_cycle(
             self._cycle.user, self._cycle.began_s[m.Phase.BEACONING], self.now_s,
             completed=outcome in ('served', Outcome.NO_FIX.value))
         self._report(m.Phase.BEACONING, outcome)
+        self._apply_settings()
 
     def _announce(self, phase: m.Phase) -> None:
         self._cycle.began_s[phase] = self.now_s
@@ -449,12 +433,19 @@ class BaseStation(StateMachine):
                    elapsed_s=float(self.now_s - beacon_s))
 
     # Conditions under which a message of a cycle is dropped.
-    _OF_CYCLE: Drops = {_wrong_cycle: Outcome.WRONG_CYCLE}
-    _SAME_USER: Drops = {_wrong_user: Outcome.WRONG_USER}
-    _OF_USER: Drops = _OF_CYCLE | _SAME_USER
+    _OF_USER = SignalCollector._OF_USER
     _OF_CODEBOOK: Drops = {_wrong_codebook: Outcome.WRONG_CODEBOOK}
     _DELIVERED: Drops = {_not_delivered_uplink: None}
     _ELSEWHERE: Drops = {_sounds_elsewhere: None}
+    # The row that repeats the request of a step, and the row that ends its cycle.
+    _retry = functools.partial(AnyRow, guard=_may_retry, restart_timeout=True)
+    _give_up = functools.partial(AnyRow, target=State.RESTING)
+    # A beam and its configuration come from two roles of each surface, in either order.
+    _ANSWER = (
+        AnyRow((State.ESTIMATING,), (_store_answer,), State.STEERING),
+        AnyRow((State.STEERING,), (_store_answer, _begin_transmission), State.TRANSMITTING,
+               guard=_last_answer),
+        AnyRow((State.STEERING,), (_store_answer,)))
 
     # In each table, the first matching row for an event applies. The operator and the other roles
     # decide when cycles begin.
@@ -497,7 +488,8 @@ class BaseStation(StateMachine):
     _ADMISSION = (
         *on(m.Ack, 'ack', {_not_allowed: Outcome.NOT_ALLOWED, _too_often: Outcome.TOO_OFTEN})(
             # All acks that pass these two checks count towards the rate limit.
-            Row(ANY, (_count_ack,), guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+            Row(ANY, (_count_ack,), guard=SignalCollector._wrong_cycle,
+                outcome=Outcome.WRONG_CYCLE),
             # If several nodes have the same number, the first one is served.
             Row(ANY, (_count_ack, _reject_number), guard=_number_taken,
                 outcome=Outcome.NUMBER_TAKEN),
@@ -519,76 +511,61 @@ class BaseStation(StateMachine):
                 guard=_pausing_or_not_ready),
             Row((State.BEACONING,), (_apply_settings, _beacon_again), outcome=Outcome.UNANSWERED,
                 restart_timeout=True),
-            Row((State.CONFIGURING,), (_command_bands,), guard=_may_retry,
-                outcome=Outcome.RETRY_RHS, restart_timeout=True),
-            Row((State.CONFIGURING,), (_abandon, _apply_settings), State.RESTING,
-                outcome=Outcome.RHS_SILENT),
+            _retry((State.CONFIGURING,), (_command_bands,), outcome=Outcome.RETRY_RHS),
+            _give_up((State.CONFIGURING,), (_abandon,), outcome=Outcome.RHS_SILENT),
             # Repeat the command too, because the channel may have missed the report of the RHS.
-            Row((State.SOUNDING,), (_command_silent_bands, _request_pilots), guard=_may_retry,
-                outcome=Outcome.RETRY_BAND, restart_timeout=True),
-            Row((State.SOUNDING,), (_abandon, _apply_settings), State.RESTING,
-                guard=_signals_due, outcome=Outcome.CHANNEL_SILENT),
-            Row((State.SOUNDING,), (_remove_user, _abandon, _apply_settings), State.RESTING,
-                outcome=Outcome.USER_GONE),
-            Row((State.ESTIMATING,), (_resend_signals,), guard=_may_retry,
-                outcome=Outcome.RETRY_POSITION, restart_timeout=True),
-            Row((State.ESTIMATING,), (_abandon, _apply_settings), State.RESTING,
-                outcome=Outcome.POSITIONER_SILENT),
+            _retry((State.SOUNDING,), (_command_silent_bands, _request_pilots),
+                   outcome=Outcome.RETRY_BAND),
+            _give_up((State.SOUNDING,), (_abandon,), guard=_signals_due,
+                     outcome=Outcome.CHANNEL_SILENT),
+            _give_up((State.SOUNDING,), (_remove_user, _abandon), outcome=Outcome.USER_GONE),
+            _retry((State.ESTIMATING,), (_resend_signals,), outcome=Outcome.RETRY_POSITION),
+            _give_up((State.ESTIMATING,), (_abandon,), outcome=Outcome.POSITIONER_SILENT),
             # A surface that does not answer is not awaited in the next cycle either.
             Row((State.STEERING,), (_begin_transmission,), State.TRANSMITTING, guard=_some_ready),
             # Roles answer a repeated message again, so repeated signals lead to the beam again.
-            Row((State.STEERING,), (_resend_signals,), guard=_may_retry,
-                outcome=Outcome.RETRY_BEAM, restart_timeout=True),
-            Row((State.STEERING,), (_abandon, _apply_settings), State.RESTING,
-                outcome=Outcome.TRANSMISSION_SILENT),
+            _retry((State.STEERING,), (_resend_signals,), outcome=Outcome.RETRY_BEAM),
+            _give_up((State.STEERING,), (_abandon,), outcome=Outcome.TRANSMISSION_SILENT),
             # The channel may have missed the beam or its configuration, or another surface can
             # carry the data.
-            Row((State.TRANSMITTING,), (_note_loss, _resend_signals, _send_downlink),
-                guard=_may_retry, outcome=Outcome.RETRY_DATA, restart_timeout=True),
-            Row((State.TRANSMITTING,), (_note_loss, _abandon, _apply_settings), State.RESTING,
-                outcome=Outcome.DATA_LOST)),
+            _retry((State.TRANSMITTING,), (_note_loss, _resend_signals, _send_downlink),
+                   outcome=Outcome.RETRY_DATA),
+            _give_up((State.TRANSMITTING,), (_note_loss, _abandon), outcome=Outcome.DATA_LOST)),
         *on(m.RhsConfiguration, 'configured')(
             Row(ANY, (_await_surface,), guard=_shown_late, outcome=Outcome.WRONG_CYCLE)),
-        *on(m.RhsConfiguration, 'configured', _ELSEWHERE | _OF_CYCLE | _OF_CODEBOOK)(
+        *on(m.RhsConfiguration, 'configured',
+              _ELSEWHERE | SignalCollector._OF_CYCLE | _OF_CODEBOOK)(
             # The report concerns the configurations of a band or the configuration of the beam.
             Row((State.CONFIGURING,), (_store_configured, _request_pilots), State.SOUNDING,
                 guard=_last_configuration),
             Row((State.CONFIGURING, State.SOUNDING), (_store_configured,), guard=_for_positioning),
             Row((State.ESTIMATING, State.STEERING, State.TRANSMITTING), guard=_for_positioning,
                 outcome=Outcome.DUPLICATE),
-            # The beam and its configuration come from two roles, in either order.
-            Row((State.ESTIMATING,), (_store_answer,), State.STEERING),
-            Row((State.STEERING,), (_store_answer, _begin_transmission), State.TRANSMITTING,
-                guard=_last_answer),
-            Row((State.STEERING,), (_store_answer,)),
+            *_ANSWER,
             Row((State.TRANSMITTING, State.RESTING), (_store_answer,), guard=_late_surface),
             # A repeated request may be answered twice.
             Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
         # Only who is silent, the user or the channel, depends on the pilots.
         *on(m.Pilot, 'pilot', _OF_USER)(Row(ANY, (_store_piloted,))),
-        *on(m.FeedSignals, 'signals', _OF_USER | {_wrong_instance: Outcome.WRONG_INSTANCE,
-                                        _duplicate_signals: Outcome.DUPLICATE})(
-            Row((State.SOUNDING,), (_store_signals, _send_signals), State.ESTIMATING,
-                guard=_last_signals),
-            Row((State.SOUNDING,), (_store_signals,), State.SOUNDING)),
+        *on(m.FeedSignals, 'signals', SignalCollector._OF_SIGNALS)(
+            Row((State.SOUNDING,), (SignalCollector._store_signals, _send_signals),
+                State.ESTIMATING, guard=SignalCollector._last_signals),
+            Row((State.SOUNDING,), (SignalCollector._store_signals,), State.SOUNDING)),
         *on(m.PositionEstimate, 'estimate', _OF_USER | _OF_CODEBOOK)(
             Row((State.ESTIMATING,), (_store_estimate,), State.STEERING),
             Row((State.STEERING,), (_store_estimate,)),
             Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
         *on(m.NoFix, 'no_fix', _OF_USER | _OF_CODEBOOK)(
-            Row((State.ESTIMATING,), (_abandon, _apply_settings), State.RESTING,
-                outcome=Outcome.NO_FIX)),
+            _give_up((State.ESTIMATING,), (_abandon,), outcome=Outcome.NO_FIX)),
         *on(m.Beam, 'beam')(
-            Row(ANY, (_await_surface,), guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE)),
-        *on(m.Beam, 'beam', _SAME_USER | _OF_CODEBOOK)(
-            Row((State.ESTIMATING,), (_store_answer,), State.STEERING),
-            Row((State.STEERING,), (_store_answer, _begin_transmission), State.TRANSMITTING,
-                guard=_last_answer),
-            Row((State.STEERING,), (_store_answer,)),
+            Row(ANY, (_await_surface,), guard=SignalCollector._wrong_cycle,
+                outcome=Outcome.WRONG_CYCLE)),
+        *on(m.Beam, 'beam', SignalCollector._SAME_USER | _OF_CODEBOOK)(
+            *_ANSWER,
             Row((State.TRANSMITTING,), (_store_answer,), guard=_late_surface),
             Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
         *on(m.Data, 'delivered', _DELIVERED | _OF_USER)(
-            Row((State.TRANSMITTING,), (_finish, _apply_settings), State.RESTING),
+            Row((State.TRANSMITTING,), (_finish,), State.RESTING),
             Row((State.PAUSED, State.RESTING), outcome=Outcome.DUPLICATE)),
     )
 

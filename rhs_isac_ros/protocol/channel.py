@@ -321,10 +321,16 @@ class Channel(Role):
         """Return what the surface is to show for a message, [F, N_E]; None if still unknown."""
         if isinstance(event, m.Pilot):
             return self._configurations.get((event.cycle_id, m.Mode.POSITIONING, event.band))
-        beam = self._beams.get((event.cycle_id, event.user))
-        if beam is None or cycle.rate_bps is None:
+        steered = self._steered(cycle)
+        return steered and steered[1]
+
+    def _steered(self, cycle: _Cycle) -> tuple[m.Beam, np.ndarray] | None:
+        """Return the beam of a cycle, and what the surface shows for it, [1, N_E]."""
+        beam = self._beams.get((cycle.truth.cycle_id, cycle.truth.user))
+        if beam is None:
             return None
-        return self._configurations[event.cycle_id, m.Mode.TRANSMISSION, beam.band]
+        shown = self._configurations.get((beam.cycle_id, m.Mode.TRANSMISSION, beam.band))
+        return None if shown is None else (beam, shown)
 
     def _resume(self, applied: PatternsApplied) -> None:
         """Answer a message whose configurations were shown, unless its cycle is over."""
@@ -376,14 +382,10 @@ class Channel(Role):
 
     def _rate_bps(self, cycle: _Cycle) -> float | None:
         """Return the true capacity [bit/s]; None until the beam and its configuration arrive."""
-        beam = self._beams.get((cycle.truth.cycle_id, cycle.truth.user))
-        if beam is None:
+        if (steered := self._steered(cycle)) is None:
             return None
-        configurations = self._configurations.get(
-            (cycle.truth.cycle_id, m.Mode.TRANSMISSION, beam.band))
-        if configurations is None:
-            return None
-        (applied,) = self._coefficients(configurations, beam.band)
+        beam, shown = steered
+        (applied,) = self._coefficients(shown, beam.band)
         digital = beam.digital
         if cycle.factors is not None:
             # The phases of the factors do not change the capacity.

@@ -3,6 +3,7 @@
 import dataclasses
 import enum
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered, Outcome, SettingsOffered
-from rhs_isac_ros.protocol.role import ANY, Row, StateMachine, on
+from rhs_isac_ros.protocol.role import ANY, Drops, Row, StateMachine, on
 from rhs_isac_ros.protocol.settings import PendingSettings, ReceiverSettings
 from rhs_isac_ros.support import streams
 
@@ -65,6 +66,46 @@ class Reception:
                 self.codebook, feeds, self.user, self.cycle_id, noise))
 
 
+class SignalCollector(StateMachine):
+    """A role that collects the feed signals of one cycle at a time; `cycle` is the first one."""
+
+    def __init__(self, initial: enum.Enum, scenario: Scenario, combine: Combine,
+                 cycle: Reception) -> None:
+        super().__init__(initial)
+        self._combine, self._cycle = combine, cycle
+        self._bands = frozenset(range(scenario.n_bands))
+
+    def _silent_bands(self) -> list[int]:
+        """Return the bands whose signals are missing, in ascending order."""
+        return sorted(self._bands - self._cycle.signals.keys())
+
+    def _wrong_cycle(self, event: m.Message) -> bool:
+        return event.cycle_id != self._cycle.cycle_id
+
+    def _wrong_user(self, event: Any) -> bool:
+        return bool(event.user != self._cycle.user)
+
+    def _wrong_instance(self, event: m.FeedSignals) -> bool:
+        return not (m.same_instance(event.user_instance, self._cycle.user_instance)
+                    and m.same_instance(event.sender, self._cycle.channel))
+
+    def _duplicate_signals(self, event: m.FeedSignals) -> bool:
+        return event.band in self._cycle.signals
+
+    def _last_signals(self, event: m.FeedSignals) -> bool:
+        return self._silent_bands() == [event.band]
+
+    def _store_signals(self, event: m.FeedSignals) -> None:
+        self._cycle.store(event)
+
+    # Conditions under which a message of a cycle is dropped.
+    _OF_CYCLE: Drops = {_wrong_cycle: Outcome.WRONG_CYCLE}
+    _SAME_USER: Drops = {_wrong_user: Outcome.WRONG_USER}
+    _OF_USER: Drops = _OF_CYCLE | _SAME_USER
+    _OF_SIGNALS: Drops = _OF_USER | {
+        _wrong_instance: Outcome.WRONG_INSTANCE, _duplicate_signals: Outcome.DUPLICATE}
+
+
 class State(enum.Enum):
     """States of the receiver."""
 
@@ -72,7 +113,7 @@ class State(enum.Enum):
     SOUNDING = 'sounding'    # waits for the feed signals of all bands
 
 
-class Receiver(StateMachine):
+class Receiver(SignalCollector):
     """The role that receives the pilots of each granted cycle with a surface of its own.
 
     Pilots are uplink, so all surfaces receive the same ones. The receiver commands its surface
@@ -86,12 +127,9 @@ class Receiver(StateMachine):
 
     def __init__(self, scenario: Scenario, combine: Combine,
                  settings: ReceiverSettings | None = None) -> None:
-        super().__init__(State.LISTENING)
-        self._combine = combine
-        self._bands = frozenset(range(scenario.n_bands))
+        super().__init__(State.LISTENING, scenario, combine, Reception(0))
         self._settings = PendingSettings(settings or ReceiverSettings())
         self._codebook: Codebook | None = None
-        self._cycle = Reception(0)
 
     def status(self) -> dict[str, str]:
         """Return the settings and the codebook in use."""
@@ -105,22 +143,6 @@ class Receiver(StateMachine):
     def _same_cycle(self, event: m.Grant) -> bool:
         return event.cycle_id == self._cycle.cycle_id and event.user == self._cycle.user
 
-    def _wrong_cycle(self, event: m.FeedSignals) -> bool:
-        return event.cycle_id != self._cycle.cycle_id
-
-    def _wrong_user(self, event: m.FeedSignals) -> bool:
-        return event.user != self._cycle.user
-
-    def _wrong_instance(self, event: m.FeedSignals) -> bool:
-        return not (m.same_instance(event.user_instance, self._cycle.user_instance)
-                    and m.same_instance(event.sender, self._cycle.channel))
-
-    def _duplicate_signals(self, event: m.FeedSignals) -> bool:
-        return event.band in self._cycle.signals
-
-    def _last_signals(self, event: m.FeedSignals) -> bool:
-        return self._cycle.signals.keys() | {event.band} == self._bands
-
     # Steps
 
     def _store_codebook(self, event: CodebookOffered) -> None:
@@ -131,9 +153,9 @@ class Receiver(StateMachine):
         self.log(self._settings.apply())
 
     def _give_up(self, event: m.Grant) -> None:
-        user, missing = self._cycle.user, sorted(self._bands - self._cycle.signals.keys())
+        user = self._cycle.user
         self.log_state(f'signals of user {user}', f'cycle {self._cycle.cycle_id}: no signals of '
-                       f'user {user} in the bands {missing}', True)
+                       f'user {user} in the bands {self._silent_bands()}', True)
 
     def _begin(self, event: m.Grant) -> None:
         """Begin a cycle, and command the configurations of all bands."""
@@ -141,9 +163,6 @@ class Receiver(StateMachine):
                                 event.user_instance)
         for band in sorted(self._bands):
             self.send(m.derive(m.RhsCommand, self._cycle, band=band))
-
-    def _store_signals(self, event: m.FeedSignals) -> None:
-        self._cycle.store(event)
 
     def _send_signals(self, event: m.FeedSignals) -> None:
         cycle = self._cycle
@@ -159,10 +178,8 @@ class Receiver(StateMachine):
             Row((State.SOUNDING,), (_give_up, _begin), State.SOUNDING,
                 outcome=Outcome.INCOMPLETE),
             Row((State.LISTENING,), (_begin,), State.SOUNDING)),
-        *on(m.FeedSignals, 'signals', {
-            _wrong_cycle: Outcome.WRONG_CYCLE, _wrong_user: Outcome.WRONG_USER,
-            _wrong_instance: Outcome.WRONG_INSTANCE, _duplicate_signals: Outcome.DUPLICATE})(
-            Row((State.SOUNDING,), (_store_signals, _send_signals), State.LISTENING,
-                guard=_last_signals),
-            Row((State.SOUNDING,), (_store_signals,))),
+        *on(m.FeedSignals, 'signals', SignalCollector._OF_SIGNALS)(
+            Row((State.SOUNDING,), (SignalCollector._store_signals, _send_signals),
+                State.LISTENING, guard=SignalCollector._last_signals),
+            Row((State.SOUNDING,), (SignalCollector._store_signals,))),
     )

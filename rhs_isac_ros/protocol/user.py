@@ -9,7 +9,7 @@ import numpy as np
 from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.mobility import Crowd, Mobility
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Outcome, PeersChanged, Timeout
+from rhs_isac_ros.protocol.events import Event, Outcome, PeersChanged, Timeout
 from rhs_isac_ros.protocol.role import ANY, REMEMBERED_CYCLES, NewestDict, Row, StateMachine, on
 
 # Number of consecutive steps in which a granted user may receive nothing: the steps that wait for
@@ -25,6 +25,10 @@ class State(enum.Enum):
     NO_BEACON = 'no_beacon'        # has waited for a beacon for longer than the timeout
     ACKNOWLEDGED = 'acknowledged'  # waits for the grant
     GRANTED = 'granted'            # a user is being positioned and served
+
+
+# States of connected users without a granted cycle.
+NOT_GRANTED = (State.LISTENING, State.NO_BEACON, State.ACKNOWLEDGED)
 
 
 class User(StateMachine):
@@ -82,6 +86,13 @@ class User(StateMachine):
 
     def _time_s(self, now_s: float) -> float:
         return self._world_s() if self._world_s else now_s
+
+    def react(self, event: Event) -> None:
+        """Process an event, and log that beacons have resumed."""
+        before = self.state
+        super().react(event)
+        if before is State.NO_BEACON and self.state not in self.BLOCKED_STATES:
+            self.log_state('beacons', 'beacons resumed', False)
 
     def timeout_s(self, state: enum.Enum) -> float | None:
         """Return the timeout of a state [s], or None if it has none."""
@@ -155,9 +166,6 @@ class User(StateMachine):
     def _log_no_beacon(self, event: Timeout) -> None:
         self.log_state('beacons', f'no beacon for {self._beacon_s:g} s', True)
 
-    def _log_resumed(self, event: m.Beacon | m.Grant) -> None:
-        self.log_state('beacons', 'beacons resumed', False)
-
     def _log_other_instance(self, event: m.Grant) -> None:
         text = m.describe_conflict(event.user, event.user_instance)
         self.log('' if event.user in self._conflicts else text, warning=True)
@@ -208,15 +216,10 @@ class User(StateMachine):
             Row(ANY, guard=_stale_beacon, outcome=Outcome.STALE_BEACON),
             Row((State.DISCONNECTED,)),
             # A beacon to other users shows that the base station is active, and the cycle is over.
-            Row((State.LISTENING,), (_note_beacon,), guard=_invites_others, restart_timeout=True),
-            Row((State.NO_BEACON,), (_log_resumed, _note_beacon), State.LISTENING,
-                guard=_invites_others),
-            Row((State.ACKNOWLEDGED,), (_note_beacon,), State.LISTENING, guard=_invites_others),
+            Row(NOT_GRANTED, (_note_beacon,), State.LISTENING, guard=_invites_others),
             Row((State.GRANTED,), (_note_beacon,), State.LISTENING, guard=_invites_others,
                 outcome=Outcome.ABANDONED),
-            Row((State.LISTENING,), (_acknowledge,), State.ACKNOWLEDGED),
-            Row((State.NO_BEACON,), (_log_resumed, _acknowledge), State.ACKNOWLEDGED),
-            Row((State.ACKNOWLEDGED,), (_acknowledge,), restart_timeout=True),
+            Row(NOT_GRANTED, (_acknowledge,), State.ACKNOWLEDGED),
             Row((State.GRANTED,), (_acknowledge,), State.ACKNOWLEDGED, outcome=Outcome.ABANDONED)),
         *on(m.Grant, 'grant')(
             Row((State.ACKNOWLEDGED,), target=State.LISTENING, guard=_other_user_granted),
@@ -227,8 +230,7 @@ class User(StateMachine):
             Row(ANY, guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE),
             Row(ANY, guard=_late_grant, outcome=Outcome.LATE_GRANT),
             # The base station may wait longer than the user, so a grant may follow the timeout.
-            Row((State.LISTENING, State.ACKNOWLEDGED), (_publish_position,), State.GRANTED),
-            Row((State.NO_BEACON,), (_log_resumed, _publish_position), State.GRANTED),
+            Row(NOT_GRANTED, (_publish_position,), State.GRANTED),
             Row((State.GRANTED,))),
         *on(m.PilotRequest, 'pilot_request', {_other_user: None,
                              _other_instance: None,

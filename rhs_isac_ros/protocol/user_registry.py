@@ -1,6 +1,5 @@
 """The users of a base station: admission, turns, owners of numbers, codebooks, log of service."""
 
-import bisect
 import collections
 import dataclasses
 import math
@@ -60,8 +59,6 @@ class UserRegistry:
         self._users: dict[int, _User] = {}
         # Time at which a conflict was last observed [s] and its description, by number.
         self._conflicts: dict[int, tuple[float, str]] = {}
-        # The registered users in ascending order.
-        self._numbers: list[int] = []
         # The registered users that were invited and have not answered yet.
         self._awaited: set[int] = set()
         # Users to serve once before all others, in the order of the requests.
@@ -88,12 +85,12 @@ class UserRegistry:
         cycle that nobody answered; the range grows with it.
         """
         self.answered = {}
-        numbers, size = self._numbers, INVITED * _EXTENSION**min(attempt, 8)
+        numbers, size = sorted(self._users), INVITED * _EXTENSION**min(attempt, 8)
         self.all_invited = size >= len(numbers)
         if self.all_invited:
             self._awaited = set(numbers)
             return 1, LAST_NUMBER
-        begin = bisect.bisect_left(numbers, self._next()) // size * size
+        begin = numbers.index(self._next(numbers)) // size * size
         invited = numbers[begin:begin + size]
         self._awaited = set(invited)
         return (numbers[begin - 1] + 1 if begin else 1,
@@ -103,9 +100,9 @@ class UserRegistry:
         """Serve a user once before all others, as soon as the user answers."""
         self._requested[user] = None
 
-    def _next(self) -> int:
+    def _next(self, numbers: list[int]) -> int:
         """Return the registered user whose turn it is."""
-        users = self._preferred(self._numbers)
+        users = self._preferred(numbers)
         return users[self._turn * INVITED % len(users)] if self.policy == 'first' else (
             self._choose(users))
 
@@ -147,7 +144,6 @@ class UserRegistry:
         # no user gains a turn by leaving and returning.
         if user is None:
             user = self._users[number] = _User((self._turn, 0, number), instance=instance)
-            bisect.insort(self._numbers, number)
         elif self.policy == 'round_robin' and number in self._awaited:
             user.turn = self._turn, 0, number
         warning = ''
@@ -166,9 +162,8 @@ class UserRegistry:
 
     def remove(self, number: int) -> None:
         """Remove a user until the user answers again, and release the number."""
-        if self._users.pop(number, None) is not None:
-            del self._numbers[bisect.bisect_left(self._numbers, number)]
-            self._awaited.discard(number)
+        self._users.pop(number, None)
+        self._awaited.discard(number)
 
     def owner(self, number: int) -> int:
         """Return the instance that owns a number; 0 if there is none or it is unknown."""
@@ -183,7 +178,7 @@ class UserRegistry:
 
     def remove_all_except(self, is_allowed: Callable[[int], bool]) -> list[int]:
         """Remove and return the users that are not allowed."""
-        removed = [user for user in self._numbers if not is_allowed(user)]
+        removed = [user for user in sorted(self._users) if not is_allowed(user)]
         for user in removed:
             self.remove(user)
         return removed
