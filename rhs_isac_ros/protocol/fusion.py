@@ -152,8 +152,13 @@ class Fusion(Role):
         if key in self._closed:
             self._answer_again(name, *self._closed[key])
         elif fix is None:
-            due_s = self.now_s + self._settings.in_use.wait_s
-            self.count(Outcome.OVERFLOW, self._open.put(key, _Fix(due_s, {name: message})))
+            wait_s = self._settings.in_use.wait_s
+            if any(cycle_id < message.cycle_id for cycle_id, _ in self._open):
+                self.log(f'wait_s: {wait_s:g} s, expected less than step_timeout_s of the base '
+                         'station, which began another cycle meanwhile', warning=True,
+                         key='wait_s')
+            self.count(Outcome.OVERFLOW, self._open.put(
+                key, _Fix(self.now_s + wait_s, {name: message})))
         elif name in fix.answers:
             self.count(Outcome.DUPLICATE)
         else:

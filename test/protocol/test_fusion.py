@@ -232,6 +232,15 @@ def test_a_mixture_that_cannot_be_located_is_dropped_and_logged(fusion, answer):
     assert fusion.counters == {'malformed': 1}
 
 
+def test_a_wait_beyond_the_next_cycle_is_logged(fusion, answer):
+    fusion.handle(answer('front'), 0.0)
+    assert texts(fusion.handle(answer('front', 2), WAIT_S / 2)) == [
+        'wait_s: 0.2 s, expected less than step_timeout_s of the base station, which began '
+        'another cycle meanwhile']
+    fusion.handle(Timeout(), 2 * WAIT_S)
+    assert texts(fusion.handle(answer('front', 3), 1.0)) == []
+
+
 def test_a_new_time_to_wait_applies_to_the_next_cycle(fusion, answer):
     actions = fusion.handle(SettingsOffered(FusionSettings(wait_s=1.0)), 0.0)
     assert texts(actions) == ["settings applied: wait_s '1.0'"]
