@@ -330,14 +330,14 @@ class BaseStation(SignalCollector):
 
     def _lose_absent(self) -> None:
         """Count missed invitations, and remove the users that no longer answer."""
-        instances = {user: self._users.owner(user) for user in self._users.awaited}
         lost = self._users.remove_absent()
         self.count(Outcome.USER_LOST, len(lost))
-        if lost:
-            plural, verb = ('s', 'answer') if len(lost) > 1 else ('', 'answers')
-            # A restarted user is another one; many users are one event.
-            self.log(f'user{plural} {join_users(lost)} no longer {verb}', warning=True,
-                     key=f'lost {lost[0]} {instances[lost[0]]}' if len(lost) == 1 else 'lost')
+        # A restarted user is another one; many users are one event.
+        if len(lost) == 1:
+            ((user, instance),) = lost.items()
+            self.log(f'user {user} no longer answers', True, f'lost {user} {instance}')
+        elif lost:
+            self.log(f'users {join_users(lost)} no longer answer', True, 'lost')
 
     def _command_bands(self, event: Event) -> None:
         self._command(sorted(self._bands - self._cycle.configured))

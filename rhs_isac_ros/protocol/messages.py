@@ -134,7 +134,8 @@ def _array_problem(
     return (f'{value.min():g} to {value.max():g}, expected {declared.range}' if has_range else '')
 
 
-_LAST_USER = 2**32 - 1
+# Highest number of a user in a message.
+LAST_USER = 2**32 - 1
 # Highest magnitude of the coordinates in a message [m].
 MAX_COORDINATE_M = 1e6
 _MAX_BITS = 1e15
@@ -239,22 +240,22 @@ class Beacon(Message):
     """Invitation from the base station to a range of users to take part in a cycle."""
 
     attempt: int
-    first_user: int = number(1, _LAST_USER, default=1)
-    last_user: int = number(1, _LAST_USER, default=_LAST_USER)
+    first_user: int = number(1, LAST_USER, default=1)
+    last_user: int = number(1, LAST_USER, default=LAST_USER)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Ack(Message):
     """Request from a user to be served."""
 
-    user: int = number(1, _LAST_USER)
+    user: int = number(1, LAST_USER)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Grant(Message):
     """Assignment of the cycle to a user."""
 
-    user: int = number(1, _LAST_USER)
+    user: int = number(1, LAST_USER)
     user_instance: int = 0
 
 
@@ -284,7 +285,7 @@ class RhsConfiguration(Message):
 class PilotRequest(Message):
     """Request to a user for pilots in the bands `band` to `last_band`, in ascending order."""
 
-    user: int = number(1, _LAST_USER)
+    user: int = number(1, LAST_USER)
     user_instance: int = 0
     band: int = index('N_B')
     last_band: int = index('N_B')
@@ -295,7 +296,7 @@ class PilotRequest(Message):
 class Pilot(Message):
     """Pilots of a user in one band: a symbol of unit magnitude for each frame."""
 
-    user: int = number(1, _LAST_USER)
+    user: int = number(1, LAST_USER)
     band: int = index('N_B')
     symbols: np.ndarray = array('F', complex, low=0.99, high=1.01)
 
@@ -307,7 +308,7 @@ class FeedSignals(Message):
     The sender divides the signals of each frame by the symbol of the pilots.
     """
 
-    user: int = number(1, _LAST_USER)
+    user: int = number(1, LAST_USER)
     user_instance: int = 0
     band: int = index('N_B')
     signals: np.ndarray = array('F N_SB K', complex)
@@ -317,7 +318,7 @@ class FeedSignals(Message):
 class ReceivedSignals(Message):
     """Signals of a positioning phase in all bands, combined over the feeds."""
 
-    user: int = number(1, _LAST_USER)
+    user: int = number(1, LAST_USER)
     user_instance: int = 0
     codebook_id: str
     signals: np.ndarray = array('N_B N_SB F', complex)
@@ -327,7 +328,7 @@ class ReceivedSignals(Message):
 class PositionEstimate(Message):
     """Estimate of the position of a user, in the frame of the site."""
 
-    user: int = number(1, _LAST_USER)
+    user: int = number(1, LAST_USER)
     user_instance: int = 0
     codebook_id: str
     position: np.ndarray = array('3', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M,
@@ -352,7 +353,7 @@ _MAX_COMPONENTS = 256
 class Posterior(Message):
     """What one or all surfaces know about the position of a user, in the frame of the site."""
 
-    user: int = number(1, _LAST_USER)
+    user: int = number(1, LAST_USER)
     user_instance: int = 0
     codebook_id: str
     log_weights: np.ndarray = array('COMPONENTS')
@@ -398,7 +399,7 @@ class Posterior(Message):
 class NoFix(Message):
     """Report that the received signals yield no position."""
 
-    user: int = number(1, _LAST_USER)
+    user: int = number(1, LAST_USER)
     codebook_id: str
     reason: str
 
@@ -407,7 +408,7 @@ class NoFix(Message):
 class Beam(Message):
     """Beam of the transmission phase."""
 
-    user: int = number(1, _LAST_USER)
+    user: int = number(1, LAST_USER)
     codebook_id: str
     band: int = index('N_B')
     analog: np.ndarray = array('N_E', low=0, high=1)
@@ -419,7 +420,7 @@ class Beam(Message):
 class Data(Message):
     """Number of bits offered or delivered in one direction of the transmission phase."""
 
-    user: int = number(1, _LAST_USER)
+    user: int = number(1, LAST_USER)
     direction: Direction
     stage: Stage
     duration_s: float = number(0, 3600)
@@ -430,7 +431,7 @@ class Data(Message):
 class Capacity(Message):
     """Capacities of the beam in a cycle, and of a beam chosen for the true position."""
 
-    user: int = number(1, _LAST_USER)
+    user: int = number(1, LAST_USER)
     codebook_id: str
     band: int = index('N_B')
     expected_bps: float = number(0, _MAX_BITS)
@@ -457,7 +458,7 @@ class CapacityStatistics(Message):
 class GroundTruth(Message):
     """True position and velocity of a user, in the frame of the site."""
 
-    user: int = number(1, _LAST_USER)
+    user: int = number(1, LAST_USER)
     position: np.ndarray = array('3', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M,
                                  in_front=True)
     velocity: np.ndarray = array('3')
@@ -467,7 +468,7 @@ class GroundTruth(Message):
 class GroundTruths(Message):
     """True positions and velocities of all users of one node, in the frame of the site."""
 
-    users: np.ndarray = array('USERS', int, low=1, high=_LAST_USER)
+    users: np.ndarray = array('USERS', int, low=1, high=LAST_USER)
     position: np.ndarray = array('USERS 3', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M,
                                  in_front=True)
     velocity: np.ndarray = array('USERS 3')
@@ -489,7 +490,7 @@ class GroundTruths(Message):
 class ProtocolState(Message):
     """Report that a phase of a cycle has begun, or that the cycle has ended."""
 
-    user: int = number(0, _LAST_USER)
+    user: int = number(0, LAST_USER)
     phase: Phase
     outcome: str
     began_s: np.ndarray = array('4', nan_allowed=True)

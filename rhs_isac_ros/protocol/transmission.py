@@ -158,8 +158,8 @@ class Transmission(Role):
         self._counted: NewestDict[int, None] = NewestDict(REMEMBERED_CYCLES)
         self._waiting: collections.deque[_Waiting] = collections.deque()
         self._active_s = -math.inf
-        # Figures of the newest reports, in a ring buffer.
-        self._reported, self._n_reported = np.empty((window, len(_FIGURES))), 0
+        # Figures of the newest reports.
+        self._reported: collections.deque[list[float]] = collections.deque(maxlen=window)
 
     def react(self, event: Event) -> None:
         """Process an event: send the beam, or the capacity and its statistics."""
@@ -275,10 +275,7 @@ class Transmission(Role):
         if not math.isfinite(report.loss_percent) or report.cycle_id in self._counted:
             return
         self._counted.put(report.cycle_id, None)
-        self._reported[self._n_reported % len(self._reported)] = [
-            getattr(report, name) for name in _FIGURES]
-        self._n_reported += 1
-        newest = self._reported[:self._n_reported]
-        quartiles = np.quantile(newest, (0.25, 0.5, 0.75), axis=0).T
-        self.send(m.derive(m.CapacityStatistics, report, n_reports=len(newest),
+        self._reported.append([getattr(report, name) for name in _FIGURES])
+        quartiles = np.quantile(self._reported, (0.25, 0.5, 0.75), axis=0).T
+        self.send(m.derive(m.CapacityStatistics, report, n_reports=len(self._reported),
                            **dict(zip(_FIGURES, quartiles, strict=True))))

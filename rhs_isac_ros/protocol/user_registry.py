@@ -17,7 +17,6 @@ from rhs_isac_ros.protocol.role import NewestDict
 POLICIES = ('round_robin', 'first', 'random')
 # Highest user number that is ever accepted. It bounds the memory, whatever acks arrive.
 MAX_USERS = 4096
-LAST_NUMBER = 2**32 - 1
 # Number of registered users that the first beacon of a cycle invites, and the factor by which each
 # further beacon increases it. The number is small: a cycle serves one user, and acks take time.
 INVITED, _EXTENSION = 8, 8
@@ -89,22 +88,19 @@ class UserRegistry:
         self.all_invited = size >= len(numbers)
         if self.all_invited:
             self._awaited = set(numbers)
-            return 1, LAST_NUMBER
-        begin = numbers.index(self._next(numbers)) // size * size
+            return 1, m.LAST_USER
+        users = self._preferred(numbers)
+        due = users[self._turn * INVITED % len(users)] if self.policy == 'first' else (
+            self._choose(users))
+        begin = numbers.index(due) // size * size
         invited = numbers[begin:begin + size]
         self._awaited = set(invited)
         return (numbers[begin - 1] + 1 if begin else 1,
-                invited[-1] if begin + size < len(numbers) else LAST_NUMBER)
+                invited[-1] if begin + size < len(numbers) else m.LAST_USER)
 
     def request(self, user: int) -> None:
         """Serve a user once before all others, as soon as the user answers."""
         self._requested[user] = None
-
-    def _next(self, numbers: list[int]) -> int:
-        """Return the registered user whose turn it is."""
-        users = self._preferred(numbers)
-        return users[self._turn * INVITED % len(users)] if self.policy == 'first' else (
-            self._choose(users))
 
     def _preferred(self, users: Iterable[int]) -> list[int]:
         """Return the given users that take precedence: a requested one, else seniors, else all."""
@@ -190,19 +186,17 @@ class UserRegistry:
             return True
         return self._awaited <= {user}
 
-    @property
-    def awaited(self) -> frozenset[int]:
-        """The registered users that were invited and have not answered yet."""
-        return frozenset(self._awaited)
+    def remove_absent(self) -> dict[int, int]:
+        """Count missed invitations; remove the users that missed too many in a row.
 
-    def remove_absent(self) -> list[int]:
-        """Count missed invitations; remove and return the users that missed too many in a row."""
-        lost = []
-        for number in sorted(self._awaited):
+        Returns the instances of their nodes by number, in ascending order.
+        """
+        for number in self._awaited:
             self._users[number].missed += 1
-            if self._users[number].missed >= _MAX_MISSED:
-                self.remove(number)
-                lost.append(number)
+        lost = {number: self._users[number].instance for number in sorted(self._awaited)
+                if self._users[number].missed >= _MAX_MISSED}
+        for number in lost:
+            self.remove(number)
         return lost
 
     def select(self) -> int:
@@ -234,7 +228,7 @@ _RANGE = re.compile(r'\s*(\d+)\s*(?:-\s*(\d+)\s*)?')
 def parse_users(text: str) -> tuple[range, ...]:
     """Parse a possibly empty list of user numbers and ranges, such as ``1, 4, 10-20``.
 
-    Raises ValueError if a part is not a number from 1 to `LAST_NUMBER` or an ascending range.
+    Raises ValueError if a part is not a number from 1 to `LAST_USER` or an ascending range.
     """
     return tuple(_parse_range(part) for part in text.split(',')) if text.strip() else ()
 
@@ -242,8 +236,8 @@ def parse_users(text: str) -> tuple[range, ...]:
 def _parse_range(part: str) -> range:
     match = _RANGE.fullmatch(part)
     first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, 0)
-    if not 1 <= first <= last <= LAST_NUMBER:
-        raise ValueError(f'{part.strip()!r}, expected numbers from 1 to {LAST_NUMBER} and ranges '
+    if not 1 <= first <= last <= m.LAST_USER:
+        raise ValueError(f'{part.strip()!r}, expected numbers from 1 to {m.LAST_USER} and ranges '
                          'such as 10-20')
     return range(first, last + 1)
 
@@ -265,7 +259,7 @@ class Admission:
 
     def __init__(self, allowed_users: str, max_users: int, rate_hz: float) -> None:
         self._max_users, self._rate_hz = max_users, rate_hz
-        self._allowed = parse_users(allowed_users) or (range(LAST_NUMBER + 1),)
+        self._allowed = parse_users(allowed_users) or (range(m.LAST_USER + 1),)
         # Number of acks by user in the current second; cleared each second, to bound the memory.
         self._acks: collections.Counter[int] = collections.Counter()
         self._second = 0

@@ -1,45 +1,68 @@
-"""Tracks of users in the network, on the bus in memory and from the signals alone."""
+"""Tracks of users, and codebooks that follow them."""
 
 import numpy as np
 import pytest
-from in_memory_network import Network
+from in_memory_network import LATENCY_S, Fault, Network
 
 from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.codebook.library import EMPTY, Library, Plan
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.mobility import Waypoints
-from rhs_isac_ros.positioning import TrackEstimate, make_estimator
+from rhs_isac_ros.positioning import BayesEstimator, TrackEstimate
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import PauseRequested, ResumeRequested
 from rhs_isac_ros.protocol.positioner import Tracks
+from rhs_isac_ros.protocol.settings import PositionerSettings
 
 PLACE = np.array([8.0, -2.0, 0.5])
+TRACK = PositionerSettings(prior='track')
 
 
 @pytest.fixture(scope='module')
 def scenario():
-    return Scenario(n_subbands=4, n_frames=2, elements_per_side=6, roi_center_m=(8.0, 0.0, 0.0),
+    return Scenario(center_frequencies_hz=(2.5e9, 2.56e9, 2.58e9, 2.6e9), n_subbands=4,
+                    n_frames=2, elements_per_side=6, roi_center_m=(8.0, 0.0, 0.0),
                     roi_size_m=(4.0, 6.0, 2.0))
 
 
 @pytest.fixture(scope='module')
-def codebook(scenario):
+def region(scenario):
     return random_codebook(scenario, np.random.default_rng(1))
 
 
 @pytest.fixture(scope='module')
-def estimator(scenario, codebook):
-    return make_estimator('bayes', scenario, codebook)
+def library(scenario, region):
+    """Random codebooks for 12 cells of 2 m x 2 m x 1 m."""
+    plan = Plan(scenario.unplaced.id, region.id, 'error', (0.5,), (2.0,))
+    cells, rng = plan.cells(scenario), np.random.default_rng(2)
+    return Library.of(plan, cells, [random_codebook(scenario, rng) for _ in cells])
+
+
+@pytest.fixture(scope='module')
+def estimator(scenario, region):
+    return BayesEstimator(scenario, region)
 
 
 @pytest.fixture
-def signals(scenario, codebook):
+def net(scenario, region, library, estimator):
+    """Function that returns a network with the prior ``track``; `follows` gives it the library."""
+    def make(place=PLACE, follows=True, **options):
+        users = place if isinstance(place, dict) else {1: place}
+        return Network(scenario, region, users, library=library if follows else EMPTY,
+                       positioner=TRACK, make=lambda codebook: estimator, **options)
+    return make
+
+
+@pytest.fixture
+def signals(scenario, region):
     """Function that returns the signals of a cycle of a user at a fixed place."""
-    model, rng = MeasurementModel(scenario, codebook), np.random.default_rng(2)
+    model, rng = MeasurementModel(scenario, region), np.random.default_rng(2)
 
     def make(cycle_id, user=1, **fields):
-        drawn = model.sample(PLACE[None], rng)[0].reshape(codebook.digital.shape[:3])
+        drawn = model.sample(PLACE[None], rng)[0].reshape(region.digital.shape[:3])
         return m.ReceivedSignals(
-            cycle_id=cycle_id, user=user, codebook_id=codebook.id, signals=drawn, **fields)
+            cycle_id=cycle_id, user=user, codebook_id=region.id, signals=drawn, **fields)
     return make
 
 
@@ -100,19 +123,9 @@ def test_the_number_of_tracks_is_bounded(monkeypatch, locate):
     assert len(locate.tracks._tracks) == 2
 
 
-@pytest.fixture
-def tracked(scenario, codebook, estimator):
-    """Function that runs a network with the prior ``track``."""
-    def make(users, **options):
-        network = Network(scenario, codebook, users, make=lambda codebook: estimator,
-                          rest_s=0.02, ack_timeout_s=0.01, **options)
-        network.change('positioner', prior='track')
-        return network
-    return make
-
-
-def test_users_that_share_the_cycles_have_tracks_that_the_beam_uses(tracked):
-    network = tracked({1: PLACE, 2: Waypoints([[7, 1, 0], [7, -1, 0], [9, -1, 0]], 1.0)})
+def test_users_that_share_the_cycles_have_tracks_that_the_beam_uses(net):
+    network = net({1: PLACE, 2: Waypoints([[7, 1, 0], [7, -1, 0], [9, -1, 0]], 1.0)},
+                  follows=False, rest_s=0.02, ack_timeout_s=0.01)
     network.run_cycles(50)
     assert {track.user for track in network.tracks} == {1, 2}
     for user in (1, 2):
@@ -126,8 +139,8 @@ def test_users_that_share_the_cycles_have_tracks_that_the_beam_uses(tracked):
     assert network['positioner'].status()['parameter.prior'] == 'track'
 
 
-def test_the_prior_region_ends_all_tracks(tracked):
-    network = tracked({1: PLACE})
+def test_the_prior_region_ends_all_tracks(net):
+    network = net(follows=False)
     network.run_cycles(10)
     network.change('positioner', prior='region')
     network.run_cycles(2)
@@ -137,3 +150,117 @@ def test_the_prior_region_ends_all_tracks(tracked):
     network.change('positioner', prior='track')
     network.run_cycles(5)
     assert network.tracks[seen].estimate.n_phases == 1
+
+
+# Codebooks
+
+
+def used(network):
+    """Return the id of the codebook in each cycle."""
+    return [signals.codebook_id for signals in network.sent(m.ReceivedSignals)]
+
+
+def test_codebooks_follow_a_walk(net, library, region):
+    network = net(Waypoints([[8, -2.5, 0.5], [8, 2.5, 0.5]], 1.0))
+    network.run_cycles(40)
+    assert network.served() == [1] * 40
+    ids = used(network)
+    # The interval between cycles, and therefore the prediction, is known after two cycles.
+    assert ids[:2] == [region.id] * 2
+    assert set(ids[2:]) <= set(library.by_id)
+    assert len(set(ids[2:])) >= 3
+    network.verify()
+    # Each estimator is prepared once.
+    assert len(network.prepared) == len(set(ids[2:]))
+    # The watch on residuals goes on.
+    assert network['positioner'].status()['residual.fixes'] == '40'
+    assert not any('wrong' in reason for c in network.counters().values() for reason in c)
+
+
+class Jump:
+    """A user that is 3 m away after a time [s]."""
+
+    def __init__(self, time_s):
+        self.time_s = time_s
+
+    def state(self, time_s):
+        return PLACE + [0.0, 3.0 * (time_s > self.time_s), 0.0], np.zeros(3)
+
+
+def test_a_user_that_jumps_is_found_within_three_cycles(net, library, region):
+    network = net(Jump(1.0))
+    network.run(lambda: network.now_s > 1.0)
+    network.run_cycles(4)
+    ids, estimates = used(network), network.sent(m.PositionEstimate)
+    errors = [estimate.position - network.sent(
+        m.GroundTruth, cycle_id=estimate.cycle_id)[0].position for estimate in estimates]
+    jumped = next(n for n, estimate in enumerate(estimates)
+                  if network.sent(m.GroundTruth, cycle_id=estimate.cycle_id)[0].position[1] > 0)
+    assert ids[jumped] in library.by_id
+    # The signals speak against the track, although most of its weight is still at the old place.
+    assert region.id in ids[jumped + 1:jumped + 3]
+    for error, estimate in zip(errors[jumped + 2:], estimates[jumped + 2:], strict=True):
+        # A chi-square variable with three degrees of freedom exceeds 21.1 with probability 1e-4.
+        assert error @ np.linalg.solve(estimate.covariance_m2, error) < 21.1
+        assert np.linalg.norm(error) < 1.5
+
+
+@pytest.mark.parametrize(('fault', 'outcome'), [
+    (Fault(m.PositionEstimate, 'bs', LATENCY_S, cycle_id=6,
+           alter=lambda estimate: m.derive(m.NoFix, estimate, reason='none')), 'no_fix'),
+    (Fault(m.Beam, 'rhs_controller', cycle_id=6), 'transmission_silent')])
+def test_a_cycle_without_service_is_followed_by_one_for_the_whole_region(
+        net, library, region, fault, outcome):
+    network = net(transport=fault, step_timeout_s=0.1)
+    network.run_cycles(8)
+    assert network.ends()[5:] == [outcome, 'served', 'served']
+    assert used(network)[5] in library.by_id
+    assert used(network)[6] == region.id
+    assert used(network)[7] in library.by_id
+
+
+def pause(network):
+    network.dispatch('bs', PauseRequested())
+    network.run(limit_s=3.0)
+    network.dispatch('bs', ResumeRequested())
+
+
+@pytest.mark.parametrize('interrupt', [pause, lambda network: network.restart('user1')],
+                         ids=['pause', 'restart of the user'])
+def test_a_proposal_ends_with_time_and_with_its_user(net, library, region, interrupt):
+    network = net()
+    network.run_cycles(5)
+    interrupt(network)
+    network.run_cycles(1)
+    assert used(network)[4] in library.by_id
+    assert used(network)[-1] == region.id
+
+
+@pytest.mark.parametrize('role', ['positioner', 'bs'])
+def test_a_positioner_or_base_station_without_the_library_uses_the_codebook_of_the_region(
+        net, region, role):
+    network = net(without_library=[role])
+    network.run_cycles(5)
+    assert used(network) == [region.id] * 5
+
+
+def test_a_controller_without_the_library_rejects_its_codebooks(net, region):
+    network = net(without_library=['rhs_controller'])
+    network.run_cycles(6)
+    # After the long interval, the next prediction is too uncertain for a codebook.
+    assert network.ends() == ['served', 'served', 'rhs_silent'] * 2
+    assert set(used(network)) == {region.id}
+    assert 'library: none' in network.logged('rhs_controller')[0]
+
+
+def test_signals_of_a_cell_without_a_track_are_searched_in_the_whole_region(
+        net, scenario, library):
+    network = net()
+    cell = library.codebook_at(PLACE, 0.3)
+    drawn = MeasurementModel(scenario, cell).sample(PLACE[None], np.random.default_rng(3))[0]
+    before = len(network.sent(m.PositionEstimate))
+    network.dispatch('positioner', m.ReceivedSignals(
+        cycle_id=1, user=7, codebook_id=cell.id,
+        signals=drawn.reshape(cell.digital.shape[:3])))
+    (estimate,) = network.sent(m.PositionEstimate)[before:]
+    assert np.linalg.norm(estimate.position - PLACE) < 1.5

@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.protocol.user_registry import (
-    LAST_NUMBER,
-    POLICIES,
-    SILENT_S,
-    UserRegistry,
-    parse_users,
-)
+from rhs_isac_ros.protocol.messages import LAST_USER
+from rhs_isac_ros.protocol.user_registry import POLICIES, SILENT_S, UserRegistry, parse_users
 
 # Number of users that a beacon invites, and of seniors.
 INVITED = 8
@@ -151,7 +146,7 @@ def test_of_many_users_few_are_invited(make, policy):
         registry.select()
     # Together, the ranges contain every number once.
     ranges = sorted(ranges)
-    assert (ranges[0][0], ranges[-1][1]) == (1, LAST_NUMBER)
+    assert (ranges[0][0], ranges[-1][1]) == (1, LAST_USER)
     assert all(first == last + 1 for (_, last), (first, _)
                in zip(ranges, ranges[1:], strict=False))
 
@@ -305,7 +300,7 @@ def test_a_conflict_is_logged_once_until_it_has_ended(instances):
     instances.reject(2)
     assert instances.register(2, FIRST, 15.0) == ''
     assert instances.conflicts(19.0) == {'conflict.user_2': first}
-    assert instances.conflicts(20.1) == {}
+    assert instances.conflicts(20.0) == {}
     instances.reject(2)
     assert instances.register(2, FIRST, 21.0) == first
 
