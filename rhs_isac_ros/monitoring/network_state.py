@@ -50,8 +50,7 @@ class Overview:
     status of each node by name. Both are limited in size, because the keys come from messages.
     """
 
-    def __init__(self, max_users: int = MAX_USERS, max_nodes: int = _MAX_NODES) -> None:
-        self._max_users, self._max_nodes = max_users, max_nodes
+    def __init__(self) -> None:
         self.phase = ''
         self.phase_began_s = math.nan
         self.cycle_id = self.user = self.served = self.given_up = 0
@@ -75,7 +74,7 @@ class Overview:
                 if message.outcome:
                     self._end_cycle(message, now_s)
             case m.GroundTruth():
-                if len(self.users) < self._max_users:
+                if len(self.users) < MAX_USERS:
                     self.users.setdefault(message.user, None)
             case m.ReceivedSignals():
                 self.codebook_id = message.codebook_id
@@ -87,7 +86,7 @@ class Overview:
 
     def add_report(self, node: str, report: Report, now_s: float) -> None:
         """Add a report of a node; the report arrived at `now_s` [s]."""
-        if node in self.nodes or len(self.nodes) < self._max_nodes:
+        if node in self.nodes or len(self.nodes) < _MAX_NODES:
             self.nodes[node] = NodeStatus(report, finite('now_s', now_s))
 
     def rate_hz(self, now_s: float) -> float:
@@ -169,12 +168,11 @@ class UserState:
 class SceneState:
     """The configuration of the surface, the latest beam, and the users by id.
 
-    There are at most `max_users` users, because their ids come from messages. Further users are
+    There are at most `MAX_USERS` users, because their ids come from messages. Further users are
     ignored until others are discarded.
     """
 
-    def __init__(self, max_users: int = MAX_USERS) -> None:
-        self._max_users = max_users
+    def __init__(self) -> None:
         self.configuration: m.RhsConfiguration | None = None
         self.beam: m.Beam | None = None
         self.users: dict[int, UserState] = {}
@@ -192,7 +190,7 @@ class SceneState:
                 for truth in message.each():
                     self.add(truth, now_s)
             case m.GroundTruth() | m.PositionEstimate():
-                if message.user in self.users or len(self.users) < self._max_users:
+                if message.user in self.users or len(self.users) < MAX_USERS:
                     self.users.setdefault(message.user, UserState(message.user, now_s)).add(
                         message, now_s)
 

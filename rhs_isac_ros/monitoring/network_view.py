@@ -75,12 +75,10 @@ Sample: TypeAlias = tuple[str, float, Series]
 class Charts:
     """Computes the samples of the charts from the cycles and reports of a network.
 
-    Only the first `max_series` users, and the first nodes that dropped a message, have series of
-    their own.
+    Only the first users, and the first nodes that dropped a message, have series of their own.
     """
 
-    def __init__(self, max_series: int = _MAX_SERIES) -> None:
-        self._max_series = max_series
+    def __init__(self) -> None:
         self._drawn: set[str] = set()
         self._square_m2 = 0.0
         self._n_fixes = self._n_given_up = 0
@@ -103,7 +101,7 @@ class Charts:
         self._n_dropped.put(node, count)
         yield 'drops/all', sum(self._n_dropped.values()), Series('all nodes', _WHITE)
         name = node.rpartition('/')[2]
-        if count and len(self._nodes) < self._max_series:
+        if count and len(self._nodes) < _MAX_SERIES:
             self._nodes.add(name)
         if name in self._nodes:
             # Python's hash of a string differs between processes.
@@ -116,7 +114,7 @@ class Charts:
 
     def of_cycle(self, cycle: CompleteCycle) -> Iterator[Sample]:
         """Yield the samples of a complete cycle."""
-        if len(self._users) < self._max_series:
+        if len(self._users) < _MAX_SERIES:
             self._users.add(cycle.user)
         if cycle.user in self._users:
             yield (f'error/user_{cycle.user}', cycle.error_m,
@@ -181,13 +179,12 @@ class NetworkView:
     """Converts the messages of a network to entries, in the order of arrival.
 
     `n_cycles` counts the observed cycles; `n_ended` counts the complete cycles and the cycles that
-    were given up. The view contains at most `max_users` users.
+    were given up. The view contains only the first users.
     """
 
-    def __init__(self, scenario: Scenario, charts: Charts | None = None,
-                 max_users: int = _MAX_USERS) -> None:
-        self._scenario, self._max_users = scenario, max_users
-        self._scene, self._log, self._charts = SceneState(), CycleLog(), charts or Charts()
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._scene, self._log, self._charts = SceneState(), CycleLog(), Charts()
         self._cycles: NewestDict[int, int] = NewestDict(_MAX_CYCLES)
         self.n_cycles = self.n_ended = 0
         self._users: list[int] = []
@@ -300,7 +297,7 @@ class NetworkView:
         self._log.clear()
 
     def _shows(self, user: int) -> bool:
-        if user not in self._users and len(self._users) < self._max_users:
+        if user not in self._users and len(self._users) < _MAX_USERS:
             self._users.append(user)
         return user in self._users
 

@@ -54,7 +54,7 @@ class StoodBy:
 class Resumed:
     """The node serves again; another node may have used cycle ids below `first_cycle_id`."""
 
-    first_cycle_id: int = 0
+    first_cycle_id: int
 
 
 @dataclasses.dataclass(frozen=True)

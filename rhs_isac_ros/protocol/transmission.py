@@ -131,9 +131,9 @@ class Transmission(Role):
 
     The true position affects only the reported capacities, never the beam. A report takes as long
     to compute as a beam, so reports are usually computed between cycles. `surface_of` takes the
-    name of a calibration file, and returns the surface in the file, or None for an empty name. The
-    statistics are those of the newest `window` reports. `choose` and `evaluate` take the place of
-    `choose_beam` and `capacity_report`. Estimates may have the codebooks of a `library`, too.
+    name of a calibration file, and returns the surface in the file, or None for an empty name.
+    `choose` and `evaluate` take the place of `choose_beam` and `capacity_report`. Estimates may
+    have the codebooks of a `library`, too.
     """
 
     SENDS = (m.Beam, m.Capacity, m.CapacityStatistics)
@@ -142,7 +142,7 @@ class Transmission(Role):
     def __init__(
             self, scenario: Scenario, settings: TransmissionSettings | None = None,
             surface_of: Callable[[str], SurfaceEstimate | None] = lambda file: None,
-            window: int = _WINDOW, choose: Callable[..., Choice] = choose_beam,
+            choose: Callable[..., Choice] = choose_beam,
             evaluate: Callable[..., CapacityReport] = capacity_report,
             library: Library = EMPTY) -> None:
         super().__init__()
@@ -159,7 +159,7 @@ class Transmission(Role):
         self._waiting: collections.deque[_Waiting] = collections.deque()
         self._active_s = -math.inf
         # Figures of the newest reports.
-        self._reported: collections.deque[list[float]] = collections.deque(maxlen=window)
+        self._reported: collections.deque[list[float]] = collections.deque(maxlen=_WINDOW)
 
     def react(self, event: Event) -> None:
         """Process an event: send the beam, or the capacity and its statistics."""

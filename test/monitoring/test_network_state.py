@@ -40,12 +40,12 @@ def test_users_have_the_results_of_their_latest_cycle(network, codebooks):
 
 
 def test_the_numbers_of_users_and_nodes_are_bounded():
-    overview = Overview(max_users=2, max_nodes=2)
-    for number in (1, 2, 3):
+    overview = Overview()
+    for number in range(1, 4098):
         overview.add(m.GroundTruth(
             cycle_id=1, user=number, position=np.ones(3), velocity=np.zeros(3)), 0.0)
         overview.add_report(f'node_{number}', Report(False, '', {}), 0.0)
-    assert (list(overview.users), list(overview.nodes)) == ([1, 2], ['node_1', 'node_2'])
+    assert len(overview.users) == len(overview.nodes) == 4096
 
 
 def test_phases_follow_each_other_and_have_their_start_times(network):
@@ -154,18 +154,17 @@ def test_the_scene_is_complete_once_every_user_has_an_estimate():
 
 
 def test_the_number_of_users_is_bounded():
-    scene = SceneState(max_users=2)
+    scene, places = SceneState(), np.ones((4097, 3))
     scene.add(m.GroundTruths(
-        cycle_id=0, users=np.arange(1, 4), position=np.ones((3, 3)), velocity=np.zeros((3, 3))),
-        1.0)
-    for message in (truth(4, [9, 0, 0]), estimate(5, [9, 0, 0], 1), estimate(1, [9, 0, 0], 1)):
-        scene.add(message, 2.0)
-    assert list(scene.users) == [1, 2]
+        cycle_id=0, users=np.arange(1, 4098), position=places, velocity=0 * places), 1.0)
+    for user in (5000, 5001, 1):
+        scene.add(estimate(user, [9, 0, 0], 1), 2.0)
+    assert list(scene.users) == [*range(1, 4097)]
     assert scene.users[1].estimate
     # The place of a user that has left is free for another.
-    assert scene.discard_stale(1.5) == [2]
-    scene.add(truth(4, [9, 0, 0]), 2.0)
-    assert list(scene.users) == [1, 4]
+    assert scene.discard_stale(1.5) == [*range(2, 4097)]
+    scene.add(truth(5000, [9, 0, 0]), 2.0)
+    assert list(scene.users) == [1, 5000]
 
 
 def test_an_error_needs_the_true_position_of_its_cycle():

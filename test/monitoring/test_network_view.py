@@ -200,14 +200,14 @@ def test_dropped_messages_are_shown_for_all_nodes_and_for_those_with_any(scenari
     assert values == {'drops/bs': 4, 'drops/all': 4}
 
 
-def test_cycles_of_further_users_are_in_the_charts(watched, scenario):
-    view = NetworkView(scenario, network_view.Charts(max_series=1), max_users=1)
-    entries = [entry for sent in messages_of(watched.run)
-               for entry in view.add(sent.message, sent.time_s)]
-    assert view.n_ended == N_CYCLES
-    assert len([entity for _, entity in on(entries, 'error/root_mean_square')
-                if isinstance(entity, Number)]) == N_CYCLES
-    assert {path for _, path, _ in entries if path.startswith('error/user_')} == {'error/user_1'}
-    assert len([entity for _, entity in on(entries, 'error/others')
-                if isinstance(entity, Number)]) == N_CYCLES / 2
-    assert not any(path.startswith(f'{network_view.WORLD}/user_2') for _, path, _ in entries)
+def test_only_the_first_users_have_a_series_and_a_place_in_the_scene(network, scenario, places):
+    run = network({user: places[0] for user in range(1, 7)})
+    run.run_cycles(7)
+    view = NetworkView(scenario)
+    entries = [entry for sent in messages_of(run) for entry in view.add(sent.message, sent.time_s)]
+    assert len({entry.path for entry in entries if entry.path.startswith('error/user_')}) == 4
+    for path, n in (('error/root_mean_square', 7), ('error/others', 2)):
+        assert len([entity for _, entity in on(entries, path) if isinstance(entity, Number)]) == n
+    shown = [user for user in range(1, 200) if view.add(m.GroundTruth(
+        cycle_id=0, user=user, position=np.ones(3), velocity=np.zeros(3)), 0.0)]
+    assert shown == [*range(1, 65)]
