@@ -29,29 +29,31 @@ def array(
     the entries are positions in front of the surface, in the frame of the site.
     """
     return dataclasses.field(
-        metadata={'dims': tuple(dims.split()), 'declared': Field(kind, low=low, high=high),
-                  'nan_allowed': nan_allowed, 'in_front': in_front})
+        metadata={'check': _array_problem, 'dims': tuple(dims.split()),
+                  'declared': Field(kind, low=low, high=high), 'nan_allowed': nan_allowed,
+                  'in_front': in_front})
 
 
 def index(symbol: str) -> Any:
     """Declare an index field, from 0 to one less than the size `symbol` in `Scenario.sizes`."""
-    return dataclasses.field(metadata={'index_of': symbol})
+    return dataclasses.field(metadata={'check': _index_problem, 'index_of': symbol})
 
 
 def number(low: float, high: float, default: Any = dataclasses.MISSING) -> Any:
     """Declare a number field with an inclusive range."""
     return dataclasses.field(
-        default=default, metadata={'declared': Field(float, low=low, high=high)})
+        default=default,
+        metadata={'check': _number_problem, 'declared': Field(float, low=low, high=high)})
 
 
 def size(symbol: str) -> Any:
     """Declare a field that must equal the size `symbol` in `Scenario.sizes`."""
-    return dataclasses.field(metadata={'equals': symbol})
+    return dataclasses.field(metadata={'check': _size_problem, 'equals': symbol})
 
 
 def optional_float() -> Any:
     """Declare a number field in which NaN stands for an unknown value."""
-    return dataclasses.field(metadata={'nan_allowed': True})
+    return dataclasses.field(metadata={'check': _number_problem, 'nan_allowed': True})
 
 
 def check(message: 'Message', scenario: Scenario) -> None:
@@ -78,17 +80,11 @@ def check(message: 'Message', scenario: Scenario) -> None:
 @functools.cache
 def _checks(kind: type) -> tuple[tuple[str, Callable[[Any, Mapping[str, int]], str], bool], ...]:
     """Return the name, a function that describes violations, and `in_front` of each field."""
-    return tuple((field.name, functools.partial(_check_of(field.metadata), field.metadata),
-                  field.metadata.get('in_front', False))
-                 for field in dataclasses.fields(kind) if field.metadata or field.type is float)
-
-
-def _check_of(meta: Mapping[str, Any]) -> Callable[..., str]:
-    if 'dims' in meta:
-        return _array_problem
-    if 'index_of' in meta:
-        return _index_problem
-    return _size_problem if 'equals' in meta else _number_problem
+    return tuple(
+        (field.name, functools.partial(meta.get('check', _number_problem), meta),
+         meta.get('in_front', False))
+        for field in dataclasses.fields(kind)
+        if (meta := field.metadata) or field.type is float)
 
 
 def _index_problem(meta: Mapping[str, Any], value: int, sizes: Mapping[str, int]) -> str:
