@@ -336,7 +336,8 @@ class Mismatches:
                   for topic in sorted(ours)]
         if counts != self._counts:
             self._counts = counts
-            self._texts = {key: text for topic in ours for key, text in self._find(topic)}
+            self._texts = {
+                key: text for topic, *_ in counts for key, text in self._find(topic)}
         return self._texts
 
     def _find(self, topic: str) -> Iterator[tuple[str, str]]:

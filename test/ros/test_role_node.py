@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -11,9 +12,9 @@ from ros_messages import to_ros
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, Send, Timeout
 from rhs_isac_ros.protocol.role import Role
-from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros import convert, role_node, topics
 from rhs_isac_ros.ros.endpoints import LATCHED, steady_timer
-from rhs_isac_ros.ros.role_node import RoleNode
+from rhs_isac_ros.ros.role_node import Clocks, RoleNode
 
 
 class Scripted(Role):
@@ -196,6 +197,29 @@ def test_topics_follow_the_namespace_and_remapping(bench, start):
     assert names
     assert not probe.count_publishers('/a/grant')
     assert probe.count_publishers('/a/beacon') == probe.count_publishers('/a/permit') == 1
+
+
+@pytest.mark.parametrize('pace', [0.2, 5.0])
+def test_the_world_follows_a_simulation_and_the_clock_of_the_roles_only_in_its_states(
+        pace, monkeypatch):
+    now_s, simulated_s, node = 7.0, 1000.0, mock.Mock()
+    clock = node.get_clock.return_value
+    clock.ros_time_is_active = True
+    clock.now.side_effect = lambda: mock.Mock(nanoseconds=1e9 * simulated_s)
+    monkeypatch.setattr(role_node, 'time', mock.Mock(monotonic=lambda: now_s))
+    clocks = Clocks(node)
+    assert (clocks.world_s(), clocks.role_s(in_world=True)) == (7.0, 7.0)
+    now_s, simulated_s = now_s + 1.0, simulated_s + pace
+    assert clocks.role_s(in_world=True) == clocks.world_s() == pytest.approx(7.0 + pace)
+    now_s, simulated_s = now_s + 1.0, simulated_s + pace
+    assert clocks.role_s(in_world=False) == pytest.approx(8.0 + pace)
+    assert clocks.world_s() == pytest.approx(7.0 + 2 * pace)
+    # The simulation restarts.
+    now_s, simulated_s = now_s + 1.0, 0.0
+    assert clocks.world_s() == pytest.approx(7.0 + 2 * pace)
+    clock.ros_time_is_active = False
+    now_s += 1.0
+    assert clocks.world_s() == pytest.approx(8.0 + 2 * pace)
 
 
 # Deadlines. The delay of a tick depends on the machine; only that it is not early is certain.
