@@ -22,24 +22,14 @@ from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, subscribe
 from rhs_isac_ros.ros.recording import CycleObserver
 from system import invariants
 
+# Maximum time to recover, for all trials [s].
+RECOVERY_LIMIT_S = 3.0
+
 
 class NetworkObserver(CycleObserver):
     """Collects the cycles of a network, checks its results and keeps its diagnostics.
 
     Malformed messages are ignored here; the nodes count them.
-
-    Attributes
-    ----------
-    invariants
-        Checker of the published results.
-    reports
-        Newest report of each node by name.
-    warnings
-        Distinct summaries of the reports with a fault, by name of the node.
-    n_codebooks
-        Number of codebooks received.
-    on_phase
-        Called when a cycle enters a phase.
     """
 
     def __init__(self, scenario: Scenario, **node_options: Any) -> None:
@@ -51,9 +41,11 @@ class NetworkObserver(CycleObserver):
         self._executor = EventsExecutor()
         self._executor.add_node(self)
         self.invariants = invariants.InvariantChecker(scenario)
+        # Newest report of each node by name, and the distinct summaries of those with a fault.
         self.reports: dict[str, Report] = {}
         self.warnings: dict[str, list[str]] = {}
         self.n_codebooks = 0
+        # Called when a cycle enters a phase.
         self.on_phase: Callable[[m.Phase], None] = lambda phase: None
         self._subscribe(ros.Codebook, topics.CODEBOOK, LATCHED, self._on_codebook)
         self._subscribe(
@@ -71,15 +63,7 @@ class NetworkObserver(CycleObserver):
                 self.on_phase(message.phase)
 
     def spin_until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Receive messages until a condition holds; return whether it does.
-
-        Parameters
-        ----------
-        condition
-            Evaluated after every message.
-        timeout_s
-            Maximum duration [s].
-        """
+        """Receive messages until a condition holds, or for a time [s]; return whether it does."""
         end_s = time.monotonic() + timeout_s
         while not condition():
             remaining_s = end_s - time.monotonic()

@@ -11,13 +11,8 @@ from rhs_isac_ros.ros.processes import Processes
 class TrialProcesses(Processes):
     """Processes of a trial.
 
-    Parameters
-    ----------
-    logs, environment
-        As in `Processes`.
-    command_prefix
-        Takes the name of a process, and returns a prefix of its command, such as ``ip netns exec
-        lab``.
+    `command_prefix` takes the name of a process, and returns a prefix of its command, such as ``ip
+    netns exec lab``.
     """
 
     def __init__(self, logs: Path, environment: dict[str, str],

@@ -2,11 +2,12 @@
 
 import argparse
 import dataclasses
+import itertools
 import json
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +19,10 @@ from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.environment import check_environment, private_domain, use_discovery_profile
-from rhs_isac_ros.support.arguments import (
-    ArgumentParser,
-    check_distinct,
-    output_file,
-    positive_float,
-    positive_int,
-)
+from rhs_isac_ros.support.arguments import ArgumentParser, positive_float, positive_int
 from rhs_isac_ros.support.exits import print_error
-from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.tools.demo import add_network_options, load_files, start_network
-from system.chaos import crashes, fuzzing, intruders, report, soaking
+from system.chaos import crashes, fuzzing, intruders, soaking
 from system.chaos.trial import ChaosError, Trial
 from system.invariants import CHECK_DELAY_S
 from system.observer import NetworkObserver
@@ -40,23 +34,14 @@ _PHASES = [phase.name.lower() for phase in crashes.PHASES]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command.
+    """Run the command, and return its exit code.
 
-    Parameters
-    ----------
-    arguments
-        Command line; by default that of the process.
-
-    Returns
-    -------
-    int
-        Exit code: 0 if all trials passed, or after Ctrl-C; 1 if a trial failed; 2 if an argument
-        or a file is invalid.
+    It is 0 if all trials passed, or after Ctrl-C; 1 if a trial failed; 2 if an argument or a file
+    is invalid.
     """
     parser = _parser()
     options = parser.parse_args(arguments)
     check_environment(parser)
-    check_distinct(parser, options)
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
     except (ScenarioError, CodebookError) as error:
@@ -75,7 +60,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     codebook_file=codebook_file,
                     rest_s=_FUZZING_REST_S if options.fuzz else _REST_S,
                     **(dataclasses.asdict(soaking.IMPAIRMENTS) if options.soak else {}))
-                figures = _run(observer, processes, scenario, options, Path(logs), codebook_file)
+                figures, passed = _run(observer, processes, scenario, options, codebook_file)
+                # The last results are checked after the settling time.
+                observer.spin_for(CHECK_DELAY_S)
+                for name, code in processes.ended().items():
+                    last = '\n  '.join(processes.log(name).splitlines()[-12:])
+                    print(f'ENDED: {name}, exit code {code}\n  {last}', file=sys.stderr)
         except ChaosError as error:
             print_error(error, parser.prog)
             return 1
@@ -84,80 +74,55 @@ def main(arguments: Sequence[str] | None = None) -> int:
         finally:
             observer.destroy_node()
             rclpy.try_shutdown()
-    if options.json:
-        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
-    return 0 if figures['passed'] else 1
+    checker = observer.invariants
+    # Results of messages that were forged may be wrong.
+    passed = passed and (bool(options.fuzz) or not checker.violations)
+    print(json.dumps({
+        **figures, 'wrong_publications': len(checker.violations),
+        'checked_publications': checker.checked, 'unverified_publications': checker.unverified,
+        'violations': checker.violations, 'passed': passed}, indent=2))
+    return 0 if passed else 1
 
 
 def _run(
         observer: NetworkObserver, processes: TrialProcesses, scenario: Scenario,
-        options: argparse.Namespace, folder: Path, codebook_file: Path) -> dict[str, Any]:
-    if options.soak or options.fuzz:
-        figures = (_soak(observer, processes, options) if options.soak
-                   else _fuzz(observer, processes, scenario, options))
-        print(json.dumps(figures, indent=2))
-        return figures
-    trials: list[Trial] = []
+        options: argparse.Namespace, codebook_file: Path) -> tuple[dict[str, Any], bool]:
+    """Return the figures of the chosen trials, and whether these have passed."""
+    if options.soak:
+        soaked = soaking.soak(observer, processes, options.soak, lambda minutes, n: _progress(
+            f'{minutes:.1f} of {options.soak:g} minutes, {n} cycles'))
+        return soaked.figures(), soaked.passed
+    if options.fuzz:
+        fuzzed = fuzzing.fuzz(
+            observer, processes, scenario, options.fuzz, np.random.default_rng(options.seed),
+            lambda n: _progress(f'{n} of {options.fuzz} mutations'))
+        return dataclasses.asdict(fuzzed), fuzzed.passed
     crashes_chosen = options.nodes is not None or options.phases is not None
+    chosen: list[Iterator[Trial]] = []
     if crashes_chosen or options.intruders is None:
-        trials += _crash(observer, processes, options)
-        print(report.trial_summary('crashes', trials))
+        chosen.append(crashes.crash_all(
+            observer, processes, options.nodes or crashes.NODES, options.repeat * [
+                m.Phase[name.upper()] for name in options.phases or _PHASES]))
     if options.intruders is not None or not crashes_chosen:
-        intrusions = _intrude(observer, processes, scenario, options, folder, codebook_file)
-        print(report.trial_summary('second nodes', intrusions))
-        trials += intrusions
-    observer.spin_for(CHECK_DELAY_S)
-    figures = report.trial_figures(trials, observer.invariants)
-    print(report.publication_summary(figures))
-    for name, code in processes.ended().items():
-        last = '\n  '.join(processes.log(name).splitlines()[-12:])
-        print(f'ENDED: {name}, exit code {code}\n  {last}')
-    return figures
+        common = {'scenario_file': options.config.resolve()} if options.config else {}
+        chosen.append(intruders.intrude_all(
+            observer, processes, options.intruders or intruders.INTRUDERS, options.seconds,
+            common, scenario, Codebook.load(codebook_file)))
+    trials = []
+    for trial in itertools.chain(*chosen):
+        trials.append(trial)
+        print(json.dumps(dataclasses.asdict(trial)), file=sys.stderr, flush=True)
+    times_s = [trial.recovery_s for trial in trials]
+    return {
+        'trials': len(trials),
+        'trials_recovered': sum(trial.recovered for trial in trials),
+        'trials_reported': sum(trial.reported for trial in trials),
+        'worst_recovery_s': None if None in times_s else max(times_s),
+        'table': [dataclasses.asdict(trial) for trial in trials],
+    }, all(trial.recovered and trial.reported for trial in trials)
 
 
-def _soak(
-        observer: NetworkObserver, processes: TrialProcesses, options: argparse.Namespace
-) -> dict[str, Any]:
-    result = soaking.soak(
-        observer, processes, options.soak, lambda minutes, cycles: _show_progress(
-            f'{minutes:.1f} of {options.soak:g} minutes, {cycles} cycles'))
-    # The last results are checked after the settling time.
-    observer.spin_for(CHECK_DELAY_S)
-    return report.soak_figures(result, observer.invariants)
-
-
-def _fuzz(
-        observer: NetworkObserver, processes: TrialProcesses, scenario: Scenario,
-        options: argparse.Namespace) -> dict[str, Any]:
-    result = fuzzing.fuzz(
-        observer, processes, scenario, options.fuzz, np.random.default_rng(options.seed),
-        lambda sent: _show_progress(f'{sent} of {options.fuzz} mutations'))
-    return report.fuzz_figures(result)
-
-
-def _crash(
-        observer: NetworkObserver, processes: TrialProcesses, options: argparse.Namespace
-) -> list[crashes.CrashTrial]:
-    print(report.CRASH_HEAD)
-    phases = [m.Phase[name.upper()] for name in options.phases or _PHASES]
-    return crashes.crash_all(
-        observer, processes, options.nodes or crashes.NODES, phases,
-        lambda trial: print(report.crash_line(trial), flush=True), options.repeat)
-
-
-def _intrude(
-        observer: NetworkObserver, processes: TrialProcesses, scenario: Scenario,
-        options: argparse.Namespace, folder: Path, codebook_file: Path
-) -> list[intruders.IntrusionTrial]:
-    print(report.INTRUSION_HEAD)
-    common = {'scenario_file': options.config.resolve()} if options.config else {}
-    return intruders.intrude_all(
-        observer, processes, options.intruders or intruders.INTRUDERS, options.seconds, folder,
-        common, scenario, Codebook.load(codebook_file),
-        lambda trial: print(report.intrusion_line(trial), flush=True))
-
-
-def _show_progress(text: str) -> None:
+def _progress(text: str) -> None:
     if sys.stderr.isatty():
         print(f'\r{text}', end='', file=sys.stderr, flush=True)
 
@@ -188,6 +153,4 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--seconds', type=positive_float, default=intruders.SECONDS,
                         metavar='S', help='duration of each intrusion')
     add_network_options(parser)
-    parser.add_argument('--json', type=output_file, metavar='PATH',
-                        help='JSON file for the results')
     return parser

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterator, Sequence
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.roster import ROSTER
@@ -25,56 +25,29 @@ PUBLISHES = {name if member.is_unique else f'{name}_1': member.role.SENDS if mem
 _NEEDED = {name for member in ROSTER.values() for name in member.needed}
 NODES = tuple(name for name in PUBLISHES if name in _NEEDED or name not in ROSTER)
 PHASES = tuple(m.Phase)
-# A killed node is restarted after this time [s]. Until then, the other nodes must report that it
-# is missing: users wait 1.5 s for a beacon, and diagnostics are published once a second.
+# A killed node is restarted after this time [s], or once the other nodes have reported that it is
+# missing: users wait 1.5 s for a beacon, and diagnostics are published once a second.
 _DOWNTIME_S = 3.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CrashTrial(Trial):
-    """Result of one trial, whose fault ends with the restart of the node.
-
-    Attributes
-    ----------
-    node, phase
-        The node that was killed, and the phase.
-    kill_delay_s
-        Time from the observed start of the phase to the end of the process [s].
-    """
+    """Result of killing a node in a phase; the fault ends with the restart of the node."""
 
     node: str
     phase: str
-    kill_delay_s: float
+    kill_delay_s: float  #: From the observed start of the phase to the end of the process [s].
 
 
 def crash_all(
         observer: NetworkObserver, processes: TrialProcesses, nodes: Sequence[str],
-        phases: Iterable[m.Phase], on_trial: Callable[[CrashTrial], None],
-        repetitions: int = 1) -> list[CrashTrial]:
-    """Kill every node in every phase.
+        phases: Sequence[m.Phase]) -> Iterator[CrashTrial]:
+    """Kill every node in every phase of a network with the users 1 and 2; yield the trials.
 
-    Parameters
-    ----------
-    processes
-        The network, with the users 1 and 2.
-    nodes
-        Names of the nodes to kill.
-    on_trial
-        Called after each trial.
-    repetitions
-        Number of trials of each node and phase.
-
-    Raises
-    ------
-    ChaosError
-        If the network does not serve its users before a trial.
+    Raises ChaosError if the network does not serve its users before a trial.
     """
-    trials = []
-    for node in nodes:
-        for phase in itertools.chain.from_iterable(itertools.repeat(tuple(phases), repetitions)):
-            trials.append(crash(observer, processes, node, phase))
-            on_trial(trials[-1])
-    return trials
+    for node, phase in itertools.product(nodes, phases):
+        yield crash(observer, processes, node, phase)
 
 
 def crash(
@@ -82,10 +55,7 @@ def crash(
 ) -> CrashTrial:
     """Kill a node in a phase, and restart it.
 
-    Raises
-    ------
-    ChaosError
-        If the network does not serve its users before the trial, or a node still reports `node`.
+    Raises ChaosError if the network does not serve its users before, or still reports the node.
     """
     wait_for_service(observer)
     _wait_until_found(observer, node)
@@ -94,6 +64,9 @@ def crash(
     kill_delay_s = _kill_in(observer, processes, node, phase)
     observer.warnings.clear()
     observer.spin_for(_DOWNTIME_S)
+    # On a busy machine, the reports take longer.
+    observer.spin_until(lambda: bool(
+        observer.warnings and warnings_since(processes, log_lengths, node)), TIMEOUT_S)
     diagnosed = tuple(sorted(observer.warnings))
     logged = tuple(warnings_since(processes, log_lengths, node))
     observer.invariants.expect_rediscovery(PUBLISHES[node])

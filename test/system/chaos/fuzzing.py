@@ -45,33 +45,17 @@ _UNUSED = {topics.NAMES[m.NoFix], topics.NAMES[m.GroundTruths], topics.MARKERS}
 
 @dataclasses.dataclass(frozen=True)
 class FuzzResult:
-    """Result of fuzzing.
+    """Result of fuzzing."""
 
-    Attributes
-    ----------
-    sent
-        Number of mutations by topic.
-    malformed
-        Number of received mutations that violate the declaration of their type, by node.
-    counted
-        Number of messages that a node counted as malformed, by node.
-    dropped
-        Number of messages that all nodes dropped, by reason.
-    ended
-        Processes that ended.
-    traces
-        Lines of logs that belong to unhandled errors.
-    recovery_s
-        Time from the last mutation until both users have been served again [s].
-    """
-
-    sent: Mapping[str, int]
+    sent: Mapping[str, int]  #: Number of mutations by topic.
+    #: Number of received mutations that violate the declaration of their type, by node.
     malformed: Mapping[str, int]
-    counted: Mapping[str, int]
-    dropped: Mapping[str, int]
-    ended: tuple[str, ...]
-    traces: tuple[str, ...]
-    recovery_s: float
+    counted: Mapping[str, int]  #: Number of messages that a node counted as malformed, by node.
+    dropped: Mapping[str, int]  #: Number of messages that all nodes dropped, by reason.
+    ended: tuple[str, ...]  #: Processes that ended.
+    traces: tuple[str, ...]  #: Lines of logs that belong to unhandled errors.
+    #: From the last mutation until both users have been served again [s]; None if never.
+    recovery_s: float | None
 
     @property
     def passed(self) -> bool:
@@ -107,16 +91,11 @@ class _Mutator:
 
 
 class _Counters:
-    """Counters in the diagnostics of the nodes, relative to those at the start.
-
-    Attributes
-    ----------
-    subscribers
-        Nodes of the network that subscribe to each topic of the protocol.
-    """
+    """Counters in the diagnostics of the nodes, relative to those at the start."""
 
     def __init__(self, observer: NetworkObserver) -> None:
         self._observer = observer
+        # Nodes of the network that subscribe to each topic of the protocol.
         self.subscribers = {name: sorted(_subscribers(observer, name)) for name in _PROTOCOL}
         self._nodes = {node for nodes in self.subscribers.values() for node in nodes}
         self._before: dict[str, dict[str, int]] = {}
@@ -147,19 +126,9 @@ class _Counters:
 def fuzz(
         observer: NetworkObserver, processes: Processes, scenario: Scenario, n: int,
         rng: np.random.Generator, on_progress: Callable[[int], None]) -> FuzzResult:
-    """Publish mutations to a network.
+    """Publish `n` mutations to a network, and call `on_progress` with their number so far.
 
-    Parameters
-    ----------
-    n
-        Number of mutations.
-    on_progress
-        Called with the number of mutations so far.
-
-    Raises
-    ------
-    ChaosError
-        If a topic has no messages, or a node does not receive all mutations.
+    Raises ChaosError if a topic has no messages, or a node does not receive all mutations.
     """
     mutators = [_Mutator(observer, name, convert.ros_type(kind), profile_for(kind))
                 for name, kind in _PROTOCOL.items()]
@@ -213,7 +182,7 @@ def _result(
     """Wait until the network serves its users again, and collect the counters."""
     first, begin_s = len(observer.log.ended), time.monotonic()
     recovered = observer.spin_until(lambda: both_served(observer, first), _TIMEOUT_S)
-    recovery_s = time.monotonic() - begin_s if recovered else float('inf')
+    recovery_s = time.monotonic() - begin_s if recovered else None
     # Diagnostics are published once a second.
     observer.spin_for(1.5)
     final = counters.current()

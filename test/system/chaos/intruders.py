@@ -2,8 +2,9 @@
 
 import contextlib
 import dataclasses
+import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,57 +42,29 @@ _NAMES_OF_CONFLICTS = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class IntrusionTrial(Trial):
-    """Result of one trial, whose fault ends with the intruder.
+    """Result of starting a second node; the fault ends with this node, the intruder.
 
     With two users of the same number, the first user is killed, and the second is then served.
-
-    Attributes
-    ----------
-    intruder
-        Which node was started in addition.
-    served
-        Number of cycles served while the intruder was present.
     """
 
     intruder: str
-    served: int
+    served: int  #: Number of cycles served while the intruder was present.
 
 
 def intrude_all(
         observer: NetworkObserver, processes: TrialProcesses, intruders: Iterable[str],
-        seconds: float, folder: Path, parameters: dict[str, Any], scenario: Scenario,
-        codebook: Codebook, on_trial: Callable[[IntrusionTrial], None]) -> list[IntrusionTrial]:
-    """Add each intruder to a network for a time.
+        seconds: float, parameters: dict[str, Any], scenario: Scenario, codebook: Codebook
+) -> Iterator[IntrusionTrial]:
+    """Add each intruder, of `INTRUDERS`, to a network with the users 1 and 2; yield the trials.
 
-    Parameters
-    ----------
-    processes
-        The network, with the users 1 and 2.
-    intruders
-        Some of `INTRUDERS`, possibly repeated.
-    seconds
-        Duration of each intrusion after it has first been reported [s].
-    folder
-        Directory for the files of the intruders.
-    parameters
-        Parameters of all nodes of the network.
-    scenario, codebook
-        Scenario and codebook of the network.
-    on_trial
-        Called after each trial.
-
-    Raises
-    ------
-    ChaosError
-        If the network does not serve its users before a trial.
+    An intrusion lasts `seconds` [s] after it has first been reported. `parameters` are those of
+    all nodes. Raises ChaosError if the network does not serve its users before a trial.
     """
-    commands = _commands(folder, parameters, scenario, codebook)
-    trials = []
-    for intruder in intruders:
-        with _incompatible_observer() if intruder == OBSERVER else contextlib.nullcontext():
-            trials.append(_intrude(observer, processes, intruder, commands[intruder], seconds))
-        on_trial(trials[-1])
-    return trials
+    with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
+        commands = _commands(Path(folder), parameters, scenario, codebook)
+        for intruder in intruders:
+            with _incompatible_observer() if intruder == OBSERVER else contextlib.nullcontext():
+                yield _intrude(observer, processes, intruder, commands[intruder], seconds)
 
 
 @contextlib.contextmanager

@@ -21,22 +21,10 @@ _LENGTHS = (0, 1, 2, 3, 7, 40, 100, 200, 5000)
 
 
 def mutate(kind: type, originals: Sequence[bytes], rng: np.random.Generator) -> bytes:
-    """Create a random or mutated message.
+    """Return a random message of a ROS type, or one of the originals, if any, with a change.
 
-    Parameters
-    ----------
-    kind
-        ROS type of the message.
-    originals
-        Messages of this type to mutate, in CDR; may be empty.
-
-    Returns
-    -------
-    bytes
-        A random message, or an original with a changed field, with changed bytes, or without its
-        last bytes.
-        The first four bytes, the CDR header, are always intact: Fast DDS does not deliver a
-        message without them.
+    The change is that of a field, of bytes, or the loss of the last bytes. The first four bytes,
+    the CDR header, are always intact: Fast DDS does not deliver a message without them.
     """
     if not originals or rng.random() < 0.3:
         return serialize_message(random_message(kind, rng))

@@ -4,6 +4,7 @@ import collections
 import dataclasses
 import time
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from rhs_isac_ros.protocol.settings import Impairments
 from system.chaos.trial import ChaosError
@@ -21,33 +22,16 @@ _TIMEOUT_S = 30.0
 
 @dataclasses.dataclass(frozen=True)
 class SoakResult:
-    """Result of a soak test.
+    """Result of a soak test."""
 
-    Attributes
-    ----------
-    minutes
-        Duration of the run [min].
-    outcomes
-        Number of cycles by outcome.
-    estimates
-        Number of cycles that led to an estimate.
-    retries
-        Number of repeated requests by step.
-    impaired
-        Number of impaired messages by kind of impairment.
-    memory_bytes
-        Resident memory by node, after the warm-up and at the end.
-    ended
-        Processes that ended.
-    """
-
-    minutes: float
-    outcomes: Mapping[str, int]
-    estimates: int
-    retries: Mapping[str, int]
-    impaired: Mapping[str, int]
+    minutes: float  #: Duration of the run [min].
+    outcomes: Mapping[str, int]  #: Number of cycles by outcome.
+    estimates: int  #: Number of cycles that led to an estimate.
+    retries: Mapping[str, int]  #: Number of repeated requests by step.
+    impaired: Mapping[str, int]  #: Number of impaired messages by kind of impairment.
+    #: Resident memory by node, after the warm-up and at the end.
     memory_bytes: Mapping[str, tuple[int, int]]
-    ended: tuple[str, ...]
+    ended: tuple[str, ...]  #: Processes that ended.
 
     @property
     def cycles(self) -> int:
@@ -64,6 +48,11 @@ class SoakResult:
         """Relative growth of the memory by node."""
         return {name: last / first - 1 for name, (first, last) in self.memory_bytes.items()}
 
+    def figures(self) -> dict[str, Any]:
+        """Return all fields and properties but `passed`, for JSON."""
+        return {**dataclasses.asdict(self), 'cycles': self.cycles,
+                'estimate_share': self.estimate_share, 'memory_growth': self.memory_growth}
+
     @property
     def passed(self) -> bool:
         """Whether the requirements are met and all processes kept running."""
@@ -74,19 +63,10 @@ class SoakResult:
 def soak(
         observer: NetworkObserver, processes: TrialProcesses, minutes: float,
         on_progress: Callable[[float, int], None]) -> SoakResult:
-    """Observe a network for a time.
+    """Observe a network for a time [min].
 
-    Parameters
-    ----------
-    minutes
-        Duration [min].
-    on_progress
-        Called every few seconds with the elapsed minutes and the number of cycles that ended.
-
-    Raises
-    ------
-    ChaosError
-        If no cycle ends at the start.
+    `on_progress` is called every few seconds with the elapsed minutes and the number of cycles
+    that ended. Raises ChaosError if no cycle ends at the start.
     """
     log = observer.log
     if not observer.spin_until(lambda: bool(log.ended), _TIMEOUT_S):

@@ -1,5 +1,6 @@
 """``scripts/chaos`` on a small network: a short run of each test."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -12,31 +13,35 @@ from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.environment import claim_domain
 from rhs_isac_ros.ros.roster import UNIQUE
 from system.chaos.command import main
+from system.chaos.crashes import CrashTrial
+from system.chaos.fuzzing import FuzzResult
+from system.chaos.soaking import SoakResult
 
 # The parent directory of the package `system`.
 FOLDER = Path(__file__).parents[2]
 
 
-def chaos(small_files, tmp_path, *arguments):
-    """Run the command; return its figures and its output."""
-    file = tmp_path / 'figures.json'
-    environment = {**os.environ, 'ROS_DOMAIN_ID': claim_domain()}
-    done = subprocess.run(
-        [sys.executable, '-m', 'system.chaos', '--config',
-         small_files / 'scenario.yaml', '--codebook', small_files / 'first.yaml',
-         '--json', file, *arguments],
-        capture_output=True, text=True, timeout=150, env=environment, cwd=FOLDER)
-    assert file.exists(), done.stdout + done.stderr
-    figures = json.loads(file.read_text(encoding='utf-8'))
-    assert done.returncode == (0 if figures['passed'] else 1), done.stdout + done.stderr
-    return figures, done.stdout + done.stderr
+@pytest.fixture
+def chaos(small_files):
+    """Function that runs the command on a small network; returns its figures and its output."""
+    def chaos(*arguments):
+        done = subprocess.run(
+            [sys.executable, '-m', 'system.chaos', '--config', small_files / 'scenario.yaml',
+             '--codebook', small_files / 'first.yaml', *arguments],
+            capture_output=True, text=True, timeout=150, check=False, cwd=FOLDER,
+            env={**os.environ, 'ROS_DOMAIN_ID': claim_domain()})
+        output = done.stdout + done.stderr
+        assert done.stdout, output
+        figures = json.loads(done.stdout)
+        assert done.returncode == (0 if figures['passed'] else 1), output
+        return figures, output
+    return chaos
 
 
-def test_cycles_are_served_after_a_crash_and_a_second_base_station(small_files, tmp_path):
+def test_cycles_are_served_after_a_crash_and_a_second_base_station(chaos):
     """The older of two base stations resumes when the newer has gone."""
-    figures, output = chaos(
-        small_files, tmp_path, '--nodes', 'rhs_controller', '--phases', 'positioning',
-        '--intruders', 'bs', '--seconds', '1')
+    figures, output = chaos('--nodes', 'rhs_controller', '--phases', 'positioning',
+                            '--intruders', 'bs', '--seconds', '1')
     assert figures['trials'] == 2
     assert figures['wrong_publications'] == 0, output
     assert figures['checked_publications'] > figures['unverified_publications']
@@ -47,14 +52,13 @@ def test_cycles_are_served_after_a_crash_and_a_second_base_station(small_files, 
     for trial in figures['table']:
         assert trial['others_running']
         assert trial['recovery_s'] is not None, output
-    assert crash['logged'] and 'bs' in crash['diagnosed']
     assert figures['trials_reported'] == 2, output
 
 
-def test_mutations_crash_no_node_and_are_counted(small_files, tmp_path):
-    figures, output = chaos(small_files, tmp_path, '--fuzz', '1500')
+def test_mutations_crash_no_node_and_are_counted(chaos):
+    figures, output = chaos('--fuzz', '1500')
     assert figures['passed'], output
-    assert figures['mutations'] == sum(figures['sent'].values()) == 1500
+    assert sum(figures['sent'].values()) == 1500
     assert figures['sent'].keys() == {
         *topics.NAMES.values(), topics.CODEBOOK, topics.PRESENCE, topics.POSITION,
         topics.DIAGNOSTICS, topics.MARKERS}
@@ -65,11 +69,11 @@ def test_mutations_crash_no_node_and_are_counted(small_files, tmp_path):
     assert figures['dropped']['malformed'] == sum(figures['malformed'].values())
 
 
-def test_cycles_are_served_over_an_impaired_channel(small_files, tmp_path):
-    figures, output = chaos(small_files, tmp_path, '--soak', '0.1')
+def test_cycles_are_served_over_an_impaired_channel(chaos):
+    figures, output = chaos('--soak', '0.05')
     assert figures['wrong_publications'] == 0, output
-    assert figures['cycles'] > 5
-    assert figures['estimate_share'] >= 0.9, output
+    # The number of cycles depends on the load of the machine.
+    assert figures['cycles'] == sum(figures['outcomes'].values())
     assert not figures['ended']
     assert figures['memory_growth'].keys() == {*UNIQUE, 'user_1', 'user_2'}
 
@@ -87,3 +91,35 @@ def test_an_invalid_file_is_named(capsys):
     with pytest.raises(SystemExit, match='2'):
         main(['--config', '/nonexistent.yaml'])
     assert '/nonexistent.yaml' in capsys.readouterr().err
+
+
+# The verdicts
+
+CRASH = CrashTrial(
+    node='rhs_controller', phase='positioning', kill_delay_s=1e-3, recovery_s=2.5,
+    others_running=True, logged=('bs: missing', 'user: missing'), diagnosed=('bs',),
+    violations=())
+FUZZ = FuzzResult(
+    sent={'beacon': 5}, malformed={'bs': 3}, counted={'bs': 3}, dropped={'malformed': 3},
+    ended=(), traces=(), recovery_s=0.5)
+SOAK = SoakResult(
+    minutes=10.0, outcomes={'served': 995, 'user_gone': 5}, estimates=996, retries={},
+    impaired={}, memory_bytes={'bs': (100, 104)}, ended=())
+
+
+@pytest.mark.parametrize(('changed', 'recovered', 'reported'), [
+    ({}, True, True), ({'recovery_s': 3.01}, False, True), ({'recovery_s': None}, False, True),
+    ({'others_running': False}, False, True), ({'logged': ()}, True, False),
+    ({'diagnosed': ()}, True, False), ({'logged': ('bs: missing',) * 2}, True, False)])
+def test_a_trial_fails_if_recovery_is_late_a_process_ends_or_the_report_is_missing_or_repeated(
+        changed, recovered, reported):
+    trial = dataclasses.replace(CRASH, **changed)
+    assert (trial.recovered, trial.reported) == (recovered, reported)
+
+
+@pytest.mark.parametrize(('result', 'failures'), [
+    (FUZZ, ({'counted': {'bs': 2}}, {'ended': ('bs',)}, {'traces': ('bs: Traceback',)})),
+    (SOAK, ({'estimates': 989}, {'memory_bytes': {'bs': (100, 106)}}, {'ended': ('bs',)}))])
+def test_fuzzing_and_soaking_fail_beyond_their_limits(result, failures):
+    assert result.passed
+    assert not any(dataclasses.replace(result, **changed).passed for changed in failures)

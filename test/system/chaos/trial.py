@@ -5,8 +5,7 @@ import time
 from collections.abc import Callable
 
 from rhs_isac_ros.ros.processes import Processes
-from system.observer import NetworkObserver
-from system.recovery import RECOVERY_LIMIT_S
+from system.observer import RECOVERY_LIMIT_S, NetworkObserver
 
 TIMEOUT_S = 30.0
 # Number of latest cycles among which a served cycle is sought.
@@ -19,33 +18,21 @@ class ChaosError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Trial:
-    """Result of one trial.
+    """Result of one trial."""
 
-    Attributes
-    ----------
-    recovery_s
-        Time from the end of the fault to the end of the first cycle served after it [s]; if the
-        fault concerns a user, the first cycle of this user. Infinite if there was none.
-    others_running
-        Whether all other processes kept running.
-    logged
-        Warnings that name the fault, each as ``<node>: <text>``.
-    diagnosed
-        Nodes whose diagnostics reported the fault.
-    violations
-        Results that violate an invariant.
-    """
-
-    recovery_s: float
-    others_running: bool
-    logged: tuple[str, ...]
-    diagnosed: tuple[str, ...]
-    violations: tuple[str, ...]
+    #: Time from the end of the fault to the end of the first cycle served after it [s]; if the
+    #: fault concerns a user, the first cycle of this user. None if there was none.
+    recovery_s: float | None
+    others_running: bool  #: Whether all other processes kept running.
+    logged: tuple[str, ...]  #: Warnings that name the fault, each as ``<node>: <text>``.
+    diagnosed: tuple[str, ...]  #: Nodes whose diagnostics reported the fault.
+    violations: tuple[str, ...]  #: Results that violate an invariant.
 
     @property
     def recovered(self) -> bool:
         """Whether cycles were served in time and all other processes kept running."""
-        return self.recovery_s <= RECOVERY_LIMIT_S and self.others_running
+        return (self.recovery_s is not None and self.recovery_s <= RECOVERY_LIMIT_S
+                and self.others_running)
 
     @property
     def reported(self) -> bool:
@@ -61,13 +48,7 @@ def both_served(observer: NetworkObserver, first: int) -> bool:
 
 
 def wait_for_service(observer: NetworkObserver) -> None:
-    """Wait until both users have been served in cycles that end after this call.
-
-    Raises
-    ------
-    ChaosError
-        If they are not served in time.
-    """
+    """Wait until both users have been served from now on; raise ChaosError after a timeout."""
     first = len(observer.log.ended)
     if not observer.spin_until(lambda: both_served(observer, first), TIMEOUT_S):
         outcomes = [record.outcome for record in observer.log.ended[first:]]
@@ -77,33 +58,24 @@ def wait_for_service(observer: NetworkObserver) -> None:
 
 def measure_recovery(
         observer: NetworkObserver, end_s: float, user: int | None,
-        also: Callable[[], bool] = lambda: True) -> float:
-    """Return the time from the end of a fault until a cycle was served [s]; infinite if never.
+        also: Callable[[], bool] = lambda: True) -> float | None:
+    """Return the time from the end of a fault until a cycle was served [s]; None if never.
 
-    Parameters
-    ----------
-    end_s
-        End of the fault on the clock `time.monotonic` [s].
-    user
-        User that must be served; None for any user.
-    also
-        A further condition for recovery.
+    `end_s` is the end of the fault on the clock `time.monotonic` [s], `user` the user that must be
+    served (None: any), and `also` a further condition for recovery.
     """
     def recovered() -> bool:
         return also() and any(
             record.outcome == 'served' and record.began_s > end_s and user in (None, record.user)
             for record in observer.log.ended[-_N_LATEST:])
-    return time.monotonic() - end_s if observer.spin_until(recovered, TIMEOUT_S) else float('inf')
+    return time.monotonic() - end_s if observer.spin_until(recovered, TIMEOUT_S) else None
 
 
 def warnings_since(
         processes: Processes, log_lengths: dict[str, int], excluded: str = '') -> list[str]:
     """Return new warnings in the logs of all nodes but one, each with the name of its node.
 
-    Parameters
-    ----------
-    log_lengths
-        Length of each old log, by name of the process.
+    `log_lengths` contains the length of each old log, by name of the process.
     """
     return [f'{name}: {line.split("]: ", 1)[-1]}'
             for name, length in log_lengths.items() if name != excluded

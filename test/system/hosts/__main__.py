@@ -1,12 +1,15 @@
-"""The command line of ``scripts/hosts``."""
+"""The command ``scripts/hosts``: outages of the links of a network on several hosts."""
 
 import argparse
+import collections
+import dataclasses
 import json
 import os
 import signal
 import sys
 import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import rclpy
@@ -15,24 +18,111 @@ from rclpy.signals import SignalHandlerOptions
 
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.support.arguments import ArgumentParser, check_distinct, integer, output_file
-from rhs_isac_ros.support.exits import exit_code_of, print_error
-from rhs_isac_ros.support.files import write_whole
-from rhs_isac_ros.tools.demo import (
-    add_network_options,
-    load_files,
-    start_network,
-)
+from rhs_isac_ros.monitoring.cycle_log import CycleTimes
+from rhs_isac_ros.protocol.presences import SILENCE_S
+from rhs_isac_ros.ros.processes import Processes
+from rhs_isac_ros.support.arguments import ArgumentParser, integer
+from rhs_isac_ros.support.exits import exit_code_of, on_end_signals
+from rhs_isac_ros.tools.demo import add_network_options, load_files, start_network
 from system import invariants
 from system.hosts import namespaces
 from system.hosts.namespaces import HOSTS, NamespacesUnavailable
-from system.hosts.trial import NetworkBroken, Outage, Trial
-from system.observer import NetworkObserver
-from system.recovery import RECOVERY_LIMIT_S
+from system.observer import RECOVERY_LIMIT_S, NetworkObserver
 from system.trial_processes import TrialProcesses
 
 # Exit code of a skipped test, as test drivers define it.
 SKIPPED = 77
+# Nodes that wait for a node of the disconnected host.
+WAITING: dict[str, tuple[str, ...]] = {
+    'base_station': ('user',), 'surface': ('bs',), 'channel': ('bs', 'user'),
+    'positioner': ('bs',), 'users': ()}
+# Time until a node reports that it is waiting [s]: 3 s after bs misses announcements, or after
+# Fast DDS removes an unreachable node from the graph, on which users rely.
+_REPORTED_AFTER_S = {'bs': SILENCE_S + 3.0, 'user': 23.0}
+# Time within which messages that were sent before an outage arrive [s].
+_IN_FLIGHT_S = 0.2
+# Maximum time until cycles are served before an outage, and after it [s].
+_BEFORE_S, _AFTER_S = 60.0, 20.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Outage:
+    """Result of an outage of one link."""
+
+    host: str
+    outage_s: float
+    #: From the restoration to the end of the first cycle that began after it; None if none.
+    recovery_s: float | None
+    #: Complete cycles during the outage, which have bypassed the link: a cycle needs all hosts.
+    during: int
+    #: Nodes whose log or diagnostics lack the required report of a missing node.
+    unreported: tuple[str, ...]
+    #: Nodes that logged more than once that they wait for the same node.
+    repeated: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether the network recovered in time, and every node reported the outage once."""
+        in_time = self.recovery_s is not None and self.recovery_s <= RECOVERY_LIMIT_S
+        return in_time and not (self.during or self.unreported or self.repeated)
+
+
+def evaluate(
+        host: str, down_s: float, restored_s: float, cycles: Sequence[CycleTimes],
+        logs: Mapping[str, str], warnings: Mapping[str, Sequence[str]]) -> Outage:
+    """Evaluate an outage of a host from its start and end [s] and the complete cycles.
+
+    `logs` and `warnings` contain the log of each node, and the warnings in its diagnostics, during
+    the outage.
+    """
+    spans_s = [(cycle.began_s, cycle.ended_s) for cycle in cycles]
+    awaited = {node: collections.Counter(
+        line.partition('waiting for ')[2] for line in log.splitlines() if 'waiting for ' in line)
+        for node, log in logs.items()}
+    required = [kind for kind in WAITING[host] if restored_s - down_s >= _REPORTED_AFTER_S[kind]]
+    return Outage(
+        host, restored_s - down_s,
+        recovery_s=min((end - restored_s for begin, end in spans_s if begin >= restored_s),
+                       default=None),
+        during=sum(down_s + _IN_FLIGHT_S <= begin and end < restored_s for begin, end in spans_s),
+        unreported=tuple(
+            node for node in logs if node.partition('_')[0] in required and not (awaited[node]
+            and any(text.startswith('waiting for ') for text in warnings.get(node, ())))),
+        repeated=tuple(node for node, counts in awaited.items()
+                       if max(counts.values(), default=0) > 1))
+
+
+def observe(
+        processes: Processes, observer: NetworkObserver, seconds: float, cycles: int = 0) -> bool:
+    """Observe for a time [s], or until a number of cycles (0: none) have begun and been served.
+
+    Returns whether the cycles were served. If a node ends, the command ends, too.
+    """
+    begin_s = time.monotonic()
+
+    def served() -> bool:
+        for node, code in processes.ended().items():
+            sys.exit(f'{node} ended with exit code {code}:\n{processes.log(node)}')
+        newest = observer.log.complete[-cycles:] if cycles else ()
+        return bool(cycles) and len(newest) == cycles and newest[0].began_s >= begin_s
+    return observer.spin_until(served, seconds)
+
+
+def interrupt(
+        processes: Processes, observer: NetworkObserver, host: str, seconds: float) -> Outage:
+    """Take a link down for a time [s], restore it, and wait until cycles are served again."""
+    log_lengths = {node: len(processes.log(node)) for node in processes.names}
+    observer.warnings.clear()
+    namespaces.connect(host, up=False)
+    down_s = time.monotonic()
+    observe(processes, observer, seconds)
+    logs = {node: processes.log(node)[n:] for node, n in log_lengths.items()}
+    warnings = {node: tuple(texts) for node, texts in observer.warnings.items()}
+    restored_s = time.monotonic()
+    observer.invariants.expect_rediscovery(invariants.RECEIVES)
+    namespaces.connect(host, up=True)
+    observe(processes, observer, _AFTER_S, 3)
+    return evaluate(host, down_s, restored_s, observer.log.complete, logs, warnings)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,111 +131,79 @@ def main(arguments: Sequence[str] | None = None) -> int:
     It is 0 if all outages passed, otherwise 1; 2 if an argument or a file is invalid; 77 if
     network namespaces are unavailable; 130 after Ctrl-C or SIGTERM.
     """
-    parser = _parser()
+    parser = ArgumentParser(
+        prog='scripts/hosts', description='Run the network on several hosts, which are network '
+        'namespaces of this machine, and take their links down: cycles must be served again '
+        f'within {RECOVERY_LIMIT_S:g} s after a link is restored. Needs root; exits with '
+        f'{SKIPPED} without network namespaces.')
+    parser.add_argument('--pull', nargs='+', choices=list(HOSTS), default=list(HOSTS),
+                        metavar='NAME', help=f'hosts to disconnect, out of {", ".join(HOSTS)}')
+    parser.add_argument('--seconds', type=integer(1, 3600), default=6,
+                        help='duration of each outage, by default 6')
+    add_network_options(parser)
+    parser.add_argument('--usual-discovery', action='store_true',
+                        help="use Fast DDS's default settings instead of the package's profile")
     options = parser.parse_args(arguments)
-    check_distinct(parser, options)
     try:
         return _run(options, *load_files(options.config, options.codebook))
     except NamespacesUnavailable as error:
         print(f'hosts: skipped: no network namespaces: {error}', file=sys.stderr)
         return SKIPPED
-    except (ScenarioError, CodebookError, NetworkBroken) as error:
-        print_error(error, parser.prog)
-        return 1 if isinstance(error, NetworkBroken) else 2
     except KeyboardInterrupt:
         return 130
 
 
 def _run(options: argparse.Namespace, scenario: Scenario, codebook_file: Path) -> int:
-    profile = None if options.usual_discovery else (
-        Path(get_package_share_directory('rhs_isac_ros')) / 'config' / 'discovery.xml')
+    """Interrupt the links in turn, and print the figures."""
+    profile = '' if options.usual_discovery else (
+        f'{get_package_share_directory("rhs_isac_ros")}/config/discovery.xml')
     os.environ.pop('ROS_LOCALHOST_ONLY', None)
     os.environ.update({
         'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp',
         # The hosts belong to this run alone.
         'ROS_DOMAIN_ID': '0',
-        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST' if options.static_peers else 'SUBNET',
-        'ROS_STATIC_PEERS': ';'.join(namespaces.ADDRESSES.values()) * options.static_peers,
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET',
         # The namespaces share memory, which would bypass the links.
         'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',
         # An empty value keeps nodes from loading the profile of the package.
-        'FASTRTPS_DEFAULT_PROFILES_FILE': str(profile or ''),
+        'FASTRTPS_DEFAULT_PROFILES_FILE': profile,
     })
     with namespaces.connected_hosts(), \
             tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs, TrialProcesses(
                 Path(logs), {'ROS_LOG_DIR': logs}, namespaces.command_prefix) as processes:
-        start_network(processes, options.users, scenario, first_cycle=1, seed=options.seed,
+        print('hosts created', file=sys.stderr, flush=True)
+        start_network(processes, 2, scenario, first_cycle=1, seed=options.seed,
                       scenario_file=options.config, codebook_file=codebook_file)
         namespaces.enter(namespaces.OBSERVER)
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         observer = NetworkObserver(scenario)
         try:
-            trial = Trial(processes, observer)
-            trial.wait_until_served()
             outages = []
-            for host in options.pull or namespaces.HOSTS:
-                print(f'taking the link of {host} down for {options.seconds:g} s',
-                      file=sys.stderr, flush=True)
-                outages.append(trial.interrupt(host, options.seconds))
+            for host in options.pull:
+                if not observe(processes, observer, _BEFORE_S, 3):
+                    sys.exit(f'no cycles within {_BEFORE_S:g} s:\n{processes.log("bs")}')
+                outages.append(interrupt(processes, observer, host, options.seconds))
             # The last results are checked after the settling time.
             observer.spin_for(invariants.CHECK_DELAY_S)
-            return _report(outages, observer, namespaces.packets(), options.json)
         finally:
             observer.destroy_node()
             rclpy.try_shutdown()
-
-
-def _report(
-        outages: Sequence[Outage], observer: NetworkObserver, packets: dict[str, int],
-        file: Path | None) -> int:
     violations, log = observer.invariants.violations, observer.log
     passed = not violations and all(outage.passed for outage in outages)
-    text = json.dumps({
-        'outages': [outage.figures() for outage in outages],
+    print(json.dumps({
+        'outages': [dataclasses.asdict(outage) for outage in outages],
         'wrong_publications': len(violations), 'violations': violations,
         'cycles_served': len(log.complete), 'cycles_given_up': len(log.given_up),
-        'packets': packets, 'passed': passed}, indent=1, allow_nan=False)
-    print(text)
-    if file is not None:
-        write_whole(file, text + '\n')
+        'passed': passed}, indent=1, allow_nan=False))
     return 0 if passed else 1
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = ArgumentParser(
-        prog='scripts/hosts', formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-        description='Run the network on several hosts of this machine, which are network '
-        'namespaces, and take their links down: cycles must be served again within '
-        f'{RECOVERY_LIMIT_S:g} s after a link is restored. Needs root; exits with {SKIPPED} if '
-        'network namespaces are unavailable.')
-    parser.add_argument('--pull', action='append', choices=list(HOSTS), metavar='NAME',
-                        help=f'host to disconnect: {", ".join(HOSTS)}; may be repeated; by '
-                        'default, each host in turn')
-    parser.add_argument('--seconds', type=integer(1, 3600), default=6,
-                        help='duration of each outage')
-    parser.add_argument('--users', type=integer(1, 64), metavar='N',
-                        default=2, help='number of users, each in its own process')
-    add_network_options(parser)
-    parser.add_argument('--usual-discovery', action='store_true',
-                        help="use Fast DDS's default settings instead of the package's profile")
-    parser.add_argument('--static-peers', action='store_true',
-                        help='discover nodes by their addresses, without multicast')
-    parser.add_argument('--json', type=output_file, metavar='PATH',
-                        help='JSON file for the results')
-    return parser
-
-
-def interrupt_on_signals() -> None:
-    """Treat SIGTERM and SIGHUP like Ctrl-C, and ignore signals after the first: see `main`."""
-    def interrupt(number: int, frame: object) -> None:
-        for each in numbers:
-            signal.signal(each, signal.SIG_IGN)
-        raise KeyboardInterrupt
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    for each in numbers:
-        signal.signal(each, interrupt)
+def _interrupted(number: int, frame: object) -> None:
+    """Treat a signal like Ctrl-C, and ignore further ones."""
+    on_end_signals(signal.SIG_IGN)
+    raise KeyboardInterrupt
 
 
 if __name__ == '__main__':
-    interrupt_on_signals()
-    sys.exit(exit_code_of(main))
+    on_end_signals(_interrupted)
+    sys.exit(exit_code_of(main, (ScenarioError, CodebookError)))

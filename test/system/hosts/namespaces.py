@@ -6,13 +6,11 @@ that the machine's own network is not touched.
 
 import contextlib
 import ctypes
-import json
 import os
 import re
-import shutil
 import signal
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from rhs_isac_ros.ros.roster import ROSTER
@@ -42,18 +40,12 @@ def connected_hosts() -> Iterator[None]:
 
     First removes the hosts that killed runs have left behind.
     """
-    if shutil.which('ip') is None:
-        raise NamespacesUnavailable('the command ip is missing (Debian: apt install iproute2)')
-    _remove(lambda pid: not Path(f'/proc/{pid}').exists())
+    _remove()
     try:
-        try:
-            _create()
-        except subprocess.CalledProcessError as error:
-            raise NamespacesUnavailable(
-                f'{" ".join(error.cmd)}: {error.stderr.strip()}') from None
+        _create()
         yield
     finally:
-        _remove(lambda pid: pid == os.getpid())
+        _remove()
 
 
 def _create() -> None:
@@ -71,14 +63,14 @@ def _create() -> None:
             _ip('link', 'set', device, 'up', host=name)
 
 
-def _remove(is_chosen: Callable[[int], bool]) -> None:
-    """Remove the hosts of runs with chosen process ids, and kill the processes on these hosts."""
-    for name in sorted(path.name for path in _FOLDER.glob('*')):
-        match = re.fullmatch(r'rhs_isac-(\d+)-\w+', name)
-        if not match or not is_chosen(int(match[1])):
+def _remove() -> None:
+    """Remove the hosts of this run and of those that have ended, with the processes on them."""
+    for name in sorted(path.name for path in _FOLDER.glob('rhs_isac-*-*')):
+        owner = name.split('-')[1]
+        if owner != str(os.getpid()) and Path(f'/proc/{owner}').exists():
             continue
         # Another run may be removing the namespace already.
-        with contextlib.suppress(subprocess.CalledProcessError):
+        with contextlib.suppress(NamespacesUnavailable):
             for pid in map(int, _ip('netns', 'pids', name).split()):
                 # This process itself may have moved there.
                 if pid != os.getpid():
@@ -106,13 +98,6 @@ def connect(host: str, up: bool) -> None:
     _ip('link', 'set', _port(host), 'up' if up else 'down', host=_SWITCH)
 
 
-def packets() -> dict[str, int]:
-    """Return the number of packets that the bridge has received from each host."""
-    received = {port['ifname']: int(port['stats64']['rx']['packets'])
-                for port in json.loads(_ip('-s', '-j', 'link', host=_SWITCH))}
-    return {host: received[_port(host)] for host in HOSTS}
-
-
 def _namespace(host: str) -> str:
     return f'rhs_isac-{os.getpid()}-{host}'
 
@@ -125,7 +110,10 @@ def _port(host: str) -> str:
 def _ip(*arguments: str, host: str = '') -> str:
     """Run the command ip, on a host if one is given, and return its output."""
     place = ('-n', _namespace(host)) if host else ()
-    return subprocess.run(
-        ('ip', *place, *arguments), stdin=subprocess.DEVNULL, capture_output=True, text=True,
-        # Ctrl-C must not interrupt a command halfway.
-        check=True, start_new_session=True).stdout
+    try:
+        return subprocess.run(
+            ('ip', *place, *arguments), stdin=subprocess.DEVNULL, capture_output=True, text=True,
+            # Ctrl-C must not interrupt a command halfway.
+            check=True, start_new_session=True).stdout
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise NamespacesUnavailable(getattr(error, 'stderr', '') or error) from None
