@@ -123,12 +123,10 @@ CALLS = [
 # The scripts, as processes.
 PROCESSES = [
     (['record', ''], "record: error: argument file: '', expected a file"),
-    (['run', 'demo', '--users', '100000'], 'demo: error: argument --users: 100000'),
     (['run', 'user', 'seed:=1'], 'user: error: unrecognized arguments: seed:=1'),
     (['board', 'show', 'nothing'], 'frontend: error: nothing: the port cannot be used'),
     (['run', '../setup'], 'no executable named ../setup'),
     (['reproduce', 'fig5'], 'no experiment named fig5'),
-    (['benchmark', ''], 'no benchmark named'),
     (['benchmark', 'channels', '--blocked', '2'],
      "argument --blocked: 2.0, expected 0 to 1"),
 ]

@@ -88,8 +88,7 @@ def test_any_other_name_is_an_attribute_error(name):
         getattr(executables, name)
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_during_the_imports_ends_the_process_without_a_traceback(number):
+def test_a_signal_during_the_imports_ends_the_process_without_a_traceback():
     code = """
 import importlib, signal, sys
 from rhs_isac_ros import executables
@@ -103,6 +102,6 @@ executables.bs()
         [sys.executable, '-c', code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env={**os.environ, 'PYTHONPATH': os.pathsep.join(map(str, [ROOT, *sys.path]))})
     assert process.stdout.readline() == 'importing rhs_isac_ros.nodes.bs\n'
-    process.send_signal(number)
+    process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (0, '')

@@ -5,8 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 import rhs_isac_ros
 
 ROOT = Path(rhs_isac_ros.__file__).parent
@@ -46,6 +44,6 @@ def test_pure_layers_can_be_imported_without_ros_and_optional_libraries():
     assert 'refused: rclpy' in imported_in_a_fresh_interpreter(['rclpy']).stderr
 
 
-@pytest.mark.parametrize('name', MODULES)
-def test_modules_can_be_read_from_top_to_bottom(name):
-    assert len(MODULES[name].read_text(encoding='utf-8').splitlines()) <= 600
+def test_modules_can_be_read_from_top_to_bottom():
+    assert not [name for name, path in MODULES.items()
+                if len(path.read_text(encoding='utf-8').splitlines()) > 600]

@@ -52,8 +52,6 @@ def test_a_report_is_published_once_a_second(bench, probe):
         reports.append(None)
         return Report(False, str(len(reports)), {})
     publish_reports(probe, report)
-    bench.until(lambda: len(received) == 2, 'the second report')
-    assert [message.status[0].message for message in received] == ['1', '2']
-    stamps = [message.header.stamp for message in received]
-    stamps_s = [stamp.sec + 1e-9 * stamp.nanosec for stamp in stamps]
-    assert 0.5 < stamps_s[1] - stamps_s[0] < 10
+    bench.until(lambda: len(received) >= 2, 'the second report')
+    assert [message.status[0].message for message in received[:2]] == ['1', '2']
+    assert [timer.timer_period_ns for timer in probe.timers] == [10**9]

@@ -21,7 +21,6 @@ from rhs_isac_ros.nodes.channel import ChannelNode
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
 from rhs_isac_ros.nodes.positioner import PositionerNode
 from rhs_isac_ros.nodes.rhs_controller import RhsControllerNode
-from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import presences
 from rhs_isac_ros.protocol.role import Role
@@ -147,13 +146,6 @@ def test_only_the_own_namespace_counts(bench, monitor, announce):
     bench.until(lambda: reports[-1] == (), 'presence')
 
 
-def test_a_remapped_topic_of_the_announcements_is_followed(bench, monitor, announce):
-    rules = ['-r', 'presence:=/elsewhere/presence']
-    announce('optimizer', cli_args=['--ros-args', *rules])
-    reports = monitor('transmission', *rules)
-    bench.until(lambda: () in reports, 'presence')
-
-
 def test_a_node_is_reported_as_present_when_it_is_ready(bench, monitor):
     """The channel is ready at once; the positioner subscribes when it has an estimator."""
     reports = monitor('bs')
@@ -165,9 +157,8 @@ def test_a_node_is_reported_as_present_when_it_is_ready(bench, monitor):
     bench.until(lambda: 'positioner' not in reports[-1], 'presence of the positioner')
 
 
-@pytest.mark.parametrize('kind', [RhsControllerNode, PositionerNode, TransmissionNode])
-def test_a_node_without_an_optimizer_reports_it(bench, kind, capfd):
-    node = bench.add(kind)
+def test_a_node_without_an_optimizer_reports_it(bench, capfd):
+    node = bench.add(RhsControllerNode)
     bench.until(lambda: node.report().summary == 'waiting for optimizer', 'the report')
     assert node.report().fault
     optimizer = bench.add(OptimizerNode)
@@ -322,7 +313,7 @@ def test_a_node_announces_itself_periodically_also_while_it_computes(bench, prob
     node = busy.add(RoleNode, 'channel', parameter_overrides=[
         Parameter('use_sim_time', value=True)])
     node.start(Radio())
-    bench.until(lambda: len(received) == 3, 'the announcements')
+    bench.until(lambda: len(received) >= 3, 'the announcements')
     busy.close()
     assert {(one.sender, one.node, one.scenario_id, one.use_sim_time) for one in received} == {
         (node.instance, '/channel', node.scenario.id, True)}

@@ -5,12 +5,8 @@ import select
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
-from ament_index_python.packages import get_package_prefix
 from system.trial_processes import TrialProcesses
-
-from rhs_isac_ros.ros.roster import UNIQUE
 
 TIMEOUT_S = 60.0
 # A parent that starts two nodes and prints their process ids.
@@ -40,21 +36,6 @@ def test_no_child_survives_a_parent_that_is_killed(tmp_path):
         children = [os.pidfd_open(int(pid)) for pid in parent.stdout.readline().split()]
         assert len(children) == 2
         parent.send_signal(signal.SIGKILL)
-        until_ended(children)
-
-
-def test_no_node_survives_a_demonstration_that_is_killed(tmp_path):
-    program = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros' / 'demo'
-    with subprocess.Popen(
-            [program, '--cycles', '1000000'], cwd=tmp_path, stderr=subprocess.PIPE, text=True,
-            env={**os.environ, 'TMPDIR': str(tmp_path)}) as demo:
-        # The first line follows the start of all nodes.
-        assert demo.stderr.readline().startswith('network started')
-        folder = f'/proc/{demo.pid}/task/{demo.pid}/children'
-        with open(folder, encoding='ascii') as file:
-            children = [os.pidfd_open(int(pid)) for pid in file.read().split()]
-        assert len(children) == len(UNIQUE) + 2
-        demo.send_signal(signal.SIGKILL)
         until_ended(children)
 
 
