@@ -17,7 +17,6 @@ import rclpy
 import yaml
 from ament_index_python.packages import get_package_prefix
 from forked import Forked
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -29,7 +28,7 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import EXCHANGE
+from rhs_isac_ros.ros.endpoints import EXCHANGE, OBSERVATION
 from rhs_isac_ros.ros.environment import claim_domain
 from rhs_isac_ros.ros.processes import with_parent
 
@@ -43,6 +42,8 @@ with warnings.catch_warnings():
 
 # Generous: starting ten processes takes long on a loaded machine.
 TIMEOUT_S = 60.0
+# Time without a response after which a request is repeated, which may then be handled twice [s].
+REQUEST_S = 10.0
 # Texts that show an uncaught exception.
 CRASH_TEXTS = ('Traceback', 'Exception in', 'Error occurred at', '[FATAL]', 'Segmentation')
 EXECUTABLES = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros'
@@ -150,15 +151,12 @@ class Watch:
         self._of_cycle = collections.defaultdict(list)
         # Final states of the served cycles, in order.
         self.served = []
-        self.poses = []
         # Functions by message class, called with each message.
         self.hooks = {}
         for kind, name in topics.NAMES.items():
             self.node.create_subscription(
                 convert.ros_type(kind), name,
-                lambda message, kind=kind: self._receive(kind, message), EXCHANGE, raw=True)
-        self.node.create_subscription(
-            PoseWithCovarianceStamped, topics.POSITION, self.poses.append, EXCHANGE)
+                lambda message, kind=kind: self._receive(kind, message), OBSERVATION, raw=True)
 
     def _receive(self, kind, serialized):
         plain = convert.from_bytes(kind, serialized)
@@ -169,7 +167,7 @@ class Watch:
         if kind in self.hooks:
             self.hooks[kind](plain)
 
-    def _spin(self):
+    def spin(self):
         """Spin briefly: checking a condition after each message would take too long."""
         end_s = time.monotonic() + 0.02
         while (left_s := end_s - time.monotonic()) > 0:
@@ -183,7 +181,7 @@ class Watch:
                 assert process.running, f'ended with {process.wait()}\n{process.log}'
             assert time.monotonic() < end_s, '\n'.join(
                 [f'{what}: not within {TIMEOUT_S:g} s', *(process.log for process in processes)])
-            self._spin()
+            self.spin()
         return value
 
     def call(self, client, request, processes=()):
@@ -194,7 +192,7 @@ class Watch:
 
         def response():
             nonlocal requested_s
-            if time.monotonic() > requested_s + 2.0:
+            if time.monotonic() > requested_s + REQUEST_S:
                 requested_s = time.monotonic()
                 futures.append(request(client))
             return next((future for future in futures if future.done()), None)

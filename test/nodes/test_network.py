@@ -17,7 +17,7 @@ def networks(module_processes, make_watch, small_files):
     result = {}
     for namespace, users, codebook in (('/a', 1, 'first'), ('/b', 2, 'second')):
         process = module_processes.start(
-            'network', namespace=namespace, users=users, seed=users, rest_s=0.0,
+            'network', namespace=namespace, users=users, seed=users, rest_s=0.02,
             scenario_file=small_files / 'scenario.yaml',
             codebook_file=small_files / f'{codebook}.yaml')
         result[namespace] = types.SimpleNamespace(

@@ -1,5 +1,6 @@
-"""A network of processes, started in random order and ended by a signal."""
+"""A network of programs, started in random order and ended by signals."""
 
+import itertools
 import random
 import signal
 import subprocess
@@ -15,32 +16,27 @@ from rhs_isac_ros.ros.roster import ROSTER
 EXECUTABLES = tuple(ROSTER)
 
 
-@pytest.fixture(scope='module', params=[signal.SIGINT, signal.SIGTERM],
-                ids=lambda number: number.name)
-def ended_network(request, module_processes, make_watch, small_files):
-    """The observer of a network, and exit code and log of each process after a signal.
-
-    One of the networks consists of programs, the other of copies, which start sooner.
-    """
-    number = request.param
-    namespace = f'/{number.name.lower()}'
-    watch = make_watch(namespace)
-    order = random.Random(number).sample(EXECUTABLES, len(EXECUTABLES))
+@pytest.fixture(scope='module')
+def ended_network(module_processes, make_watch, small_files):
+    """The observer of a network of programs, and exit code and log of each after a signal."""
+    watch = make_watch('/ended')
+    order = random.Random(2).sample(EXECUTABLES, len(EXECUTABLES))
     assert order != list(EXECUTABLES)
     parameters = {'optimizer': {'codebook_file': small_files / 'first.yaml'},
-                  'bs': {'rest_s': 0.0}}
+                  'bs': {'rest_s': 0.02}}
     running = {}
     for name in order:
         running[name] = module_processes.start(
-            name, namespace=namespace, as_program=number == signal.SIGINT,
+            name, namespace='/ended', as_program=True,
             scenario_file=small_files / 'scenario.yaml', **parameters.get(name, {}))
         if len(running) == 2:
             # The first two are running before the others start.
             watch.wait_for_nodes(*running)
     watch.until_served(2, processes=running.values())
     files = {file for process in running.values() for file in process.open_files}
-    # The signal arrives while most nodes are busy.
-    for process in running.values():
+    # The signals arrive while most nodes are busy.
+    for process, number in zip(running.values(), itertools.cycle(
+            (signal.SIGINT, signal.SIGTERM)), strict=False):
         process.signal(number)
     ends = {name: (process.wait(), process.log) for name, process in running.items()}
     return types.SimpleNamespace(watch=watch, ends=ends, files=files)
@@ -65,7 +61,8 @@ def test_no_process_receives_through_shared_memory(ended_network):
 def test_hardly_any_process_waits_for_itself_in_the_middleware(ended_network):
     """In about one of 200 ends, Fast DDS 2.14 never destroys a publisher; see `run.run`."""
     codes = [code for code, _ in ended_network.ends.values()]
-    assert codes.count(-signal.SIGALRM) <= 1
+    # Chance exceeds this number in one of 200 000 runs.
+    assert codes.count(-signal.SIGALRM) <= 2
 
 
 @pytest.mark.parametrize('executable', EXECUTABLES)

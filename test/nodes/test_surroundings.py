@@ -32,7 +32,7 @@ def network(processes, make_watch, tmp_path):
     common = {'namespace': NAMESPACE, 'scenario_file': tmp_path / 'scenario.yaml'}
     watch = make_watch(NAMESPACE)
     network = processes.start(
-        'network', users=1, rest_s=0.0,
+        'network', users=1, rest_s=0.02,
         codebook_file=tmp_path / 'codebook.yaml', position_m='[4.0, 0.3, 0.1]', **common)
     watch.until_served(2, STATIC, [network])
     walking = processes.start(
