@@ -57,6 +57,17 @@ def test_the_node_logs_that_it_drops_an_invalid_message(bench, probe, capfd):
     assert 'rcutils' not in text
 
 
+@pytest.mark.parametrize('overridable', [False, True])
+def test_endpoints_have_no_event_handlers(probe, overridable):
+    """Otherwise, a node crashes that withdraws publishers beside an observer that gets nothing."""
+    publisher = endpoints.create_publisher(
+        probe, Point, 'one', endpoints.EXCHANGE, overridable=overridable)
+    endpoints.subscribe(
+        probe, Point, 'one', lambda message: None, endpoints.EXCHANGE, overridable=overridable)
+    (subscription,) = (one for one in probe.subscriptions if one.topic_name == '/one')
+    assert publisher.event_handlers == subscription.event_handlers == []
+
+
 @pytest.fixture
 def refused(monkeypatch):
     """Names of the topics and services that were refused: all but those of every rclpy node."""

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import yaml
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.duration import Infinite
 from rclpy.node import Node
 from rclpy.qos import (
@@ -107,22 +106,6 @@ def test_another_decoder_needs_only_the_file(recording):
     assert [list(message.signals.re) for message in (found[0], found[2])] == [
         list(message.signals.re) for message in (sent[0], sent[2])]
     assert list(found[1].covariance_m2) == list(range(9))
-
-
-def test_every_definition_can_be_parsed():
-    pytest.importorskip('mcap_ros2', reason='there is no mcap_ros2 here')
-    from mcap_ros2._dynamic import generate_dynamic
-    for kind, _ in recorded_topics().values():
-        assert type_name(kind) in generate_dynamic(type_name(kind), schema(kind))
-
-
-def test_a_definition_contains_each_of_its_parts_once():
-    text = schema(PoseWithCovarianceStamped)
-    parts = [line for line in text.splitlines() if line.startswith('MSG: ')]
-    assert sorted(parts) == [
-        'MSG: builtin_interfaces/Time', 'MSG: geometry_msgs/Point', 'MSG: geometry_msgs/Pose',
-        'MSG: geometry_msgs/PoseWithCovariance', 'MSG: geometry_msgs/Quaternion',
-        'MSG: std_msgs/Header']
 
 
 def test_an_observer_logs_the_cycles_that_it_records(bench, probe, tmp_path):
@@ -355,20 +338,6 @@ def test_rosbags_reads_all_topics(bench, probe, tmp_path):
             ours = sent[connection.topic].pop(0)
             assert agree(ours, reader.deserialize(content, connection.msgtype)), connection.topic
     assert not any(sent.values())
-
-
-def test_the_file_declares_its_profile_and_encodings(recording):
-    """``ros2 bag`` reads them if there is no ``metadata.yaml``."""
-    from mcap.reader import make_reader
-    path, _ = recording
-    with path.open('rb') as stream:
-        reader = make_reader(stream)
-        assert reader.get_header().profile == 'ros2'
-        summary = reader.get_summary()
-    assert summary.statistics.message_count == 3
-    assert {found.encoding for found in summary.schemas.values()} == {'ros2msg'}
-    assert {channel.message_encoding for channel in summary.channels.values()} == {'cdr'}
-    assert len(summary.channels) == len(recorded_topics())
 
 
 def test_a_full_disk_ends_the_recording_with_one_error(bench, probe, tmp_path):

@@ -13,7 +13,6 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, Send, Timeout
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, role_node, topics
-from rhs_isac_ros.ros.endpoints import LATCHED, steady_timer
 from rhs_isac_ros.ros.role_node import Clocks, RoleNode
 
 
@@ -164,26 +163,6 @@ def test_a_role_may_subscribe_to_its_topics_later_and_only_once(bench, probe):
         publisher.publish(to_ros(m.Ack(cycle_id=1, user=user), None))
     bench.until(lambda: len(role.events) >= 2, 'both messages')
     assert [event.user for event, _ in role.events] == [1, 2]
-
-
-def test_a_node_withdraws_publishers_despite_an_observer_with_incompatible_qos(bench, probe):
-    """The executor may hold an event of a publisher that is destroyed."""
-    kinds = [m.Beacon, m.Grant, m.Ack, m.Pilot, m.RhsCommand]
-    node = bench.add(RoleNode, 'channel', 'scripted')
-    node.start(Scripted(sends=kinds))
-    for kind in kinds:
-        probe.create_subscription(
-            convert.ros_type(kind), topics.NAMES[kind], lambda _: None, LATCHED)
-    changes, periods_s = [], itertools.cycle((1e-4, 3e-4, 1e-3, 2e-3, 5e-3))
-
-    def change():
-        changes.append(len(changes) % 2 == 0)
-        node._on_rival(changes[-1])
-        timer.timer_period_ns = int(1e9 * next(periods_s))
-    timer = steady_timer(node, 1e-3, change)
-    # An exception would end the executor of a node; `until` ignores it.
-    while len(changes) < 2000:
-        bench.spin_once()
 
 
 def test_topics_follow_the_namespace_and_remapping(bench, start):
