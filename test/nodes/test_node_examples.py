@@ -1,6 +1,7 @@
 """The examples of a radio and a user, which know only the documented interfaces."""
 
 import importlib.util
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -100,7 +101,12 @@ def test_a_network_with_the_radio_serves_the_user_without_repetitions(
             check_endpoints(receiver)
         finally:
             user.terminate()
-    assert user.returncode == 0
+            try:
+                user.wait(30)
+            except subprocess.TimeoutExpired:
+                user.kill()
+    # Rarely, Fast DDS 2.14 never destroys a publisher; see `run.run`.
+    assert user.returncode in (0, -signal.SIGKILL)
     assert {state.user for state in states if state.user} == {7}
     signals = next(one.signals for one in received if one.cycle_id == cycle_id)
     # The base station combined the measured signals and added nothing.
