@@ -1,8 +1,16 @@
 """Messages of the protocol as ROS messages, as another program publishes and receives them."""
 
+import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 
+from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert
+
+
+def position_estimate(user=1, position=(8.0, 2.5, 0.1), **given):
+    return m.PositionEstimate(user=user, position=np.array(position), **{
+        'cycle_id': 1, 'codebook_id': 'cb', 'covariance_m2': np.eye(3), 'crlb_m2': 0.1,
+        'estimator': 'bayes', 'latency_s': 0.01} | given)
 
 
 def to_ros(message, stamp=None, identity=None):

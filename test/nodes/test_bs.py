@@ -9,6 +9,7 @@ from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Time
 from rclpy.action.client import ActionClient
 from rclpy.node import Node
+from ros_messages import position_estimate
 
 from rhs_isac_msgs.action import Locate
 from rhs_isac_ros.nodes import bs
@@ -28,9 +29,7 @@ def state(user, phase, outcome='', cycle_id=7):
 
 
 def estimate(user, cycle_id=7):
-    return m.PositionEstimate(
-        cycle_id=cycle_id, user=user, codebook_id='a', position=np.array([9.0, user, 0.0]),
-        covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.1)
+    return position_estimate(user, [9.0, user, 0.0], cycle_id=cycle_id)
 
 
 @pytest.fixture

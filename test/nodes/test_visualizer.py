@@ -8,7 +8,7 @@ import pytest
 import yaml
 from nav_msgs.msg import Path
 from rclpy.parameter import Parameter
-from ros_messages import to_ros
+from ros_messages import position_estimate, to_ros
 from visualization_msgs.msg import Marker, MarkerArray
 
 from rhs_isac_ros.nodes.visualizer import VisualizerNode
@@ -47,15 +47,18 @@ def ground_truth(user, x):
         velocity=np.zeros(3))
 
 
+def beam(sizes):
+    return m.Beam(cycle_id=1, user=1, codebook_id='cb', band=0, analog=np.ones(sizes['N_E']),
+                  digital=np.ones((sizes['N_SB'], sizes['K']), complex), expected_bps=1.0)
+
+
 def test_users_and_estimates_are_shown_at_their_positions(bench, probe, shown):
     truths, estimates = (
         bench.publisher(probe, kind) for kind in (m.GroundTruth, m.PositionEstimate))
     stamp = probe.get_clock().now().to_msg()
     for user in (1, 2):
         truths.publish(to_ros(ground_truth(user, 9.0), stamp))
-    estimates.publish(to_ros(m.PositionEstimate(
-        cycle_id=1, user=2, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
-        covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01), stamp))
+    estimates.publish(to_ros(position_estimate(2), stamp))
     bench.until(lambda: {('truth', 1), ('truth', 2), ('estimate', 2)} <= shown.keys(), 'the users')
     assert shown['truth', 2].pose.position.y == 2.0
     assert shown['estimate', 2].pose.position.x == 8.0
@@ -72,11 +75,8 @@ def test_rviz_lists_the_namespaces_of_all_markers(bench, probe, shown, small):
     sizes, stamp = small.scenario.sizes, probe.get_clock().now().to_msg()
     for message in (
             ground_truth(1, 9.0),
-            m.PositionEstimate(
-                cycle_id=1, user=1, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
-                covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01),
-            m.Beam(cycle_id=1, user=1, codebook_id='cb', band=0, analog=np.ones(sizes['N_E']),
-                   digital=np.ones((sizes['N_SB'], sizes['K']), complex), expected_bps=1.0)):
+            position_estimate(),
+            beam(sizes)):
         bench.publisher(probe, type(message)).publish(to_ros(message, stamp))
     # Only a scenario with propagation paths shows these.
     bench.until(lambda: set(display['Namespaces']) == {'traced', *(name for name, _ in shown)},
@@ -85,9 +85,8 @@ def test_rviz_lists_the_namespaces_of_all_markers(bench, probe, shown, small):
 
 def test_messages_of_another_scenario_are_ignored_without_a_warning(bench, probe, shown, capfd):
     publisher, stamp = bench.publisher(probe, m.Beam), probe.get_clock().now().to_msg()
-    beam = m.Beam(cycle_id=1, user=1, codebook_id='cb', band=0, analog=np.ones(9),
-                  digital=np.ones((1, 1), complex), expected_bps=1.0)
-    publisher.publish(to_ros(beam, stamp, (7, 'sc2')))
+    other = beam({'N_E': 9, 'N_SB': 1, 'K': 1})
+    publisher.publish(to_ros(other, stamp, (7, 'sc2')))
     truths = bench.publisher(probe, m.GroundTruth)
     truths.publish(to_ros(ground_truth(1, 9.0), stamp, (7, 'sc2')))
     truths.publish(to_ros(ground_truth(2, 9.0), stamp))
@@ -95,7 +94,7 @@ def test_messages_of_another_scenario_are_ignored_without_a_warning(bench, probe
     assert ('truth', 1) not in shown
     assert 'dropped' not in capfd.readouterr().err
     # The same message of an unknown scenario is an error.
-    publisher.publish(to_ros(beam, stamp))
+    publisher.publish(to_ros(other, stamp))
     log = []
     bench.until(lambda: log.append(capfd.readouterr().err) or 'Beam.analog' in ''.join(log),
                 'the warning')
@@ -106,15 +105,13 @@ def test_a_user_without_messages_is_removed(bench, probe, shown, small):
     """Its beam and its topics are removed as well; the other user stays."""
     truths, beams = (bench.publisher(probe, kind) for kind in (m.GroundTruth, m.Beam))
     stamp, sizes = probe.get_clock().now().to_msg(), small.scenario.sizes
-    beam = m.Beam(cycle_id=1, user=1, codebook_id='cb', band=0, analog=np.ones(sizes['N_E']),
-                  digital=np.ones((sizes['N_SB'], sizes['K']), complex), expected_bps=1.0)
     sending = {1, 2}
 
     def send():
         for user in sending:
             truths.publish(to_ros(ground_truth(user, 9.0), stamp))
         if 1 in sending:
-            beams.publish(to_ros(beam, stamp))
+            beams.publish(to_ros(beam(sizes), stamp))
     probe.create_timer(0.05, send)
     bench.until(lambda: {('truth', 1), ('truth', 2), ('beam', 0)} <= shown.keys(), 'both users')
     lobe = np.array([[p.x, p.y, p.z] for p in shown['beam', 0].points])
@@ -140,10 +137,8 @@ def test_each_user_has_a_path(bench, probe, shown):
     stamp = probe.get_clock().now().to_msg()
     for cycle_id, x in enumerate((8.0, 8.5, 9.0), start=1):
         truths.publish(to_ros(ground_truth(7, x), stamp))
-        estimates.publish(to_ros(m.PositionEstimate(
-            cycle_id=cycle_id, user=7, codebook_id='cb', position=np.array([x + 0.1, 2.5, 0.1]),
-            covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01),
-            stamp))
+        estimates.publish(to_ros(
+            position_estimate(7, [x + 0.1, 2.5, 0.1], cycle_id=cycle_id), stamp))
 
     def xs(name):
         return [pose.pose.position.x for pose in paths[name].poses] if name in paths else []

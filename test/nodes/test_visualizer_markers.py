@@ -9,7 +9,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from rclpy.parameter import Parameter
 from rclpy.time import Time as RosTime
-from ros_messages import to_ros
+from ros_messages import position_estimate, to_ros
 from visualization_msgs.msg import Marker
 
 from rhs_isac_ros.link import beam_pattern, steer
@@ -35,9 +35,8 @@ def rgb(colour):
 
 def an_estimate(covariance_m2, user=1):
     """The ellipsoid of an estimate as a marker, and as a shape."""
-    _, shape = shapes.estimate(m.PositionEstimate(
-        cycle_id=5, user=user, codebook_id='cb', position=np.array([9.0, -1.0, 0.5]),
-        covariance_m2=covariance_m2, crlb_m2=0.1, estimator='bayes', latency_s=0.01))
+    _, shape = shapes.estimate(position_estimate(
+        user, [9.0, -1.0, 0.5], covariance_m2=covariance_m2))
     return scene.marker('estimate', user, shape, STAMP), shape
 
 
@@ -183,9 +182,7 @@ def test_the_visualizer_publishes_transforms(bench, probe):
     bench.until(lambda: topics.RHS_FRAME in found, 'the surface')
     bench.until(lambda: probe.count_publishers(topics.TF), 'the publisher')
     estimates = bench.publisher(probe, m.PositionEstimate)
-    estimate = to_ros(m.PositionEstimate(
-        cycle_id=1, user=2, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
-        covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01), Time())
+    estimate = to_ros(position_estimate(2), Time())
     probe.create_timer(0.05, lambda: estimates.publish(estimate))
     bench.until(lambda: 'user_2' in found, 'the user')
     assert found['user_2'].y == 2.5
@@ -205,9 +202,7 @@ def test_two_networks_share_one_tree(bench, probe, tmp_path):
             Parameter('frame_id', value='odom'), Parameter('scenario_file', value=str(file))])
         estimates = probe.create_publisher(
             convert.ros_type(m.PositionEstimate), f'/{space}/position_estimate', EXCHANGE)
-        estimate = to_ros(m.PositionEstimate(
-            cycle_id=1, user=2, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
-            covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01), Time())
+        estimate = to_ros(position_estimate(2), Time())
         probe.create_timer(0.05, functools.partial(estimates.publish, estimate))
     for space, position_m in poses.items():
         for child, place in (('user_2', [8.0, 2.5, 0.1]), ('rhs_link', position_m)):

@@ -3,7 +3,6 @@
 import importlib
 import threading
 
-import numpy as np
 import pytest
 from geometry_msgs.msg import Point, Vector3
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -11,6 +10,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import serialize_message
+from ros_messages import position_estimate
 
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.nodes import bs
@@ -18,10 +18,6 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import endpoints, topics
 from rhs_isac_ros.ros.endpoints import BackgroundWorker, UserTopics
 from rhs_isac_ros.ros.roster import ROSTER
-
-ESTIMATE = m.PositionEstimate(
-    cycle_id=1, user=1, codebook_id='', position=np.array([2.0, 0.0, 0.0]),
-    covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01)
 
 
 def test_a_message_is_created_once_for_all_topics_with_subscribers(bench, probe):
@@ -109,7 +105,7 @@ def test_a_role_runs_without_what_was_refused(bench, make, refused, capfd, role)
         node._on_codebook(Codebook.load(default_codebook_file()))
     if role == 'positioner':
         bench.until(lambda: topics.NAMES[m.ReceivedSignals] in refused, 'the estimator')
-        assert node.publish(ESTIMATE)
+        assert node.publish(position_estimate())
     if role == 'user':
         node._publish_ground_truth()
     bench.spin_once()
@@ -136,7 +132,7 @@ def test_a_simulation_whose_time_was_refused_is_not_used(bench, make, refused):
 
 def test_the_visualizer_runs_without_what_was_refused(make, refused):
     node = make('visualizer')
-    node._on_message(ESTIMATE)
+    node._on_message(position_estimate())
     node._show()
     assert {topics.MARKERS, topics.PATH.format(user=1), topics.TRUE_PATH.format(user=1)} <= {
         *refused}
