@@ -112,9 +112,10 @@ def test_a_robot_is_served_where_it_is(driven):
     ends = watch.until_served(6, 2, driven.running)
     errors, delays_m = [], []
     for end in ends:
-        truth, = watch.until(lambda n=end.cycle_id: watch.of_cycle(m.GroundTruth, n), 'the truth')
-        estimate, = watch.until(
-            lambda n=end.cycle_id: watch.of_cycle(m.PositionEstimate, n), 'the estimate')
+        # On a busy machine, messages of a cycle are repeated.
+        truth, estimate = (watch.until(
+            lambda kind=kind, n=end.cycle_id: watch.of_cycle(kind, n), kind.__name__)[0]
+            for kind in (m.GroundTruth, m.PositionEstimate))
         assert BEGIN_S < 1e-9 * estimate.stamp_ns < 1e6
         delays_m.append(np.linalg.norm(
             truth.position - driven.robot.place(1e-9 * truth.stamp_ns)[0]))
@@ -183,8 +184,8 @@ def test_an_action_returns_the_position_of_each_user(driven):
                             f'the position of user {user}', driven.running)
         assert found.status == GoalStatus.STATUS_SUCCEEDED, found.result.reason
         assert found.result.pose.header.frame_id == 'odom'
-        estimate, = watch.until(
-            lambda n=found.result.cycle_id: watch.of_cycle(m.PositionEstimate, n), 'the estimate')
+        estimate = watch.until(lambda n=found.result.cycle_id: watch.of_cycle(
+            m.PositionEstimate, n), 'the estimate')[0]
         assert estimate.user == user
         assert Time.from_msg(found.result.pose.header.stamp).nanoseconds == estimate.stamp_ns
         assert_at(found.result.pose, estimate)

@@ -42,7 +42,10 @@ def connected_hosts() -> Iterator[None]:
     """
     _remove()
     try:
-        _create()
+        try:
+            _create()
+        except (OSError, subprocess.CalledProcessError) as error:
+            raise NamespacesUnavailable(getattr(error, 'stderr', error)) from None
         yield
     finally:
         _remove()
@@ -70,7 +73,7 @@ def _remove() -> None:
         if owner != str(os.getpid()) and Path(f'/proc/{owner}').exists():
             continue
         # Another run may be removing the namespace already.
-        with contextlib.suppress(NamespacesUnavailable):
+        with contextlib.suppress(subprocess.CalledProcessError):
             for pid in map(int, _ip('netns', 'pids', name).split()):
                 # This process itself may have moved there.
                 if pid != os.getpid():
@@ -110,10 +113,7 @@ def _port(host: str) -> str:
 def _ip(*arguments: str, host: str = '') -> str:
     """Run the command ip, on a host if one is given, and return its output."""
     place = ('-n', _namespace(host)) if host else ()
-    try:
-        return subprocess.run(
-            ('ip', *place, *arguments), stdin=subprocess.DEVNULL, capture_output=True, text=True,
-            # Ctrl-C must not interrupt a command halfway.
-            check=True, start_new_session=True).stdout
-    except (OSError, subprocess.CalledProcessError) as error:
-        raise NamespacesUnavailable(getattr(error, 'stderr', '') or error) from None
+    # Ctrl-C must not interrupt a command halfway.
+    return subprocess.run(
+        ('ip', *place, *arguments), stdin=subprocess.DEVNULL, capture_output=True, text=True,
+        check=True, start_new_session=True).stdout
