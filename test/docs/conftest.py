@@ -23,7 +23,7 @@ def build(tmp_path_factory):
     done = subprocess.run(
         [sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-E', '-q', '-b', 'html',
          '-w', folder / 'warnings', '-d', folder / 'doctrees', DOCS, folder / 'html'],
-        capture_output=True, text=True, timeout=480, check=False,
+        capture_output=True, text=True, timeout=1200, check=False,
         # A proxy that does not exist: reading from the network fails.
         env={**os.environ, 'http_proxy': 'http://127.0.0.1:9', 'https_proxy': 'http://127.0.0.1:9',
              'OPENBLAS_NUM_THREADS': '1'})
