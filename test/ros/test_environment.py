@@ -1,10 +1,16 @@
 """Environment variables that ROS reads: their checks and defaults."""
 
 import argparse
+import os
 
 import pytest
 
-from rhs_isac_ros.ros.environment import check_environment, discovery_range, log_arguments
+from rhs_isac_ros.ros.environment import (
+    check_environment,
+    claim_domain,
+    discovery_range,
+    log_arguments,
+)
 
 
 @pytest.mark.parametrize(('name', 'value', 'expected'), [
@@ -48,6 +54,13 @@ def test_the_older_variable_for_the_discovery_range_takes_precedence(
         if value:
             monkeypatch.setenv(name, value)
     assert discovery_range() == expected
+
+
+def test_claimed_domains_differ_and_have_ports_below_the_ephemeral_ones(monkeypatch):
+    monkeypatch.setattr(os, 'getpid', lambda: 101)
+    domains = {int(claim_domain()) for _ in range(3)}
+    assert len(domains) == 3
+    assert min(domains) >= 1 and max(domains) <= 101
 
 
 WITHOUT_LOG_FILES = ['--ros-args', '--disable-external-lib-logs']
