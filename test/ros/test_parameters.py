@@ -56,7 +56,9 @@ def make(module_bench):
 
     def make(**values):
         overrides = [Parameter(name, value=value) for name, value in values.items()]
-        nodes.append(module_bench.add(Node, f'probe_{len(nodes)}', parameter_overrides=overrides))
+        nodes.append(module_bench.add(
+            Node, f'probe_{len(nodes)}', parameter_overrides=overrides, enable_rosout=False,
+            start_parameter_services=False))
         return nodes[-1]
     yield make
     for node in nodes:
