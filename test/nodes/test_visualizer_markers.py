@@ -136,23 +136,17 @@ def test_users_are_where_their_messages_say():
 HAS_TF2 = importlib.util.find_spec('tf2_msgs') is not None
 
 
-def test_the_surface_is_at_the_origin_of_the_map():
-    frame, pose = Frame(), Pose()
-    transform = scene.transform(
-        frame, frame.surface, pose.origin, Time(sec=3), pose.unit_quaternion)
-    assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'rhs_link')
-    assert transform.header.stamp.sec == 3
-    assert [getattr(transform.transform.translation, axis) for axis in 'xyz'] == [0.0] * 3
-    assert transform.transform.rotation.w == 1.0
-
-
-def test_a_user_is_at_its_estimate():
-    frame = Frame()
-    transform = scene.transform(
-        frame, frame.user(7), np.array([9.0, -1.5, 0.25]), Time(sec=4))
-    assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'user_7')
-    assert [getattr(transform.transform.translation, axis) for axis in 'xyz'] == [9.0, -1.5, 0.25]
-    assert [getattr(transform.transform.rotation, axis) for axis in 'xyzw'] == [0.0, 0.0, 0.0, 1.0]
+def test_a_transform_has_the_place_of_its_child():
+    frame, turned = Frame(), Pose((1, 2, 3), (0, 0, 1, 1))
+    for found, child, place, turn in (
+            (scene.transform(frame, frame.surface, turned.origin, STAMP, turned.unit_quaternion),
+             'rhs_link', [1.0, 2.0, 3.0], [0.0, 0.0, *2 * [np.sqrt(0.5)]]),
+            (scene.transform(frame, frame.user(7), np.array([9.0, -1.5, 0.25]), STAMP),
+             'user_7', [9.0, -1.5, 0.25], [0.0, 0.0, 0.0, 1.0])):
+        assert (found.header.frame_id, found.child_frame_id) == ('map', child)
+        assert found.header.stamp == STAMP
+        assert of(found.transform.translation).tolist() == place
+        assert [getattr(found.transform.rotation, axis) for axis in 'xyzw'] == pytest.approx(turn)
 
 
 def test_two_networks_have_frames_of_their_own():
