@@ -257,7 +257,6 @@ class BsNode(RoleNode[BaseStation]):
         # An action that is still to be withdrawn would outlive its node.
         self.endings.callback(self._locate.destroy)
 
-
     def execute(self, action: events.Action) -> None:
         """Store a reply for the service call that caused it."""
         if isinstance(action, events.Reply):

@@ -70,8 +70,7 @@ class PositionerNode(LocatingNode[Positioner]):
     def _make_estimator(
             self, settings: PositionerSettings, codebook: Codebook) -> positioning.Estimator:
         options = positioning.file_options(
-            settings.estimator, self.table_folder,
-            settings.model_file)
+            settings.estimator, self.table_folder, settings.model_file)
         if settings.estimator in positioning.REGION_ESTIMATORS:
             options['reject_outside'] = settings.reject_outside
             options['progress'] = self._on_progress

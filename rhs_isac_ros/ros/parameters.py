@@ -286,18 +286,14 @@ def check_nodes(nodes: Sequence[Node]) -> None:
         if (n := names.count(name)) > 1:
             raise ParameterError(f'argument -r: {n} nodes are renamed to {name}, expected one: '
                                  '-r NAME:__node:=NEW_NAME')
-    for node in nodes:
-        _check_overrides(node)
-
-
-def _check_overrides(node: Node) -> None:
     known = known_names()
-    # rclpy gives no public access to all overrides. An endpoint declares its qos_overrides.*.
-    foreign = [f'{name}{hint(name)}' for name in sorted(node._parameter_overrides)
-               if not (name in known or node.has_parameter(name)
-                       or name.startswith('qos_overrides.'))]
-    if foreign:
-        node.get_logger().warning(f'unknown parameters are ignored: {", ".join(foreign)}')
+    for node in nodes:
+        # rclpy gives no public access to all overrides. An endpoint declares its qos_overrides.*.
+        foreign = [f'{name}{hint(name)}' for name in sorted(node._parameter_overrides)
+                   if not (name in known or node.has_parameter(name)
+                           or name.startswith('qos_overrides.'))]
+        if foreign:
+            node.get_logger().warning(f'unknown parameters are ignored: {", ".join(foreign)}')
 
 
 def known_names() -> set[str]:
