@@ -124,14 +124,15 @@ def test_an_invalid_message_of_the_role_is_not_published(each_bench, start, capf
 
 
 def test_log_messages_are_logged_with_their_severity(bench, start, capfd):
-    role = Scripted(
-        lambda role, event, now_s: [LogMessage('information'), LogMessage('a warning', True)])
+    role = Scripted(lambda role, event, now_s: [
+        LogMessage('information'), LogMessage('a warning', True),
+        LogMessage('a state', True, 'key', True), LogMessage('its end', False, 'key', False)])
     start(bench, role).dispatch(m.Ack(cycle_id=1, user=1))
-    first, second = capfd.readouterr().err.strip().splitlines()
-    assert '[INFO]' in first
-    assert first.endswith('[scripted]: information')
-    assert '[WARN]' in second
-    assert second.endswith('[scripted]: a warning')
+    lines = capfd.readouterr().err.strip().splitlines()
+    for line, severity, text in zip(lines, ('INFO', 'WARN', 'WARN', 'INFO'), (
+            'information', 'a warning', 'a state', 'its end'), strict=True):
+        assert f'[{severity}]' in line
+        assert line.endswith(f'[scripted]: {text}')
 
 
 def test_messages_keep_their_order(each_bench, start):

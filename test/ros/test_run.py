@@ -105,6 +105,15 @@ def test_each_process_has_the_enclave_of_its_node(args, enclave, secure, initial
     assert initialised == [[*args, '--ros-args', '--enclave', enclave]]
 
 
+@pytest.mark.parametrize(('program', 'strategy', 'is_named'), [
+    ('watch', 'Permissive', True), ('watch', 'Enforce', False), ('bs', 'Permissive', False)])
+def test_a_process_that_runs_without_security_says_so(
+        program, strategy, is_named, secure, initialised, monkeypatch, capsys):
+    monkeypatch.setenv('ROS_SECURITY_STRATEGY', strategy)
+    run.init([program])
+    assert ('WITHOUT security: ' in capsys.readouterr().err) == is_named
+
+
 def test_a_given_enclave_takes_precedence(secure, initialised):
     args = ['bs', '--ros-args', '--enclave', '/other']
     run.init(args)
