@@ -262,7 +262,7 @@ class FailedSurfaces:
     def extensions(self, failed: Failed, remainder: float) -> Whitening:
         """Return the factors for a set with each element added in turn.
 
-        `remainder` times `error` is added to their covariances.
+        `remainder` times the covariance of the errors of all failures is added to theirs.
         """
         if (failed, remainder) not in self._extensions:
             surface = self.surface(failed)
@@ -439,10 +439,9 @@ class FailureSearch:
     of some hypothesis is as low as usual, or else after `FailureLimits.growth` elements.
     """
 
-    def __init__(self, model: FailureModel, signals: Signals,
-                 limits: FailureLimits = LIMITS) -> None:
-        self._model, self._signals, self._limits = model, signals, limits
-        self._usual = energy_limit(int(np.prod(model.likelihood.model.shape)), limits.unusual)
+    def __init__(self, model: FailureModel, signals: Signals) -> None:
+        self._model, self._signals = model, signals
+        self._usual = energy_limit(int(np.prod(model.likelihood.model.shape)), LIMITS.unusual)
         self.sites: list[Site] = []
         # Logarithm of prior times likelihood of each hypothesis.
         self.values: dict[Key, float] = {}
@@ -470,17 +469,17 @@ class FailureSearch:
         """
         # Earlier growth does not count: it may have ended with a set that is less probable.
         found = self._weigh(parents)
-        for _ in range(self._limits.growth):
+        for _ in range(LIMITS.growth):
             ranked = self._weigh_children(parents, remainder)
             if not ranked:
                 # All elements have failed.
                 break
-            exact = self._weigh(ranked[:self._limits.exact])
-            limit = max(self.values[key] for key in found) - self._limits.margin
+            exact = self._weigh(ranked[:LIMITS.exact])
+            limit = max(self.values[key] for key in found) - LIMITS.margin
             if self.values[exact[0]] < limit and self.explains(found):
                 break
             found += exact
-            parents = _diverse(ranked, self._limits)
+            parents = _diverse(ranked, LIMITS)
 
     def try_neighbours(self, key: Key) -> None:
         """Weigh the sets in which one element is added, removed or replaced."""
@@ -488,7 +487,7 @@ class FailureSearch:
         smaller = [tuple(sorted(set(failed) - {element})) for element in failed]
         self._weigh((one, index) for one in smaller)
         for parent in (failed, *smaller):
-            self._weigh(self._weigh_children([(parent, index)])[:self._limits.exact])
+            self._weigh(self._weigh_children([(parent, index)])[:LIMITS.exact])
 
     def _weigh(self, keys: Iterable[Key]) -> list[Key]:
         """Weigh hypotheses, and return them, the most probable first."""

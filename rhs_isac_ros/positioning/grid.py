@@ -33,7 +33,7 @@ from rhs_isac_ros.positioning.templates import Cells, Filters, Query, turns_at
 Draw: TypeAlias = Callable[[Query, int], Fit | None]
 
 
-class SearchLimits(NamedTuple):
+class _Limits(NamedTuple):
     """Numbers that trade the speed of the search for the completeness of its result."""
 
     # Number of filter outputs in a block, which limits the number of shots in it.
@@ -51,13 +51,13 @@ class SearchLimits(NamedTuple):
     # Remaining error of the log-likelihood after a step with the slopes, as a share of the loss
     # that the step recovers.
     step_error: float = 0.25
+    # Squared Mahalanobis distance below which points belong to the same mode, and largest distance
+    # at which they are compared, in radii of an ellipsoid that contains no other mode.
+    same_mode: float = 2.0
+    reach: float = 3.0
 
 
-LIMITS = SearchLimits()
-# Squared Mahalanobis distance below which points belong to the same mode.
-_SAME_MODE = 2.0
-# Largest distance at which points are compared, in radii of the ellipsoid.
-_MAX_REACH = 3.0
+_LIMITS = _Limits()
 
 
 class Starts(NamedTuple):
@@ -86,9 +86,9 @@ class TemplateTable:
     """
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray],
-                 limits: SearchLimits = LIMITS, grid: Grid | None = None) -> None:
+                 grid: Grid | None = None) -> None:
         self.normal, self.spread = arrays['normal'], arrays['spread']
-        self.grid, self._limits = grid or lay_grid(scenario), limits
+        self.grid = grid or lay_grid(scenario)
         self._resolution = resolution = Resolution.of(scenario)
         self.filters = Filters.of(arrays)
         self.cells = Cells.of(self.grid, resolution, arrays)
@@ -115,7 +115,7 @@ class TemplateTable:
         for it. A shot for which it returns a posterior has no points. These posteriors are
         returned, too, keyed by the shot.
         """
-        n = max(1, self._limits.block // (len(self.cells.energy) * len(self._wavenumbers)))
+        n = max(1, _LIMITS.block // (len(self.cells.energy) * len(self._wavenumbers)))
         parts, drawn = [], {}
         for first in range(0, len(whitened), n):
             query = self.query(whitened[first:first + n], prior, margin)
@@ -147,7 +147,7 @@ class TemplateTable:
         value = value - likelihood_loss(inside - points, curvature)
         order = np.lexsort((-value, peaks.shots))
         of_shot = Segments.of_keys(peaks.shots[order])
-        error = self._limits.step_error * self.cells.loss[peaks.cell[order]]
+        error = _LIMITS.step_error * self.cells.loss[peaks.cell[order]]
         # A peak and the best one may both be wrong.
         slack = error + of_shot.repeat(of_shot.first(error))
         margin = np.broadcast_to(query.margin, self.cells.loss.shape)[peaks.cell[order]]
@@ -163,7 +163,7 @@ class TemplateTable:
         """
         bound, loss, shots = query.bound, self.cells.loss, np.arange(len(query.bound))[:, None]
         # The cells with the highest bounds determine how likely peaks in the others must be.
-        n_first = min(self._limits.first_cells, bound.shape[1])
+        n_first = min(_LIMITS.first_cells, bound.shape[1])
         first = np.sort(np.argpartition(bound, -n_first, axis=1)[:, -n_first:], axis=1)
         peaks = self._peaks_in(np.repeat(shots, n_first), first.ravel(), query)
         best = np.full(len(shots), -np.inf)
@@ -173,8 +173,8 @@ class TemplateTable:
         is_likely[shots, first] = False
         drawn = {}
         if draw:
-            many = np.count_nonzero(is_likely, axis=1) > self._limits.searched_cells
-            weak = np.flatnonzero(many & (best <= self._limits.drawn_likelihood)).tolist()
+            many = np.count_nonzero(is_likely, axis=1) > _LIMITS.searched_cells
+            weak = np.flatnonzero(many & (best <= _LIMITS.drawn_likelihood)).tolist()
             drawn = {shot: fit for shot in weak if (fit := draw(query, shot)) is not None}
             is_likely[[*drawn]] = False
             peaks = select(peaks, ~np.isin(peaks.shots, [*drawn]))
@@ -184,7 +184,7 @@ class TemplateTable:
         peaks = select(
             peaks, peaks.value + loss[peaks.cell] >= limit[peaks.shots, peaks.cell])
         peaks = select(peaks, np.lexsort((-peaks.value, peaks.shots)))
-        peaks = select(peaks, Segments.of_keys(peaks.shots).places < self._limits.peaks)
+        peaks = select(peaks, Segments.of_keys(peaks.shots).places < _LIMITS.peaks)
         radii = self._resolution.separation(query.prior.is_coarse)
         return select(peaks, separate(peaks.shots, self._points(peaks), radii)), drawn
 
@@ -324,14 +324,14 @@ def separate(shots: np.ndarray, points: np.ndarray, radii: np.ndarray,
         return chosen
     if curvature is not None:
         variance = np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2) / radii**2
-        reach = float(np.clip(np.sqrt(_SAME_MODE * variance.max()), 1.0, _MAX_REACH))
+        reach = float(np.clip(np.sqrt(_LIMITS.same_mode * variance.max()), 1.0, _LIMITS.reach))
     # Move points of different shots far away from each other.
     scaled[:, 0] += shots * (2 * reach + np.ptp(scaled[:, 0]))
     better, worse = cKDTree(scaled).query_pairs(reach, output_type='ndarray').T
     if curvature is not None:
         offset = points[worse] - points[better]
         close = np.sum((offset / radii)**2, axis=1) < 1
-        close |= np.einsum('kp,kpq,kq->k', offset, curvature[worse], offset) < _SAME_MODE
+        close |= np.einsum('kp,kpq,kq->k', offset, curvature[worse], offset) < _LIMITS.same_mode
         worse, better = worse[close], better[close]
     previous = ~chosen
     # Only better points matter to a point, so each round settles at least one more. A few rounds

@@ -148,7 +148,7 @@ class NuisancePrior(Exponents):
         self.relative_phase_std_rad = _relative_std(self.phase_covariance)
         self.is_coarse = self.relative_phase_std_rad >= COARSE_STD_RAD
         kept = ~(declared.phases.any(axis=0) & self.is_coarse)
-        n_bands, n_rows = model.shape
+        _, n_bands, n_rows = declared.scaled_patterns.shape
         turns = _UNIFORM_EQUIVALENT * np.eye(n_bands)[:n_bands * self.is_coarse]
         patterns = np.concatenate([
             declared.scaled_patterns[kept], 1j * turns[:, :, None] * np.ones(n_rows)])

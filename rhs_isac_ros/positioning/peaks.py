@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.positioning.lattice import Grid
-from rhs_isac_ros.positioning.segments import Segments
+from rhs_isac_ros.positioning.segments import Segments, select
 from rhs_isac_ros.positioning.templates import Query, turns_at
 
 # Fine range steps per shortest wavelength; at least four are needed to resolve the posterior.
@@ -37,9 +37,10 @@ class RangeWindows:
 
         Returns the index from 0 to K - 1 of each window's pair, and of the window, int [W].
         """
-        first, counts = (field[self._cell[cells]] for field in self._of_cell)
-        of_pair = Segments.of_counts(counts)
-        return of_pair.repeat(np.arange(len(cells))), of_pair.repeat(first) + of_pair.places
+        windows = select(self._of_cell, self._cell[cells])
+        of_pair = Segments.of_counts(windows.counts)
+        pair = of_pair.repeat(np.arange(len(cells)))
+        return pair, of_pair.repeat(windows.starts) + of_pair.places
 
 
 class Candidates(NamedTuple):
@@ -127,11 +128,10 @@ def _inner_maxima(along: np.ndarray, of_shot: Segments) -> tuple[np.ndarray, np.
     inner = along[1:-1]
     is_peak = inner >= along[:-2]
     is_peak &= inner > along[2:]
-    has_peak = of_shot.max(is_peak.max(axis=0))
-    for rows, is_found in zip(of_shot.slices, has_peak.tolist(), strict=True):
-        if not is_found:
-            values = inner[:, rows]
-            is_peak[:, rows][np.unravel_index(values.argmax(), values.shape)] = True
+    lacking = ~of_shot.max(np.logical_or.reduce(is_peak))
+    for rows in select(of_shot, lacking).slices:
+        values = inner[:, rows]
+        is_peak[:, rows][np.unravel_index(values.argmax(), values.shape)] = True
     step, window = np.nonzero(is_peak)
     return step + 1, window
 

@@ -215,8 +215,8 @@ def sample_with(model, failed, seed):
         POSITION[None], rng)
 
 
-def search_at_the_truth(model, received, limits=LIMITS):
-    search = FailureSearch(model, model.likelihood.signals(received), limits)
+def search_at_the_truth(model, received):
+    search = FailureSearch(model, model.likelihood.signals(received))
     return search, search.add(POINT[None], NO_VALUES[None])
 
 

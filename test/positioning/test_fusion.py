@@ -193,13 +193,6 @@ def test_agreement_is_the_density_of_the_signals_relative_to_separate_users():
     np.testing.assert_allclose(fuse([first], BOUNDS).log_agreement, 0.0, atol=0.01)
 
 
-def test_agreement_does_not_depend_on_the_level_of_the_likelihood():
-    front, side = sheets(FRONT, PLACE), sheets(SIDE, PLACE)
-    louder = dataclasses.replace(front, mixture=front.mixture.weighted(300.0))
-    np.testing.assert_allclose(fuse([louder, side], BOUNDS).log_agreement,
-                               fuse([front, side], BOUNDS).log_agreement)
-
-
 def test_fusion_needs_a_surface():
     with pytest.raises(ValueError, match='sightings: none, expected at least one'):
         fuse([], BOUNDS)

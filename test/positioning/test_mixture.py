@@ -75,15 +75,6 @@ def test_a_likelihood_of_positions_also_updates_velocities():
         joint.log_density(points) + likelihood.log_density(points[:, :3]))
 
 
-def test_widening_keeps_the_mass_and_the_mean():
-    both = mixture(13)
-    wide = both.widened(0.5 * np.eye(3))
-    np.testing.assert_allclose(wide.log_mass, both.log_mass)
-    (mean, covariance), (wide_mean, wide_covariance) = both.moments(), wide.moments()
-    np.testing.assert_allclose(wide_mean, mean)
-    np.testing.assert_allclose(wide_covariance, covariance + 0.5 * np.eye(3))
-
-
 def test_the_position_is_a_marginal():
     both = mixture(14, size=6)
     mean, covariance = both.moments()

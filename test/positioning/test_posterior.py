@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.special import i0e, ive
-from scipy.stats import multivariate_normal, qmc
+from scipy.stats import multivariate_normal, norm, qmc
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import estimators, make_estimator
 from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
-from rhs_isac_ros.positioning.posterior import _SPREAD, BandPhases, _log_share
+from rhs_isac_ros.positioning.posterior import _SPREAD, BandPhases, _log_density, _log_share
 from rhs_isac_ros.positioning.search import Modes
 
 SCENARIO = Scenario(
@@ -111,6 +111,14 @@ def test_the_factors_average_the_series_over_a_wavelength_and_the_shared_phase(
     np.testing.assert_allclose(found, np.log(likely.mean(axis=1)), atol=tolerance)
     np.testing.assert_allclose(
         offsets_m, likely @ ranges / likely.sum(axis=1), atol=wavelength / 10)
+
+
+@pytest.mark.parametrize('std_rad', [0.3, 1.5, 3.0])
+def test_a_wrapped_density_is_the_sum_over_all_turns(std_rad):
+    angles = np.linspace(-5, 5, 41)
+    turns = 2 * np.pi * np.arange(-4, 5)
+    expected = 2 * np.pi * norm(scale=std_rad).pdf(angles[:, None] + turns).sum(axis=1)
+    np.testing.assert_allclose(_log_density(angles, std_rad), np.log(expected), atol=0.01)
 
 
 @pytest.mark.parametrize('std_rad, is_informative', [

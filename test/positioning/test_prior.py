@@ -10,7 +10,8 @@ from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
 from rhs_isac_ros.model.geometry import to_polar
 from rhs_isac_ros.positioning import BayesEstimator, Mixture
 from rhs_isac_ros.positioning.lattice import Resolution, lay_grid
-from rhs_isac_ros.positioning.prior import bend, cells_of, flatten
+from rhs_isac_ros.positioning.prior import bend, cells_of, flatten, multiply
+from rhs_isac_ros.positioning.search import Modes
 
 PLACE = np.array([8.5, -1.5, 0.2])
 STD_M = 0.15
@@ -93,6 +94,20 @@ def test_the_search_covers_four_standard_deviations():
         part.widths_m[part.cell] / 2, np.tile(0.2 * resolution.direction, (len(part.cell), 1))])
     assert (apart <= 1.01 * half).all(axis=2).any(axis=1).all()
     assert np.count_nonzero(chosen) < 0.1 * len(chosen)
+
+
+@pytest.mark.parametrize('share', [0.25, 1.0])
+def test_a_share_is_an_exponent_of_the_likelihood(share):
+    point, before = to_polar(PLACE), bend(around(PLACE + [0.1, -0.2, 0.05]), Pose())
+    curvature = np.diag(1 / np.array([0.1, 0.02, 0.03])**2)
+    modes = Modes(np.zeros(1, int), point[None], np.zeros((1, 3)), curvature[None], np.zeros(1),
+                  np.zeros((1, 0)), np.zeros(1), np.zeros(1, int))
+    found = multiply(before, modes, share, None, None, Scenario().roi_bounds_m).bent
+    precision = np.linalg.inv(before.covariances[0])
+    covariance = np.linalg.inv(precision + share * curvature)
+    np.testing.assert_allclose(found.covariances[0], covariance, atol=1e-12)
+    np.testing.assert_allclose(
+        found.means[0], covariance @ (precision @ before.means[0] + share * curvature @ point))
 
 
 def test_the_posterior_is_the_prior_times_the_likelihood(table1_estimator, model):

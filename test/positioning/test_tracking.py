@@ -36,14 +36,6 @@ def continued(motion, mixture, elapsed_s):
     return select(motion.predict(mixture, elapsed_s), slice(len(mixture.means)))
 
 
-def test_a_mixture_starts_at_rest_with_the_assumed_speed():
-    mixture = started(Motion(speed_mps=2.0))
-    positions, velocities, covariances = cartesian(mixture)
-    np.testing.assert_allclose(positions, PLACE)
-    np.testing.assert_array_equal(velocities, 0.0)
-    np.testing.assert_allclose(np.trace(covariances[0, 3:, 3:]), 4.0)
-
-
 def test_means_move_in_straight_lines_and_slow_down():
     motion = Motion(memory_s=2.0)
     mixture = started(motion)
@@ -388,12 +380,6 @@ def test_a_time_that_is_not_finite_is_an_error_and_does_not_change_the_track(
         found, expected = (each.update(0.3 * step, signals) for each in (tracker, other))
         np.testing.assert_array_equal(found.mean, expected.mean)
         assert found.n_phases == expected.n_phases
-
-
-@pytest.mark.parametrize('elapsed_s', [np.nan, np.inf, -1.0])
-def test_a_prediction_takes_a_finite_time(elapsed_s):
-    with pytest.raises(ValueError, match='^elapsed_s: .*expected at least 0'):
-        Motion().predict(started(Motion()), elapsed_s)
 
 
 MISSING = 1e-6
