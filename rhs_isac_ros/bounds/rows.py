@@ -257,15 +257,14 @@ class CompressedRows(MeasurementRows):
     To a given accuracy, the rows of all positions in a region span far fewer dimensions than a row
     has entries. A randomised range finder with a fixed seed finds a basis. `tolerance` limits the
     root mean square of the relative errors of the rows. Raises ValueError if it is less than
-    `MIN_TOLERANCE`, or not less than 1. The first sketch has `n_columns`, by default as many as
-    usually suffice.
+    `MIN_TOLERANCE`, or not less than 1.
     """
 
-    def __init__(self, source: RowSource, tolerance: float, n_columns: int = 0) -> None:
+    def __init__(self, source: RowSource, tolerance: float) -> None:
         super().__init__(source, n_groups=1)
         scenario = source.scenario
         # Enough for Table I, and more for larger surfaces.
-        n_columns = n_columns or max(_MIN_SKETCH, min(scenario.n_elements // 2, _MAX_RANK))
+        n_columns = max(_MIN_SKETCH, min(scenario.n_elements // 2, _MAX_RANK))
         self.coefficients: list[np.ndarray] = []
         for band in range(scenario.n_bands):
             coefficients, basis = _compress(

@@ -35,8 +35,6 @@ _DEVIATIONS = ('gains_std', 'offsets_std', 'band_gains_std')
 _N_WORST = 5
 
 
-
-
 class CalibrationWarning(UserWarning):
     """A calibration does not explain the signals of its pilots."""
 

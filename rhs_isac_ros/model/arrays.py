@@ -119,21 +119,20 @@ def position_problem(positions: np.ndarray) -> str:
     return ''
 
 
-def checked_positions(positions: ArrayLike, name: str = 'positions') -> np.ndarray:
+def checked_positions(positions: ArrayLike) -> np.ndarray:
     """Return positions in front of the surface as float64 [N, 3] [m], or raise ValueError."""
-    array = numbers(name, positions)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f'{name}: shape {array.shape}, expected [N, 3]')
-    if problem := position_problem(array):
-        raise ValueError(f'{name}: {problem}')
-    return array
+    return _checked('positions', positions, 2, '[N, 3]')
 
 
 def checked_position(position: ArrayLike, name: str = 'positions') -> np.ndarray:
     """Return a position in front of the surface as float64 [3] [m], or raise ValueError."""
-    array = numbers(name, position)
-    if array.shape != (3,):
-        raise ValueError(f'{name}: shape {array.shape}, expected [3]')
+    return _checked(name, position, 1, '[3]')
+
+
+def _checked(name: str, value: ArrayLike, n_axes: int, expected: str) -> np.ndarray:
+    array = numbers(name, value)
+    if array.ndim != n_axes or array.shape[-1] != 3:
+        raise ValueError(f'{name}: shape {array.shape}, expected {expected}')
     if problem := position_problem(array):
         raise ValueError(f'{name}: {problem}')
     return array

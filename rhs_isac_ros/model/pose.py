@@ -123,7 +123,6 @@ class Pose:
         turned = _nested(quaternion_product(half, np.array(self.quaternion)))
         return dataclasses.replace(self, position_m=moved, quaternion=turned)
 
-
     def error_of(self, other: 'Pose') -> np.ndarray:
         """Return the error that displaces this pose to another one, float64 [6]; see `displaced`.
 

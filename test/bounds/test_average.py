@@ -1,4 +1,4 @@
-"""Averages of losses of quadratic forms, and the average bound."""
+"""The average bound and its gradients."""
 
 import dataclasses
 
@@ -6,119 +6,13 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import AverageCrlb, average_crlb, crlb
-from rhs_isac_ros.bounds.average import Average, Gradient
-from rhs_isac_ros.bounds.rows import RowSource
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import MeasurementModel, MultipathEstimate, Scenario
+from rhs_isac_ros.model.elements import SurfaceEstimate
+from rhs_isac_ros.model.hall import CONDITIONS, FIELDS
 from rhs_isac_ros.model.impairments import BUILT_IN
 from rhs_isac_ros.model.multipath import multipath_covariance
-
-N_ITEMS = 7
-
-
-def complex_array(rng, *shape):
-    return rng.normal(size=(*shape, 2)) @ [1, 1j]
-
-
-@pytest.fixture(scope='module')
-def faded(random_beams):
-    """Two bands whose sub-bands and frames are far from fully correlated."""
-    scenario = Scenario(
-        center_frequencies_hz=(1.2e9, 3.1e9), n_subbands=3, n_frames=2, n_feeds=2,
-        elements_per_side=3, subband_width_hz=4e5, frame_duration_s=3e-3, noise_psd_dbm_hz=-70,
-        roi_center_m=(3, 0, 0), roi_size_m=(2, 4, 2))
-    return scenario, random_beams(scenario, np.random.default_rng(0))
-
-
-@pytest.fixture(scope='module', params=[1, 2, 3], ids='{} rows'.format)
-def items(request):
-    """Random rows, complex [N_ITEMS, G, N_B, N_SB, N_E]."""
-    return 1e-4 * complex_array(np.random.default_rng(request.param), N_ITEMS, request.param,
-                                2, 3, 9)
-
-
-def make(scenario, items, loss, tolerance=0.0, **options):
-    return Average(RowSource(
-        scenario, lambda block, band: items[block, :, band], N_ITEMS, items.shape[1], **options),
-        loss, tolerance)
-
-
-def plain_forms(p, items, spatial):
-    """The forms [N_ITEMS, G, G] by their definition."""
-    n_items, n_rows, n_bands = items.shape[:3]
-    forms = np.zeros((n_items, n_rows, n_rows))
-    for i in range(n_bands):
-        pattern, inverse = p.pattern(i), np.linalg.inv(p.covariance(i, spatial[i]))
-        means = np.stack([items[:, :, i, j] @ pattern[r] for r, (j, _) in enumerate(p.rows)], -1)
-        for n, u, v in np.ndindex(forms.shape):
-            forms[n, u, v] += 2 * (means[n, u].conj() @ inverse @ means[n, v]).real
-    return forms
-
-
-@pytest.fixture(scope='module')
-def loss(items):
-    """Product of the form and a matrix of the item, plus log(1 + trace)."""
-    roots = np.random.default_rng(4).normal(size=(N_ITEMS, *[items.shape[1]] * 2))
-    matrices = roots + np.swapaxes(roots, 1, 2)
-
-    def of(block, forms):
-        traces = np.trace(forms, axis1=1, axis2=2)
-        values = np.sum(matrices[block] * forms, axis=(1, 2)) + np.log(1 + traces)
-        slopes = matrices[block] + np.eye(forms.shape[1]) / (1 + traces)[:, None, None]
-        return values, -slopes
-    return of
-
-
-@pytest.fixture(scope='module')
-def plain_average(faded, items, loss, plain):
-    scenario, _ = faded
-    spatial = multipath_covariance(scenario)
-
-    def of(analog, digital):
-        forms = plain_forms(plain(scenario, analog, digital), items, spatial)
-        return loss(slice(None), forms)[0].mean()
-    return of
-
-
-def assert_is(outcome, expected, tolerance):
-    for actual, wanted in zip(outcome, expected, strict=True):
-        np.testing.assert_allclose(
-            actual, wanted, rtol=0, atol=tolerance * np.abs(wanted).max())
-
-
-@pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
-def test_gradients_are_the_limit_of_differences_of_the_plain_average(
-        faded, items, loss, plain_average, tolerance, assert_gradients):
-    scenario, codebook = faded
-    outcome = make(scenario, items, loss, tolerance)(codebook)
-    assert isinstance(outcome, Gradient)
-    assert type(outcome.value) is float
-    assert outcome.value == pytest.approx(
-        plain_average(codebook.analog, codebook.digital), rel=1e-6)
-    assert_gradients(outcome[1:], plain_average, codebook, np.random.default_rng(5))
-
-
-@pytest.mark.parametrize('tolerance', [0, 1e-5], ids=['exact', 'compressed'])
-def test_value_alone_equals_the_value_with_gradients(faded, items, loss, tolerance):
-    scenario, codebook = faded
-    average = make(scenario, items, loss, tolerance)
-    value = average.value(codebook)
-    assert type(value) is float
-    assert value == pytest.approx(average(codebook).value, rel=1e-13)
-    assert value == pytest.approx(average.value(codebook), rel=1e-13)
-
-
-@pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
-@pytest.mark.parametrize('size', [1, 3, 7])
-def test_results_do_not_depend_on_the_blocks(
-        faded, items, loss, tolerance, size):
-    """The last block is shorter, of equal size, or the only one; the loss depends on the item."""
-    scenario, codebook = faded
-    expected = make(scenario, items, loss)(codebook)
-    average = make(scenario, items, loss, tolerance, block=size)
-    assert len(average.rows.blocks()) == -(-N_ITEMS // (size * max(3 // items.shape[1], 1)))
-    assert_is(average(codebook), expected, max(1e-12, 10 * tolerance))
-    assert average.value(codebook) == pytest.approx(expected.value, rel=max(1e-12, 10 * tolerance))
+from rhs_isac_ros.model.surface import AppliedBeams
 
 
 def assert_matches_vectors(outcome, vectors, tolerance=1e-8, value_tolerance=1e-8):
@@ -177,6 +71,7 @@ def test_gradients_are_the_limit_of_differences_of_plain_bounds(
 
 
 def test_the_bound_is_the_mean_of_the_bounds_of_many_positions(small):
+    """They make several blocks."""
     positions = small.scenario.sample_positions(300, np.random.default_rng(0))
     expected = crlb(small.scenario, small.codebook, positions).mean()
     for tolerance, allowed in ((0, 1e-9), (1e-7, 5e-6)):
@@ -210,24 +105,67 @@ ERRORS = 'element_error_rms', 'failed_element_share'
 @pytest.mark.parametrize('absent', [(*FACTORS, *ERRORS), ERRORS, FACTORS, ()],
                          ids=['none', 'nuisance', 'errors', 'all'])
 def test_with_impairments_average_and_gradients_are_those_of_the_bound(
-        uncertain, uncertain_codebook, absent, tolerance, region_prior):
+        uncertain, uncertain_codebook, absent, tolerance, region_prior, assert_gradients):
     codebook = uncertain_codebook
     scenario = dataclasses.replace(uncertain, **dict.fromkeys(absent, 0.0))
     positions = scenario.sample_positions(3, np.random.default_rng(2))
     average = AverageCrlb(scenario, positions, tolerance, region_prior=region_prior)
-    value, by_analog, by_digital = average(codebook)
+    value, *gradients = average(codebook)
     assert average.value(codebook) == pytest.approx(value, rel=1e-12)
+    expected = crlb(scenario, codebook, positions, region_prior=region_prior).mean()
+    assert value == pytest.approx(expected, rel=1e-5)
+    assert_gradients(gradients, lambda **parts: average.value(AppliedBeams(**parts)), codebook,
+                     np.random.default_rng(3))
 
-    def bound(analog, digital):
-        return crlb(scenario, Codebook(analog, digital), positions,
-                    region_prior=region_prior).mean()
 
-    assert value == pytest.approx(bound(codebook.analog, codebook.digital), rel=1e-5)
-    rng, step = np.random.default_rng(3), 1e-5
-    for _ in range(3):
-        analog = rng.normal(size=by_analog.shape)
-        digital = rng.normal(size=(*by_digital.shape, 2)) @ [1, 1j] * np.abs(codebook.digital)
-        ahead, behind = (bound(np.clip(codebook.analog + sign * step * analog, 0, 1),
-                               codebook.digital + sign * step * digital) for sign in (1, -1))
-        expected = np.sum(by_analog * analog) + np.sum(np.conj(by_digital) * digital).real
-        assert (ahead - behind) / (2 * step) == pytest.approx(expected, rel=2e-4)
+@pytest.fixture(scope='module')
+def odd(random_beams):
+    scenario = Scenario(
+        center_frequencies_hz=(1.9e9, 3.3e9), n_subbands=3, n_frames=2, n_feeds=4,
+        elements_per_side=3, subband_width_hz=2e7)
+    return scenario, random_beams(scenario, np.random.default_rng(0))
+
+
+SCENARIO = Scenario(elements_per_side=4, n_feeds=2, element_error_rms=0.1)
+N_ELEMENTS = SCENARIO.n_elements
+
+
+@pytest.fixture
+def average():
+    """The average bound for a surface with complex coefficients, failures and band gains."""
+    rng = np.random.default_rng(0)
+    numbers = rng.normal(size=(2, N_ELEMENTS, 2)) @ [1, 1j]
+    failed = np.arange(N_ELEMENTS) % 7 == 0
+    average = AverageCrlb(SCENARIO, SCENARIO.sample_positions(10, rng))
+    average.surface = SurfaceEstimate(
+        np.where(failed, 0, 1 + 0.3 * numbers[0]), np.where(failed, 0.5 + 0.1 * numbers[1], 0),
+        np.array([1.2 + 0.3j, 0.8 - 0.1j]),
+        0.1 * np.ones((2 * N_ELEMENTS + 2, 1), complex), failed.astype(float))
+    return average
+
+
+def test_gradients_for_an_estimated_surface_are_slopes(average, random_beams, assert_gradients):
+    beams = random_beams(SCENARIO, np.random.default_rng(1))
+    value, *gradients = average(beams)
+    assert value == pytest.approx(average.value(beams), rel=1e-12)
+    assert_gradients(gradients, lambda **parts: average.value(AppliedBeams(**parts)), beams,
+                     np.random.default_rng(2))
+
+
+def test_gradients_under_a_measured_covariance_are_slopes(odd, random_beams, assert_gradients):
+    scenario, codebook = odd
+    places = scenario.sample_positions(4, np.random.default_rng(4))
+    hall = dataclasses.replace(scenario, angular_spread_deg=40.0, delay_spread_s=2e-8)
+    other = random_beams(scenario, np.random.default_rng(5))
+    declared, fields = MeasurementModel(scenario, other), scenario.fields()
+    inverse = np.linalg.inv(declared.covariance())
+    difference = MeasurementModel(hall, other).covariance() - declared.covariance()
+    measured = dataclasses.replace(scenario, multipath=MultipathEstimate(
+        *(fields[name] for name in FIELDS), np.array(declared.radiation),
+        inverse @ difference @ inverse, {name: fields[name] for name in CONDITIONS}))
+    cost = AverageCrlb(measured, places)
+    value, *gradients = cost(codebook)
+    assert value == pytest.approx(np.mean(crlb(measured, codebook, places)))
+    assert abs(value / AverageCrlb(scenario, places).value(codebook) - 1) > 0.01
+    assert_gradients(gradients, lambda **parts: cost.value(AppliedBeams(**parts)), codebook,
+                     np.random.default_rng(6))

@@ -12,7 +12,6 @@ from rhs_isac_ros.bounds import (
     fisher,
     fisher_information,
 )
-from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.impairments import nuisance_of
@@ -30,46 +29,8 @@ def test_information_and_bound_match_the_vectors(case):
     np.testing.assert_allclose(bound, case.vectors['crlb'], rtol=1e-8)
 
 
-def test_bound_is_infinite_where_signals_do_not_determine_the_position(small):
-    """One complex signal has two real parts, and a position three coordinates."""
-    scenario = Scenario(center_frequencies_hz=(2.5e9,), n_subbands=1, n_frames=1,
-                        n_feeds=1, elements_per_side=4)
-    codebook = Codebook(np.full((1, 1, 16), 0.5), np.full((1, 1, 1, 1), np.sqrt(1e-3)))
-    positions = scenario.sample_positions(50, np.random.default_rng(0))
-    assert (crlb(scenario, codebook, positions) == np.inf).all()
-    # A surface with all elements off receives nothing.
-    dark = Codebook(np.zeros((1, 2, 16)), small.codebook.digital)
-    assert (crlb(small.scenario, dark, positions) == np.inf).all()
-
-
-def test_inverse_information_inverts_regular_matrices_only():
-    rng = np.random.default_rng(3)
-    roots = rng.normal(size=(3, 3, 3))
-    information = roots @ np.swapaxes(roots, 1, 2)
-    information[1] = roots[1][:, :2] @ roots[1][:, :2].T
-    inverse = fisher.inverse_information(information)
-    for n in (0, 2):
-        np.testing.assert_allclose(inverse[n] @ information[n], np.eye(3), atol=1e-9)
-    np.testing.assert_array_equal(np.diag(inverse[1]), np.inf)
-
-
 def random_directions(rng, n):
     return np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
-
-
-def test_inverse_information_does_not_depend_on_the_units():
-    """The units of the axes differ by up to nine orders of magnitude."""
-    rng = np.random.default_rng(4)
-    roots = rng.normal(size=(200, 3, 5))
-    matrices = roots @ np.swapaxes(roots, 1, 2)
-    units = 10.0**rng.uniform(-4, 5, size=(200, 3))
-    scale = units[:, :, None] * units[:, None, :]
-    inverse = fisher.inverse_information(matrices * scale)
-    expected = np.linalg.inv(matrices)
-    errors = np.abs(inverse * scale - expected).max(axis=(1, 2))
-    sizes = np.abs(expected).max(axis=(1, 2))
-    assert (errors <= 1e-14 * np.linalg.cond(matrices) * sizes).all()
-    np.testing.assert_allclose(inverse, np.swapaxes(inverse, 1, 2), rtol=1e-9)
 
 
 @pytest.mark.parametrize('eigenvalues', [
@@ -98,13 +59,8 @@ def test_singular_information_is_infinite_without_a_warning(rank):
     inverse = fisher.inverse_information(roots @ np.swapaxes(roots, 1, 2))
     np.testing.assert_array_equal(np.diagonal(inverse, axis1=1, axis2=2), np.inf)
     assert not np.isnan(inverse).any()
-
-
-@pytest.mark.parametrize('axes', [(), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2)], ids=str)
-def test_an_axis_without_information_makes_the_bound_infinite(axes):
-    information = np.zeros((1, 3, 3))
-    information[0, axes, axes] = 7.0
-    inverse = fisher.inverse_information(information)
+    # Axes without any information.
+    inverse = fisher.inverse_information(np.diag([7.0] * rank + [0.0] * (3 - rank))[None])
     np.testing.assert_array_equal(np.diagonal(inverse[0]), np.inf)
 
 
@@ -128,10 +84,6 @@ def test_bound_is_the_trace_of_the_inverse_information_at_any_distance(shipped, 
     np.testing.assert_allclose(
         crlb(scenario, shipped, positions), expected,
         rtol=1e-15 * np.linalg.cond(information).max())
-
-
-def test_no_positions_give_no_bounds(small):
-    assert crlb(small.scenario, small.codebook, np.zeros((0, 3))).shape == (0,)
 
 
 DECLARED = {
@@ -192,15 +144,6 @@ def test_the_region_is_an_upper_limit(small):
     np.testing.assert_allclose(bound, np.sum(np.square(mute.roi_size_m)) / 12, rtol=1e-3)
     np.testing.assert_allclose(
         np.linalg.inv(region_information(mute)), np.diag(np.square(mute.roi_size_m) / 12))
-
-
-def test_equation_12_is_that_of_the_position_alone(table1):
-    declared = dataclasses.replace(table1.scenario, **DECLARED)
-    # Some processors round the last digit of matrix products by their sizes.
-    np.testing.assert_allclose(
-        *(fisher_information(MeasurementModel(scenario, table1.codebook),
-                             table1.vectors['positions'])
-          for scenario in (declared, table1.scenario)), rtol=1e-12)
 
 
 def test_a_flat_region_determines_the_coordinate(table1):

@@ -10,11 +10,10 @@ from rhs_isac_ros.calibration import (
     Pilots,
     SurfacePrior,
     calibrate,
-    prior_of,
     report,
 )
 from rhs_isac_ros.calibration.estimate import initial_values
-from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario
+from rhs_isac_ros.model import ElementErrors, MeasurementModel
 from rhs_isac_ros.model.elements import DeclaredElements, SurfaceEstimate
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.positioning import make_estimator
@@ -134,16 +133,6 @@ def test_several_codebooks_reveal_more_of_the_elements(scenario, damaged, send, 
     assert together.std()[:25].mean() < 0.8 * alone.std()[:25].mean()
 
 
-def test_an_intact_surface_stays_intact(beams, scenario, send):
-    """With the default prior of a scenario that declares nothing."""
-    silent = Scenario(elements_per_side=5, n_feeds=2)
-    assert prior_of(silent).element_error_rms > 0
-    pilots = send(silent, beams, None)
-    found = calibrate(silent, [pilots]).surface
-    assert not found.failed.any()
-    assert excess_energy(silent, beams, None, found) < 2.0
-
-
 def test_estimators_use_the_surface(scenario, beams, damaged, send):
     """With errors close to those of exact knowledge, and consistent covariances.
 
@@ -190,13 +179,3 @@ def test_an_exact_estimate_is_the_surface(scenario, beams, damaged, truth):
     np.testing.assert_allclose(one.radiation, other.radiation, rtol=1e-12)
     np.testing.assert_allclose(one.covariance(), other.covariance(), rtol=1e-12)
     assert surface.id != ElementErrors(surface.gains + 1, surface.stuck).id
-
-
-@pytest.mark.parametrize(('positions', 'received', 'error'), [
-    (np.zeros((2, 2)), None, r'positions: shape \(2, 2\)'),
-    (np.ones((2, 3)), np.zeros((1, 2, 32)), r'received: shape \(1, 2, 32\), expected'),
-    (np.ones((1, 3)), np.full((1, 2, 32), np.nan), 'received: not finite'),
-])
-def test_malformed_pilots_are_named(beams, positions, received, error):
-    with pytest.raises(ValueError, match=error):
-        Pilots(beams, positions, received)

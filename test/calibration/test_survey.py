@@ -10,12 +10,8 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.calibration import (
-    Pilots,
     SurveyWarning,
-    calibrate,
-    load_surface,
     survey,
-    survey_report,
 )
 from rhs_isac_ros.calibration.survey import PLACE_WAVELENGTHS
 from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario, simulate_received
@@ -83,14 +79,6 @@ def test_the_covariance_is_that_of_the_hall(estimate, beams):
     assert 1 <= estimate.about['inflation'] < 1.4
 
 
-def test_the_report_lists_what_was_found(estimate):
-    text = survey_report(estimate)
-    assert text.startswith('100 positions, 0 more without a direct path, codebook ')
-    assert f'\nplaces: {estimate.about["places"]};' in text
-    assert 'of the places left out are in the 95 % region' in text
-    assert 'warning' not in text
-
-
 @pytest.mark.slow
 def test_estimates_after_a_survey_are_in_their_regions(shipped):
     """Directions of arrival that no fields describe, learnt from 100 positions."""
@@ -144,11 +132,14 @@ def test_users_in_sight_with_strong_multipath_take_part(beams):
 
 @pytest.mark.slow
 def test_impairments_are_estimated_with_the_multipath(beams):
-    impaired = {'user_gain_std_db': 3.0, 'phase_std_rad': 6.2832, 'timing_std_s': 5e-9}
+    """The region has no extent along z."""
+    impaired = {'user_gain_std_db': 3.0, 'phase_std_rad': 6.2832, 'timing_std_s': 5e-9,
+                'roi_size_m': (10.0, 10.0, 0.0)}
     declared, hall = (dataclasses.replace(one, **impaired) for one in (DECLARED, HALL))
     estimate = survey(declared, beams, *send(hall, beams, 60))
     assert estimate.multipath_to_los_db == pytest.approx(-5, abs=2)
     assert estimate.delay_spread_s == pytest.approx(200e-9, rel=0.4)
+    assert estimate.about['coverage'][0] > 0.9
     positions, received = send(hall, beams, 60, 2)
     errors = []
     for scenario in (dataclasses.replace(declared, multipath=estimate), hall):
@@ -156,16 +147,6 @@ def test_impairments_are_estimated_with_the_multipath(beams):
         assert fixes.fix.mean() > 0.95
         errors.append(np.median(np.linalg.norm(fixes.mean - positions, axis=1)))
     assert errors[0] < 1.1 * errors[1]
-
-
-@pytest.mark.slow
-def test_users_with_a_random_phase_at_one_height(beams):
-    """The region has no extent along z, and the phase of a user is a nuisance parameter."""
-    declared, hall = (dataclasses.replace(
-        one, phase_std_rad=1.0, roi_size_m=(10.0, 10.0, 0.0)) for one in (DECLARED, HALL))
-    estimate = survey(declared, beams, *send(hall, beams, 40))
-    assert estimate.multipath_to_los_db == pytest.approx(-5, abs=2)
-    assert estimate.about['coverage'][0] > 0.9
 
 
 @pytest.mark.slow
@@ -182,31 +163,25 @@ def test_a_calibrated_surface_takes_part(beams):
     assert levels[1] > levels[0] + 1
 
 
-def test_a_calibration_holds_in_every_hall(estimate, beams, tmp_path):
-    calibrate(DECLARED, [Pilots(beams, *send(DECLARED, beams, 5))]).save(tmp_path / 's.npz')
-    measured = dataclasses.replace(DECLARED, multipath=estimate)
-    surface = load_surface(str(tmp_path / 's.npz'), measured)
-    assert make_estimator('bayes', measured, beams, surface=surface).surface is surface
-
-
 @pytest.mark.slow
 def test_one_position_yields_nearly_the_fields_and_a_warning(beams):
     with pytest.warns(SurveyWarning, match='expected at least 20'):
         estimate = survey(DECLARED, beams, *send(HALL, beams, 1))
-    assert 'positions: 1' in estimate.about['warnings'][0]
+    few, *spans = estimate.about['warnings']
+    assert few.startswith('positions: 1,')
+    assert 'along y, expected at least half of the 10 m of the region' in spans[-2]
     assert np.isfinite(estimate.excess).all()
     assert 1.2 < estimate.about['inflation'] < 2
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('jitter_m', [0.0, 0.05])
-def test_repeated_signals_add_nothing(beams, jitter_m):
+def test_repeated_signals_add_nothing(beams):
     """A survey of 10 places whose signals were recorded six times is one of 10 places."""
     positions, received = send(HALL, beams, 10)
     estimates = []
     for n in (1, 6):
         places = np.repeat(positions, n, axis=0)
-        offsets = np.random.default_rng(0).uniform(-jitter_m, jitter_m, places.shape)
+        offsets = np.random.default_rng(0).uniform(-0.05, 0.05, places.shape)
         residuals = received - MeasurementModel(HALL, beams).mean(positions)
         signals = np.repeat(residuals, n, axis=0) + MeasurementModel(HALL, beams).mean(
             places + offsets)
@@ -219,30 +194,7 @@ def test_repeated_signals_add_nothing(beams, jitter_m):
     for name in ('coverage', 'level_std_db', 'prior_weight'):
         assert six.about[name] == pytest.approx(one.about[name], rel=1e-6), name
     assert six.about['inflation'] == pytest.approx(
-        one.about['inflation'], rel=0.1 if jitter_m else 1e-6)
-
-
-@pytest.fixture(scope='module')
-def hall():
-    return Scenario.from_yaml(EXAMPLES.parents[1] / 'config' / 'hall.yaml')
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(('n', 'cycles'), [(10, 6), (30, 4), (60, 2)])
-def test_cycles_at_one_place_are_one_place(hall, shipped, n, cycles):
-    """In a hall whose paths do not fade, more cycles at a place only repeat its multipath."""
-    rng, declared = np.random.default_rng(n), Scenario()
-    places, users = (rng.permutation(hall.channel.users)[:size] for size in (n, 200))
-    signals, results = simulate_received(hall, shipped, users, rng), []
-    for visits in (cycles, 1):
-        visited = np.repeat(places, visits, axis=0)
-        estimate = measured(
-            declared, shipped, visited, simulate_received(hall, shipped, visited, rng))
-        assert (estimate.about['positions'], estimate.about['places']) == (n * visits, n)
-        results.append([*estimate.about['coverage'], *covered(dataclasses.replace(
-            declared, multipath=estimate), shipped, users, signals)])
-    assert min(results[0][3:]) > 0.93
-    np.testing.assert_allclose(*results, atol=0.04)
+        one.about['inflation'], rel=0.1)
 
 
 @pytest.mark.slow
@@ -271,20 +223,10 @@ def test_a_walk_is_divided_into_places(shipped, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_survey_in_a_corner_causes_a_warning(beams):
-    positions, received = send(HALL, beams, 120)
-    corner = (positions[:, 1] < -2)
-    with pytest.warns(SurveyWarning, match='along y, expected at least half of the 10 m'):
-        estimate = survey(DECLARED, beams, positions[corner], received[corner])
-    assert len(estimate.about['warnings']) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('shift', [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-def test_shifted_positions_cause_a_warning(shipped, shift):
+def test_shifted_positions_cause_a_warning(shipped):
     positions, received = send(Scenario(), shipped, 60)
     with pytest.warns(SurveyWarning, match=r'positions: \d+ of 60 do not fit a direct path'):
-        survey(Scenario(), shipped, positions + shift, received)
+        survey(Scenario(), shipped, positions + [0.0, 1.0, 0.0], received)
 
 
 @pytest.mark.slow
@@ -323,13 +265,8 @@ def test_signals_of_other_positions_are_refused(beams):
 
 def test_invalid_arrays_are_refused(beams):
     positions, received = send(HALL, beams, 5)
-    with pytest.raises(ValueError, match='positions: none given'):
-        survey(DECLARED, beams, positions[:0], received[:0])
-    with pytest.raises(ValueError, match='received: shape'):
-        survey(DECLARED, beams, positions, received[:, :1])
-    with pytest.raises(ValueError, match='received: not finite'):
-        survey(DECLARED, beams, positions, received * np.nan)
-    with pytest.raises(ValueError, match='positions: .*of type <U.*, expected numbers'):
-        survey(DECLARED, beams, positions.astype(str), received)
-    with pytest.raises(ValueError, match='positions: complex numbers, expected real numbers'):
-        survey(DECLARED, beams, positions + 1j, received)
+    for arrays, error in (((positions[:0], received[:0]), 'positions: none given'),
+                          ((positions, received[:, :1]), 'received: shape'),
+                          ((positions, received * np.nan), 'received: not finite')):
+        with pytest.raises(ValueError, match=error):
+            survey(DECLARED, beams, *arrays)

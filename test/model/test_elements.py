@@ -16,7 +16,6 @@ from rhs_isac_ros.model.elements import (
     DeclaredElements,
     SurfaceEstimate,
     element_correlation,
-    error_terms,
 )
 
 N_SURFACES = 1500
@@ -63,21 +62,6 @@ def test_a_higher_share_adds_failures():
     failed = ~np.isnan(few.stuck)
     assert 0 < failed.sum() < (~np.isnan(many.stuck)).sum()
     np.testing.assert_array_equal(many.stuck[failed], few.stuck[failed])
-
-
-def test_factors_are_the_covariance_of_the_coefficients():
-    scenario = Scenario(elements_per_side=128, element_error_rms=0.4, failed_element_share=0.3)
-    configurations = np.array([0.0, 0.3, 1.0])
-    analog = np.broadcast_to(configurations[:, None], (3, scenario.n_elements))
-    applied = draw_surface(scenario, np.random.default_rng(0)).applied(analog)
-    mean = 0.7 * configurations + 0.15
-    np.testing.assert_allclose(applied.mean(axis=1), mean, atol=0.02)
-    deviation = applied - mean[:, None]
-    factors = np.array([constant + slope * configurations
-                        for constant, slope in error_terms(scenario)])
-    np.testing.assert_allclose(
-        deviation @ deviation.conj().T / scenario.n_elements,
-        np.einsum('tq,tp->qp', factors, factors), atol=0.01)
 
 
 @pytest.mark.parametrize('errors', ERRORS, ids=str)

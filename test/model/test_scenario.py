@@ -1,7 +1,6 @@
 """The scenario: defaults, checks, files and derived values."""
 
 import dataclasses
-import math
 import re
 
 import numpy as np
@@ -87,9 +86,6 @@ def test_a_surface_has_one_or_two_numbers_of_elements():
     assert wide.changes() == {'elements_per_side': [12, 3]}
     assert wide == Scenario(**wide.changes())
     assert len({wide.id, square.id, Scenario(elements_per_side=(3, 12)).id}) == 3
-
-
-def test_elements_may_have_two_intervals():
     assert Scenario(element_interval_wavelengths=[0.3, 0.3]) == Scenario()
     uneven = Scenario(element_interval_wavelengths=(0.4, 0.25))
     assert uneven == Scenario(**uneven.changes())
@@ -105,20 +101,7 @@ def test_bands_may_touch_but_not_overlap():
 # Field, value, value and expectation in the message.
 BAD = [
     ('n_feeds', 2.5, '2.5', 'expected an integer'),
-    ('n_feeds', True, 'True', 'expected an integer'),
-    ('n_feeds', 'three', "'three'", 'expected an integer'),
     ('n_feeds', 0, '0', 'expected 1 to 256'),
-    ('n_frames', 5000, '5000', 'expected 1 to 4096'),
-    ('elements_per_side', -1, '-1', 'expected 1 to 128'),
-    ('subband_width_hz', 'wide', "'wide'", 'expected a number'),
-    ('subband_width_hz', 0, '0.0', 'expected 1 to 1e+10 Hz'),
-    ('delay_spread_s', None, 'None', 'expected a number'),
-    ('delay_spread_s', -1e-6, '-1e-06', 'expected 0 to 1 s'),
-    ('element_gain', True, 'True', 'expected a number'),
-    ('max_power_w', math.nan, 'nan', 'expected 1e-15 to 1e+06 W'),
-    ('max_power_w', math.inf, 'inf', 'expected 1e-15 to 1e+06 W'),
-    ('max_power_w', 0, '0.0', 'expected 1e-15 to 1e+06 W'),
-    ('refractive_index', 0.5, '0.5', 'expected 1 to 100'),
     ('center_frequencies_hz', 3e9, '3000000000.0', 'expected a list of numbers'),
     ('center_frequencies_hz', [], '[]', 'expected a list of numbers'),
     ('center_frequencies_hz', [3e9, 'x'], "'x'", 'expected a number'),
@@ -128,13 +111,11 @@ BAD = [
     ('roi_size_m', '123', "'123'", 'expected a list of 3 numbers'),
     ('elements_per_side', [4, 5, 6], '[4, 5, 6]', 'expected an integer or two'),
     ('elements_per_side', [4, 2.5], '2.5', 'expected an integer'),
-    ('elements_per_side', [4, 129], '129', 'expected 1 to 128'),
     ('element_interval_wavelengths', [0.3], '[0.3]', 'expected a number or two'),
     ('element_interval_wavelengths', [], '[]', 'expected a list of numbers'),
     ('element_interval_wavelengths', [0.3, 0], '0.0', 'expected 0.001 to 10'),
     ('roi_size_m', [1, -1, 1], '-1.0', 'expected 0 to 1e+06 m'),
     ('roi_size_m', [0, 0, 0], '(0.0, 0.0, 0.0)', 'expected at least one length above 0'),
-    ('angular_spread_deg', 0.005, '0.005', 'expected 0.01 to 1000 deg'),
     ('multipath_direction_deg', [91, 0], '91.0', 'expected -90 to 90 deg'),
     ('multipath_direction_deg', [0, 0, 0], '3 values', 'expected a list of 2 numbers'),
     ('center_frequencies_hz', [3e9, 2e9, 2.0005e9], '2e+09 and 2.0005e+09 Hz',
@@ -147,7 +128,6 @@ BAD = [
     ('roi_center_m', [5, 0, 0], '(5.0, 0.0, 0.0)', 'expected x > 0'),
     ('roi_center_m', [-10, 0, 0], '(-10.0, 0.0, 0.0)', 'expected x > 0'),
     ('amplitude_levels', 1, '1', 'expected 0 for continuous amplitudes, or at least 2'),
-    ('user_gain_std_db', -1, '-1.0', 'expected 0 to 60 dB'),
     ('multipath', 1.0, '1.0', 'expected the path of a file, or null'),
     ('channel', True, 'True', 'expected the path of a file, or null'),
     ('channel', 'none.npz', 'none.npz', 'cannot be read'),
@@ -248,14 +228,9 @@ def test_a_given_default_is_not_a_change(case):
     ('n_feeds', ['expected a mapping of field names to values']),
     ('n_feeds: [', ['cannot be read']),
     ('n_feeds: 3e0', ["n_feeds: '3e0'", 'expected an integer']),
-    ('n_feeds: 010', ["n_feeds: '010'", 'expected an integer']),
-    ('noise_psd_dbm_hz: -1:30', ["noise_psd_dbm_hz: '-1:30'", 'expected a number']),
-    ('noise_psd_dbm_hz: -0170', ["noise_psd_dbm_hz: '-0170'", 'expected a number']),
-    ('roi_center_m: [010, 0, 0]', ["roi_center_m: '010'", 'expected a number']),
     ('n_feeds: 2\nn_frames: 4\nn_feeds: 3', ['n_feeds: repeated in line 3', 'expected one value']),
     ('max_power_w: -28e9', ['max_power_w: -28000000000.0', 'expected 1e-15 to 1e+06 W']),
     ('roi_center_m: [1, 2]', ['roi_center_m: 2 values', 'expected a list of 3 numbers']),
-    ('max_power_w: 2023-99-99', ['cannot be read']),
 ])
 def test_from_yaml_message_names_the_file_and_the_fault(tmp_path, text, words):
     path = tmp_path / 'scenario.yaml'
@@ -359,16 +334,6 @@ class TestImpairments:
             Scenario(impairments=value)
         assert str(caught.value) == (
             f'impairments: {value!r}, expected a mapping of names to strengths')
-
-    @pytest.mark.parametrize(('strength', 'error'), [
-        ('strong', "'strong', expected a number, 0 to 1e[+]300"),
-        (None, 'None, expected a number, 0 to 1e[+]300'),
-        (True, 'True, expected a number, 0 to 1e[+]300'),
-        (math.nan, 'nan, expected 0 to 1e[+]300'), (-0.1, '-0.1, expected 0 to 1e[+]300')])
-    def test_a_strength_that_is_no_number_in_range_is_an_error(self, plugin, strength, error):
-        with pytest.raises(ScenarioError, match=f'^impairments: {error}$'):
-            Scenario(impairments={plugin: strength})
-
 
 def test_positions_are_uniform_in_the_region():
     s = Scenario(roi_center_m=(4, 1, -2), roi_size_m=(2, 6, 1))
