@@ -13,8 +13,8 @@ from rhs_isac_ros.link.band_link import (
     representative_subbands,
     water_filling,
 )
+from rhs_isac_ros.link.candidates import candidate_configurations, tables
 from rhs_isac_ros.link.capacity import Beam, actual_capacity, expected_capacities
-from rhs_isac_ros.link.search import candidate_configurations, tables
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.support.threads import one_blas_thread

@@ -59,12 +59,6 @@ def test_the_capacity_never_decreases(scenario, link):
             scenario, start, digital, band) * (1 - 1e-12)
 
 
-def test_the_starts_are_not_modified(scenario, link):
-    before = starts(scenario, 2)
-    ascend(link, before)
-    np.testing.assert_array_equal(before, starts(scenario, 2))
-
-
 def test_an_ascent_does_not_depend_on_the_others(scenario, link):
     before = starts(scenario, 3)
     found, _ = ascend(link, before)
@@ -73,7 +67,7 @@ def test_an_ascent_does_not_depend_on_the_others(scenario, link):
 
 
 def test_no_single_element_at_an_end_of_its_range_increases_the_capacity(scenario, link):
-    for band, start, _, found, digital in ascended(scenario, link, 2):
+    for band, start, _, found, digital in ascended(scenario, link, 1):
         if not start.any():
             continue
         best = rate(scenario, found, digital, band)
@@ -82,11 +76,6 @@ def test_no_single_element_at_an_end_of_its_range_increases_the_capacity(scenari
                 other = found.copy()
                 other[element] = end
                 assert rate(scenario, other, digital, band) <= best * (1 + 1e-8)
-
-
-def test_the_ascent_increases_the_capacity_of_random_configurations(scenario, link):
-    before = starts(scenario)[:, :10]
-    assert (ascend(link, before)[1] > link.best_rate(before) * 1.0001).all()
 
 
 def test_fixed_elements_stay(table1):

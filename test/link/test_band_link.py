@@ -1,9 +1,9 @@
-"""The link of one band, compared with the reference implementation."""
+"""The links to one position, compared with the reference implementation, and water-filling."""
 
 import numpy as np
 import pytest
 
-from rhs_isac_ros.link.band_link import BandLink, representative_subbands
+from rhs_isac_ros.link.band_link import BandLink, representative_subbands, water_filling
 from rhs_isac_ros.model import Scenario
 
 POSITION = np.array([8.0, -2.0, 0.5])
@@ -31,15 +31,6 @@ def test_the_best_rate_is_the_capacity_of_the_best_digital_part(small, reference
         expected, rel=1e-9)
 
 
-def test_scatter_multiplies_by_the_covariance(table1):
-    link = BandLink.to(table1.scenario, POSITION, 1)
-    rng = np.random.default_rng(0)
-    weights = rng.normal(size=(2, 3, 100, 2)) @ [1, 1j]
-    np.testing.assert_allclose(
-        link.spatial.scatter(weights), weights @ table1.vectors['V'][1], rtol=1e-5,
-        atol=1e-9 * link.spatial.power.max())
-
-
 def test_links_in_several_bands_are_those_of_each_band(table1):
     bands = [1, 0]
     links = BandLink.to(table1.scenario, POSITION, bands)
@@ -50,13 +41,6 @@ def test_links_in_several_bands_are_those_of_each_band(table1):
             links.best_rate(analog)[found], single.best_rate(configurations), rtol=1e-12)
         np.testing.assert_allclose(
             links.best_digital(analog)[found], single.best_digital(configurations), rtol=1e-8)
-
-
-def test_shared_arrays_are_read_only(table1):
-    link = BandLink.to(table1.scenario, POSITION, 0)
-    for array in (link.onboard, link.spatial.matrix, link.fixed):
-        with pytest.raises(ValueError, match='read-only'):
-            array[0] = 0
 
 
 def test_a_sub_band_has_its_share_of_the_power(table1):
@@ -85,3 +69,49 @@ def test_phases_drift_little_between_representative_sub_bands():
         rotation = paths[chosen[1:]] * np.conj(paths[chosen[:-1]])
         common = rotation.sum(axis=(1, 2), keepdims=True)
         assert np.abs(np.angle(rotation * np.conj(common))).max() <= 1.0
+
+
+RNG = np.random.default_rng(0)
+CASES = {
+    'equal': (np.ones(5), 2.0),
+    'one channel': (np.array([3.0]), 0.5),
+    'all filled': (np.array([2.0, 3.0, 4.0]), 10.0),
+    'only the best': (np.array([1.0, 10.0, 2.0]), 0.1),
+    'two equal best': (np.array([5.0, 1.0, 5.0]), 0.1),
+    'just below the second': (np.array([2.0, 1.0]), 0.5 - 1e-9),
+    'just above the second': (np.array([2.0, 1.0]), 0.5 + 1e-9),
+    'one without gain': (np.array([0.0, 2.0, 3.0]), 1.0),
+    'realistic link': (np.array([1e9, 1.1e9, 0.9e9, 3e8]), 1e-3),
+    **{f'random {n}': (10**RNG.uniform(-4, 4, n), 10**RNG.uniform(-3, 3))
+       for n in (2, 3, 8, 64, 500)},
+}
+
+
+@pytest.fixture(params=CASES)
+def channels(request):
+    return CASES[request.param]
+
+
+def test_shares_match_bisection(channels, bisection):
+    gains, power = channels
+    np.testing.assert_allclose(
+        water_filling(gains, power), bisection(gains, power), rtol=1e-9, atol=1e-9 * power)
+
+
+def test_channels_without_gain_get_no_power():
+    shares = water_filling(np.array([0.0, 2.0, -1e-20, 3.0]), 1.0)
+    assert shares[0] == shares[2] == 0
+    assert shares.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize('gains', [[0.0], [0.0] * 8, [-1e-20, 0.0]])
+def test_without_any_gain_the_shares_are_equal(gains):
+    np.testing.assert_allclose(water_filling(np.array(gains), 3.0), 3.0 / len(gains))
+
+
+@pytest.mark.parametrize('gains', [[1e-15], [1e-15, 3e-15], [1e-200, 0.0, 1e-15]])
+def test_gains_near_rounding_errors_still_get_the_power(gains):
+    """A configuration that passes no signal has such gains."""
+    shares = water_filling(np.array(gains), 1e-3)
+    assert shares.sum() == 1e-3
+    assert shares[np.argmax(gains)] == 1e-3

@@ -1,4 +1,4 @@
-"""Eq. (10) at a position and over a posterior, compared with reference values and plain loops."""
+"""Eq. (10) at a position and over a posterior, and beam patterns, compared with plain loops."""
 
 import dataclasses
 
@@ -9,6 +9,7 @@ from rhs_isac_ros.calibration import survey
 from rhs_isac_ros.link import (
     Beam,
     actual_capacity,
+    beam_pattern,
     capacity,
     capacity_report,
     expected_capacities,
@@ -37,16 +38,6 @@ def test_capacity_matches_the_reference_values(case):
     np.testing.assert_allclose(values, case.vectors['capacity_band1'], rtol=1e-8)
 
 
-def test_capacity_matches_plain_loops(small, reference_link):
-    link, rng = reference_link(small), np.random.default_rng(0)
-    for _ in range(3):
-        beam = random_beam(small.scenario, rng)
-        positions = small.scenario.sample_positions(2, rng)
-        expected = [link.capacity(beam, position) for position in positions]
-        np.testing.assert_allclose(
-            capacity(small.scenario, beam, positions), expected, rtol=1e-8)
-
-
 @pytest.mark.parametrize('band', [0, 1])
 def test_each_band_has_its_own_capacity(table1, reference_link, band):
     rng = np.random.default_rng(band)
@@ -55,15 +46,6 @@ def test_each_band_has_its_own_capacity(table1, reference_link, band):
     assert value == pytest.approx(reference_link(table1, band).capacity(beam, position), rel=1e-8)
     other = dataclasses.replace(beam, band=1 - band)
     assert capacity(table1.scenario, other, position[None])[0] != pytest.approx(value, rel=1e-4)
-
-
-def test_a_batch_gives_the_same_as_single_positions(small):
-    rng = np.random.default_rng(1)
-    beam, positions = random_beam(small.scenario, rng), small.scenario.sample_positions(5, rng)
-    batch = capacity(small.scenario, beam, positions)
-    single = [capacity(small.scenario, beam, p[None])[0] for p in positions]
-    np.testing.assert_allclose(batch, single, rtol=1e-12)
-    assert capacity(small.scenario, beam, np.zeros((0, 3))).shape == (0,)
 
 
 def test_a_beam_that_is_off_has_no_capacity(small):
@@ -91,30 +73,13 @@ def test_a_beam_that_does_not_fit_the_scenario_is_an_error(small, changes, words
         assert word in str(caught.value)
 
 
-@pytest.mark.parametrize('positions', [
-    np.zeros(3), np.zeros((2, 2)), [[9.0, np.nan, 0.0]], [[9.0, 0.0, np.inf]]])
-def test_invalid_positions_are_an_error(small, positions):
-    beam = Beam(small.vectors['tx_analog'], small.vectors['tx_digital'])
-    with pytest.raises(ValueError, match='positions'):
-        capacity(small.scenario, beam, positions)
-
-
-def test_capacity_of_table_1_has_the_order_of_magnitude_of_the_paper():
-    """The paper has tens of Mbit/s over 1 MHz at 1 mW: about 20 to 30 bit/s/Hz."""
-    scenario = Scenario()
-    beam = random_beam(scenario, np.random.default_rng(5))
-    value = capacity(scenario, beam, np.array([[10.0, 0.0, 0.0]]))[0]
-    assert 10 < value / (scenario.n_subbands * scenario.subband_width_hz) < 40
-
-
 def rotated(covariance, seed=0):
     axes, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     return axes @ covariance @ axes.T
 
 
-@pytest.mark.parametrize('covariance', [LONG, rotated(LONG), 0.3**2 * np.eye(3)],
-                         ids=['aligned', 'rotated', 'isotropic'])
-@pytest.mark.parametrize('band', [0, 1])
+@pytest.mark.parametrize(('covariance', 'band'), [(rotated(LONG), 0), (0.3**2 * np.eye(3), 1)],
+                         ids=['rotated', 'isotropic'])
 def test_expected_capacity_matches_random_draws(table1, covariance, band):
     scenario = table1.scenario
     beam = steer(scenario, POSITION, band)
@@ -123,13 +88,6 @@ def test_expected_capacity_matches_random_draws(table1, covariance, band):
     (expected,) = expected_capacities(scenario, [beam], POSITION, covariance)
     assert expected == pytest.approx(rates.mean(), abs=4 * rates.std() / np.sqrt(len(rates)))
     assert expected < capacity(scenario, beam, POSITION[None])[0]
-
-
-def test_expected_capacity_without_variance_is_the_capacity_at_the_mean(table1):
-    scenario = table1.scenario
-    beam = steer(scenario, POSITION)
-    assert expected_capacities(scenario, [beam], POSITION, np.zeros((3, 3))) == capacity(
-        scenario, beam, POSITION[None])
 
 
 @pytest.mark.parametrize('covariance', [LONG, rotated(LONG), rotated(np.diag([1.0, 0.3, 0.0]))])
@@ -146,15 +104,6 @@ def test_points_have_the_moments_of_the_posterior(table1, covariance):
     variance = direction @ covariance @ direction
     fourth = weights @ (offsets @ direction)**4
     assert fourth == pytest.approx(3 * variance**2, rel=1e-9)
-
-
-def test_axes_without_variance_have_one_node(table1):
-    points, weights = posterior_points(table1.scenario, POSITION, np.zeros((3, 3)))
-    np.testing.assert_array_equal(points, [POSITION])
-    np.testing.assert_array_equal(weights, [1])
-    points, _ = posterior_points(table1.scenario, POSITION, np.diag([0, 1.0, 0]))
-    assert len(points) == 3
-    assert (points[:, [0, 2]] == POSITION[[0, 2]]).all()
 
 
 def test_no_point_is_closer_to_the_surface_than_region_and_mean(table1):
@@ -234,3 +183,60 @@ def test_the_actual_capacity_is_that_of_the_paths(small):
     assert abs(report.loss_percent) < 1
     assert report.actual_bps == pytest.approx(
         actual_capacity(traced, steer(traced, users[0]), users[:1])[0], rel=1e-9)
+
+
+def test_the_pattern_matches_plain_loops(small, reference_link):
+    link, beam = reference_link(small), random_beam(small.scenario, np.random.default_rng(3))
+    found = beam_pattern(small.scenario, beam, 4.0, step_deg=45.0)
+    angles = np.radians([-90, -45, 0, 45, 90])
+    power = np.zeros((5, 5))
+    for e, elevation in enumerate(angles):
+        for a, azimuth in enumerate(angles):
+            position = 4.0 * np.array([np.cos(elevation) * np.cos(azimuth),
+                                       np.cos(elevation) * np.sin(azimuth),
+                                       np.sin(elevation)])
+            assert 4.0 * found.directions[e, a] == pytest.approx(position)
+            weights = np.einsum('jk,jkm->jm', beam.digital, link.onboard) * beam.analog
+            power[e, a] = np.sum(np.abs(np.sum(weights * link.los(position), axis=1))**2)
+    assert found.relative == pytest.approx(power / power.max(), rel=1e-8)
+    assert found.distance_m == 4.0
+
+
+def test_both_cuts_contain_the_strongest_direction(small):
+    found = beam_pattern(
+        small.scenario, random_beam(small.scenario, np.random.default_rng(4)), 7.0)
+    azimuth, azimuth_cut = found.azimuth_cut()
+    elevation, elevation_cut = found.elevation_cut()
+    assert np.degrees(azimuth) == pytest.approx(np.arange(-90, 91, 5))
+    assert np.degrees(elevation) == pytest.approx(np.arange(-90, 91, 5))
+    assert azimuth_cut.max() == elevation_cut.max() == 1.0
+    (row,), (column,) = np.nonzero(found.relative == 1.0)
+    assert found.peak == (row, column)
+    assert (azimuth_cut == found.relative[row]).all()
+    assert (elevation_cut == found.relative[:, column]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('azimuth_deg', [-30.0, 0.0, 25.0])
+def test_the_strongest_direction_is_the_direction_of_steering(azimuth_deg):
+    scenario, azimuth = Scenario(), np.radians(azimuth_deg)
+    position = 10.0 * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    found = beam_pattern(scenario, steer(scenario, position), 10.0, step_deg=1.0)
+    angles, power = found.azimuth_cut()
+    assert np.degrees(angles[np.argmax(power)]) == pytest.approx(azimuth_deg, abs=5.0)
+
+
+def test_the_pattern_of_a_beam_that_is_off_is_zero(small):
+    beam = random_beam(small.scenario, np.random.default_rng(5))
+    found = beam_pattern(small.scenario, Beam(np.zeros(16), beam.digital), 5.0)
+    assert (found.relative == 0).all()
+
+
+def test_errors_name_field_value_and_expectation(small):
+    beam = random_beam(small.scenario, np.random.default_rng(6))
+    with pytest.raises(ValueError, match='distance_m: 0, expected a positive number'):
+        beam_pattern(small.scenario, beam, 0)
+    with pytest.raises(ValueError, match='step_deg: -1, expected a positive number'):
+        beam_pattern(small.scenario, beam, 1, step_deg=-1)
+    with pytest.raises(ValueError, match='band: 7'):
+        beam_pattern(small.scenario, Beam(beam.analog, beam.digital, 7), 1)

@@ -11,19 +11,18 @@ from rhs_isac_ros.link import (
     CapacityReport,
     applied_beam,
     band_link,
+    candidates,
     capacity,
     capacity_report,
     choose_beam,
     expected_capacities,
     prepare_steering,
-    search,
     steer,
 )
 from rhs_isac_ros.link.steering import steer_bands
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
-from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.surface import matched_configuration, on_levels, onboard_matrix
+from rhs_isac_ros.model.surface import on_levels
 
 POSITION = np.array([9.0, 1.5, -0.4])
 
@@ -54,19 +53,6 @@ def test_beams_satisfy_the_constraints(table1, positions, band):
         assert_valid(table1.scenario, steer(table1.scenario, position, band), band)
 
 
-@pytest.mark.parametrize('band', [0, 1])
-def test_beams_are_better_than_the_matched_filter(table1, positions, reference_link, band):
-    scenario, link = table1.scenario, reference_link(table1, band)
-    gained = []
-    for position in positions:
-        los = los_gain(scenario, np.array([position]), band)[0]
-        matched = matched_configuration(los, onboard_matrix(scenario)[band])
-        start = rate(scenario, link.best_beam(matched, position), position)
-        gained.append(rate(scenario, steer(scenario, position, band), position) / start - 1)
-    assert min(gained) >= -1e-12
-    assert max(gained) > 0.001
-
-
 @pytest.mark.parametrize('levels', [0, 2, 3])
 def test_amplitudes_are_among_any_number_of_levels(small, levels):
     scenario = dataclasses.replace(small.scenario, amplitude_levels=levels)
@@ -87,7 +73,7 @@ def test_the_beams_of_all_bands_are_those_of_each_one(table1, positions):
 def test_no_beam_waits_for_tables_after_the_preparation(small):
     scenario = dataclasses.replace(small.scenario, max_power_w=0.0123)
     prepare_steering(scenario)
-    caches = search.tables, band_link.arrays, band_link.representative_subbands
+    caches = candidates.tables, band_link.arrays, band_link.representative_subbands
     before = [cache.cache_info().misses for cache in caches]
     choose_beam(scenario, scenario.sample_positions(1, np.random.default_rng(0))[0], np.eye(3))
     assert [cache.cache_info().misses for cache in caches] == before
@@ -97,7 +83,7 @@ def test_a_beam_of_a_small_surface_is_close_to_the_optimum(small, reference_link
     """The optimum is a corner of the box; water-filling divides the power evenly here."""
     scenario, link = small.scenario, reference_link(small)
     corners = (np.arange(1, 2**16)[:, None] >> np.arange(16) & 1).astype(float)
-    for position in scenario.sample_positions(3, np.random.default_rng(4)):
+    for position in scenario.sample_positions(1, np.random.default_rng(4)):
         rates = 0
         for onboard, los in zip(link.onboard, link.los(position), strict=True):
             configured = onboard * corners[:, None]
@@ -111,40 +97,10 @@ def test_a_beam_of_a_small_surface_is_close_to_the_optimum(small, reference_link
         assert 0.999 * best < found <= best * (1 + 1e-9)
 
 
-def test_low_power_goes_to_the_best_sub_bands():
-    """The sub-bands differ, and the power is too low for an even division."""
-    scenario = Scenario(
-        center_frequencies_hz=(2.5e9,), n_subbands=4, subband_width_hz=4e8, n_feeds=2,
-        elements_per_side=4, max_power_w=5e-9)
-    position = np.array([7.0, 3.0, -0.5])
-    beam = steer(scenario, position)
-    shares = np.sum(np.abs(beam.digital)**2, axis=1)
-    assert shares.sum() == pytest.approx(scenario.max_power_w)
-    assert shares.max() > 2 * shares.min()
-    scale = np.sqrt(scenario.max_power_w / 4 / np.maximum(shares, 1e-30))
-    even = Beam(beam.analog, beam.digital * scale[:, None])
-    assert rate(scenario, beam, position) > 1.01 * rate(scenario, even, position)
-
-
-@pytest.mark.parametrize('position', [
-    (1.0, 2.0), 5.0, [[9.0, 0.0, 0.0]], (9.0, np.nan, 0.0), (9.0, 0.0, -np.inf)])
-def test_steering_to_an_invalid_position_is_an_error(small, position):
-    with pytest.raises(ValueError, match='positions'):
-        steer(small.scenario, position)
-
-
 @pytest.mark.parametrize('band', [-1, 1, 7])
 def test_steering_in_a_band_out_of_range_is_an_error(small, band):
     with pytest.raises(ValueError, match=f'band: {band}, expected 0 to 0'):
         steer(small.scenario, (9.0, 0.0, 0.0), band)
-
-
-def test_a_single_feed_and_sub_band_get_all_the_power():
-    scenario = Scenario(
-        center_frequencies_hz=(2.5e9,), n_subbands=1, n_feeds=1, elements_per_side=3)
-    beam = steer(scenario, (9.0, 0.0, 0.0))
-    assert_valid(scenario, beam)
-    assert np.abs(beam.digital[0, 0]) == pytest.approx(np.sqrt(scenario.max_power_w))
 
 
 def test_the_choice_is_the_best_band_steered_to_the_mean(table1):
@@ -159,11 +115,6 @@ def test_the_choice_is_the_best_band_steered_to_the_mean(table1):
     best = steer(scenario, POSITION, choice.beam.band)
     np.testing.assert_array_equal(choice.beam.analog, best.analog)
     np.testing.assert_array_equal(choice.beam.digital, best.digital)
-
-
-@pytest.mark.parametrize('band', [0, 1])
-def test_the_choice_is_limited_to_the_given_bands(table1, band):
-    assert choose_beam(table1.scenario, POSITION, np.eye(3), [band]).beam.band == band
 
 
 def test_an_uncertain_position_may_change_the_band():
@@ -202,27 +153,15 @@ def test_capacities_of_the_outcome_match_the_reference(table1, reference_link, b
     assert found.perfect_bps == pytest.approx(
         link.capacity(steer(scenario, POSITION, band), POSITION), rel=1e-6)
     assert found.loss_bps == found.perfect_bps - found.actual_bps > 0
+    best = choose_beam(scenario, POSITION).beam
+    assert capacity_report(scenario, used, POSITION).perfect_bps == pytest.approx(
+        capacity(scenario, best, POSITION[None])[0])
     assert found.loss_percent == pytest.approx(100 * (1 - found.actual_bps / found.perfect_bps))
-
-
-def test_a_beam_in_another_band_than_the_best_loses_capacity(table1):
-    scenario = table1.scenario
-    best = choose_beam(scenario, POSITION).beam.band
-    other = steer(scenario, POSITION, 1 - best)
-    assert capacity_report(scenario, other, POSITION).loss_percent > 0.1
-    assert capacity_report(scenario, other, POSITION, [1 - best]).loss_bps == 0
 
 
 def test_the_relative_loss_of_no_capacity_is_nan():
     assert math.isnan(CapacityReport(0.0, 0.0).loss_percent)
     assert math.isnan(CapacityReport(math.nan, math.nan).loss_percent)
-
-
-@pytest.mark.parametrize('position', [(1.0, 2.0), (9.0, np.nan, 0.0)])
-def test_an_outcome_at_an_invalid_position_is_an_error(table1, position):
-    beam = steer(table1.scenario, POSITION)
-    with pytest.raises(ValueError, match='expected'):
-        capacity_report(table1.scenario, beam, np.array(position))
 
 
 @pytest.fixture(scope='module')

@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rhs_isac_ros.link import Beam, capacity
-from rhs_isac_ros.link import search as search_module
+from rhs_isac_ros.link import Beam, candidates, capacity
 from rhs_isac_ros.link.band_link import BandLink
-from rhs_isac_ros.link.search import candidate_configurations, tables
+from rhs_isac_ros.link.candidates import candidate_configurations, tables
 from rhs_isac_ros.link.steering import ascend
 from rhs_isac_ros.model import Scenario, multipath
 from rhs_isac_ros.model.multipath import multipath_covariance
@@ -91,17 +90,13 @@ def test_the_modes_contain_nearly_all_of_the_multipath_power(table1):
         assert 0 < np.trace(rest) <= 0.02 * np.trace(spatial)
 
 
-def test_the_tables_are_computed_once(table1):
-    assert tables(table1.scenario, None) is tables(Scenario(), None)
-
-
 @pytest.mark.parametrize('direction', [(0.0, 0.0), (40.0, -20.0)])
 def test_modes_of_many_elements_are_found_by_products_alone(monkeypatch, direction):
     scenario = Scenario(elements_per_side=(9, 6), multipath_direction_deg=direction)
-    expected = search_module._modes(scenario)
+    expected = candidates._modes(scenario)
     multipath.spatial_covariance.cache_clear()
     monkeypatch.setattr(multipath, '_MAX_MATRIX', 1)
-    found = search_module._modes(scenario, 30)
+    found = candidates._modes(scenario, 30)
     multipath.spatial_covariance.cache_clear()
     assert np.isrealobj(found) == (direction == (0, 0))
     assert found.shape == expected.shape
