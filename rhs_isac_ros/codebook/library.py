@@ -26,7 +26,7 @@ from rhs_isac_ros.codebook.optimize import optimize
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.errors import translated
-from rhs_isac_ros.support.files import read_archive, write_archive
+from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
 
 # Default spreads [m], and the loss from which the pitch of their cells follows.
 SPREADS_M = (0.2, 0.5)
@@ -132,16 +132,16 @@ class Library:
     @classmethod
     def load(cls, path: str | Path) -> 'Library':
         """Read a file; raise CodebookError if it is no library, or damaged."""
-        with translated((ValueError, TypeError), CodebookError, path):
+        with translated(ArchiveError, CodebookError):
             arrays, about = read_archive(path, 'library of codebooks', _FORMAT, {*_ARRAYS})
+        with translated((ValueError, TypeError), CodebookError, path):
             lengths = {len(array) for array in arrays.values()}
             if len(lengths) != 1 or arrays['centres_m'].shape[1:] != (3,):
                 raise CodebookError(f'lengths {sorted(lengths)}, expected one for all arrays')
             fields: dict[str, Any] = {
                 name: tuple(value) if isinstance(value, list) else value
                 for name, value in about.items()}
-            plan = Plan(**fields)
-            library = cls(plan, **arrays)
+            library = cls(Plan(**fields), **arrays)
             _ = library.codebooks
         return library
 

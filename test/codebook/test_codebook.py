@@ -158,14 +158,6 @@ def test_malformed_parameters_are_errors(small, name, value, words):
         Codebook.from_parameters(small.codebook.to_parameters() | {name: value})
 
 
-@pytest.mark.parametrize('name', ['shape', 'analog', 'digital_re', 'digital_im'])
-def test_a_missing_parameter_is_an_error(small, name):
-    parameters = small.codebook.to_parameters()
-    del parameters[f'codebook.{name}']
-    with pytest.raises(CodebookError, match=f'codebook.{name}: '):
-        Codebook.from_parameters(parameters)
-
-
 @pytest.mark.parametrize('change', [{}, {'codebook.id': ''}], ids=['missing', 'empty'])
 def test_the_id_is_optional(small, change):
     parameters = small.codebook.to_parameters()
@@ -191,32 +183,6 @@ def test_a_file_without_a_codebook_is_an_error(tmp_path, content, words):
     with pytest.raises(CodebookError, match=words) as caught:
         Codebook.load(path)
     assert str(caught.value).startswith(f'{path}: ')
-
-
-def test_a_missing_file_is_an_error(tmp_path):
-    with pytest.raises(CodebookError, match='cannot be read'):
-        Codebook.load(tmp_path / 'none.yaml')
-
-
-def test_a_tampered_file_is_an_error(small, tmp_path):
-    path = tmp_path / 'codebook.yaml'
-    small.codebook.save(path)
-    content = yaml.safe_load(path.read_text(encoding='utf-8'))
-    (node,) = content.values()
-    node['ros__parameters']['codebook']['analog'][3] += 1e-9
-    path.write_text(yaml.safe_dump(content), encoding='utf-8')
-    with pytest.raises(CodebookError, match=f"codebook.id: '{small.codebook.id}', expected "):
-        Codebook.load(path)
-
-
-def test_any_node_of_a_parameter_file_may_hold_the_codebook(small, tmp_path):
-    path = tmp_path / 'parameters.yaml'
-    values = {key.partition('.')[2]: value
-              for key, value in small.codebook.to_parameters().items()}
-    path.write_text(yaml.safe_dump({
-        '/bs': {'ros__parameters': {'policy': 'first'}},
-        '/x/optimizer': {'ros__parameters': {'seed': 1, 'codebook': values}}}), encoding='utf-8')
-    assert Codebook.load(path).id == small.codebook.id
 
 
 SHIPPED = {'codebook.yaml': 'ambiguity', 'codebook_ambiguity.yaml': 'ambiguity',

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import importlib.util
+import re
 import sys
 
 import numpy as np
@@ -24,19 +25,19 @@ from rhs_isac_ros.codebook import (
 )
 from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS, Method, _Report
 from rhs_isac_ros.codebook.problem import Problem
+from rhs_isac_ros.codebook.unoptimised import STARTS
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.support import threads
 
 STEPS = 30
-NO_PYMOO = importlib.util.find_spec('pymoo') is None
-# Methods that search, each with few steps.
+# Many evaluations. Ubuntu has no package of pymoo.
+MARKS = {'genetic': [pytest.mark.slow, pytest.mark.skipif(
+    importlib.util.find_spec('pymoo') is None, reason='needs pymoo')]}
+# A new method needs a number of steps that suffices to lower every objective, but no test.
 FEW_STEPS = {'alternating': 24, 'direct': 12, 'genetic': 2, 'lbfgs': 10}
-SEARCHING = [
-    'alternating', 'direct', 'lbfgs',
-    # Many evaluations. Ubuntu has no package of pymoo.
-    pytest.param('genetic', marks=[
-        pytest.mark.skipif(NO_PYMOO, reason='needs pymoo'), pytest.mark.slow])]
+SEARCHING = [pytest.param(name, marks=MARKS.get(name, ()))
+             for name, method in METHODS.items() if method.minimize]
 # The objective's rows are not exact, see ROW_TOLERANCE.
 ABOUT = 1e-3
 
@@ -47,37 +48,35 @@ def positions(scenario):
 
 
 @pytest.fixture(scope='module')
-def run(scenario, positions):
-    """An optimisation, the arguments of its progress callback, and its positions."""
-    seen = []
-    result = optimize(scenario, positions, seed=3, max_steps=STEPS, progress=seen.append)
-    return result, seen, positions
+def result(scenario, positions):
+    return optimize(scenario, positions, seed=3, max_steps=STEPS)
+
+
+class Evaluations(list):
+    """Values and codebooks; Ctrl-C interrupts an evaluation."""
+
+    interrupt_at: int | None = None
 
 
 @pytest.fixture
 def evaluated(monkeypatch):
-    """Record all variables for which the objective is evaluated."""
-    seen = []
+    """Record all evaluations of the objective."""
+    seen = Evaluations()
     for name in ('value', 'value_and_gradient'):
         def spy(problem, variables, *, evaluate):
-            seen.append(np.array(variables))
-            return evaluate(problem, variables)
+            if len(seen) + 1 == seen.interrupt_at:
+                raise KeyboardInterrupt
+            outcome = evaluate(problem, variables)
+            seen.append((outcome[0] if isinstance(outcome, tuple) else outcome,
+                         problem.unpack(variables)))
+            return outcome
         monkeypatch.setattr(Problem, name, functools.partialmethod(
             spy, evaluate=getattr(Problem, name)))
     return seen
 
 
-def test_the_bound_falls_strongly_also_on_held_out_positions(scenario, run):
-    result, _, _ = run
-    assert result.history[-1].value_m2 < 0.3 * result.history[0].value_m2
-    held_out = scenario.sample_positions(400, np.random.default_rng(1))
-    start = random_codebook(scenario, np.random.default_rng(3))
-    optimised = crlb(scenario, result.codebook, held_out).mean()
-    assert optimised < 0.3 * crlb(scenario, start, held_out).mean()
-
-
-def test_the_best_codebook_is_feasible_and_has_the_reported_bound(scenario, run, plain):
-    result, _, positions = run
+def test_the_best_codebook_is_feasible_and_has_the_reported_bound(
+        scenario, positions, result, plain):
     result.codebook.check(scenario)
     p = plain(scenario, result.codebook.analog, result.codebook.digital)
     expected = p.crlb(positions, multipath_covariance(scenario)).mean()
@@ -85,8 +84,7 @@ def test_the_best_codebook_is_feasible_and_has_the_reported_bound(scenario, run,
     assert result.history[-1].value_m2 == pytest.approx(expected, rel=ABOUT)
 
 
-def test_the_provenance_contains_arguments_and_progress(scenario, run):
-    result, _, _ = run
+def test_the_provenance_contains_arguments_and_progress(scenario, result):
     end = result.history[-1]
     assert Provenance.parse(result.codebook.provenance) == Provenance(
         method='lbfgs', objective='crlb', seed=3, sampling='given', positions=60,
@@ -100,23 +98,6 @@ def assert_consistent(history):
         assert after.value_m2 <= before.value_m2
         assert after.evaluations >= before.evaluations
         assert after.elapsed_s >= before.elapsed_s
-
-
-def test_the_history_never_rises_and_is_passed_to_progress(run):
-    result, seen, _ = run
-    assert list(result.history) == seen
-    assert_consistent(result.history)
-    evaluations = [entry.evaluations for entry in seen]
-    assert evaluations == sorted(set(evaluations))
-
-
-def test_stops_at_the_limit_of_steps(run, scenario):
-    result, _, positions = run
-    assert len(result.history) == STEPS + 1
-    assert result.reason
-    short = optimize(scenario, positions, seed=3, max_steps=2)
-    assert len(short.history) == 3
-    assert short.history[-1].value_m2 == result.history[2].value_m2
 
 
 @pytest.mark.parametrize('objective', OBJECTIVES)
@@ -140,7 +121,7 @@ def test_every_method_lowers_every_objective(scenario, positions, method, object
     assert result.codebook.average_crlb_m2 == pytest.approx(exact, rel=1e-12)
 
 
-@pytest.mark.parametrize('method', ['alternating', 'direct', 'lbfgs'])
+@pytest.mark.parametrize('method', ['direct', 'lbfgs'])
 def test_methods_of_scipy_run_its_blas_with_one_thread(
         scenario, positions, method, monkeypatch):
     seen = []
@@ -159,7 +140,7 @@ def test_methods_of_scipy_run_its_blas_with_one_thread(
     assert seen[-1] == {1}
 
 
-@pytest.mark.parametrize('budget', [1, 2, 5])
+@pytest.mark.parametrize('budget', [1, 5])
 @pytest.mark.parametrize('method', SEARCHING)
 def test_a_budget_of_evaluations_ends_every_method(
         scenario, positions, method, budget, evaluated):
@@ -170,40 +151,20 @@ def test_a_budget_of_evaluations_ends_every_method(
     assert result.history[-1].evaluations == budget
     assert_consistent(result.history)
     result.codebook.check(scenario)
-    if budget == 1:
-        start = random_codebook(scenario, np.random.default_rng(0))
-        assert result.codebook.analog.shape == start.analog.shape
-        assert result.history[-1].value_m2 == result.history[0].value_m2
 
 
 @pytest.mark.parametrize('method', SEARCHING)
-@pytest.mark.parametrize('at', [2, 4, 12])
-def test_an_interrupt_returns_the_best_so_far(scenario, positions, method, at, monkeypatch):
-    values = []
-    for name in ('value', 'value_and_gradient'):
-        def spy(problem, variables, *, evaluate):
-            if len(values) + 1 == at:
-                raise KeyboardInterrupt
-            outcome = evaluate(problem, variables)
-            values.append((np.min(outcome[0]) if isinstance(outcome, tuple) else outcome,
-                           problem.unpack(variables)))
-            return outcome
-        monkeypatch.setattr(Problem, name, functools.partialmethod(
-            spy, evaluate=getattr(Problem, name)))
+@pytest.mark.parametrize('at', [2, 12])
+def test_an_interrupt_returns_the_best_so_far(scenario, positions, method, at, evaluated):
+    evaluated.interrupt_at = at
     result = optimize(scenario, positions, method, seed=3, max_steps=100)
     assert result.reason == 'interrupted'
-    assert len(values) == at - 1
+    assert len(evaluated) == at - 1
     assert Provenance.parse(result.codebook.provenance).reason == 'interrupted'
-    best = min(values, key=lambda entry: entry[0])[1]
-    assert result.codebook.id == best.id
+    assert result.codebook.id == min(evaluated, key=lambda entry: entry[0])[1].id
 
 
-def test_the_genetic_algorithm_has_ten_generations(scenario, positions, monkeypatch):
-    monkeypatch.setattr(Problem, 'value', lambda problem, variables: float(np.sum(variables)))
-    assert optimize(scenario, positions, 'genetic', seed=3).history[-1].step == 10
-
-
-@pytest.mark.parametrize('objective', OBJECTIVES)
+@pytest.mark.parametrize('objective', ['ambiguity', 'crlb'])
 def test_progress_is_reported_while_the_objective_is_set_up(
         scenario, positions, objective, monkeypatch):
     monkeypatch.setattr(_Report, '_TICK_S', 0.0)
@@ -253,10 +214,7 @@ def test_keep_receives_the_results_so_far(scenario, positions, monkeypatch):
         made = Provenance.parse(partial.codebook.provenance)
         assert (made.steps, made.evaluations, made.value_m2, made.reason) == (
             end.step, end.evaluations, end.value_m2, 'not finished')
-        exact = crlb(scenario, partial.codebook, positions).mean()
-        assert partial.codebook.average_crlb_m2 == pytest.approx(exact, rel=1e-12)
     assert kept[-1].codebook.id == result.codebook.id
-    assert kept[0].codebook.average_crlb_m2 > kept[-1].codebook.average_crlb_m2
 
 
 def test_returns_the_best_point_of_a_method_that_ends_elsewhere(small, monkeypatch):
@@ -293,20 +251,13 @@ def test_methods_without_a_search_return_the_start_and_set_up_no_objective(
     assert len(result.history) == 1
     assert result.history[0].evaluations == 0
     assert result.history[0].value_m2 == result.codebook.average_crlb_m2
-    if method == 'directional':
-        expected = directional_codebook(scenario)
-    else:
-        # Every method starts from it by default.
-        expected = random_codebook(scenario, np.random.default_rng(0))
-        assert result.history[0].value_m2 == pytest.approx(first.value_m2, rel=2 * ABOUT)
-        analog = result.codebook.analog
-        assert analog.min() < 0.2
-        assert analog.max() > 0.8
+    expected = STARTS[method](scenario, np.random.default_rng(0))
     np.testing.assert_allclose(result.codebook.digital, expected.digital, rtol=1e-12)
     if method == 'directional':
         np.testing.assert_array_equal(result.codebook.analog, expected.analog)
-    exact = crlb(scenario, result.codebook, positions).mean()
-    assert result.codebook.average_crlb_m2 == pytest.approx(exact, rel=1e-12)
+    else:
+        # Every method starts from it by default.
+        assert result.history[0].value_m2 == pytest.approx(first.value_m2, rel=2 * ABOUT)
     given = optimize(scenario, positions, method, start=small.codebook)
     np.testing.assert_array_equal(given.codebook.analog, small.codebook.analog)
 
@@ -331,11 +282,6 @@ def test_sampling_and_number_determine_the_positions(scenario, small):
             assert (made.sampling, made.positions) == (sampling, n)
             bounds.add(result.codebook.average_crlb_m2)
     assert len(bounds) == 4
-    # With many samples, both samplings agree.
-    one, other = (optimize(scenario, method='random', sampling=sampling, n_positions=4096,
-                           start=small.codebook).codebook.average_crlb_m2
-                  for sampling in SAMPLINGS)
-    assert one == pytest.approx(other, rel=0.1)
 
 
 def steps_of(history):
@@ -360,16 +306,6 @@ def test_a_result_can_be_resumed(scenario, positions, method):
     assert Provenance.parse(second.codebook.provenance).steps == second.history[-1].step
 
 
-def test_resuming_a_complete_result_returns_it(scenario, positions, run):
-    again = optimize(
-        scenario, positions, seed=3, max_steps=STEPS, resume=run[0].codebook)
-    assert again.reason == 'max_steps reached'
-    assert len(again.history) == 1
-    np.testing.assert_array_equal(again.codebook.analog, run[0].codebook.analog)
-    assert again.codebook.average_crlb_m2 == pytest.approx(
-        run[0].codebook.average_crlb_m2, rel=1e-9)
-
-
 def test_the_budget_includes_the_evaluations_of_the_resumed_run(scenario, positions, evaluated):
     first = optimize(scenario, positions, seed=3, max_steps=50, max_evaluations=5)
     second = optimize(scenario, positions, seed=3, max_steps=50, max_evaluations=9,
@@ -379,8 +315,7 @@ def test_the_budget_includes_the_evaluations_of_the_resumed_run(scenario, positi
     assert second.reason == 'max_evaluations reached'
 
 
-def test_a_result_of_other_arguments_cannot_be_resumed(scenario, positions, run):
-    codebook = run[0].codebook
+def test_a_result_of_other_arguments_cannot_be_resumed(scenario, positions, result):
     for arguments, words in [
             ({'seed': 4}, 'seed: 4, expected 3'),
             ({'method': 'direct'}, "method: 'direct', expected 'lbfgs'"),
@@ -389,32 +324,23 @@ def test_a_result_of_other_arguments_cannot_be_resumed(scenario, positions, run)
             ({'positions': None}, "sampling: 'sobol', expected 'given'"),
             ({'resume': random_codebook(scenario, np.random.default_rng(0))},
              "resume: provenance 'random', expected that of an optimisation")]:
-        original = {'positions': positions, 'seed': 3, 'resume': codebook, 'max_steps': 40}
+        original = {'positions': positions, 'seed': 3, 'resume': result.codebook,
+                    'max_steps': 40}
         with pytest.raises(ValueError) as caught:
             optimize(scenario, **(original | arguments))
         assert str(caught.value).startswith(words)
 
 
-@pytest.mark.parametrize(('name', 'known'), [
-    ('method', METHODS), ('objective', OBJECTIVES), ('sampling', SAMPLINGS)])
-def test_the_error_for_an_unknown_name_lists_the_known_ones(scenario, name, known):
-    with pytest.raises(ValueError, match=f"^{name}: 'magic', expected one of") as caught:
-        optimize(scenario, **{name: 'magic'})
-    for one in known:
-        assert repr(one) in str(caught.value)
-
-
-@pytest.mark.parametrize(('name', 'low'), [
-    ('n_positions', 1), ('max_steps', 1), ('max_evaluations', 1), ('seed', 0)])
-def test_numbers_below_their_limits_are_errors(scenario, name, low):
-    with pytest.raises(ValueError, match=f'^{name}: {low - 1}, expected at least {low}$'):
-        optimize(scenario, **{name: low - 1})
-
-
-@pytest.mark.parametrize('objective', OBJECTIVES)
-def test_a_single_position_suffices(scenario, objective):
-    result = optimize(scenario, n_positions=1, objective=objective, max_steps=3)
-    assert result.history[-1].value_m2 < result.history[0].value_m2
+@pytest.mark.parametrize(('arguments', 'error'), [
+    *(({name: 'magic'}, f"{name}: 'magic', expected one of {re.escape(str(sorted(known)))}")
+      for name, known in (('method', METHODS), ('objective', OBJECTIVES),
+                          ('sampling', SAMPLINGS))),
+    *(({name: low - 1}, f'{name}: {low - 1}, expected at least {low}') for name, low in (
+        ('n_positions', 1), ('max_steps', 1), ('max_evaluations', 1), ('seed', 0))),
+    ({'positions': np.zeros((0, 3))}, 'positions: none, expected at least one')])
+def test_an_invalid_argument_is_an_error(scenario, arguments, error):
+    with pytest.raises(ValueError, match=f'^{error}$'):
+        optimize(scenario, **arguments)
 
 
 def test_a_start_that_does_not_fit_is_an_error(scenario, table1, small):
@@ -425,33 +351,13 @@ def test_a_start_that_does_not_fit_is_an_error(scenario, table1, small):
         optimize(scenario, start=weak, max_steps=1)
 
 
-def test_no_positions_are_an_error(scenario):
-    with pytest.raises(ValueError, match='^positions: none, expected at least one'):
-        optimize(scenario, np.zeros((0, 3)), max_steps=1)
-
-
-def test_bounds_below_a_millimetre_are_minimised_as_well(scenario):
-    """With weak multipath, objectives are of the order of 1e-6 m^2."""
-    clear = dataclasses.replace(scenario, multipath_to_los_db=-60.0)
-    result = optimize(clear, n_positions=64, max_steps=STEPS)
-    assert len(result.history) == STEPS + 1
-    assert result.history[0].value_m2 < 1e-4
-    assert result.history[-1].value_m2 < 0.5 * result.history[0].value_m2
-
-
 @pytest.mark.parametrize('objective', OBJECTIVES)
-def test_a_flat_region_and_a_rectangular_surface_are_accepted(scenario, objective):
+def test_one_position_in_a_flat_region_and_a_rectangular_surface_suffice(scenario, objective):
     flat = dataclasses.replace(scenario, roi_size_m=(*scenario.roi_size_m[:2], 0.0),
                                elements_per_side=(6, 3))
-    result = optimize(flat, n_positions=16, objective=objective, max_steps=5)
+    result = optimize(flat, n_positions=1, objective=objective, max_steps=5)
     result.codebook.check(flat)
     assert result.history[-1].value_m2 < result.history[0].value_m2
-
-
-def test_a_seed_may_be_a_numpy_integer(scenario):
-    one, same = (optimize(scenario, n_positions=4, seed=seed, max_steps=1)
-                 for seed in (np.int64(3), 3))
-    assert one.codebook.provenance == same.codebook.provenance
 
 
 def test_a_position_that_the_signals_do_not_determine_is_an_error():

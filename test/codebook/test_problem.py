@@ -1,27 +1,15 @@
-"""Problem P1: variables, constraints and gradient, with the exact bound."""
-
-import dataclasses
+"""Problem P1: variables and constraints; and the search: best point, history and budget."""
 
 import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import AverageCrlb
-from rhs_isac_ros.codebook.problem import Problem
-from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.multipath import multipath_covariance
+from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Progress
 
 
 @pytest.fixture(scope='module')
 def problem(small):
     return Problem(small.scenario, AverageCrlb(small.scenario, small.vectors['positions']))
-
-
-def test_the_value_matches_the_test_vectors(case):
-    problem = Problem(case.scenario, AverageCrlb(case.scenario, case.vectors['positions']))
-    variables = problem.pack(case.codebook)
-    expected = pytest.approx(float(case.vectors['average_crlb']), rel=1e-8)
-    assert problem.value(variables) == expected
-    assert problem.value_and_gradient(variables)[0] == expected
 
 
 def test_variables_are_configurations_then_combining_vectors(problem, small):
@@ -65,35 +53,105 @@ def test_the_scale_of_the_combining_vectors_has_no_effect(problem, small):
     assert abs(gradient[32:] @ scaled[32:]) < 1e-8 * np.linalg.norm(gradient[32:]) * 7
 
 
-def test_the_gradient_agrees_with_finite_differences_of_plain_bounds(plain, random_beams):
-    """The reference scales the combining vectors independently."""
-    rng = np.random.default_rng(1)
-    scenario = Scenario(
-        center_frequencies_hz=(1.8e9, 2.9e9), n_subbands=2, n_frames=2, n_feeds=2,
-        elements_per_side=3, max_power_w=0.02, roi_center_m=(3, 0, 0), roi_size_m=(2, 2, 2))
-    positions = scenario.sample_positions(2, rng)
-    spatial = multipath_covariance(scenario)
-    problem = Problem(scenario, AverageCrlb(scenario, positions))
-    start = random_beams(scenario, rng)
-    # Move off the bounds, and change the scale of the combining vectors.
-    start = dataclasses.replace(start, analog=0.1 + 0.8 * start.analog)
-    variables = problem.pack(start)
-    variables[problem.n_analog:] *= 1.9
+START = np.full(20, 0.5)
 
-    def bound(point):
-        analog = point[:problem.n_analog].reshape(2, 2, 9)
-        real, imag = point[problem.n_analog:].reshape(2, 2, 2, 2, 2)
-        digital = real + 1j * imag
-        for i in range(2):
-            for q in range(2):
-                digital[i, :, q] *= np.sqrt(0.02 / np.sum(np.abs(digital[i, :, q])**2))
-        return plain(scenario, analog, digital).crlb(positions, spatial).mean()
 
-    value, gradient = problem.value_and_gradient(variables)
-    assert value == pytest.approx(bound(variables), rel=1e-7)
-    for _ in range(4):
-        direction = rng.normal(size=variables.shape)
-        difference = (bound(variables + 1e-5 * direction)
-                      - bound(variables - 1e-5 * direction)) / 2e-5
-        assert gradient @ direction == pytest.approx(
-            difference, abs=1e-5 * np.linalg.norm(gradient) * np.linalg.norm(direction))
+def test_a_search_provides_limits_bounds_start_and_generator(quadratic, search_of):
+    search = search_of(quadratic(0), 7, seed=3)
+    assert search.max_steps == 7
+    assert search.n_analog == 10
+    assert search.bounds == [(0.0, 1.0)] * 10 + [(None, None)] * 10
+    np.testing.assert_array_equal(search.start, START)
+    assert search.rng.integers(1000) == np.random.default_rng(3).integers(1000)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_keeps_the_best_point_of_both_kinds_of_evaluation(quadratic, search_of, seed):
+    problem, rng = quadratic(seed), np.random.default_rng(seed)
+    search = search_of(problem)
+    reference = quadratic(seed)
+    best = None
+    for n in range(30):
+        point = rng.normal(size=20)
+        if n % 2:
+            value = search.value(point)
+        else:
+            value, gradient = search.value_and_gradient(point)
+            np.testing.assert_array_equal(gradient, reference.value_and_gradient(point)[1])
+        assert value == reference.value(point)
+        if best is None or value < best[0]:
+            best = value, point.copy()
+        # A method may reuse the array.
+        point[:] = 0
+        assert search.value_m2 == best[0]
+        np.testing.assert_array_equal(search.best, best[1])
+
+
+def test_nan_is_never_the_best_value(flat, search_of):
+    search = search_of(flat)
+    search.value(START)
+    flat.value = lambda variables: np.nan
+    assert np.isnan(search.value(START + 1))
+    assert search.value_m2 == 3.0
+    np.testing.assert_array_equal(search.best, START)
+
+
+def test_a_repeated_point_is_not_evaluated_again(quadratic, search_of):
+    problem = quadratic(0)
+    search = search_of(problem)
+    point = START.copy()
+    first = search.value_and_gradient(point)
+    again = search.value_and_gradient(START)
+    assert len(problem.points) == 1
+    assert first[0] == again[0]
+    np.testing.assert_array_equal(first[1], again[1])
+    # A change in place makes it another point.
+    point[3] = 0.25
+    moved = search.value_and_gradient(point)
+    assert len(problem.points) == 2
+    assert moved[0] == quadratic(0).value(point)
+
+
+def test_history_counts_steps_and_evaluations(quadratic, search_of):
+    seen = []
+    search = search_of(quadratic(0), progress=seen.append)
+    search.value(START)
+    search.on_step()
+    search.value_and_gradient(START - 0.1)
+    search.value(START + 0.1)
+    search.on_step()
+    assert search.history == seen
+    assert all(isinstance(entry, Progress) for entry in seen)
+    assert [entry.step for entry in seen] == [0, 1]
+    assert [entry.evaluations for entry in seen] == [1, 3]
+    assert seen[0].value_m2 == quadratic(0).value(START)
+    assert seen[1].value_m2 == search.value_m2 <= seen[0].value_m2
+    assert 0 <= seen[0].elapsed_s <= seen[1].elapsed_s < 60
+
+
+@pytest.mark.parametrize('budget', [1, 2, 5])
+@pytest.mark.parametrize('name', ['value', 'value_and_gradient'])
+def test_no_evaluation_is_done_beyond_the_budget(quadratic, search_of, budget, name):
+    problem = quadratic(0)
+    search = search_of(problem, max_evaluations=budget)
+    for n in range(budget):
+        getattr(search, name)(START + n)
+    for _ in range(2):
+        with pytest.raises(BudgetSpent):
+            getattr(search, name)(START - 1)
+    assert len(problem.points) == budget
+    search.on_step()
+    assert search.history[-1].evaluations == budget
+
+
+def test_limits_include_the_steps_and_evaluations_of_the_resumed_search(quadratic, search_of):
+    search = search_of(quadratic(0), 10, 7, done=(4, 5))
+    assert search.max_steps == 6
+    search.value(START)
+    search.on_step()
+    search.value(START)
+    with pytest.raises(BudgetSpent):
+        search.value(START)
+    search.on_step()
+    assert [entry.step for entry in search.history] == [4, 5]
+    assert [entry.evaluations for entry in search.history] == [6, 7]

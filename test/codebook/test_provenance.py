@@ -1,12 +1,14 @@
-"""Provenance: text that can be parsed, and the checks before resuming."""
+"""Provenance: text that can be parsed, also as the parameter ``codebook.provenance``."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+import yaml
 
 import rhs_isac_ros
-from rhs_isac_ros.codebook import Codebook, Progress, Provenance
+from rhs_isac_ros.codebook import Progress, Provenance
+from rhs_isac_ros.codebook.codebook import decode, encode, from_parameter, to_parameter
 from rhs_isac_ros.model import Scenario
 
 PLAIN = Provenance(
@@ -45,27 +47,12 @@ def test_parsing_restores_all_fields(scenario):
     assert Scenario(**read.scenario) == scenario
 
 
-@pytest.mark.parametrize('reason', [
-    '', 'a: b, {c} [d] #e', '"quoted" and \'quoted\'', 'é ∞ 日本', '- x', 'null', '1e3', 'yes',
-    '2023-99-99', '%s & *x !tag', '\\n \t|>', 'line\nline', 'x' * 3000, '\x07', ' ends '])
-def test_any_reason_is_preserved(reason):
-    assert Provenance.parse(text_of(reason=reason)).reason == reason
-
-
 @pytest.mark.parametrize('value', [0.0, 1e-300, 1e22, np.float64(0.25), 3.0, np.inf])
 def test_any_value_is_preserved_as_a_float(value):
     end = dataclasses.replace(END, value_m2=value)
     read = Provenance.parse(text_of(end=end)).value_m2
     assert type(read) is float
     assert read == value
-
-
-def test_a_codebook_file_preserves_it(small, tmp_path):
-    text = text_of(scenario=small.scenario.changes(), reason='a: "b"')
-    dataclasses.replace(small.codebook, provenance=text).save(tmp_path / 'codebook.yaml')
-    loaded = Codebook.load(tmp_path / 'codebook.yaml')
-    assert loaded.provenance == text
-    assert Provenance.parse(loaded.provenance).scenario == small.scenario.changes()
 
 
 @pytest.mark.parametrize('text', [
@@ -78,6 +65,40 @@ def test_parsing_any_other_text_returns_none(text):
     assert Provenance.parse(text) is None
 
 
-def test_resuming_returns_the_earlier_progress(small):
-    earlier = PLAIN.resumed(text_of())
-    assert (earlier.steps, earlier.evaluations, earlier.reason) == (5, 9, 'done')
+WORDS = ['done', 'max_steps reached', 'null', 'true', 'NaN', '0.1.0', '1e3', '', ' ends ',
+         'a, b=c', 'a: b, {c} [d] #e', '"quoted" and \'quoted\'', 'é ∞', 'line\nline', '\x07',
+         '%s & *x !tag']
+
+
+@pytest.mark.parametrize('value', [
+    *WORDS, 0, -3, 1e-300, True, None, [], {}, {'n_feeds': 2, 'name': 'a b'}, [1.5, 'x']])
+def test_any_value_survives_and_the_text_is_a_string_in_yaml(value):
+    encoded = encode({'first': value, 'second': value})
+    assert yaml.safe_load(encoded) == encoded
+    assert decode(encoded) == {'first': value, 'second': value}
+
+
+@pytest.mark.parametrize('given', ['seed', 'seed=', '=1', 'a=1,b=2', '[1, 2]', '', 'a=1, b'])
+def test_other_texts_are_rejected(given):
+    with pytest.raises(ValueError, match=r'expected name=value|Expecting|Extra'):
+        decode(given)
+
+
+@pytest.mark.parametrize('given', [
+    *WORDS, 'by hand', 'by hand: 3', '3', '- x', '[1, 2', '"', '@x', 'note="x"', 'note=x',
+    '{broken', '2023-99-99', '[' * 700])
+def test_any_text_survives_as_a_parameter_that_yaml_parses_as_a_string(given):
+    parameter = to_parameter(given)
+    assert parameter == '' or yaml.safe_load(parameter) == parameter
+    assert from_parameter(parameter) == given
+
+
+def test_plain_text_is_its_own_parameter():
+    assert to_parameter('by hand') == 'by hand'
+    assert to_parameter('method=lbfgs, seed=0') == 'method=lbfgs, seed=0'
+
+
+def test_the_yaml_of_earlier_versions_is_converted():
+    legacy = '{method: lbfgs, scenario: {n_feeds: 2}, reason: max_steps reached}'
+    assert from_parameter(legacy) == (
+        'method=lbfgs, scenario={"n_feeds":2}, reason=max_steps reached')
