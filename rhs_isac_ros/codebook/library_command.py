@@ -110,5 +110,3 @@ def _resumed(partial: Path, scenario: Scenario, start: Codebook, options: argpar
 def _print_loss(spread_m: float, pitch_m: float, loss: float) -> None:
     print(f'spread {spread_m:g} m, cells of {pitch_m:g} m: loss {100 * loss:.1f} %',
           file=sys.stderr)
-
-

@@ -183,5 +183,3 @@ def test_unequal_spacing_pays_only_if_phases_are_known(
 def test_what_does_not_fit_is_an_error(small, n_bands, options, message):
     with pytest.raises(ValueError, match=message):
         choose_bands(small, SPECTRUM, n_bands, **options)
-
-
