@@ -355,8 +355,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog='calibrate', description='Estimate errors and failures of the elements, and gains '
         'and phases of the bands, or the covariance of the multipath, from signals of users at '
-        'known positions. Without a file, the signals come from a running network; ROS arguments '
-        'select its namespace: --ros-args -r __ns:=/lab')
+        'known positions. Without a file, the signals come from a running network.')
     add = parser.add_argument
     add('file', type=input_file, nargs='?',
         help='recording made with record, or .npz file with the arrays positions [N, 3] (m) and '

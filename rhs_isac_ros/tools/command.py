@@ -79,6 +79,7 @@ def entry(
     """
     def main(arguments: Sequence[str] | None = None) -> int:
         parser, arguments = make_parser(), sys.argv[1:] if arguments is None else list(arguments)
+        parser.epilog = 'ROS arguments select the namespace: --ros-args -r __ns:=/lab'
         options = parse(parser, arguments)
         if problem := conflict(options):
             parser.error(problem)

@@ -45,7 +45,7 @@ def _record(options: argparse.Namespace, arguments: list[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog='record', description='Record a network as MCAP until Ctrl-C, or a site with the '
-        'networks of all surfaces. ROS arguments select the namespace: --ros-args -r __ns:=/lab')
+        'networks of all surfaces.')
     parser.add_argument('file', type=output_file, help='recording to write')
     files = parser.add_mutually_exclusive_group()
     for name, text in [

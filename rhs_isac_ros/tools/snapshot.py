@@ -113,8 +113,7 @@ def _missing(scene: SceneState) -> list[str]:
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog=_PROGRAM, description='Draw the scene of a network when every user has an '
-        'estimate, or some seconds after the first estimate. ROS arguments select the namespace: '
-        '--ros-args -r __ns:=/lab')
+        'estimate, or some seconds after the first estimate.')
     add = parser.add_argument
     add('--output', type=picture_file, default='scene.png', metavar='FILE',
         help='picture to write: PNG, PDF or SVG (default: scene.png)')

@@ -206,8 +206,7 @@ def _show_recording(
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog=_PROGRAM, description='Show a running network, or a recording, in three dimensions '
-        'and in charts over the cycles: in the browser until Ctrl-C, or as a file for Rerun. ROS '
-        'arguments select the namespace of a running network: --ros-args -r __ns:=/lab')
+        'and in charts over the cycles: in the browser until Ctrl-C, or as a file for Rerun.')
     add = parser.add_argument
     add('file', nargs='?', type=input_file, help='recording; by default the running network')
     add('--save', type=output_file, metavar='FILE',

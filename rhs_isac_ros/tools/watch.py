@@ -194,7 +194,7 @@ def _print_once(timeout_s: float, arguments: Sequence[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog=_PROGRAM, description='Show phase, users, losses and faults of a network until '
-        'Ctrl-C. ROS arguments select the namespace: --ros-args -r __ns:=/lab')
+        'Ctrl-C.')
     parser.add_argument('--once', action='store_true',
                         help='wait for one complete cycle, print the view, and exit')
     parser.add_argument('--timeout', type=nonnegative_float, default=60.0, metavar='S',
