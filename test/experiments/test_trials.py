@@ -1,5 +1,6 @@
 """Running jobs: stored results, repeated jobs, and runs that end early."""
 
+import io
 import json
 import os
 import subprocess
@@ -218,6 +219,14 @@ def test_a_dask_cluster_without_workers_is_an_error(tmp_path):
         with pytest.raises(ConnectionError, match='^Dask cluster inproc://.*workers'):
             run_jobs(Worker(), JOBS, tmp_path, dask=empty.scheduler_address,
                      worker_timeout_s=0.1)
+
+
+def test_a_terminal_shows_the_progress(tmp_path, monkeypatch):
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
+    monkeypatch.setattr(sys, 'stderr', terminal)
+    run_jobs(Worker(), JOBS, tmp_path, n_jobs=1, label='squares')
+    assert 'squares: 100%' in terminal.getvalue()
 
 
 def test_duplicate_names_are_an_error(tmp_path):

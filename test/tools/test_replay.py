@@ -144,10 +144,13 @@ def received(built_scripts, shared_session):
     with subprocess.Popen(
             [SCRIPTS / 'run', 'positioner', '--ros-args', '-r', '__ns:=/again', '-p',
              f'scenario_file:={CONFIG}/quick.yaml'], stderr=subprocess.DEVNULL) as process:
-        # The replay awaits the positioner, but not this observer.
-        assert shared_session.spin_until(lambda: subscription.get_publisher_count() > 0, 60)
-        yield found
-        process.send_signal(signal.SIGINT)
+        try:
+            # The replay awaits the positioner, but not this observer.
+            assert shared_session.spin_until(
+                lambda: subscription.get_publisher_count() > 0, 60)
+            yield found
+        finally:
+            process.send_signal(signal.SIGINT)
     shared_session.node.destroy_subscription(subscription)
 
 

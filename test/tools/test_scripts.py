@@ -3,6 +3,7 @@
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,13 @@ def test_another_name_is_rejected(tmp_path):
     done = subprocess.run([tmp_path / 'permissions'], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, '')
     assert done.stderr.startswith('permissions: not a tool')
+
+
+def test_a_missing_name_is_an_error():
+    done = subprocess.run([sys.executable, '-m', 'rhs_isac_ros.tools'], cwd=ROOT,
+                          capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, '')
+    assert done.stderr.startswith('usage: python3 -m rhs_isac_ros.tools COMMAND ')
 
 
 def test_a_link_in_another_directory_finds_the_package(built_scripts, tmp_path):
