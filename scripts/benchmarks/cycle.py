@@ -117,7 +117,7 @@ def figures(cycles: list['Cycle'], hops_s: np.ndarray) -> dict[str, dict[str, fl
                 for chain in chains])):
         found[f'{name} [ms]'] = own = percentiles(times_s)
         found[f'{name}, relative to {n} hops'] = {
-            key: value / n / hop[key] for key, value in own.items()}
+            key: own[key] / n / hop[key] for key in ('median', 'p10')}
     # After the previous message of the chain.
     return found | {name: percentiles(times_s) for name, times_s in of_link.items()
                     if len(times_s) > len(chains) / 2}
