@@ -55,17 +55,14 @@ class CodebookClient:
         # Id of the announced codebook while it is requested.
         self._announced_id = ''
         self.codebook_id = ''
-        # Raw, because Fast DDS leaves an error behind when it cannot deserialize a message.
-        endpoints.subscribe(node, ros.Codebook, topics.CODEBOOK, self._on_announcement,
-                            endpoints.LATCHED, raw=True)
+        endpoints.subscribe(
+            node, ros.Codebook, topics.CODEBOOK, self._on_announcement, endpoints.LATCHED)
         self._timer = endpoints.steady_timer(node, _RETRY_S, self._request)
 
-    def _on_announcement(self, content: bytes) -> None:
-        # Anything may be published on the topic.
-        with contextlib.suppress(m.MessageError):
-            self._announced_id = convert.from_bytes(convert.CodebookMessage, content).codebook_id
-            self._timer.reset()
-            self._request()
+    def _on_announcement(self, announcement: ros.Codebook) -> None:
+        self._announced_id = announcement.codebook_id
+        self._timer.reset()
+        self._request()
 
     def _request(self) -> None:
         if self._announced_id in ('', self.codebook_id):

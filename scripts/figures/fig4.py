@@ -41,6 +41,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import make_estimator, simulate_pairs
 from rhs_isac_ros.positioning.neural import INPUTS, train
 from rhs_isac_ros.support.arguments import ArgumentParser, integer
+from rhs_isac_ros.support.optional import optional_import
 
 TRIALS, QUICK_TRIALS = 50, 3
 # Random codebooks are drawn at least this often.
@@ -213,6 +214,9 @@ def add_options(parser: ArgumentParser) -> None:
     add('--conditions', nargs='+', type=condition, metavar='NAME:DB',
         help='estimators with the level of the multipath relative to the direct path [dB]; NAME '
              'is bayes or an input of the network, as in magnitudes:-30 bayes:0')
+    add('--ros', action='store_true',
+        help='measure (b) in a running network with the default codebook instead, and compare it '
+             'with the library; --positions is the number of cycles')
 
 
 def complete(options: argparse.Namespace) -> None:
@@ -227,10 +231,22 @@ def complete(options: argparse.Namespace) -> None:
             Condition(*reading, level) for reading in readings for level in LEVELS_DB]
 
 
+def over_ros(options: argparse.Namespace) -> None:
+    """Measure (b) in a running network; only this needs ROS."""
+    with optional_import('measuring over ROS'):
+        from parts import fig4_ros
+    options.output.mkdir(parents=True, exist_ok=True)
+    cycles = (options.positions if options.positions != POSITIONS else
+              fig4_ros.QUICK_CYCLES if options.quick else fig4_ros.CYCLES)
+    fig4_ros.compare(frame.CONFIG / 'codebook.yaml', cycles, options.output)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = frame.experiment_options(
         'fig4', __doc__, TRIALS, QUICK_TRIALS, arguments, add_options)
+    if options.ros:
+        return run_command(lambda: over_ros(options))
     complete(options)
     return run_command(lambda: reproduce(options))
 
