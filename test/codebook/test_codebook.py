@@ -127,6 +127,7 @@ def test_the_file_is_a_ros_2_parameter_file(tmp_path):
     assert values == {
         'id': codebook.id, 'shape': [1, 1, 1, 2, 3], 'average_crlb': 2.0, 'provenance': 'x',
         'analog': [0.0, 1.0, 0.5], 'digital_re': [1e-5, 1.0], 'digital_im': [0.0, 0.0]}
+    assert next(iter(values)) == 'id'
     assert all(type(size) is int for size in values['shape'])
     for name in ('analog', 'digital_re', 'digital_im'):
         assert all(type(value) is float for value in values[name])

@@ -24,7 +24,7 @@ from rhs_isac_ros.codebook import (
     random_codebook,
 )
 from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS, Method, _Report
-from rhs_isac_ros.codebook.problem import Problem
+from rhs_isac_ros.codebook.problem import Problem, Progress
 from rhs_isac_ros.codebook.unoptimised import STARTS
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
@@ -215,6 +215,17 @@ def test_keep_receives_the_results_so_far(scenario, positions, monkeypatch):
         assert (made.steps, made.evaluations, made.value_m2, made.reason) == (
             end.step, end.evaluations, end.value_m2, 'not finished')
     assert kept[-1].codebook.id == result.codebook.id
+
+
+def test_keep_is_called_at_most_every_ten_seconds():
+    def entry(elapsed_s):
+        return Progress(0, 0, 1.0, elapsed_s)
+    report, kept = _Report(None, entry(0.0)), []
+    report(entry(30.0))
+    report.keep = lambda: kept.append(elapsed_s)
+    for elapsed_s in (9.9, 10.0, 19.9, 21.0, 30.0, 31.0):
+        report(entry(elapsed_s))
+    assert kept == [10.0, 21.0, 31.0]
 
 
 def test_returns_the_best_point_of_a_method_that_ends_elsewhere(small, monkeypatch):
