@@ -113,9 +113,9 @@ def optimize(
     max_evaluations
         Maximum number of evaluations of the objective; by default unlimited.
     progress
-        Called at the start, after each step and, during the set-up of the objective, at most once
-        a second with an infinite value. An exception from `progress` ends the optimisation; with a
-        KeyboardInterrupt during the set-up, the result is the start.
+        Called at the start and after each step. During the set-up of the objective, it is called
+        at most once a second, with an infinite value. An exception from `progress` ends the
+        optimisation; with a KeyboardInterrupt during the set-up, the result is the start.
     keep
         Called at most every ten seconds with the result so far.
     prior
@@ -167,6 +167,9 @@ class _Design:
                 ('sampling', sampling, SAMPLINGS)):
             if value not in known:
                 raise ValueError(f'{name}: {value!r}, expected one of {sorted(known)}')
+        if (levels := scenario.amplitude_levels) and method in ('alternating', 'direct'):
+            raise ValueError(f'method: {method!r} with amplitude_levels = {levels}, expected '
+                             "'lbfgs' or 'genetic'")
         for name, number, low in (('n_positions', n_positions, 1), ('seed', seed, 0),
                                   ('max_evaluations', max_evaluations, 1),
                                   ('max_steps', max_steps, 1)):
@@ -247,13 +250,9 @@ def check_start(codebook: Codebook, scenario: Scenario) -> None:
 
 
 def _minimizer(problem: Problem, method: str) -> Callable[[Search], str]:
-    """Return the function of a method; raise ValueError if it has none for discrete levels."""
-    levels = problem.scenario.amplitude_levels
-    if levels and method == 'lbfgs':
+    """Return the function of a method for a problem."""
+    if method == 'lbfgs' and problem.scenario.amplitude_levels:
         return minimize_levels
-    if levels and method in ('alternating', 'direct'):
-        raise ValueError(f'method: {method!r} with amplitude_levels = {levels}, expected '
-                         "'lbfgs' or 'genetic'")
     if method == 'lbfgs' and problem.n_pairs >= FEWEST_PAIRS:
         return minimize_sampled
     minimize = METHODS[method].minimize

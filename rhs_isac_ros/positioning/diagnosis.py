@@ -39,8 +39,8 @@ class _Limits(NamedTuple):
     # Probabilities that the residuals of a correct model cause a warning. For the variance, the
     # approximation is less accurate.
     begin: tuple[float, float] = (1e-6, 1e-7)
-    # Probabilities of the latest residuals at which a warning ends. They are high, so that a small
-    # deviation does not cause one warning after another.
+    # A warning ends when the p-values of the latest residuals reach these. They are high, so that
+    # a small deviation does not cause one warning after another.
     end: tuple[float, float] = (0.9, 0.5)
     # Tolerated error of an expectation, and tolerated relative excess of the variance. Modes that
     # are not Gaussian cause both.
@@ -190,7 +190,8 @@ class _Sum(NamedTuple):
 def _terms(energy: float, expected: float, level_std_db: float) -> tuple[_Sum, _Sum]:
     """Return the energy of a residual and the square of its normalised deviation.
 
-    The energy is relative to the median level of the multipath, which causes the common parts.
+    The energy is relative to the median level of the multipath, whose uncertainty causes the
+    common parts.
     """
     scale = max(expected, 1.0)
     share = share_of_level(scale, level_std_db)

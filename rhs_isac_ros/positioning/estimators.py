@@ -80,7 +80,7 @@ class Scope(NamedTuple):
     alignment: Alignment
     failures: FailedElements | None
     alternatives: Sequence[Alternative]
-    #: Cells in which less likely modes are found, too, bool [C] or [1].
+    #: Cells in which less likely modes are kept as well, bool [C] or [1].
     favoured: np.ndarray
     drawn: DrawnPosterior | None = None
 
@@ -323,13 +323,13 @@ class SearchEstimator(abc.ABC):
         means, covariances = self._moments(modes, samples)
         # If the model holds, twice the residual energy, averaged over the posterior, has the mean
         # of a chi-square variable. At the best of several modes, it is smaller than the average.
-        expected = self._mean_residual - samples.average(modes.residual)
+        excess = self._mean_residual - samples.average(modes.residual)
         # The best mode of each shot comes first.
         residuals = samples.of_shot.first(modes.residual)
         gains = samples.of_shot.first(modes.values) @ likelihood.nuisance.gain
         for shot, *fit in zip(
                 conditionals, means, covariances, samples.log_evidence.tolist(),
-                residuals.tolist(), (expected + residuals).tolist(), gains.tolist(), strict=True):
+                residuals.tolist(), (excess + residuals).tolist(), gains.tolist(), strict=True):
             yield shot, (Fit(*fit), modes.of_shot(shot))
 
     def _refined(self, failures: FailedElements | None, modes: Modes, signals: Signals
@@ -402,7 +402,7 @@ class BayesEstimator(SearchEstimator):
 
 
 class MlEstimator(SearchEstimator):
-    """The most likely position in the region, and its squared deviation from the posterior."""
+    """The most likely position in the region, and its mean squared error under the posterior."""
 
     name, averages = 'ml', False
 

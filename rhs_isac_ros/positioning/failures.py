@@ -53,8 +53,8 @@ _MAX_SURFACES = 256
 class FailureLimits(NamedTuple):
     """Numbers that trade the speed of the search for sets for the completeness of its result."""
 
-    # Probability that the residual of an intact surface exceeds the usual residual, and number of
-    # modes from which sets grow if the observed residual does not exceed it.
+    # The residual of an intact surface exceeds the usual residual with this probability. If the
+    # observed residual does not exceed it, sets grow from this number of modes.
     unusual: float = 0.01
     usual_modes: int = 2
     # If it does: largest number of grid points besides the modes, their margin, and number of
@@ -264,16 +264,19 @@ class FailedSurfaces:
 
         `remainder` times the covariance of the errors of all failures is added to theirs.
         """
-        if (failed, remainder) not in self._extensions:
+        # Another thread may replace `_extensions` at any time; none changes a dictionary in it.
+        known = self._extensions
+        found = known.get((failed, remainder))
+        if found is None:
             surface = self.surface(failed)
             covariance = surface.covariance[:, None] + np.swapaxes(
                 self.effects.growth(surface), 0, 1)
             covariance += remainder * self._error[:, None]
+            found = Whitening.of(covariance, self.likelihood.nuisance, self.whitening(failed))
             # Only extensions of the intact surface serve all shots; each takes a few megabytes.
-            self._extensions = {key: kept for key, kept in self._extensions.items() if not key[0]}
-            self._extensions[failed, remainder] = Whitening.of(
-                covariance, self.likelihood.nuisance, self.whitening(failed))
-        return self._extensions[failed, remainder]
+            self._extensions = {(failed, remainder): found} | {
+                key: kept for key, kept in known.items() if not key[0]}
+        return found
 
     @property
     def log_odds(self) -> float:

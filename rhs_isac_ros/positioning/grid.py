@@ -108,12 +108,12 @@ class TemplateTable:
                draw: Draw | None = None) -> tuple[Starts, dict[int, Fit]]:
         """Find the most likely separate points, to the accuracy of one Gauss-Newton step.
 
-        `whitened` are the signals of N shots, complex128 [N, N_B, N_SB F], without offsets of
-        carrier and timing. `margin` is the negative logarithm of the share of the posterior that
-        may be left out, a number or one for each cell, [C]. The points of a shot do not depend on
-        the other shots. If a shot has weak signals and very many relevant cells, `draw` is called
-        for it. A shot for which it returns a posterior has no points. These posteriors are
-        returned, too, keyed by the shot.
+        `whitened` are the signals of N shots, complex128 [N, N_B, N_SB F], after the
+        correction of carrier and timing. `margin` is the negative logarithm of the share of the
+        posterior that may be left out, a number or one for each cell, [C]. The points of a shot do
+        not depend on the other shots. If a shot has weak signals and very many relevant cells,
+        `draw` is called for it. A shot for which it returns a posterior has no points. These
+        posteriors are returned, too, keyed by the shot.
         """
         n = max(1, _LIMITS.block // (len(self.cells.energy) * len(self._wavenumbers)))
         parts, drawn = [], {}
@@ -142,13 +142,13 @@ class TemplateTable:
             step, value = self._step(query, peaks, points, values)
             points = points + step
         curvature = self.cells.curvature[peaks.cell]
-        # Moves into the region lower the likelihood.
+        # Moving a point into the region lowers its likelihood.
         inside = move_inside(points, curvature, self._resolution.bounds_m)
         value = value - likelihood_loss(inside - points, curvature)
         order = np.lexsort((-value, peaks.shots))
         of_shot = Segments.of_keys(peaks.shots[order])
         error = _LIMITS.step_error * self.cells.loss[peaks.cell[order]]
-        # A peak and the best one may both be wrong.
+        # The values of a peak and of the best one may both be in error.
         slack = error + of_shot.repeat(of_shot.first(error))
         margin = np.broadcast_to(query.margin, self.cells.loss.shape)[peaks.cell[order]]
         order = order[heaviest(of_shot, value[order], margin + slack)]
@@ -208,8 +208,8 @@ class TemplateTable:
             amplitude *= 2
             amplitude -= self.cells.energy
             return amplitude
-        n_rows = query.signals[0].size
-        bounds = [query.prior.over_gain(one, energy, n_rows)[0]
+        n_signals = query.signals[0].size
+        bounds = [query.prior.over_gain(one, energy, n_signals)[0]
                   for one, energy in zip(amplitude, query.energies.tolist(), strict=True)]
         return np.stack(bounds) - self.cells.energy
 
@@ -259,7 +259,7 @@ class TemplateTable:
         if len(query.prior):
             factor = np.exp(-1j * (values @ query.prior.phases.T) - peaks.gain[:, None])[..., None]
             turns, at_window = turns * factor, at_window * factor
-        # What the value of a peak lacks at the point.
+        # Correction of the value of the peak to the exact log-likelihood at the point.
         change = 2 * np.einsum('pis,pis->p', turns, at_point).real
         change -= 2 * np.einsum('pis,pis->p', at_window, outputs).real
         change += scale**2 * cells.energy_at(peaks.cell, window_m)
@@ -334,7 +334,7 @@ def separate(shots: np.ndarray, points: np.ndarray, radii: np.ndarray,
         close |= np.einsum('kp,kpq,kq->k', offset, curvature[worse], offset) < _LIMITS.same_mode
         worse, better = worse[close], better[close]
     previous = ~chosen
-    # Only better points matter to a point, so each round settles at least one more. A few rounds
+    # A point depends only on better points, so each round settles at least one more. A few rounds
     # suffice.
     while (chosen != previous).any():
         previous = chosen

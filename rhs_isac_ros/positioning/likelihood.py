@@ -129,7 +129,7 @@ class Columns(NamedTuple):
 class NuisancePrior(Exponents):
     """Prior and effect of the nuisance parameters, in units in which they are standard normal.
 
-    A uniform phase has no prior, and its unit is `_UNIFORM_EQUIVALENT`. If the relative phases of
+    A uniform phase has a flat prior and the unit `_UNIFORM_EQUIVALENT`. If the relative phases of
     bands vary by `COARSE_STD_RAD` or more, uniform phases of all bands replace the parameters that
     rotate whole bands; the range then follows from delays, amplitudes and wavefronts only.
     """
@@ -140,7 +140,7 @@ class NuisancePrior(Exponents):
     needs_search: np.ndarray  #: As in `Nuisance`, bool [Q].
     phases: np.ndarray  #: Phase of each band per unit [rad], float64 [N_B, Q].
     precision: np.ndarray  #: Inverse variance of the prior, 0 for a uniform phase, float64 [Q].
-    information: np.ndarray  #: That of the model's covariance, float64 [Q, Q].
+    information: np.ndarray  #: Contribution of the model's covariance, float64 [Q, Q].
 
     def __init__(self, model: MeasurementModel) -> None:
         self.scenario, declared = model.scenario, nuisance_of(model.scenario)
@@ -236,19 +236,19 @@ class NuisancePrior(Exponents):
                  for output, std in zip(outputs, self.phase_std_rad, strict=True)]
         return np.sum(parts, axis=0)
 
-    def over_gain(self, amplitude: np.ndarray, energy: float, n_rows: int
+    def over_gain(self, amplitude: np.ndarray, energy: float, n_signals: int
                   ) -> tuple[np.ndarray, np.ndarray]:
         """Maximise the log-likelihood, without the template's energy, over the gain.
 
         If signals y are multiplied by h, the log-likelihood at the amplitude A, of any shape, is
-        ``-h^2 |y|^2 + 2 h A + 2 n log h`` plus the log-prior of the gain -log h; n is `n_rows`.
+        ``-h^2 |y|^2 + 2 h A + 2 n log h`` plus the log-prior of the gain -log h; n is `n_signals`.
         Returns its maximum and the gain [nepers]; if the gain is known, 2 A and a single 0.
         """
         if not self.gain_std:
             return 2 * amplitude, np.zeros(1)
         gain = self.gain_std * np.linspace(-_GAIN.reach, _GAIN.reach, _GAIN.gains)
         factor = np.exp(-gain)
-        fixed = -factor**2 * energy - 2 * n_rows * gain - gain**2 / (2 * self.gain_std**2)
+        fixed = -factor**2 * energy - 2 * n_signals * gain - gain**2 / (2 * self.gain_std**2)
         low, high = float(amplitude.min()), float(amplitude.max())
         knots = np.linspace(low, high + 1e-9 * (1 + abs(high)), _GAIN.amplitudes)
         table = fixed + 2 * factor * knots[:, None]

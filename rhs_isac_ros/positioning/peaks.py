@@ -20,7 +20,7 @@ class RangeWindows:
     """Windows of similar widths that divide the range cells of a grid.
 
     `range_m` and `width_m`, float64 [R], are their centres and widths; `turns`, complex64 [N_B,
-    N_SB, R], are the factors of `turns_at` in their centres.
+    N_SB, R], are the factors of `turns_at` at their centres.
     """
 
     def __init__(self, grid: Grid, wavenumbers: np.ndarray) -> None:
@@ -60,9 +60,9 @@ class Peaks(NamedTuple):
     cell: np.ndarray  # Index of the (template, cell) pair, int [P].
     window_m: np.ndarray  # Centre of the window of range, float64 [P] [m].
     range_m: np.ndarray  # Float64 [P] [m].
-    value: np.ndarray  # Log-likelihood, as if delays were those at `window_m`, float32 [P].
-    gain: np.ndarray  # Most likely gain [nepers], float64 [P].
-    outputs: np.ndarray  # Matched-filter outputs of the bands, complex64 [P, N_B].
+    value: np.ndarray  # Log-likelihood, as if delays were those at `window_m`, float [P].
+    gain: np.ndarray  # Most likely gain [nepers], float [P].
+    outputs: np.ndarray  # Matched-filter outputs of the bands, complex128 [P, N_B].
 
 
 class PeakFinder:
@@ -149,10 +149,10 @@ def _over_gain(doubled: np.ndarray, windows: Candidates, query: Query
     """
     gain = np.broadcast_to(0.0, doubled.shape)
     if query.prior.gain_std:
-        gain, n_rows = np.zeros_like(doubled), query.signals[0].size
+        gain, n_signals = np.zeros_like(doubled), query.signals[0].size
         for part in Segments.of_keys(windows.shots).slices:
             energy = float(query.energies[windows.shots[part.start]])
             doubled[:, part], gain[:, part] = query.prior.over_gain(
-                doubled[:, part] / 2, energy, n_rows)
+                doubled[:, part] / 2, energy, n_signals)
     doubled -= windows.energy
     return doubled, gain

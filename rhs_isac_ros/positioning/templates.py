@@ -35,7 +35,7 @@ _BLOCK = 128
 _N_MOMENTS = 1024
 _N_PART_MOMENTS = 32
 # Largest mean energy of a component of the whitened signals. The error of a template is about
-# `PHASE_ERROR` times its amplitude, so it does not exceed the noise.
+# `PHASE_ERROR` times its amplitude. With this limit, it does not exceed the noise.
 _MAX_ENERGY = 1 / PHASE_ERROR**2
 # Error within a range cell, as a share of the energy of the template.
 _CELL_ERROR = 0.015
@@ -204,13 +204,13 @@ class Cells(NamedTuple):
     energy: np.ndarray  # Energy of the whitened template, float32 [C].
     mean_energy: np.ndarray  # Energy of the whitened mean, float32 [C].
     energy_slope: np.ndarray  # Derivative of `mean_energy`, float32 [C, 3].
-    # Derivative with respect to the range of `mean_energy` times the squared range, divided by the
-    # squared range, float64 [C].
+    # Derivative of r^2 E with respect to the range r, divided by r^2, with E = `mean_energy`,
+    # float64 [C].
     along: np.ndarray
     curvature: np.ndarray  # Float64 [C, 3, 3].
     inverse: np.ndarray  # Inverse of `curvature`, float32 [C, 3, 3].
-    # Largest loss of log-likelihood between the directions of the grid, and due to the curvature
-    # of the wavefront, float64 [C].
+    # Largest loss of log-likelihood because the direction lies between those of the grid, or the
+    # curvature of the wavefront differs, float64 [C].
     loss: np.ndarray
 
     @classmethod
@@ -246,7 +246,7 @@ class Query(NamedTuple):
 
     signals: np.ndarray  # Weighted with the inverse covariance, complex64 [N, N_B, N_SB, F].
     outputs: np.ndarray  # Filter outputs for all templates, complex64 [N, N_B, N_SB, G].
-    energies: np.ndarray  # Energies of the whitened signals, float64 [N].
+    energies: np.ndarray  # Energies of the limited signals, float64 [N].
     bound: np.ndarray  # Bound of the log-likelihood in each cell, [N, C].
     prior: NuisancePrior
     # Negative logarithm of the share of the posterior that may be left out, [1] or for each cell.

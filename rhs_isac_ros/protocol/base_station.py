@@ -332,7 +332,8 @@ class BaseStation(SignalCollector):
         """Count missed invitations, and remove the users that no longer answer."""
         lost = self._users.remove_absent()
         self.count(Outcome.USER_LOST, len(lost))
-        # A restarted user is another one; many users are one event.
+        # The key contains the instance, so a restarted user is logged again; several users are
+        # logged once.
         if len(lost) == 1:
             ((user, instance),) = lost.items()
             self.log(f'user {user} no longer answers', True, f'lost {user} {instance}')
@@ -521,7 +522,8 @@ class BaseStation(SignalCollector):
             _give_up((State.SOUNDING,), (_remove_user, _abandon), outcome=Outcome.USER_GONE),
             _retry((State.ESTIMATING,), (_resend_signals,), outcome=Outcome.RETRY_POSITION),
             _give_up((State.ESTIMATING,), (_abandon,), outcome=Outcome.POSITIONER_SILENT),
-            # A surface that does not answer is not awaited in the next cycle either.
+            # The cycle goes on without surfaces that did not answer; the next one does not await
+            # them either.
             Row((State.STEERING,), (_begin_transmission,), State.TRANSMITTING, guard=_some_ready),
             # Roles answer a repeated message again, so repeated signals lead to the beam again.
             _retry((State.STEERING,), (_resend_signals,), outcome=Outcome.RETRY_BEAM),
@@ -535,7 +537,7 @@ class BaseStation(SignalCollector):
             Row(ANY, (_await_surface,), guard=_shown_late, outcome=Outcome.WRONG_CYCLE)),
         *on(m.RhsConfiguration, 'configured',
               _ELSEWHERE | SignalCollector._OF_CYCLE | _OF_CODEBOOK)(
-            # The report concerns the configurations of a band or the configuration of the beam.
+            # A report concerns the configurations that sound a band, or that of the beam.
             Row((State.CONFIGURING,), (_store_configured, _request_pilots), State.SOUNDING,
                 guard=_last_configuration),
             Row((State.CONFIGURING, State.SOUNDING), (_store_configured,), guard=_for_positioning),
@@ -545,7 +547,7 @@ class BaseStation(SignalCollector):
             Row((State.TRANSMITTING, State.RESTING), (_store_answer,), guard=_late_surface),
             # A repeated request may be answered twice.
             Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
-        # Only who is silent, the user or the channel, depends on the pilots.
+        # Pilots only distinguish a silent user from a silent channel.
         *on(m.Pilot, 'pilot', _OF_USER)(Row(ANY, (_store_piloted,))),
         *on(m.FeedSignals, 'signals', SignalCollector._OF_SIGNALS)(
             Row((State.SOUNDING,), (SignalCollector._store_signals, _send_signals),
