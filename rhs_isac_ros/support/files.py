@@ -110,7 +110,12 @@ def read_yaml(path: str | Path, max_bytes: int = _MAX_YAML_BYTES) -> Any:
         with open(path, 'rb') as stream:
             return parse_yaml(stream.read(max_bytes + 1).decode(), max_bytes)
     except (OSError, ValueError) as error:
-        raise ValueError(f'{path}: cannot be read: {error}') from error
+        raise ValueError(f'{path}: cannot be read: {_reason(error)}') from error
+
+
+def _reason(error: Exception) -> str:
+    """Return the text of an error in one line, without the name of a file."""
+    return ' '.join(str(getattr(error, 'strerror', None) or error).split())
 
 
 def parse_yaml(text: str, max_bytes: int = _MAX_YAML_BYTES) -> Any:
@@ -134,7 +139,7 @@ def parse_yaml(text: str, max_bytes: int = _MAX_YAML_BYTES) -> Any:
         return yaml.load(text, _Loader)
     # PyYAML also raises ValueError, for impossible dates.
     except (ValueError, yaml.YAMLError) as error:
-        raise ValueError(' '.join(str(error).split())) from error
+        raise ValueError(_reason(error)) from error
 
 
 def write_archive(path: str | Path, arrays: Mapping[str, np.ndarray | float],
@@ -166,8 +171,7 @@ def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np
     # `zipfile` raises RuntimeError for an entry that is marked as encrypted.
     except (OSError, ValueError, EOFError, RuntimeError, SyntaxError, KeyError, MemoryError,
             OverflowError, zipfile.BadZipFile) as error:
-        reason = ' '.join(str(error).split())
-        raise ArchiveError(f'{path}: cannot be read: {reason}') from error
+        raise ArchiveError(f'{path}: cannot be read: {_reason(error)}') from error
 
 
 def read_archive(path: str | Path, kind: str, version: int, names: set[str]

@@ -11,6 +11,7 @@ from rhs_isac_ros.support.files import (
     check_writable,
     parse_yaml,
     read_archive,
+    read_arrays,
     read_yaml,
     write_archive,
     write_whole,
@@ -77,6 +78,13 @@ def test_a_description_of_another_kind_is_refused(tmp_path, about):
     np.savez(tmp_path / 'file.npz', one=1, two=2, about=about)
     with pytest.raises(ArchiveError, match='not a thing'):
         read_archive(tmp_path / 'file.npz', 'thing', 4, NAMES)
+
+
+@pytest.mark.parametrize('read', [read_yaml, read_arrays])
+def test_the_error_of_a_missing_file_names_it_once(tmp_path, read):
+    path = tmp_path / 'missing'
+    with pytest.raises(ValueError, match=f'^{path}: cannot be read: No such file or directory$'):
+        read(path)
 
 
 def test_a_flipped_bit_is_an_error_or_changes_no_content(file):
