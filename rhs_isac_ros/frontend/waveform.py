@@ -159,13 +159,13 @@ def _check(scenario: Scenario, frame_s: float) -> None:
     """Raise ScenarioError unless a scenario can be measured with frames of a duration [s]."""
     farthest_s = float(np.linalg.norm(
         np.abs(scenario.roi_bounds_m).max(axis=0))) / SPEED_OF_LIGHT_MPS
-    for name, low, unit, reason in (
-            ('frame_duration_s', frame_s, 's', f': {N_SYMBOLS} symbols of 1 / subband_width_hz '
-             f'and a prefix of {_PREFIX_SPREADS:g} delay_spread_s'),
-            ('timing_std_s', farthest_s, 's',
+    for name, low, tolerance, unit, reason in (
+            ('frame_duration_s', frame_s, 0.0, 's', f': {N_SYMBOLS} symbols of '
+             f'1 / subband_width_hz and a prefix of {_PREFIX_SPREADS:g} delay_spread_s'),
+            ('timing_std_s', farthest_s, 0.0, 's',
              ', whose timing contains the delay from the region'),
-            ('band_phase_std_rad', _UNIFORM_RAD * (scenario.n_bands > 1), 'rad',
+            ('band_phase_std_rad', _UNIFORM_RAD * (scenario.n_bands > 1), 1e-5, 'rad',
              ', because retuning changes the phase')):
-        if (value := getattr(scenario, name)) < low * (1 - 1e-5):
+        if (value := getattr(scenario, name)) < low * (1 - tolerance):
             raise ScenarioError(f'{name}: {value:g} {unit}, expected at least {low:.5g} {unit} '
                                 f'with a waveform{reason}')

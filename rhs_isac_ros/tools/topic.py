@@ -15,7 +15,9 @@ import yaml
 from rclpy.qos import QoSPresetProfiles, qos_profile_sensor_data
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
-from rhs_isac_ros.ros.endpoints import steady_timer
+from rhs_isac_ros.protocol.messages import MessageError
+from rhs_isac_ros.ros.convert import deserialize
+from rhs_isac_ros.ros.endpoints import log_dropped, steady_timer
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run_verb
 
@@ -94,10 +96,15 @@ def echo(session: Session, options: argparse.Namespace) -> None:
     max_length = None if options.full_length else _MAX_LENGTH
     printed = 0
 
-    def show(message: Any) -> None:
+    def show(content: bytes) -> None:
         nonlocal printed
         # With --once, further messages may already have arrived.
         if options.once and printed:
+            return
+        try:
+            message = deserialize(content, kind)
+        except MessageError as error:
+            log_dropped(session.node, error)
             return
         try:
             value = operator.attrgetter(options.field)(message) if options.field else message
@@ -110,7 +117,7 @@ def echo(session: Session, options: argparse.Namespace) -> None:
     # The strictest profile that suits all publishers, or one that suits any future publisher.
     profile = (QoSPresetProfiles.BEST_AVAILABLE.value
                if session.node.get_publishers_info_by_topic(name) else qos_profile_sensor_data)
-    subscription = session.node.create_subscription(kind, name, show, profile)
+    subscription = session.node.create_subscription(kind, name, show, profile, raw=True)
     try:
         session.spin_until(lambda: bool(options.once and printed), options.timeout)
     finally:
