@@ -49,7 +49,7 @@ from rhs_isac_ros.model.gaussian import (
 from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.hall import CONDITIONS, FIELDS, MultipathEstimate
 from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.model.measurement import Surface
+from rhs_isac_ros.model.measurement import KnownSurface
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Share of errors that should be in the region of the local bound, and share of residuals that
@@ -87,7 +87,7 @@ class SurveyWarning(UserWarning):
 
 @one_blas_thread
 def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
-           received: np.ndarray, surface: Surface | None = None) -> MultipathEstimate:
+           received: np.ndarray, surface: KnownSurface | None = None) -> MultipathEstimate:
     """Estimate the covariance of the multipath from signals at known positions.
 
     `positions`, float64 [N, 3] [m], should be spread over the region of interest; `received` are
@@ -176,7 +176,7 @@ class _Fit(NamedTuple):
     distances: np.ndarray
 
 
-def _fitted(fields: Scenario, pilots: Pilots, surface: Surface | None) -> _Fit:
+def _fitted(fields: Scenario, pilots: Pilots, surface: KnownSurface | None) -> _Fit:
     """Fit fields, impairments and blocked positions in turn."""
     has_nuisance, in_sight = len(nuisance_of(fields)) > 0, np.ones(len(pilots.positions), bool)
     places = places_of(fields, pilots.positions, PLACE_WAVELENGTHS)

@@ -21,8 +21,24 @@ from rhs_isac_ros.support.threads import one_blas_thread
 _MEMORY = 30
 
 
+# Objectives with fewer pairs are evaluated with all pairs.
+FEWEST_PAIRS = 4096
+
+
 def minimize_lbfgs(search: Search) -> str:
-    """Minimise with L-BFGS-B; return the reason for stopping."""
+    """Minimise with L-BFGS-B, and return the reason for stopping.
+
+    Discrete levels and objectives with many pairs have variants of their own.
+    """
+    if search.problem.scenario.amplitude_levels:
+        return minimize_levels(search)
+    if search.problem.n_pairs >= FEWEST_PAIRS:
+        return minimize_sampled(search)
+    return minimize_exactly(search)
+
+
+def minimize_exactly(search: Search) -> str:
+    """Minimise with L-BFGS-B on all pairs; return the reason for stopping."""
     result = run_lbfgs(search.value_and_gradient, search.start, search.bounds, search.max_steps,
                        search.on_step)
     return 'max_steps reached' if result.status == 1 else str(result.message)
@@ -58,10 +74,8 @@ def run_lbfgs(
                  'maxcor': memory, 'ftol': 1e-10, 'gtol': 1e-10})
 
 
-# Objectives with fewer pairs are evaluated with all pairs.
-FEWEST_PAIRS = 4096
-# Pairs and steps of each round. The first steps change the codebook,
-# and with it the important pairs, the most. Later steps need a more accurate objective.
+# Pairs and steps of each round. The first steps change the codebook, and with it the important
+# pairs, the most. Later steps need a more accurate objective.
 _ROUNDS = (2048, 200), (4096, 600)
 # Number of corrections. With more corrections, their products would take longer than evaluations.
 _SAMPLED_MEMORY = 100

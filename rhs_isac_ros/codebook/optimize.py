@@ -13,13 +13,10 @@ from rhs_isac_ros.calibration import Calibration
 from rhs_isac_ros.codebook.cell import REGION, Prior
 from rhs_isac_ros.codebook.codebook import Codebook, Provenance
 from rhs_isac_ros.codebook.methods import (
-    FEWEST_PAIRS,
     minimize_alternating,
     minimize_direct,
     minimize_genetic,
     minimize_lbfgs,
-    minimize_levels,
-    minimize_sampled,
 )
 from rhs_isac_ros.codebook.objective import OBJECTIVES, SAMPLINGS
 from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Progress, Search
@@ -126,14 +123,14 @@ def optimize(
         calibration, max_steps, max_evaluations, prior)
     report = _Report(progress, Progress(
         design.done.steps, design.done.evaluations, np.inf, 0.0))
-    if METHODS[method].minimize is None:
+    minimize = METHODS[method].minimize
+    if minimize is None:
         return _unsearched(design, report, 'nothing to optimise')
     try:
         average = design.average(report.tick)
     except KeyboardInterrupt:
         return _unsearched(design, report, INTERRUPTED)
     problem = Problem(scenario, average)
-    minimize = _minimizer(problem, method)
     search = design.search(problem, report)
     if keep:
         report.keep = lambda: keep(
@@ -247,17 +244,6 @@ def check_start(codebook: Codebook, scenario: Scenario) -> None:
     Amplitudes may be continuous, because even a search over levels begins with such amplitudes.
     """
     codebook.check(dataclasses.replace(scenario, amplitude_levels=0))
-
-
-def _minimizer(problem: Problem, method: str) -> Callable[[Search], str]:
-    """Return the function of a method for a problem."""
-    if method == 'lbfgs' and problem.scenario.amplitude_levels:
-        return minimize_levels
-    if method == 'lbfgs' and problem.n_pairs >= FEWEST_PAIRS:
-        return minimize_sampled
-    minimize = METHODS[method].minimize
-    assert minimize is not None
-    return minimize
 
 
 def _determined(value_m2: float) -> float:

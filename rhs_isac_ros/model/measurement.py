@@ -36,7 +36,7 @@ from rhs_isac_ros.model.surface import Beamforming, combine, radiation_matrix
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
 # Knowledge of the elements of one surface: known errors, or an estimate of the coefficients.
-Surface = ElementErrors | SurfaceEstimate
+KnownSurface = ElementErrors | SurfaceEstimate
 # Number of positions that `simulate_received` processes at a time; affects its random numbers.
 _BLOCK = 256
 # Target size of arrays over elements and sub-bands [bytes]. Larger arrays do not fit in the cache,
@@ -153,7 +153,7 @@ class MeasurementModel:
 
     @one_blas_thread
     def __init__(self, scenario: Scenario, beamforming: Beamforming,
-                 surface: Surface | None = None) -> None:
+                 surface: KnownSurface | None = None) -> None:
         self.scenario, self.beams, self.surface = scenario, beamforming, surface
         self.elements: SurfaceModel = surface or DeclaredElements(scenario)
         #: T_i of Eq. (9) for the coefficients in effect, complex128 [N_B, N_SB F, N_E].

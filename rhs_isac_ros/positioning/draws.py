@@ -84,7 +84,7 @@ class DrawnPosterior:
         self._log_region = float(np.log(bounds[1] - bounds[0]).sum())
         grid, points = table.grid, table.grid.points
         # Directions of each cell that meet the region: lowest (u, v) and extent, float64 [C, 2].
-        half_m = grid.widths_m[grid.cell, None] / 2
+        half_m = grid.widths_m[grid.range_bin, None] / 2
         sines = [bounds[:, None, 1:] / np.maximum(points[:, :1] + sign * half_m, half_m)
                  for sign in (-1, 1)]
         widest = np.minimum(*sines)[0], np.maximum(*sines)[1]
@@ -94,7 +94,7 @@ class DrawnPosterior:
         self._extent = np.maximum(np.minimum(highest, widest[1]) - self._low, 0.0)
         with np.errstate(divide='ignore'):
             self._log_area = np.log(self._extent).sum(axis=1)
-        volume = points[:, 0]**2 * grid.widths_m[grid.cell] / _boresight(points[:, 1:])
+        volume = points[:, 0]**2 * grid.widths_m[grid.range_bin] / _boresight(points[:, 1:])
         self._log_volume = np.log(volume) + self._log_area
 
     def of(self, query: Query, shot: int) -> Fit | None:
@@ -165,7 +165,7 @@ class DrawnPosterior:
         per_wavelength = max(self._sampling.steps, np.pi * np.sqrt(2 * amplitude[best]))
         n_steps = int(np.ceil(self._table.window_m / self._wavelength_m * per_wavelength))
         low, high = self._inside(directions)
-        rows, n = windows.pair, max(self._sampling.block // n_steps, 1)
+        rows, n = windows.row, max(self._sampling.block // n_steps, 1)
         parts = [self._integrate(select(windows, slice(k, k + n)), low, high, n_steps)
                  for k in range(0, len(rows), n)]
         log_mass, *moments = (np.concatenate(fields) for fields in zip(*parts, strict=True))
@@ -185,8 +185,8 @@ class DrawnPosterior:
         highest = value.max(axis=1)
         value -= highest[:, None]
         density = np.exp(value)
-        nearest = np.maximum(low[windows.pair] - range_m, -windows.width_m / 2)
-        farthest = np.minimum(high[windows.pair] - range_m, windows.width_m / 2)
+        nearest = np.maximum(low[windows.row] - range_m, -windows.width_m / 2)
+        farthest = np.minimum(high[windows.row] - range_m, windows.width_m / 2)
         # Part of each step that is inside.
         ends_m = np.stack([nearest, farthest], axis=1)[..., None].astype(np.float32)
         share = np.clip((ends_m - offsets_m) / np.float32(step_m), -0.5, 0.5)

@@ -1,13 +1,13 @@
 """The interface of estimators: received signals in, positions with their uncertainty out."""
 
 import dataclasses
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple, Protocol, TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Pose, Scenario
+from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.arrays import numbers, position_problem
 from rhs_isac_ros.model.gaussian import symmetric
 
@@ -45,6 +45,21 @@ class Estimate:
     #: Probability that there is no direct path, float64 [] or [N]; NaN if the estimator assumes a
     #: direct path, or if the signals are weaker than noise.
     blocked_probability: float | np.ndarray = np.nan
+
+    @classmethod
+    def without_fix(cls, reason: str, **statistics: float) -> 'Estimate':
+        """Return an estimate of one shot without a position, and its other fields."""
+        return cls(np.full(3, np.nan), np.full((3, 3), np.nan), reason, **statistics)
+
+    @classmethod
+    def of_each(cls, estimates: Sequence['Estimate']) -> 'Estimate':
+        """Combine the estimates of N shots."""
+        of = {field.name: [getattr(one, field.name) for one in estimates]
+              for field in dataclasses.fields(Estimate)}
+        mean, covariance, reason = of.pop('mean'), of.pop('covariance'), of.pop('reason')
+        return cls(
+            np.reshape(mean, (-1, 3)), np.reshape(covariance, (-1, 3, 3)), tuple(reason),
+            **{name: np.array(values, float) for name, values in of.items()})
 
     @property
     def fix(self) -> np.ndarray:
@@ -92,29 +107,29 @@ def regular(covariances: np.ndarray) -> np.ndarray:
 
 
 def estimate_each(
-        scenario: Scenario, codebook: Codebook, received: np.ndarray,
-        locate: Callable[[np.ndarray], Iterable[tuple[Any, ...]]]) -> Estimate:
+        codebook: Codebook, received: np.ndarray,
+        locate: Callable[[np.ndarray], Iterable[Estimate]]) -> Estimate:
     """Check received signals, locate every shot, and return an estimate of matching shape.
 
-    `locate` takes checked signals, [N, N_B, N_SB F]. For each shot, it yields the mean [3], the
-    covariance [3, 3] and the reason of an `Estimate`, optionally followed by its other fields. If
-    the reason is not empty, mean and covariance are ignored. Raises SignalError if the shape is
-    wrong, a value is not a finite number, or a magnitude exceeds 1000.
+    `locate` takes checked signals, [N, N_B, N_SB F], and yields an `Estimate` for each shot. A
+    position that no user can have becomes a reason. Raises SignalError if the shape is wrong, a
+    value is not a finite number, or a magnitude exceeds 1000.
     """
-    batch = checked_received(codebook, received)
-    mean, covariance = np.full((len(batch), 3), np.nan), np.full((len(batch), 3, 3), np.nan)
-    reasons, residuals = [], np.full((4, len(batch)), np.nan)
-    for row, (position, spread, reason, *energy) in enumerate(locate(batch)):
-        residuals[:len(energy), row] = energy
-        # A network or a plug-in may return any position.
-        if not reason and (problem := position_problem(position)):
-            reason = f'position: {problem}'
-        reasons.append(reason)
-        if not reason:
-            mean[row], covariance[row] = position, spread
+    found = list(map(_possible, locate(checked_received(codebook, received))))
     if np.ndim(received) == 2:
-        return Estimate(mean[0], covariance[0], reasons[0], *residuals[:, 0].tolist())
-    return Estimate(mean, covariance, tuple(reasons), *residuals)
+        return found[0]
+    return Estimate.of_each(found)
+
+
+def _possible(estimate: Estimate) -> Estimate:
+    """Return an estimate without its position if it has a reason, or if no user can be there."""
+    # A network or a plug-in may return any position.
+    reason = estimate.reason or ((problem := position_problem(estimate.mean))
+                                 and f'position: {problem}')
+    if not reason:
+        return estimate
+    return dataclasses.replace(
+        estimate, mean=np.full(3, np.nan), covariance=np.full((3, 3), np.nan), reason=reason)
 
 
 def checked_received(codebook: Codebook, received: np.ndarray) -> np.ndarray:

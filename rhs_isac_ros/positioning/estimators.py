@@ -4,9 +4,9 @@ import abc
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.gaussian import moments, share_of_level
 from rhs_isac_ros.model.geometry import to_positions
-from rhs_isac_ros.model.measurement import Surface
+from rhs_isac_ros.model.measurement import KnownSurface
 from rhs_isac_ros.positioning.alternatives import Alternative, Blocked, Outside, rejection
 from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.draws import DrawnPosterior
@@ -62,15 +62,23 @@ from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.positioning.templates import N_NORMAL, standard_normal, tabulate
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
-# Number of shots that are located together.
-_BLOCK = 128
-# Samples per mode if the phases of the bands carry information, and if modes are narrow. In the
-# first case, the density has several peaks within a mode, and a few of the samples carry most of
-# the weight.
-_N_INFORMATIVE = 512
-_N_NARROW = 64
-# Total probability of the alternatives above which residuals are not compared with the scenario.
-_DOUBT_LIMIT = 0.05
+
+class _Limits(NamedTuple):
+    """Numbers of shots and samples, and when a residual counts."""
+
+    # Number of shots that are located together.
+    block: int = 128
+    # Samples per mode if the phases of the bands carry information, and if modes are narrow. In
+    # the first case, the density has several peaks within a mode, and a few of the samples carry
+    # most of the weight.
+    informative: int = 512
+    narrow: int = 64
+    # Total probability of the alternatives above which residuals are not compared with the
+    # scenario.
+    doubt: float = 0.05
+
+
+_LIMITS = _Limits()
 
 
 class Scope(NamedTuple):
@@ -134,7 +142,7 @@ class SearchEstimator(abc.ABC):
     def __init__(
             self, scenario: Scenario, codebook: Codebook,
             table_folder: Path | None = None, *, reject_outside: bool = False,
-            surface: Surface | None = None,
+            surface: KnownSurface | None = None,
             progress: Callable[[float], None] | None = None, lazy: bool = False) -> None:
         self.scenario, self.surface = scenario, surface
         self._likelihood = likelihood = Likelihood(scenario, codebook, surface)
@@ -163,8 +171,8 @@ class SearchEstimator(abc.ABC):
         # Points that represent a standard Gaussian, float64 [128, 3].
         self.normal = standard_normal(N_NORMAL) if lazy else self._region.table.normal
         self._normal = (
-            standard_normal(_N_INFORMATIVE) if self._phases.is_informative
-            else self.normal if prior.is_coarse else self.normal[:_N_NARROW])
+            standard_normal(_LIMITS.informative) if self._phases.is_informative
+            else self.normal if prior.is_coarse else self.normal[:_LIMITS.narrow])
 
     @functools.cached_property
     def _region(self) -> Scope:
@@ -196,7 +204,7 @@ class SearchEstimator(abc.ABC):
     @one_blas_thread
     def estimate(self, received: np.ndarray) -> Estimate:
         """Estimate positions from received signals; see `Estimator.estimate`."""
-        return estimate_each(self.scenario, self._likelihood.codebook, received, self._locate)
+        return estimate_each(self._likelihood.codebook, received, self._locate)
 
     @one_blas_thread
     def posterior(self, received: np.ndarray, prior: Mixture | None = None, *,
@@ -256,7 +264,7 @@ class SearchEstimator(abc.ABC):
             everywhere = uniform(modes, self._bounds, share).log_mass
             found = concatenate(found, before.weighted(everywhere + odds))
         found, mean, covariance = inside(
-            found.reduce(), self._bounds, self.normal[:_N_NARROW])
+            found.reduce(), self._bounds, self.normal[:_LIMITS.narrow])
         return Posterior(dataclasses.replace(estimate, mean=mean, covariance=covariance), modes,
                          signals, flatten(found, pose), products.is_last)
 
@@ -264,12 +272,12 @@ class SearchEstimator(abc.ABC):
     def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
         """Return positions, [N, 3], and covariances, [N, 3, 3], of N shots."""
 
-    def _locate(self, batch: np.ndarray) -> Iterable[tuple[Any, ...]]:
+    def _locate(self, batch: np.ndarray) -> Iterator[Estimate]:
         signals = self._likelihood.signals(batch)
         parts = map_blocks(
             lambda block: self._locate_block(self._region, select(signals, block), draws=True),
-            blocks(len(batch), _BLOCK))
-        return (tuple(vars(one).values()) for one, _ in itertools.chain.from_iterable(parts))
+            blocks(len(batch), _LIMITS.block))
+        return (estimate for estimate, _ in itertools.chain.from_iterable(parts))
 
     def _locate_block(self, scope: Scope, signals: Signals, draws: bool
                       ) -> list[tuple[Estimate, Modes | None]]:
@@ -279,10 +287,10 @@ class SearchEstimator(abc.ABC):
         None after draws and without a position.
         """
         energies = np.sum(np.abs(signals.received)**2, axis=(1, 2)) / self.scenario.noise_power_w
+        reasons = list(map(self._test.min_energy_test, energies.tolist()))
         found: list[tuple[Estimate, Modes | None]] = [
-            (Estimate(*_no_fix(), self._test.min_energy_test(energy)), None)
-            for energy in energies.tolist()]
-        usable = [row for row, (estimate, _) in enumerate(found) if not estimate.reason]
+            (Estimate.without_fix(reason), None) for reason in reasons]
+        usable = [row for row, reason in enumerate(reasons) if not reason]
         if usable:
             signals = select(signals, usable)
             aligned = scope.alignment.values_of_each(signals.received)
@@ -359,14 +367,16 @@ class SearchEstimator(abc.ABC):
         probabilities, _ = mixture_weights(log_weights)
         reason = self._reason(
             alternatives, whitened * np.exp(-fit.gain), fit.residual, probabilities)
-        mean, covariance = _no_fix() if reason else (fit.mean, self._covariance(fit))
         # Without a fix, only a residual that nothing explains is evidence against the scenario.
         counts = (reason == self._test.residual_test(fit.residual) if reason
-                  else probabilities[0] >= 1 - _DOUBT_LIMIT)
-        return Estimate(
-            mean, covariance, reason, fit.residual, fit.expected if counts else np.nan,
+                  else probabilities[0] >= 1 - _LIMITS.doubt)
+        statistics = {
+            'residual': fit.residual, 'expected_residual': fit.expected if counts else np.nan,
             **{f'{one.name}_probability': float(share) for one, share in zip(
-                alternatives, probabilities[1:], strict=True)})
+                alternatives, probabilities[1:], strict=True)}}
+        if reason:
+            return Estimate.without_fix(reason, **statistics)
+        return Estimate(fit.mean, self._covariance(fit), reason, **statistics)
 
     def _covariance(self, fit: Fit) -> np.ndarray:
         """Return the covariance, scaled to the multipath level that the residual indicates."""
@@ -438,7 +448,3 @@ def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> Weighted
     order = np.argsort(-shares, kind='stable')[:np.count_nonzero(shares)]
     weights = samples.weights[order] / shares[order, None]
     return WeightedModes(shares[order], *moments(weights, samples.positions[order]))
-
-
-def _no_fix() -> tuple[np.ndarray, np.ndarray]:
-    return np.full(3, np.nan), np.full((3, 3), np.nan)

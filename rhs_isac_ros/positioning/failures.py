@@ -167,8 +167,8 @@ def first_sites(points: np.ndarray, radii: np.ndarray) -> list[int]:
     return np.argsort(turns, kind='stable')[:LIMITS.sites].tolist()
 
 
-class Surface(NamedTuple):
-    """A surface with failed elements."""
+class FailedSurface(NamedTuple):
+    """Moments of the signals from a surface with failed elements."""
 
     scattered: np.ndarray  # Radiation times multipath covariance, complex128 [N_B, N_SB F, N_E].
     # Covariance of the signals, given the amplitudes in the direct path, [N_B, N_SB F, N_SB F].
@@ -197,14 +197,14 @@ class FailureEffects(NamedTuple):
         return cls(shift, amplitude, multipath_covariance(scenario),
                    measurement_correlation(scenario))
 
-    def with_failure(self, surface: Surface, element: int) -> Surface:
+    def with_failure(self, surface: FailedSurface, element: int) -> FailedSurface:
         """Return a surface with one more failed element."""
         scattered = surface.scattered + (
             self.shift[element, ..., None] * self.spatial[:, None, element])
         growth = self.growth(surface, slice(element, element + 1))[0]
-        return Surface(scattered, surface.covariance + growth)
+        return FailedSurface(scattered, surface.covariance + growth)
 
-    def growth(self, surface: Surface, elements: slice = slice(None)) -> np.ndarray:
+    def growth(self, surface: FailedSurface, elements: slice = slice(None)) -> np.ndarray:
         """Return how each failure changes a surface's covariance, [N_E, N_B, N_SB F, N_SB F]."""
         shift, spread = self.shift[elements], self.amplitude[elements]
         power = np.diagonal(self.spatial, axis1=1, axis2=2).real.T[elements, :, None]
@@ -253,10 +253,10 @@ class FailedSurfaces:
         self.whitening = cache(lambda failed: Whitening.of(
             self.surface(failed).covariance[:, None], likelihood.nuisance))
 
-    def _surface(self, failed: Failed) -> Surface:
+    def _surface(self, failed: Failed) -> FailedSurface:
         if failed:
             return self.effects.with_failure(self.surface(failed[:-1]), failed[-1])
-        return Surface(np.matmul(self.intact.radiation, self.effects.spatial),
+        return FailedSurface(np.matmul(self.intact.radiation, self.effects.spatial),
                        self.intact.covariance())
 
     def extensions(self, failed: Failed, remainder: float) -> Whitening:
@@ -414,6 +414,8 @@ class FailureModel:
             self.surfaces.extensions(failed, remainder), site.columns_of(failed))
         changes, amplitudes = site.elements
         own = np.broadcast_to(own, (len(changes), *own.shape))
+        # In the order of the fields of `Columns`. The mean is linear in the amplitudes of failed
+        # elements.
         parts = np.concatenate([columns + changes, own, amplitudes[:, None]], axis=1)
         values = np.broadcast_to(site.values, (len(changes), len(site.values)))
         value = self._predicted(values, parts, extended, len(failed) + 1)

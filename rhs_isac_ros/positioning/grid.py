@@ -1,7 +1,7 @@
 """The search for modes of the likelihood on a grid of templates over the region of interest.
 
 The search has three levels. First, matched filters are evaluated for every template and sub-band;
-see `templates`. Second, their outputs are summed over the sub-bands for range cells, within which
+see `templates`. Second, their outputs are summed over the sub-bands for range bins, within which
 delays and amplitudes hardly change. Third, the sum for each band rotates along fine range steps,
 which resolve the carriers; see `peaks`.
 
@@ -71,7 +71,7 @@ class Starts(NamedTuple):
 class Windows(NamedTuple):
     """W windows of range, in which only the phases of the carriers change."""
 
-    pair: np.ndarray  # Index of the window's pair, int [W], ascending.
+    row: np.ndarray  # Index of the window's cell in the list of cells, int [W], ascending.
     range_m: np.ndarray  # Centre, float64 [W] [m].
     width_m: np.ndarray  # Float64 [W] [m].
     outputs: np.ndarray  # Matched-filter outputs of the bands at the centre, complex64 [W, N_B].
@@ -94,7 +94,7 @@ class TemplateTable:
         self.cells = Cells.of(self.grid, resolution, arrays)
         self._wavenumbers, self._carriers = (
             subband_wavenumbers(scenario), carrier_wavenumbers(scenario))
-        self._cell_turns = turns_at(self._wavenumbers, self.grid.ranges_m).astype(np.complex64)
+        self._bin_turns = turns_at(self._wavenumbers, self.grid.ranges_m).astype(np.complex64)
         self._windows = RangeWindows(self.grid, self._wavenumbers)
         self.window_m = self._windows.width_m.max()
         self._finder = PeakFinder(self.window_m, resolution.wavelength_m, self._carriers)
@@ -198,12 +198,12 @@ class TemplateTable:
         """Bound the log-likelihood in all cells, as if all bands were in phase, [N, C]."""
         grid, outputs = self.grid, query.outputs
         amplitude = np.empty((len(outputs), len(grid.node)), np.float32)
-        turns = np.swapaxes(self._cell_turns, 1, 2)
-        for nodes, cells, pairs in grid.shells:
-            by_range = np.abs(np.matmul(turns[:, cells], outputs[..., nodes])).sum(axis=1)
-            dense = ((grid.cell[pairs] - cells.start) * by_range.shape[2]
-                     + grid.node[pairs] - nodes.start)
-            amplitude[:, pairs] = by_range.reshape(len(outputs), -1)[:, dense]
+        turns = np.swapaxes(self._bin_turns, 1, 2)
+        for nodes, bins, cells in grid.shells:
+            by_range = np.abs(np.matmul(turns[:, bins], outputs[..., nodes])).sum(axis=1)
+            dense = ((grid.range_bin[cells] - bins.start) * by_range.shape[2]
+                     + grid.node[cells] - nodes.start)
+            amplitude[:, cells] = by_range.reshape(len(outputs), -1)[:, dense]
         if not query.prior.gain_std:
             amplitude *= 2
             amplitude -= self.cells.energy
@@ -214,9 +214,9 @@ class TemplateTable:
         return np.stack(bounds) - self.cells.energy
 
     def _peaks_in(self, shots: np.ndarray, cells: np.ndarray, query: Query) -> Peaks:
-        """Find all peaks along the range in (template, cell) pairs [K] of ascending shots [K]."""
-        pair, window = self._windows.of(cells)
-        shots, cells, range_m = shots[pair], cells[pair], self._windows.range_m[window]
+        """Find all peaks along the range in cells [K] of ascending shots [K]."""
+        row, window = self._windows.of(cells)
+        shots, cells, range_m = shots[row], cells[row], self._windows.range_m[window]
         # Complex64 [W, N_B, N_SB], then the outputs of the bands, [N_B, W].
         by_subband = query.outputs[shots, :, :, self.grid.node[cells]]
         of_band = np.einsum('wis,isw->iw', by_subband, self._windows.turns[:, :, window])
@@ -225,7 +225,7 @@ class TemplateTable:
 
     def windows(self, query: Query, shot: int, cells: np.ndarray, directions: np.ndarray
                 ) -> Windows:
-        """Evaluate range windows of (template, cell) pairs [K] in directions (u, v), [K, 2].
+        """Evaluate range windows of cells [K] in directions (u, v), [K, 2].
 
         Means are approximated as linear in the offset from the template's direction, and energies
         as quadratic.
@@ -238,43 +238,44 @@ class TemplateTable:
             optimize=True)
         energy = (cell.mean_energy + np.sum(cell.energy_slope[:, 1:] * offset, axis=1)
                   + likelihood_loss(offset, cell.curvature[:, 1:, 1:]))
-        pair, window = self._windows.of(cells)
-        outputs = np.einsum('wis,isw->wi', by_subband[pair], self._windows.turns[:, :, window])
-        range_m, cell_m = self._windows.range_m[window], cell.range_m[pair]
-        energy = (cell_m / range_m)**2 * (energy[pair] + cell.along[pair] * (range_m - cell_m))
+        row, window = self._windows.of(cells)
+        outputs = np.einsum('wis,isw->wi', by_subband[row], self._windows.turns[:, :, window])
+        range_m, cell_m = self._windows.range_m[window], cell.range_m[row]
+        energy = (cell_m / range_m)**2 * (energy[row] + cell.along[row] * (range_m - cell_m))
         return Windows(
-            pair, range_m, self._windows.width_m[window], outputs, energy.astype(np.float32))
+            row, range_m, self._windows.width_m[window], outputs, energy.astype(np.float32))
 
     def _step(self, query: Query, peaks: Peaks, points: np.ndarray, values: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute a Gauss-Newton step [P, 3] for each peak; predict its new log-likelihood [P]."""
+        """Compute a Gauss-Newton step [P, 3] for each peak, and predict its result [P].
+
+        The result is the log-likelihood after the step.
+        """
         cells, range_m, window_m = self.cells, points[:, 0], peaks.window_m
         outputs, at_point, slopes = self._outputs(query, peaks, range_m)
-        # At a peak, delays and amplitudes were those at the centre of the window.
         turns, at_window = (np.moveaxis(turns_at(self._wavenumbers, at_m), 2, 0)
                             for at_m in (range_m, window_m))
-        scale = window_m / range_m
-        at_window *= (scale[:, None] * np.exp(
+        # At a peak, delays and amplitudes were those at the centre of the window.
+        fading = window_m / range_m
+        at_window *= (fading[:, None] * np.exp(
             1j * self._carriers * (range_m - window_m)[:, None]))[..., None]
         if len(query.prior):
             factor = np.exp(-1j * (values @ query.prior.phases.T) - peaks.gain[:, None])[..., None]
             turns, at_window = turns * factor, at_window * factor
-        # Correction of the value of the peak to the exact log-likelihood at the point.
-        change = 2 * np.einsum('pis,pis->p', turns, at_point).real
-        change -= 2 * np.einsum('pis,pis->p', at_window, outputs).real
-        change += scale**2 * cells.energy_at(peaks.cell, window_m)
-        change -= cells.mean_energy_at(peaks.cell, range_m)
-        gradient = np.einsum('pis,pisq->pq', turns, slopes).real
+        approximate = (2 * np.einsum('pis,pis->p', at_window, outputs).real
+                       - fading**2 * cells.energy_at(peaks.cell, window_m))
+        exact = (2 * np.einsum('pis,pis->p', turns, at_point).real
+                 - cells.mean_energy_at(peaks.cell, range_m))
+        # The gradient of `exact`. Energies decrease with the squared range.
+        gradient = 2 * np.einsum('pis,pisq->pq', turns, slopes).real
         rate = 1j * self._wavenumbers - 1 / range_m[:, None, None]
-        gradient[:, 0] += np.einsum('pis,pis->p', turns * rate, at_point).real
-        gradient *= 2
-        # Energies decrease with the squared range.
-        scale = ((cells.range_m[peaks.cell] / range_m)**2)[:, None]
-        gradient -= scale * cells.energy_slope[peaks.cell]
-        step = np.einsum('pij,pj->pi', cells.inverse[peaks.cell], gradient) / scale
+        gradient[:, 0] += 2 * np.einsum('pis,pis->p', turns * rate, at_point).real
+        decrease = ((cells.range_m[peaks.cell] / range_m)**2)[:, None]
+        gradient -= decrease * cells.energy_slope[peaks.cell]
+        step = np.einsum('pij,pj->pi', cells.inverse[peaks.cell], gradient) / decrease
+        rise = np.sum(gradient * step, axis=1) / 2
         limits = self._resolution.step_limits(query.prior.is_coarse)
-        return (np.clip(step, -limits, limits),
-                peaks.value + change + np.sum(gradient * step, axis=1) / 2)
+        return np.clip(step, -limits, limits), peaks.value + exact - approximate + rise
 
     def _outputs(self, query: Query, peaks: Peaks, range_m: np.ndarray
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -285,8 +286,8 @@ class TemplateTable:
         """
         n_nodes, nodes = len(self.grid.nodes), self.grid.node[peaks.cell]
         # Many peaks of a shot have the same template.
-        pairs, index = np.unique(peaks.shots * n_nodes + nodes, return_inverse=True)
-        shot, node = np.divmod(pairs, n_nodes)
+        used, index = np.unique(peaks.shots * n_nodes + nodes, return_inverse=True)
+        shot, node = np.divmod(used, n_nodes)
         slopes = np.einsum('iskqf,kisf->kisq', self.filters.slopes[:, :, node],
                            query.signals[shot])[index]
         outputs, node_m = query.outputs[peaks.shots, :, :, nodes], self.grid.nodes[nodes, 0]

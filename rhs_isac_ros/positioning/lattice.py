@@ -1,7 +1,8 @@
 """The lengths over which signals from the region differ, and the grid that follows from them.
 
 The lengths follow from wavelength, aperture, bandwidth and region. The grid of the search is as
-coarse as they permit. The cells of a template share one expansion of the mean signals.
+coarse as they permit. A cell is a template in one range bin; the cells of a template share one
+expansion of the mean signals.
 """
 
 import functools
@@ -22,21 +23,21 @@ from rhs_isac_ros.model.geometry import (
 from rhs_isac_ros.positioning.segments import Segments
 
 # Phase error of a template at the edge of the aperture or of the band [rad] at which the next
-# template or range cell takes over. The slopes of the templates correct the error to first order.
+# template or range bin takes over. The slopes of the templates correct the error to first order.
 PHASE_ERROR = 0.2
 
 
 class _Limits(NamedTuple):
     """Limits of the lengths of a grid."""
 
-    # Error of the amplitude of a template at which the next range cell takes over.
+    # Error of the amplitude of a template at which the next range bin takes over.
     amplitude_error: float = 0.05
     # In wavelengths and in radians at the edge of the aperture: longest steps for which the linear
     # model of the mean holds, and radii of an ellipsoid around a mode that contains no other mode.
     step: tuple[float, float] = (0.2, 0.5)
     separation: tuple[float, float] = (0.37, 0.57)
-    # Both in range, in cells, if the phases of the bands do not constrain the range.
-    coarse_cells: float = 0.75
+    # Both in range, in range bins, if the phases of the bands do not constrain the range.
+    coarse_bins: float = 0.75
     # Largest value of `Resolution.direction`. It applies to apertures below one wavelength, where
     # the gains of elements and of the user also change with the direction.
     direction: float = 0.4
@@ -84,8 +85,8 @@ class Resolution(NamedTuple):
             nearest_m=max(nearest_m, _LIMITS.nearest * farthest_m), farthest_m=farthest_m,
             directions=np.stack([lowest, highest], axis=1), bounds_m=bounds)
 
-    def cell_width_m(self, range_m: float) -> float:
-        """Return the width of a range cell, in which delays and amplitudes hardly change [m]."""
+    def bin_width_m(self, range_m: float) -> float:
+        """Return the width of a range bin, in which delays and amplitudes hardly change [m]."""
         return min(2 * _LIMITS.amplitude_error * range_m, 2 * PHASE_ERROR * self.delay_m)
 
     def step_limits(self, is_coarse: bool) -> np.ndarray:
@@ -97,7 +98,7 @@ class Resolution(NamedTuple):
         return self._radii(is_coarse, *_LIMITS.separation)
 
     def _radii(self, is_coarse: bool, wavelengths: float, radians: float) -> np.ndarray:
-        range_m = (_LIMITS.coarse_cells * self.cell_width_m(self.nearest_m) if is_coarse
+        range_m = (_LIMITS.coarse_bins * self.bin_width_m(self.nearest_m) if is_coarse
                    else wavelengths * self.wavelength_m)
         return np.array([range_m, *radians * self.direction])
 
@@ -121,40 +122,41 @@ def subband_wavenumbers(scenario: Scenario) -> np.ndarray:
 
 
 class Shell(NamedTuple):
-    """Parts of a grid: the templates of one range, and the range cells in which they are used."""
+    """Parts of a grid: the templates of one range, and the range bins in which they are used."""
 
     nodes: slice
-    cells: slice
-    pairs: slice  # A subset of all combinations of these templates and range cells.
+    bins: slice
+    cells: slice  # A subset of all combinations of these templates and range bins.
 
 
 class Grid(NamedTuple):
-    """Templates and range cells that cover the ranges and directions of the region."""
+    """Templates and range bins that cover the ranges and directions of the region."""
 
     nodes: np.ndarray  # Points (r [m], u, v) of the templates, float64 [G, 3].
-    ranges_m: np.ndarray  # Centres of the range cells, float64 [R].
+    ranges_m: np.ndarray  # Centres of the range bins, float64 [R].
     widths_m: np.ndarray
-    node: np.ndarray  # Index of the template of each pair in the grid, int [C].
-    cell: np.ndarray  # Index of the range cell of each pair, int [C].
+    node: np.ndarray  # Index of the template of each cell, int [C].
+    range_bin: np.ndarray  # Index of the range bin of each cell, int [C].
     shells: list[Shell]
 
     def within(self, chosen: np.ndarray) -> 'Grid':
-        """Return the grid of the chosen pairs, bool [C], and of the templates that they need."""
+        """Return the grid of the chosen cells, bool [C], and of the templates that they need."""
         needed = np.zeros(len(self.nodes), bool)
         needed[self.node[chosen]] = True
-        n_nodes, n_pairs = (np.append(0, np.cumsum(one)) for one in (needed, chosen))
-        shells = [Shell(slice(n_nodes[nodes.start], n_nodes[nodes.stop]), cells,
-                        slice(n_pairs[pairs.start], n_pairs[pairs.stop]))
-                  for nodes, cells, pairs in self.shells]
+        n_nodes, n_cells = (np.append(0, np.cumsum(one)) for one in (needed, chosen))
+        shells = [Shell(slice(n_nodes[nodes.start], n_nodes[nodes.stop]), bins,
+                        slice(n_cells[cells.start], n_cells[cells.stop]))
+                  for nodes, bins, cells in self.shells]
         return self._replace(
-            nodes=self.nodes[needed], node=n_nodes[self.node[chosen]], cell=self.cell[chosen],
+            nodes=self.nodes[needed], node=n_nodes[self.node[chosen]],
+            range_bin=self.range_bin[chosen],
             shells=[one for one in shells if one.nodes.start < one.nodes.stop])
 
     @property
     def points(self) -> np.ndarray:
-        """Centres of all pairs of template and range cell, (r [m], u, v), float64 [C, 3]."""
+        """Centres of all cells, (r [m], u, v), float64 [C, 3]."""
         points: np.ndarray = self.nodes[self.node]
-        points[:, 0] = self.ranges_m[self.cell]
+        points[:, 0] = self.ranges_m[self.range_bin]
         return points
 
 
@@ -164,34 +166,34 @@ def lay_grid(scenario: Scenario) -> Grid:
     resolution = Resolution.of(scenario)
     edges_m, directions = _range_edges(resolution), _directions(resolution)
     is_used = _meets_region(resolution, edges_m, directions)
-    # The curvature of the wavefront hardly changes across the range cells of a shell.
+    # The curvature of the wavefront hardly changes across the range bins of a shell.
     step = 2 * PHASE_ERROR / resolution.curvature_m
-    cells_of_shell = Segments.as_long_as(
+    bins_of_shell = Segments.as_long_as(
         lambda first, end: bool(1 / edges_m[first] - 1 / edges_m[end] <= step), len(edges_m) - 1)
-    n_shells = len(cells_of_shell.starts)
-    range_m = 2 / (1 / edges_m[cells_of_shell.starts] + 1 / edges_m[cells_of_shell.ends])
-    has_template = cells_of_shell.max(is_used)
+    n_shells = len(bins_of_shell.starts)
+    range_m = 2 / (1 / edges_m[bins_of_shell.starts] + 1 / edges_m[bins_of_shell.ends])
+    has_template = bins_of_shell.max(is_used)
     number = np.cumsum(has_template).reshape(has_template.shape) - 1
     shell_of_node, direction = np.nonzero(has_template)
     nodes = np.column_stack([range_m[shell_of_node], directions[direction]])
-    cell, direction = np.nonzero(is_used)
-    shell_of_pair = cells_of_shell.repeat(np.arange(n_shells))[cell]
-    nodes_of_shell, pairs_of_shell = (
+    range_bin, direction = np.nonzero(is_used)
+    shell_of_cell = bins_of_shell.repeat(np.arange(n_shells))[range_bin]
+    nodes_of_shell, cells_of_shell = (
         Segments.of_counts(np.bincount(shells, minlength=n_shells))
-        for shells in (shell_of_node, shell_of_pair))
+        for shells in (shell_of_node, shell_of_cell))
     return Grid(
         read_only(nodes), read_only((edges_m[1:] + edges_m[:-1]) / 2), read_only(np.diff(edges_m)),
-        read_only(number[shell_of_pair, direction]), read_only(cell),
-        list(map(Shell, nodes_of_shell.slices, cells_of_shell.slices, pairs_of_shell.slices)))
+        read_only(number[shell_of_cell, direction]), read_only(range_bin),
+        list(map(Shell, nodes_of_shell.slices, bins_of_shell.slices, cells_of_shell.slices)))
 
 
 def _range_edges(resolution: Resolution) -> np.ndarray:
-    """Return the edges of the range cells, float64 [R + 1] [m]."""
+    """Return the edges of the range bins, float64 [R + 1] [m]."""
     # Modes slightly outside of the region extend into it.
     beyond_m = resolution.wavelength_m / 2
     edges = [max(resolution.nearest_m - beyond_m, resolution.nearest_m / 2)]
     while edges[-1] < resolution.farthest_m + beyond_m:
-        edges.append(edges[-1] + resolution.cell_width_m(edges[-1]))
+        edges.append(edges[-1] + resolution.bin_width_m(edges[-1]))
     return np.array(edges)
 
 
@@ -208,9 +210,9 @@ def _directions(resolution: Resolution) -> np.ndarray:
 
 def _meets_region(
         resolution: Resolution, edges_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Mark range cells and directions that may meet the region, bool [R, V].
+    """Mark range bins and directions that may meet the region, bool [R, V].
 
-    They do if the bounding box of the vertices of a cell meets the region.
+    They do if the bounding box of the vertices of the cell meets the region.
     """
     low, high = resolution.bounds_m
     sides = np.array([-1.0, 1.0])[:, None] * PHASE_ERROR * resolution.direction

@@ -32,7 +32,7 @@ from rhs_isac_ros.model.impairments import (
     Exponents,
     nuisance_of,
 )
-from rhs_isac_ros.model.measurement import Surface
+from rhs_isac_ros.model.measurement import KnownSurface
 from rhs_isac_ros.positioning.lattice import Resolution
 
 # Standard deviation of a Gaussian whose density at its centre equals that of a uniform phase.
@@ -110,7 +110,8 @@ class Columns(NamedTuple):
     # linear, [M, L, n].
     linear: np.ndarray
     # Negative derivatives of the signals with respect to the parameters, for the gradient,
-    # [M, Q, n].
+    # [M, Q, n]. They contain the multipath, which has no part in the expected information unless
+    # a parameter moves it.
     observed: np.ndarray
 
     @classmethod
@@ -272,7 +273,7 @@ class Likelihood:
     """The likelihood with one covariance, in which element errors are averaged over the region."""
 
     def __init__(self, scenario: Scenario, codebook: Codebook,
-                 surface: Surface | None = None) -> None:
+                 surface: KnownSurface | None = None) -> None:
         codebook.check(scenario)
         self.scenario, self.codebook, self.surface = scenario, codebook, surface
         # Estimators are built between cycles; the first estimate should be as fast as later ones.

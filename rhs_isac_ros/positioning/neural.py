@@ -138,7 +138,7 @@ class NeuralEstimator:
             self, scenario: Scenario, codebook: Codebook,
             model_file: Network | str | Path = '') -> None:
         codebook.check(scenario)
-        self._scenario, self._codebook = scenario, codebook
+        self._codebook = codebook
         self._model = MeasurementModel(scenario, codebook).prepare()
         if model_file == '':
             raise ModelError(
@@ -154,16 +154,16 @@ class NeuralEstimator:
     @one_blas_thread
     def estimate(self, received: np.ndarray) -> Estimate:
         """Estimate positions from received signals; see `Estimator.estimate`."""
-        return estimate_each(self._scenario, self._codebook, received, self._locate)
+        return estimate_each(self._codebook, received, self._locate)
 
-    def _locate(self, batch: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, str]]:
+    def _locate(self, batch: np.ndarray) -> Iterator[Estimate]:
         energies = np.sum(np.abs(self._model.whiten(batch))**2, axis=(1, 2))
         positions = self._network.positions(batch)
         max_mean_energy = float(self._network.max_energy)
         for energy, position in zip(energies.tolist(), positions, strict=True):
             reason = self._test.min_energy_test(energy) or self._test.max_energy_test(
                 energy, max_mean_energy)
-            yield position, self._network.covariance, reason
+            yield Estimate(position, self._network.covariance, reason)
 
 
 def _check_purpose(

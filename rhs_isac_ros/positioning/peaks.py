@@ -17,37 +17,37 @@ _STEPS_PER_WAVELENGTH = 8
 
 
 class RangeWindows:
-    """Windows of similar widths that divide the range cells of a grid.
+    """Windows of similar widths that divide the range bins of a grid.
 
     `range_m` and `width_m`, float64 [R], are their centres and widths; `turns`, complex64 [N_B,
     N_SB, R], are the factors of `turns_at` at their centres.
     """
 
     def __init__(self, grid: Grid, wavenumbers: np.ndarray) -> None:
-        self._cell = grid.cell
+        self._range_bin = grid.range_bin
         counts = np.ceil(grid.widths_m / grid.widths_m.min() - 1e-9).astype(int)
-        self._of_cell = Segments.of_counts(counts)
-        self.width_m = self._of_cell.repeat(grid.widths_m / counts)
-        low_m = self._of_cell.repeat(grid.ranges_m - grid.widths_m / 2)
-        self.range_m = low_m + (self._of_cell.places + 0.5) * self.width_m
+        self._of_bin = Segments.of_counts(counts)
+        self.width_m = self._of_bin.repeat(grid.widths_m / counts)
+        low_m = self._of_bin.repeat(grid.ranges_m - grid.widths_m / 2)
+        self.range_m = low_m + (self._of_bin.places + 0.5) * self.width_m
         self.turns = turns_at(wavenumbers, self.range_m).astype(np.complex64)
 
     def of(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """List the W windows of (template, cell) pairs [K].
+        """List the W windows of cells [K].
 
-        Returns the index from 0 to K - 1 of each window's pair, and of the window, int [W].
+        Returns the index from 0 to K - 1 of each window's cell, and of the window, int [W].
         """
-        windows = select(self._of_cell, self._cell[cells])
-        of_pair = Segments.of_counts(windows.counts)
-        pair = of_pair.repeat(np.arange(len(cells)))
-        return pair, of_pair.repeat(windows.starts) + of_pair.places
+        windows = select(self._of_bin, self._range_bin[cells])
+        of_cell = Segments.of_counts(windows.counts)
+        index = of_cell.repeat(np.arange(len(cells)))
+        return index, of_cell.repeat(windows.starts) + of_cell.places
 
 
 class Candidates(NamedTuple):
-    """W windows of (template, cell) pairs in which peaks are possible, in order of the shots."""
+    """W windows of cells in which peaks are possible, in order of the shots."""
 
     shots: np.ndarray  # Shot of each, int [W], ascending.
-    cell: np.ndarray  # Index of the (template, cell) pair, int [W].
+    cell: np.ndarray  # Index of the cell in the grid, int [W].
     range_m: np.ndarray  # Centre, float64 [W] [m].
     outputs: np.ndarray  # Matched-filter outputs of the bands at the centre, complex64 [N_B, W].
     energy: np.ndarray  # Energy of the template at the centre, float32 [W].
@@ -57,7 +57,7 @@ class Peaks(NamedTuple):
     """P peaks along the range."""
 
     shots: np.ndarray  # Shot of each, int [P].
-    cell: np.ndarray  # Index of the (template, cell) pair, int [P].
+    cell: np.ndarray  # Index of the cell in the grid, int [P].
     window_m: np.ndarray  # Centre of the window of range, float64 [P] [m].
     range_m: np.ndarray  # Float64 [P] [m].
     value: np.ndarray  # Log-likelihood, as if delays were those at `window_m`, float [P].

@@ -24,18 +24,26 @@ from rhs_isac_ros.positioning.region import Restricted
 from rhs_isac_ros.positioning.search import Modes, marginal_at
 from rhs_isac_ros.positioning.segments import Segments, select
 
-# Factor by which a proposal is wider than its Gaussian, because the tails of the posterior may be
-# heavier.
-_SPREAD = 1.3
-# Samples with a log-weight below the best by more than this have no effect, whatever their phases.
-_LIKELY_MARGIN = 20.0
-# Averages over the phases of the bands: spacing of the ranges, in standard deviations of the
-# product of the bands' factors; and number of values of a phase that all bands share, few because
-# the average over the range nearly removes the effect of this phase.
-_SPACING = 1.5
-_N_COMMON = 8
-# Largest standard deviation of a wrapped phase: it is nearly uniform, and one wrap suffices.
-_MAX_STD_RAD = 3.0
+
+class _Sampling(NamedTuple):
+    """Numbers that determine how samples represent broad modes."""
+
+    # Factor by which a proposal is wider than its Gaussian, because the tails of the posterior may
+    # be heavier.
+    spread: float = 1.3
+    # Samples with a log-weight below the best by more than this have no effect, whatever their
+    # phases.
+    margin: float = 20.0
+    # Averages over the phases of the bands: spacing of the ranges, in standard deviations of the
+    # product of the bands' factors; and number of values of a phase that all bands share, few
+    # because the average over the range nearly removes the effect of this phase.
+    spacing: float = 1.5
+    common: int = 8
+    # Largest standard deviation of a wrapped phase: it is nearly uniform, and one wrap suffices.
+    phase_std_rad: float = 3.0
+
+
+_SAMPLING = _Sampling()
 
 
 class Posterior(NamedTuple):
@@ -117,9 +125,9 @@ def draw_broad_samples(
 
     `conditionals` contains the likelihood for each state of the surface.
     """
-    bounds = likelihood.resolution.bounds_m
+    bounds, widening = likelihood.resolution.bounds_m, _SAMPLING.spread**2
     positions, log_weights = Restricted.of(
-        modes.points, modes.gradient / _SPREAD**2, modes.curvature / _SPREAD**2, bounds
+        modes.points, modes.gradient / widening, modes.curvature / widening, bounds
     ).sample(normal)
     for state in np.unique(modes.state):
         (rows,) = np.nonzero(modes.state == state)
@@ -129,7 +137,7 @@ def draw_broad_samples(
             conditionals[state], likelihood, points, values, signals)
         evidence += _log_share(points.reshape(len(rows), -1, 3), select(modes, rows)).ravel()
         if phases.is_informative:
-            likely = evidence >= evidence.max() - _LIKELY_MARGIN
+            likely = evidence >= evidence.max() - _SAMPLING.margin
             outputs = likelihood.outputs(points[likely], values[likely], signals)
             turns = np.exp(1j * (likelihood.nuisance.phases @ values[likely].T))
             log_factors, offsets_m = phases.factors(outputs.T * turns)
@@ -154,7 +162,7 @@ def _log_share(points: np.ndarray, modes: Modes) -> np.ndarray:
     squares = (np.einsum('pa,pb->pab', offsets, offsets).reshape(-1, 9)
                @ modes.curvature.reshape(-1, 9).T)
     squares += np.einsum('ma,ma->m', means, spread) - 2 * offsets @ spread.T
-    exponent = -squares / (2 * _SPREAD**2) + np.linalg.slogdet(modes.curvature)[1] / 2
+    exponent = -squares / (2 * _SAMPLING.spread**2) + np.linalg.slogdet(modes.curvature)[1] / 2
     own = exponent.reshape(n_modes, n_samples, n_modes)[np.arange(n_modes), :, np.arange(n_modes)]
     return own - np.logaddexp.reduce(exponent, axis=1).reshape(n_modes, n_samples)
 
@@ -178,7 +186,7 @@ class BandPhases:
             return
         wavenumbers = carrier_wavenumbers(likelihood.scenario)
         shared = max(prior.phase_covariance.min(), 0.0) if len(wavenumbers) > 1 else 0.0
-        spacing = _SPACING * self._std / np.sqrt(len(wavenumbers))
+        spacing = _SAMPLING.spacing * self._std / np.sqrt(len(wavenumbers))
         n_ranges = int(np.ceil(2 * np.pi / spacing))
         self._ranges_m = (((np.arange(n_ranges) + 0.5) / n_ranges - 0.5)
                           * 2 * np.pi / wavenumbers.mean())
@@ -201,14 +209,14 @@ class BandPhases:
         return log_total, weights.sum(axis=2) @ self._ranges_m
 
     def _broadened(self, magnitude: np.ndarray) -> np.ndarray:
-        """Return the standard deviation of the phase of noisy outputs, at most `_MAX_STD_RAD`."""
+        """Return the limited standard deviation of the phase of noisy outputs, as `magnitude`."""
         # Noise gives the phase a von Mises density, which is approximated by the wrapped normal
         # density with the same first harmonic.
         from scipy.special import i0e, i1e
 
         concentration = 2 * np.maximum(magnitude, 1e-9)
         variance = self._std**2 - 2 * np.log(i1e(concentration) / i0e(concentration))
-        return np.minimum(np.sqrt(variance), _MAX_STD_RAD)
+        return np.minimum(np.sqrt(variance), _SAMPLING.phase_std_rad)
 
 
 def _common_phase(std: float) -> tuple[np.ndarray, np.ndarray]:
@@ -216,9 +224,9 @@ def _common_phase(std: float) -> tuple[np.ndarray, np.ndarray]:
     if std == 0:
         return np.zeros(1), np.zeros(1)
     if std > UNIFORM_STD_RAD:
-        turns = 2 * np.pi * np.arange(_N_COMMON) / _N_COMMON
-        return turns, np.full(_N_COMMON, -np.log(_N_COMMON))
-    values, weights = np.polynomial.hermite_e.hermegauss(_N_COMMON)
+        turns = 2 * np.pi * np.arange(_SAMPLING.common) / _SAMPLING.common
+        return turns, np.full(_SAMPLING.common, -np.log(_SAMPLING.common))
+    values, weights = np.polynomial.hermite_e.hermegauss(_SAMPLING.common)
     return std * values, np.log(weights / weights.sum())
 
 

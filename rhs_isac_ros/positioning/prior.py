@@ -123,10 +123,10 @@ def _moments_of_square(matrices: np.ndarray, covariances: np.ndarray
 def cells_of(bent: Mixture, grid: Grid, resolution: Resolution) -> np.ndarray:
     """Mark the cells in which a prior in (r [m], u, v) requires a search, bool [C]."""
     half = np.column_stack([
-        grid.widths_m[grid.cell] / 2,
-        np.tile(PHASE_ERROR * resolution.direction, (len(grid.cell), 1))])
+        grid.widths_m[grid.range_bin] / 2,
+        np.tile(PHASE_ERROR * resolution.direction, (len(grid.node), 1))])
     merged = bent.position().reduce(_LIMITS.boxes, _LIMITS.same_box)
-    points, chosen = grid.points, np.zeros(len(grid.cell), bool)
+    points, chosen = grid.points, np.zeros(len(grid.node), bool)
     for mean, covariance in zip(merged.means, merged.covariances, strict=True):
         reach = _LIMITS.reach * np.sqrt(np.diagonal(covariance))
         chosen |= (np.abs(points - mean) <= reach + half).all(axis=1)

@@ -19,18 +19,25 @@ from rhs_isac_ros.model.gaussian import step_to_maximum
 from rhs_isac_ros.model.geometry import polar_derivative, to_polar, to_positions
 from rhs_isac_ros.positioning.segments import select
 
-# Information that is added to each axis, relative to a uniform prior over the region. At the edge
-# of the half space, directions contain no information about x.
-_FLOOR = 1e-3
-# Smallest extent of an axis in the floor, relative to the largest one.
-_MIN_EXTENT = 1e-3
-# Distance from a Gaussian's centre, in standard deviations, beyond which samples follow a Gaussian
-# that is nearer. Its distribution function is then accurate.
-_MAX_DEVIATION = 6.0
-# Limits beyond this distance do not change the samples.
-_NO_LIMIT = 5.0
-# Width of an interval below which the density in it is constant, in standard deviations.
-_CONSTANT = 1e-4
+
+class _Limits(NamedTuple):
+    """Numbers that keep the restricted Gaussians accurate."""
+
+    # Information that is added to each axis, relative to a uniform prior over the region, and
+    # smallest extent of an axis in it, relative to the largest one. At the edge of the half space,
+    # directions contain no information about x.
+    floor: float = 1e-3
+    extent: float = 1e-3
+    # The others are in standard deviations. Distance from a Gaussian's centre beyond which samples
+    # follow a Gaussian that is nearer. Its distribution function is then accurate.
+    deviation: float = 6.0
+    # Distance beyond which limits do not change the samples.
+    distant: float = 5.0
+    # Width of an interval below which the density in it is constant.
+    constant: float = 1e-4
+
+
+_LIMITS = _Limits()
 
 # Returns coordinates, given the number of the axis, and mean, standard deviation and both limits
 # of the Gaussians, [M, 1] or [M, S] [m].
@@ -60,7 +67,8 @@ class Restricted(NamedTuple):
         transposed = np.swapaxes(derivative, 1, 2)
         extent = bounds[1] - bounds[0]
         precision = np.matmul(np.matmul(transposed, curvature), derivative)
-        precision += np.diag(12 * _FLOOR / np.maximum(extent, _MIN_EXTENT * extent.max())**2)
+        precision += np.diag(
+            12 * _LIMITS.floor / np.maximum(extent, _LIMITS.extent * extent.max())**2)
         centre = positions + step_to_maximum(
             precision, np.matmul(transposed, gradient[..., None])[..., 0])
         freedom = extent * np.sqrt(np.diagonal(precision, axis1=1, axis2=2))
@@ -200,20 +208,21 @@ def _truncated(normal: np.ndarray, low: np.ndarray, high: np.ndarray
 
     deviations = np.repeat(normal[None], len(low), axis=0)
     width = high - low
-    cut = (low.max(axis=1) > -_NO_LIMIT) | (high.min(axis=1) < _NO_LIMIT)
+    cut = (low.max(axis=1) > -_LIMITS.distant) | (high.min(axis=1) < _LIMITS.distant)
     ratio = normal**2 / 2 - np.log(np.where(cut[:, None], 1.0, width))
     if cut.any():
         low, high, width = low[cut], high[cut], width[cut]
         # The lower tail of the distribution function is accurate.
         sign = np.where(low + high > 0, -1.0, 1.0)
         left, right = np.where(sign < 0, (-high, -low), (low, high))
-        shift = np.minimum(right + _MAX_DEVIATION, 0.0)
+        shift = np.minimum(right + _LIMITS.deviation, 0.0)
         left, right = left - shift, right - shift
         share = ndtr(left)
         between = ndtr(right) - share
         value = ndtri(share + between * np.where(sign < 0, ndtr(-normal), ndtr(normal)))
         centre = np.exp(-(left + right)**2 / 8) / np.sqrt(2 * np.pi)
-        density = np.where(width > _CONSTANT, between / np.maximum(width, _CONSTANT), centre)
+        least = _LIMITS.constant
+        density = np.where(width > least, between / np.maximum(width, least), centre)
         deviations[cut] = sign * (value + shift)
         ratio[cut] = value**2 / 2 + np.log(density)
     return deviations, ratio + np.log(2 * np.pi) / 2

@@ -20,14 +20,22 @@ from rhs_isac_ros.positioning.segments import Segments, select
 # which is accurate to one Gauss-Newton step, and after exact steps.
 GRID_MARGIN = 8.0
 EXACT_MARGIN = 7.0
-# A mode has converged when its last step changed the log-likelihood by less.
-_MIN_GAIN = 0.05
+
+
+class _Ascent(NamedTuple):
+    """When the steps to a mode end."""
+
+    # Maximum number of exact steps. Few modes need more than two, unless signals are strong. At
+    # the border of the region, small gains may alternate.
+    steps: int = 8
+    # A mode has converged when its last step changed the log-likelihood by less.
+    gain: float = 0.05
+
+
+_ASCENT = _Ascent()
 # Log-likelihood per u and v by which modes are ordered that are equal up to rounding, as those of
 # a surface whose halves mirror each other. Otherwise, the processor would choose one.
 _PREFERENCE = 1e-6 * np.array([0.0, 1.0, 0.6])
-# Maximum number of exact steps. Few modes need more than two, unless signals are strong. At the
-# border of the region, small gains may alternate.
-MAX_STEPS = 8
 
 
 class Modes(NamedTuple):
@@ -91,7 +99,8 @@ def modes_from(starts: Starts, likelihood: Likelihood, signals: Signals, aligned
     for the others. `extra_margin` admits modes that are less likely than usual.
     """
     starts = starts._replace(values=starts.values + aligned[starts.shots])
-    return ascend(likelihood, likelihood, starts, signals, MAX_STEPS, EXACT_MARGIN + extra_margin)
+    return ascend(likelihood, likelihood, starts, signals, _ASCENT.steps,
+                  EXACT_MARGIN + extra_margin)
 
 
 def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
@@ -109,13 +118,13 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     for number in range(n_steps):
         chosen = _prune(likelihood, modes, gain, margin)
         modes, gain = select(modes, chosen), gain[chosen]
-        (moving,) = np.nonzero(np.abs(gain) > _MIN_GAIN)
+        (moving,) = np.nonzero(np.abs(gain) > _ASCENT.gain)
         if not len(moving) or number == n_steps - 1:
             break
         moved, gain[moving] = step(select(modes, moving).starts())
         modes.replace(moving, moved)
     # Before convergence, the predicted likelihood may be arbitrarily wrong.
-    (moving,) = np.nonzero((np.abs(gain) > _MIN_GAIN) | (len(likelihood.nuisance) > 0))
+    (moving,) = np.nonzero((np.abs(gain) > _ASCENT.gain) | (len(likelihood.nuisance) > 0))
     if len(moving):
         modes.replace(moving, step(select(modes, moving).starts(), moves=False)[0])
         gain[moving] = 0.0

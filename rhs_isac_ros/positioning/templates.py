@@ -29,21 +29,29 @@ from rhs_isac_ros.support.threads import map_blocks
 
 # Number of points that represent a standard Gaussian.
 N_NORMAL = 128
-# Number of templates computed at a time.
-_BLOCK = 128
-# Number of positions in the second moments of the means, in the region and in a part of it.
-_N_MOMENTS = 1024
-_N_PART_MOMENTS = 32
-# Largest mean energy of a component of the whitened signals. The error of a template is about
-# `PHASE_ERROR` times its amplitude. With this limit, it does not exceed the noise.
-_MAX_ENERGY = 1 / PHASE_ERROR**2
-# Error within a range cell, as a share of the energy of the template.
-_CELL_ERROR = 0.015
+
+
+class _Limits(NamedTuple):
+    """Numbers that determine the accuracy of the tables, and the memory of their computation."""
+
+    # Number of templates computed at a time.
+    block: int = 128
+    # Number of positions in the second moments of the means, in the region and in a part of it.
+    moments: int = 1024
+    part_moments: int = 32
+    # Largest mean energy of a component of the whitened signals. The error of a template is about
+    # `PHASE_ERROR` times its amplitude. With this limit, it does not exceed the noise.
+    energy: float = 1 / PHASE_ERROR**2
+    # Error within a range bin, as a share of the energy of the template.
+    error: float = 0.015
+
+
+_LIMITS = _Limits()
 
 
 def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None = None,
              grid: Grid | None = None) -> dict[str, np.ndarray]:
-    """Compute the arrays of a `TemplateTable`, for G templates and C pairs of template and cell.
+    """Compute the arrays of a `TemplateTable`, for G templates and C cells.
 
     The table covers a grid, by default that of the region. The arrays are ``filters``, the
     conjugate templates, complex64 [N_B, N_SB, G, F]; ``slope_filters``, their derivatives with
@@ -59,7 +67,7 @@ def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None =
     part, grid = grid, grid or lay_grid(model.scenario)
     points, (n_bands, n_rows) = grid.points, model.shape
     n_subbands = model.scenario.n_subbands
-    n_frames, n_cells = n_rows // n_subbands, len(grid.cell)
+    n_frames, n_cells = n_rows // n_subbands, len(grid.node)
     shape = n_bands, n_subbands, len(grid.nodes)
     table: dict[str, np.ndarray] = {
         'filters': np.empty((*shape, n_frames), np.complex64),
@@ -77,26 +85,26 @@ def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None =
     of_node = Segments.of_counts(np.bincount(grid.node, minlength=len(grid.nodes)))
 
     def fill(start: int) -> None:
-        nodes = slice(start, min(start + _BLOCK, len(grid.nodes)))
+        nodes = slice(start, min(start + _LIMITS.block, len(grid.nodes)))
         expansion = Expansion.of(model, grid.nodes[nodes])
         by_frame = expansion.mean.conj().reshape(-1, n_bands, n_subbands, n_frames)
         table['filters'][:, :, nodes] = np.moveaxis(by_frame, 0, 2)
         by_frame = expansion.slopes.conj().reshape(-1, 3, n_bands, n_subbands, n_frames)
         table['slope_filters'][:, :, nodes] = np.moveaxis(by_frame, (0, 1), (2, 3))
         first, n = of_node.starts[start], of_node.counts[nodes].sum()
-        for cells in np.array_split(by_node[first:first + n], -(-n // _BLOCK)):
+        for cells in np.array_split(by_node[first:first + n], -(-n // _LIMITS.block)):
             of_cells = _of_cells(
                 expansion, table['whitener'], grid.node[cells] - start, points[cells])
             for name, values in of_cells.items():
                 table[name][cells] = values
 
-    map_blocks(fill, range(0, len(grid.nodes), _BLOCK), progress)
+    map_blocks(fill, range(0, len(grid.nodes), _LIMITS.block), progress)
     return table
 
 
 def _of_cells(expansion: Expansion, whitener: np.ndarray, index: np.ndarray, points: np.ndarray
               ) -> dict[str, np.ndarray]:
-    """Compute arrays of `tabulate` for pairs with the templates `index` [M] and centres [M, 3]."""
+    """Compute arrays of `tabulate` for cells with the templates `index` [M] and centres [M, 3]."""
     white = whiten(whitener, *expansion.at(index, points))
     template = whiten(whitener, expansion.template_at(index, points[:, 0]))
     # Products of the means, in the first row and column, and of their derivatives.
@@ -117,7 +125,7 @@ def _positions_in(scenario: Scenario, part: Grid | None) -> np.ndarray:
         return low + (high - low) * _unit_points()
     centres = to_positions(part.points)
     low, high = (np.clip(edge, low, high) for edge in (centres.min(axis=0), centres.max(axis=0)))
-    return low + (high - low) * _unit_points()[:_N_PART_MOMENTS]
+    return low + (high - low) * _unit_points()[:_LIMITS.part_moments]
 
 
 @functools.cache
@@ -125,15 +133,16 @@ def _unit_points() -> np.ndarray:
     """Return quasi-random points in the unit cube, read-only."""
     from scipy.stats import qmc
 
-    return read_only(qmc.Sobol(3, seed=0).random(_N_MOMENTS))
+    return read_only(qmc.Sobol(3, seed=0).random(_LIMITS.moments))
 
 
 def _moments(model: MeasurementModel, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return `spread` and `limiter` of `tabulate`.
 
     Where sub-bands fade alike, the energy of some components of whitened signals is so large that
-    errors of templates in them outweigh all else. The limiter scales such a component to the mean
-    energy `_MAX_ENERGY`. For the limiter, stronger signals are scaled down to the median energy.
+    errors of templates in them outweigh all else. The limiter scales such a component to a mean
+    energy of `_LIMITS.energy`. For the limiter, stronger signals are scaled down to the median
+    energy.
     """
     white = np.matmul(
         np.moveaxis(model.mean(positions), 1, 0), np.swapaxes(model.whitener, 1, 2))
@@ -142,7 +151,7 @@ def _moments(model: MeasurementModel, positions: np.ndarray) -> tuple[np.ndarray
     spread, typical = (np.matmul(np.swapaxes(white * weights[:, None], 1, 2), white.conj())
                        / len(positions) for weights in (np.ones(len(positions)), shares))
     energies, components = np.linalg.eigh(typical)
-    scale = 1 / np.sqrt(np.maximum(energies / _MAX_ENERGY, 1.0)) - 1
+    scale = 1 / np.sqrt(np.maximum(energies / _LIMITS.energy, 1.0)) - 1
     limiter = np.eye(spread.shape[1]) + np.matmul(
         components * scale[:, None], adjoint(components))
     return spread, limiter
@@ -195,12 +204,12 @@ class Filters(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """Energies of the means and curvatures of the log-likelihood in the C (template, cell) pairs.
+    """Energies of the means and curvatures of the log-likelihood in the C cells.
 
     Energies are those at the centre of the cell.
     """
 
-    range_m: np.ndarray  # Centre of the range cell, float64 [C] [m].
+    range_m: np.ndarray  # Centre of the range bin, float64 [C] [m].
     energy: np.ndarray  # Energy of the whitened template, float32 [C].
     mean_energy: np.ndarray  # Energy of the whitened mean, float32 [C].
     energy_slope: np.ndarray  # Derivative of `mean_energy`, float32 [C, 3].
@@ -216,12 +225,13 @@ class Cells(NamedTuple):
     @classmethod
     def of(cls, grid: Grid, resolution: Resolution, arrays: Mapping[str, np.ndarray]) -> 'Cells':
         """Take the energies and curvatures from the result of `tabulate`."""
-        energy, slope, range_m = arrays['energy'], arrays['energy_slope'], grid.ranges_m[grid.cell]
+        range_m, energy = grid.ranges_m[grid.range_bin], arrays['energy']
+        slope = arrays['energy_slope']
         curvature = arrays['curvature'] + np.diag(resolution.curvature_floor)
         half = PHASE_ERROR * resolution.direction
         across = np.abs(arrays['curvature'][:, 1:, 1:])
         loss = np.einsum('a,cab,b->c', half, across, half) / 2 + (
-            arrays['error'] + _CELL_ERROR * energy)
+            arrays['error'] + _LIMITS.error * energy)
         return cls(
             range_m, arrays['template_energy'], energy, slope, slope[:, 0] + 2 * energy / range_m,
             curvature, np.linalg.inv(curvature).astype(np.float32), loss)

@@ -13,7 +13,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.codebook.library import EMPTY, Library
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import position_problem
-from rhs_isac_ros.model.measurement import Surface
+from rhs_isac_ros.model.measurement import KnownSurface
 from rhs_isac_ros.positioning import (
     BayesEstimator,
     Estimate,
@@ -247,7 +247,7 @@ class Positioner(Role):
         # Reason why the latest change of settings was reverted; empty if it was not.
         self._failure = ''
         self._estimators: CodebookCache[_Built] = CodebookCache(library.by_id)
-        self._surface: Surface | None = None  # knowledge of the surface in the estimators
+        self._surface: KnownSurface | None = None  # knowledge of the surface in the estimators
         self._codebook: Codebook | None = None
         # The job whose estimator is being built, and the job that comes next.
         self._building: _Job | None = None

@@ -124,7 +124,7 @@ def locate(world: World, positions: np.ndarray, centres: np.ndarray,
         estimator = estimator_of(world.scenario, codebook)
         estimates.append(estimator.posterior(received, around(centre) if knows else None).estimate)
         times_s.append(time.process_time() - begin)
-    return frame.Fixes.of(frame.stacked(estimates), positions), float(np.median(times_s))
+    return frame.Fixes.of(Estimate.of_each(estimates), positions), float(np.median(times_s))
 
 
 def wrong_predictions(world: World, table: frame.Table, n: int, rng: np.random.Generator
@@ -172,7 +172,7 @@ def tracked(world: World, n: int, rng: np.random.Generator) -> dict:
         estimates = [one for path in paths for one in np.array(
             list(track(world, path, times_s, follows, rng)), object)[counted]]
         fixes = frame.Fixes.of(
-            frame.stacked(estimates), np.concatenate([path[counted] for path in paths]))
+            Estimate.of_each(estimates), np.concatenate([path[counted] for path in paths]))
         walk = walk_of[fixes.fix]
         squared[name] = np.bincount(walk, fixes.squared) / np.bincount(walk)
         results[name] = table.row(name, **fixes.figures(walk) | {

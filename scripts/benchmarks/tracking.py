@@ -58,7 +58,7 @@ def main() -> None:
     walks = np.repeat(np.arange(options.walks), len(counted))
     figures = {}
     for name, rows in estimates.items():
-        estimate = frame.stacked([row[cycle] for row in rows for cycle in counted])
+        estimate = Estimate.of_each([row[cycle] for row in rows for cycle in counted])
         fixes = frame.Fixes.of(estimate, places)
         walk = walks[fixes.fix]
         figures[name] = table.row(name, **fixes.figures(walk) | {

@@ -264,13 +264,6 @@ def peak_mib() -> float:
     return int(peak[1]) / 1024
 
 
-def stacked(estimates: Sequence[Estimate]) -> Estimate:
-    """Return estimates of single positions as one of N positions."""
-    fields = [np.stack([getattr(one, name) for one in estimates])
-              for name in ('mean', 'covariance', 'residual', 'expected_residual')]
-    return Estimate(fields[0], fields[1], tuple(str(one.reason) for one in estimates), *fields[2:])
-
-
 def estimate_singly(estimator: Estimator, received: np.ndarray) -> tuple[Estimate, np.ndarray]:
     """Locate the users of signals one by one; also return the times, float64 [N, 2] [s].
 
@@ -281,4 +274,4 @@ def estimate_singly(estimator: Estimator, received: np.ndarray) -> tuple[Estimat
         begin = time.perf_counter(), time.process_time()
         estimates.append(estimator.estimate(signals))
         row[:] = time.perf_counter() - begin[0], time.process_time() - begin[1]
-    return stacked(estimates), times_s
+    return Estimate.of_each(estimates), times_s

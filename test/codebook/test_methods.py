@@ -19,9 +19,9 @@ from rhs_isac_ros.codebook import (
 from rhs_isac_ros.codebook.methods import (
     minimize_alternating,
     minimize_direct,
+    minimize_exactly,
     minimize_genetic,
     minimize_interior_point,
-    minimize_lbfgs,
     run_lbfgs,
 )
 from rhs_isac_ros.codebook.objective import OBJECTIVES, ambiguity
@@ -51,7 +51,7 @@ CASES = {
     'alternating': Case(minimize_alternating, 800, 0.02, None),
     'direct': Case(minimize_direct, 400, 0.02, '5 steps at most'),
     'interior point': Case(minimize_all, 400, 0.02, None),
-    'lbfgs': Case(minimize_lbfgs, 200, 1e-3, 'max_steps reached'),
+    'lbfgs': Case(minimize_exactly, 200, 1e-3, 'max_steps reached'),
 }
 GRADIENT = pytest.mark.parametrize('case', CASES.values(), ids=CASES)
 
@@ -86,7 +86,7 @@ def test_begins_at_the_start_and_stops_at_the_limit_of_steps(
 
 
 @pytest.mark.parametrize('unit', [2.0**-40, 2.0**10, 2.0**40])
-@pytest.mark.parametrize('minimize', [minimize_lbfgs, minimize_direct])
+@pytest.mark.parametrize('minimize', [minimize_exactly, minimize_direct])
 def test_the_unit_of_the_objective_does_not_matter(quadratic, search_of, minimize, unit):
     """In nanometres or in kilometres, the steps are the same."""
     class Scaled(quadratic):
@@ -268,7 +268,7 @@ def search_from(problem, scenario):
 def test_samples_lead_to_the_value_that_all_pairs_lead_to(search_from):
     search, plain = search_from(120), search_from(60)
     methods.minimize_sampled(search, ROUNDS)
-    minimize_lbfgs(plain)
+    minimize_exactly(plain)
     start = search.history[0].value_m2
     assert plain.value_m2 < 0.6 * start
     assert search.value_m2 < plain.value_m2 + 0.05 * start
@@ -320,7 +320,7 @@ def test_a_round_without_success_ends_the_search(search_from, monkeypatch):
 
 def test_optimize_uses_samples_of_many_pairs_only(scenario, monkeypatch):
     used = []
-    monkeypatch.setattr(sys.modules[optimize.__module__], 'minimize_sampled',
+    monkeypatch.setattr(methods, 'minimize_sampled',
                         lambda search: used.append(search.problem.n_pairs) or 'done')
     for objective, n_positions in (('ambiguity', 16), ('crlb', N_POSITIONS)):
         optimize(scenario, objective=objective, n_positions=n_positions, max_steps=1)

@@ -99,7 +99,7 @@ def test_an_interrupted_optimisation_is_no_result(monkeypatch):
 
     # The package has a function of the same name.
     module = sys.modules['rhs_isac_ros.codebook.optimize']
-    monkeypatch.setattr(module, '_minimizer', lambda *_: stop)
+    monkeypatch.setitem(module.METHODS, 'lbfgs', module.Method(stop))
     with pytest.raises(KeyboardInterrupt):
         design(SMALL, 'optimize', 1, 'crlb', 2)
 

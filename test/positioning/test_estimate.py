@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.positioning import SignalError
-from rhs_isac_ros.positioning.estimate import checked_received, estimate_each
+from rhs_isac_ros.positioning.estimate import Estimate, checked_received, estimate_each
 
 
 def test_signals_of_one_phase_become_a_batch_of_one(small):
@@ -26,8 +26,8 @@ def test_the_error_for_another_shape_names_field_shape_and_expectation(small, sh
 
 def test_a_position_behind_the_surface_is_no_fix(small):
     places = np.array([[8.0, 1.0, 0.0], [-8.0, 1.0, 0.0]])
-    found = estimate_each(small.scenario, small.codebook, np.zeros((2, 1, 6)), lambda batch: (
-        (place, np.eye(3), '') for place in places))
+    found = estimate_each(small.codebook, np.zeros((2, 1, 6)), lambda batch: (
+        Estimate(place, np.eye(3)) for place in places))
     assert found.fix.tolist() == [True, False]
     assert found.reason[0] == ''
     assert found.reason[1].startswith('position: x = -8 m, expected x > 0')

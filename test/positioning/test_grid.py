@@ -100,8 +100,8 @@ def test_windows_have_the_outputs_and_energies_of_their_centres(scenario, likeli
     query = table.query(y, likelihood.nuisance, 10.0)
     cells = np.arange(len(table.cells.energy))
     windows = table.windows(query, 0, cells, table.grid.nodes[table.grid.node, 1:])
-    assert len(windows.pair) > len(cells)
-    directions = table.grid.nodes[table.grid.node[windows.pair], 1:]
+    assert len(windows.row) > len(cells)
+    directions = table.grid.nodes[table.grid.node[windows.row], 1:]
     means = model.whiten(model.mean(to_positions(np.column_stack([windows.range_m, directions]))))
     energy = np.sum(np.abs(means)**2, axis=(1, 2))
     np.testing.assert_allclose(windows.energy, energy, rtol=0.01)

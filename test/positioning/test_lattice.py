@@ -29,7 +29,7 @@ def test_grid_covers_the_region(changes):
     steps = np.array([1.0, *2 * PHASE_ERROR * resolution.direction])
 
     def scaled(points):
-        """Points whose range is in units of the relative width of a range cell."""
+        """Points whose range is in units of the relative width of a range bin."""
         return np.column_stack([np.log(points[:, 0]) / 0.1, points[:, 1:] / steps[1:]])
 
     targets = to_polar(scenario.sample_positions(4000, np.random.default_rng(1)))
@@ -92,11 +92,11 @@ def test_an_expansion_has_accurate_means_in_its_cell(changes, random_beams):
 
 def test_a_part_of_the_grid_keeps_its_pairs_and_the_templates_that_they_need():
     grid, rng = lay_grid(Scenario()), np.random.default_rng(2)
-    chosen = rng.random(len(grid.cell)) < 0.03
+    chosen = rng.random(len(grid.node)) < 0.03
     part = grid.within(chosen)
     np.testing.assert_array_equal(part.points, grid.points[chosen])
     assert set(part.node) == set(range(len(part.nodes)))
-    for nodes, cells, pairs in part.shells:
-        assert ((part.node[pairs] >= nodes.start) & (part.node[pairs] < nodes.stop)).all()
-        assert ((part.cell[pairs] >= cells.start) & (part.cell[pairs] < cells.stop)).all()
-    assert sum(pairs.stop - pairs.start for *_, pairs in part.shells) == chosen.sum()
+    for nodes, bins, cells in part.shells:
+        assert ((part.node[cells] >= nodes.start) & (part.node[cells] < nodes.stop)).all()
+        assert ((part.range_bin[cells] >= bins.start) & (part.range_bin[cells] < bins.stop)).all()
+    assert sum(cells.stop - cells.start for *_, cells in part.shells) == chosen.sum()

@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal, norm, qmc
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import estimators, make_estimator
 from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
-from rhs_isac_ros.positioning.posterior import _SPREAD, BandPhases, _log_density, _log_share
+from rhs_isac_ros.positioning.posterior import _SAMPLING, BandPhases, _log_density, _log_share
 from rhs_isac_ros.positioning.search import Modes
 
 SCENARIO = Scenario(
@@ -65,7 +65,8 @@ def test_the_shares_of_overlapping_modes_follow_their_densities():
     modes = Modes(**fields | {
         'points': means - 0.1, 'gradient': gradient, 'curvature': curvature})
     points = rng.normal(5, 1, (n, 5, 3))
-    density = np.stack([multivariate_normal(mean, _SPREAD**2 * np.linalg.inv(one)).pdf(points)
+    widening = _SAMPLING.spread**2
+    density = np.stack([multivariate_normal(mean, widening * np.linalg.inv(one)).pdf(points)
                         for mean, one in zip(means, curvature, strict=True)])
     np.testing.assert_allclose(
         np.exp(_log_share(points, modes)), np.einsum('mms->ms', density) / density.sum(axis=0),

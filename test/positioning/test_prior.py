@@ -91,7 +91,8 @@ def test_the_search_covers_four_standard_deviations():
     points, part = to_polar(PLACE + offsets), grid.within(chosen)
     apart = np.abs(points[:, None] - part.points)
     half = np.column_stack([
-        part.widths_m[part.cell] / 2, np.tile(0.2 * resolution.direction, (len(part.cell), 1))])
+        part.widths_m[part.range_bin] / 2,
+        np.tile(0.2 * resolution.direction, (len(part.node), 1))])
     assert (apart <= 1.01 * half).all(axis=2).any(axis=1).all()
     assert np.count_nonzero(chosen) < 0.1 * len(chosen)
 

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.positioning.estimate import estimate_each
+from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 
 
 class GridEstimator:
@@ -13,7 +13,7 @@ class GridEstimator:
     name = 'grid'
 
     def __init__(self, scenario, codebook, log2_points=14):
-        self._scenario, self._codebook = scenario, codebook
+        self._codebook = codebook
         low, high = scenario.roi_bounds_m
         self._points = low + (high - low) * qmc.Sobol(3, seed=0).random_base2(log2_points)
         # Whitening turns squared distances between signals into negative log-likelihoods.
@@ -23,7 +23,7 @@ class GridEstimator:
 
     def estimate(self, received):
         """Estimate the position for each phase of received signals, [..., N_B, N_SB F]."""
-        return estimate_each(self._scenario, self._codebook, received, self._locate)
+        return estimate_each(self._codebook, received, self._locate)
 
     def _locate(self, batch):
         for whitened in self._model.whiten(batch):
@@ -32,5 +32,4 @@ class GridEstimator:
             weights /= weights.sum()
             mean = weights @ self._points
             offsets = self._points - mean
-            # The third value is the reason if there is no position, and empty otherwise.
-            yield mean, (weights[:, None] * offsets).T @ offsets + 1e-6 * np.eye(3), ''
+            yield Estimate(mean, (weights[:, None] * offsets).T @ offsets + 1e-6 * np.eye(3))
