@@ -38,10 +38,10 @@ class Segments(NamedTuple):
     @classmethod
     def of_keys(cls, keys: np.ndarray) -> 'Segments':
         """Return the segments of rows with equal keys [M], which are in ascending order."""
-        changes = np.ones(len(keys), bool)
-        np.not_equal(keys[1:], keys[:-1], out=changes[1:])
-        starts = np.flatnonzero(changes)
-        return cls(starts, np.diff(starts, append=len(keys)))
+        is_edge = np.ones(len(keys) + 1, bool)
+        np.not_equal(keys[1:], keys[:-1], out=is_edge[1:-1])
+        edges = np.flatnonzero(is_edge)
+        return cls(edges[:-1], edges[1:] - edges[:-1])
 
     @classmethod
     def as_long_as(cls, fits: Callable[[int, int], bool], n: int) -> 'Segments':
