@@ -26,13 +26,11 @@ from rhs_isac_ros.positioning.estimate import (
     estimate_each,
     regular,
 )
-from rhs_isac_ros.positioning.failures import FailedElements, can_enumerate
+from rhs_isac_ros.positioning.failures import refinement_of
 from rhs_isac_ros.positioning.grid import TemplateTable
 from rhs_isac_ros.positioning.lattice import Grid, Resolution, lay_grid
 from rhs_isac_ros.positioning.likelihood import (
     Alignment,
-    Conditional,
-    DispersedLikelihood,
     Likelihood,
     Signals,
 )
@@ -56,7 +54,7 @@ from rhs_isac_ros.positioning.prior import (
     multiply,
     uniform,
 )
-from rhs_isac_ros.positioning.search import GRID_MARGIN, Modes, ascend, modes_from
+from rhs_isac_ros.positioning.search import GRID_MARGIN, Modes, modes_from
 from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.positioning.templates import N_NORMAL, standard_normal, tabulate
@@ -86,31 +84,18 @@ class Scope(NamedTuple):
 
     table: TemplateTable
     alignment: Alignment
-    failures: FailedElements | None
     alternatives: Sequence[Alternative]
     #: Cells in which less likely modes are kept as well, bool [C] or [1].
     favoured: np.ndarray
     drawn: DrawnPosterior | None = None
 
     @classmethod
-    def of(cls, likelihood: Likelihood, arrays: Mapping[str, np.ndarray], grid: Grid,
-           enumerates: bool) -> 'Scope':
-        """Take the templates of a grid, which may be part of the region's.
-
-        `enumerates` is whether sets of failed elements are compared.
-        """
+    def of(cls, likelihood: Likelihood, arrays: Mapping[str, np.ndarray], grid: Grid) -> 'Scope':
+        """Take the templates of a grid, which may be part of the region's."""
         scenario = likelihood.scenario
         table = TemplateTable(scenario, arrays, grid=grid)
-        failures = FailedElements(likelihood, table) if enumerates else None
         alternatives = [Blocked(scenario)] if scenario.blocked_probability else []
-        return cls(table, Alignment(likelihood, table.spread), failures, alternatives,
-                   np.zeros(1, bool))
-
-    @property
-    def margin(self) -> np.ndarray:
-        """Margin of modes in each cell, beyond the usual one."""
-        extra = self.failures.search_margin if self.failures else 0.0
-        return extra + PRIOR_MARGIN * self.favoured
+        return cls(table, Alignment(likelihood, table.spread), alternatives, np.zeros(1, bool))
 
 
 class SearchEstimator(abc.ABC):
@@ -159,15 +144,14 @@ class SearchEstimator(abc.ABC):
         self._bounds = likelihood.resolution.bounds_m
         self._prior_m2 = float(np.sum((self._bounds[1] - self._bounds[0])**2)) / 12
         self._phases = BandPhases(likelihood)
-        self._enumerates = surface is None and can_enumerate(scenario)
-        self._dispersed = None if self._enumerates else DispersedLikelihood.of(likelihood)
+        self._refinement = refinement_of(likelihood)
         # Twice an energy has two degrees of freedom for each complex measurement, less one for
         # each fitted coordinate or parameter.
         n_fitted = 3 + len(prior)
         self._mean_residual = max(n_measurements - n_fitted / 2, 0.5)
         # The likelihood of positions; None if it also depends on other unknowns.
-        self._exact_likelihood = None if (
-            len(prior) or self._enumerates or self._dispersed) else likelihood
+        self._exact_likelihood = (
+            likelihood if self._refinement.is_exact and not len(prior) else None)
         # Points that represent a standard Gaussian, float64 [128, 3].
         self.normal = standard_normal(N_NORMAL) if lazy else self._region.table.normal
         self._normal = (
@@ -178,7 +162,7 @@ class SearchEstimator(abc.ABC):
     def _region(self) -> Scope:
         """The whole region."""
         scenario, arrays = self.scenario, self._load()
-        scope = Scope.of(self._likelihood, arrays, lay_grid(scenario), self._enumerates)
+        scope = Scope.of(self._likelihood, arrays, lay_grid(scenario))
         if self._rejects_outside:
             scope = scope._replace(
                 alternatives=[Outside(scenario, arrays), *scope.alternatives])
@@ -196,8 +180,7 @@ class SearchEstimator(abc.ABC):
         chosen = cells_of(bent, grid, likelihood.resolution)
         if '_region' not in vars(self) and chosen.any():
             part = grid.within(chosen)
-            scope = Scope.of(
-                likelihood, tabulate(likelihood.model, grid=part), part, self._enumerates)
+            scope = Scope.of(likelihood, tabulate(likelihood.model, grid=part), part)
             yield scope._replace(favoured=np.ones(1, bool))
         yield self._region._replace(favoured=chosen)
 
@@ -304,14 +287,16 @@ class SearchEstimator(abc.ABC):
     def _fits(self, scope: Scope, signals: Signals, aligned: np.ndarray, whitened: np.ndarray,
               draws: bool) -> list[tuple[Fit, Modes | None]]:
         """Find the posterior and the modes of each shot; the modes are None after draws."""
+        # Margin of modes in each cell, beyond the usual one.
+        margin = self._refinement.margin + PRIOR_MARGIN * scope.favoured
         starts, drawn = scope.table.search(
-            whitened, self._likelihood.nuisance, GRID_MARGIN + scope.margin,
+            whitened, self._likelihood.nuisance, GRID_MARGIN + margin,
             scope.drawn.of if scope.drawn and draws else None)
         fits: dict[int, tuple[Fit, Modes | None]] = {
             shot: (fit, None) for shot, fit in drawn.items()}
         if len(starts.shots):
             modes = modes_from(
-                starts, self._likelihood, signals, aligned, float(scope.margin.max()))
+                starts, self._likelihood, signals, aligned, float(margin.max()))
             fits.update(self._fits_of(scope, modes, signals))
         return [fits[shot] for shot in range(len(aligned))]
 
@@ -319,7 +304,7 @@ class SearchEstimator(abc.ABC):
                  ) -> Iterator[tuple[int, tuple[Fit, Modes]]]:
         """Yield each shot that has modes, with its posterior and its refined modes."""
         likelihood = self._likelihood
-        modes, conditionals = self._refined(scope.failures, modes, signals)
+        modes, conditionals = self._refinement.refine(modes, signals, scope.table)
         if likelihood.nuisance.is_coarse:
             drawn = concatenate(*(
                 draw_broad_samples(likelihood, of_shot, self._phases, select(signals, [shot]),
@@ -339,23 +324,6 @@ class SearchEstimator(abc.ABC):
                 conditionals, means, covariances, samples.log_evidence.tolist(),
                 residuals.tolist(), (excess + residuals).tolist(), gains.tolist(), strict=True):
             yield shot, (Fit(*fit), modes.of_shot(shot))
-
-    def _refined(self, failures: FailedElements | None, modes: Modes, signals: Signals
-                 ) -> tuple[Modes, dict[int, Sequence[Conditional]]]:
-        """Return modes with regard to errors of elements, and the likelihoods for each shot."""
-        shots = np.unique(modes.shots).tolist()
-        if failures:
-            conditionals: dict[int, Sequence[Conditional]] = {}
-            parts = []
-            for shot in shots:
-                part, conditionals[shot] = failures.refine(
-                    modes.of_shot(shot), select(signals, [shot]))
-                # Each part counts its shots from 0.
-                parts.append(part._replace(shots=np.full(len(part.shots), shot)))
-            return concatenate(*parts), conditionals
-        if self._dispersed:
-            modes = ascend(self._dispersed, self._likelihood, modes.starts(), signals, 1, np.inf)
-        return modes, dict.fromkeys(shots, [self._dispersed or self._likelihood])
 
     def _judge(self, alternatives: Sequence[Alternative], fit: Fit, whitened: np.ndarray,
                aligned: np.ndarray) -> Estimate:

@@ -33,6 +33,7 @@ from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.likelihood import (
     Columns,
+    Conditional,
     Likelihood,
     Local,
     NuisancePrior,
@@ -41,7 +42,7 @@ from rhs_isac_ros.positioning.likelihood import (
     log_determinant,
     whiten_each,
 )
-from rhs_isac_ros.positioning.search import Modes, ascend, predict
+from rhs_isac_ros.positioning.search import Modes, OneState, Refinement, ascend, predict
 from rhs_isac_ros.positioning.segments import concatenate, select
 
 # Largest expected number of failures for which sets are searched.
@@ -96,17 +97,34 @@ def can_enumerate(scenario: Scenario) -> bool:
     return 0 < scenario.failed_element_share * scenario.n_elements <= _MAX_EXPECTED
 
 
+def refinement_of(likelihood: Likelihood) -> Refinement:
+    """Return the refinement for what a likelihood does not contain about the elements."""
+    if likelihood.surface is None and can_enumerate(likelihood.scenario):
+        return FailedElements(likelihood)
+    return OneState(likelihood)
+
+
 class FailedElements:
-    """Refinement of modes if a few elements of the surface may have failed."""
+    """Refinement if a few elements of the surface may have failed: a `Refinement`."""
 
-    # Extra margin, because the search for modes averages over sets and so misjudges each of them.
-    search_margin = 10.0
+    # The search for modes averages over sets, and so misjudges each of them.
+    margin, is_exact = 10.0, False
 
-    def __init__(self, likelihood: Likelihood, grid: TemplateTable) -> None:
-        self._likelihood, self._grid = likelihood, grid
-        self._model = FailureModel(likelihood)
+    def __init__(self, likelihood: Likelihood) -> None:
+        self._likelihood, self._model = likelihood, FailureModel(likelihood)
 
-    def _search(self, modes: Modes, signals: Signals) -> 'FailureSearch':
+    def refine(self, modes: Modes, signals: Signals, table: TemplateTable
+               ) -> tuple[Modes, dict[int, Sequence[Conditional]]]:
+        """Return modes for all probable sets, and the sets' likelihoods, by shot."""
+        parts, conditionals = [], {}
+        for shot in np.unique(modes.shots).tolist():
+            part, conditionals[shot] = self._refine(
+                modes.of_shot(shot), select(signals, [shot]), table)
+            # Each part counts its shots from 0.
+            parts.append(part._replace(shots=np.full(len(part.shots), shot)))
+        return concatenate(*parts), conditionals
+
+    def _search(self, modes: Modes, signals: Signals, table: TemplateTable) -> 'FailureSearch':
         """Search for probable sets of failed elements at the modes and, if needed, elsewhere."""
         order = modes.order
         search = FailureSearch(self._model, signals)
@@ -116,7 +134,7 @@ class FailedElements:
         else:
             # The search on the grid needs the parameters that move the multipath.
             aligned = modes.values[order[0]] * self._likelihood.nuisance.moves_multipath
-            found = self._grid.starts(
+            found = table.starts(
                 self._likelihood.whitened(aligned, signals), self._likelihood.nuisance,
                 LIMITS.point_margin)
             search.add(found.points[:LIMITS.points], found.values[:LIMITS.points] + aligned)
@@ -127,12 +145,10 @@ class FailedElements:
         search.try_neighbours(search.best)
         return search
 
-    def refine(self, modes: Modes, signals: Signals) -> tuple[Modes, list['FailedSet']]:
-        """Return modes of one shot for all probable sets, and the likelihoods of the sets.
-
-        Takes the modes found without regard to sets, and the signals of the shot, N = 1.
-        """
-        search = self._search(modes, signals)
+    def _refine(self, modes: Modes, signals: Signals, table: TemplateTable
+                ) -> tuple[Modes, Sequence[Conditional]]:
+        """Return modes and likelihoods for one shot, N = 1; see `refine`."""
+        search = self._search(modes, signals, table)
         values, best = search.values, max(search.values.values())
         keys = sorted((key for key in values if values[key] >= best - LIMITS.margin),
                       key=lambda key: -values[key])[:LIMITS.hypotheses]

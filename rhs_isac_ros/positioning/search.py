@@ -5,14 +5,21 @@ treated as Gaussian (Laplace's method). The information about the position is th
 complement, and the mass of the mode contains the determinant of the parameters' information.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from rhs_isac_ros.model.gaussian import Marginal, likelihood_loss, marginalise, step_to_maximum
 from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable, heaviest, separate
-from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Local, Signals
+from rhs_isac_ros.positioning.likelihood import (
+    Conditional,
+    DispersedLikelihood,
+    Likelihood,
+    Local,
+    Signals,
+)
 from rhs_isac_ros.positioning.region import Restricted
 from rhs_isac_ros.positioning.segments import Segments, select
 
@@ -79,6 +86,42 @@ class Modes(NamedTuple):
     def of_shot(self, shot: int) -> 'Modes':
         """Return the modes of one shot."""
         return select(self, slice(*np.searchsorted(self.shots, (shot, shot + 1))))
+
+
+class Refinement(Protocol):
+    """Modes and likelihoods with regard to what is unknown about the elements of the surface."""
+
+    #: Margin of the search for modes beyond the usual one.
+    margin: float
+    #: Whether the likelihood of a shot is `Likelihood`.
+    is_exact: bool
+
+    def refine(self, modes: Modes, signals: Signals, table: TemplateTable
+               ) -> tuple[Modes, dict[int, Sequence[Conditional]]]:
+        """Return refined modes, and the likelihoods for each state of the surface by shot.
+
+        Takes modes of `Likelihood`, and the table in which they were found.
+        """
+        ...
+
+
+class OneState:
+    """Refinement for elements that are known, or whose errors are averaged: a `Refinement`."""
+
+    margin = 0.0
+
+    def __init__(self, likelihood: Likelihood) -> None:
+        self._likelihood = likelihood
+        self._conditional: Conditional = DispersedLikelihood.of(likelihood) or likelihood
+        self.is_exact = self._conditional is likelihood
+
+    def refine(self, modes: Modes, signals: Signals, table: TemplateTable
+               ) -> tuple[Modes, dict[int, Sequence[Conditional]]]:
+        """Take one step in the likelihood with the errors; see `Refinement.refine`."""
+        if not self.is_exact:
+            modes = ascend(
+                self._conditional, self._likelihood, modes.starts(), signals, 1, np.inf)
+        return modes, dict.fromkeys(np.unique(modes.shots).tolist(), [self._conditional])
 
 
 def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
