@@ -45,14 +45,6 @@ COARSE_STD_RAD = 0.75
 _MIN_GAIN_STD = 1e-9
 
 
-class _GainProfile(NamedTuple):
-    """Resolution of the maximum over the gain, as a function of the amplitude."""
-
-    gains: int = 161
-    amplitudes: int = 256
-    reach: float = 4.5  # In standard deviations.
-
-
 class _Search(NamedTuple):
     """Grid on which parameters with several maxima are compared."""
 
@@ -61,7 +53,7 @@ class _Search(NamedTuple):
     refinements: int = 4  # Of the best point.
 
 
-_GAIN, _SEARCH = _GainProfile(), _Search()
+_SEARCH = _Search()
 # Smallest eigenvalue of a sum of signals, as a share of its trace.
 _MIN_SPREAD = 1e-12
 # Numbers of failures to average over: smallest probability of each, and how many at most.
@@ -239,22 +231,27 @@ class NuisancePrior(Exponents):
 
     def over_gain(self, amplitude: np.ndarray, energy: float, n_signals: int
                   ) -> tuple[np.ndarray, np.ndarray]:
-        """Maximise the log-likelihood, without the template's energy, over the gain.
+        """Maximise the log-likelihood, without the template's energy, over an unknown gain.
 
         If signals y are multiplied by h, the log-likelihood at the amplitude A, of any shape, is
-        ``-h^2 |y|^2 + 2 h A + 2 n log h`` plus the log-prior of the gain -log h; n is `n_signals`.
-        Returns its maximum and the gain [nepers]; if the gain is known, 2 A and a single 0.
+        ``-h^2 |y|^2 + 2 h A + 2 n log h`` plus the log-prior of the gain g = -log h; n is
+        `n_signals`. Returns its maximum and the gain [nepers].
         """
-        if not self.gain_std:
-            return 2 * amplitude, np.zeros(1)
-        gain = self.gain_std * np.linspace(-_GAIN.reach, _GAIN.reach, _GAIN.gains)
+        precision = self.gain_std**-2
+        # The maximum without the prior, and its curvature, lead to a start for two Newton steps.
+        positive = np.maximum(amplitude, 0)
+        factor = (positive + np.sqrt(positive**2 + 4 * n_signals * energy)) / (2 * energy)
+        curvature = 2 * positive * factor + 4 * n_signals
+        gain = -np.log(factor) * curvature / (curvature + precision)
+        for _ in range(2):
+            factor = np.exp(-gain)
+            slope = (2 * factor * (factor * energy - amplitude) - 2 * n_signals
+                     - precision * gain)
+            curvature = 2 * factor * (2 * factor * energy - amplitude) + precision
+            gain += slope / np.maximum(curvature, precision)
         factor = np.exp(-gain)
-        fixed = -factor**2 * energy - 2 * n_signals * gain - gain**2 / (2 * self.gain_std**2)
-        low, high = float(amplitude.min()), float(amplitude.max())
-        knots = np.linspace(low, high + 1e-9 * (1 + abs(high)), _GAIN.amplitudes)
-        table = fixed + 2 * factor * knots[:, None]
-        return (np.interp(amplitude, knots, table.max(axis=1)),
-                np.interp(amplitude, knots, gain[table.argmax(axis=1)]))
+        return (factor * (2 * amplitude - factor * energy) - 2 * n_signals * gain
+                - precision * gain**2 / 2, gain)
 
     def start(self, outputs: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Return initial parameters [M, Q] for filter outputs [N_B, M] and gains [M] [nepers]."""

@@ -1,7 +1,7 @@
 """Peaks of the log-likelihood along the range, in windows that resolve the carriers of the bands.
 
 A maximum is located as if delays and amplitudes in its window were those of the centre, so that
-only the phases of the bands turn along the range. Its value takes the amplitude into account.
+only the phases of the bands turn along the range. Its value is that of the amplitude at its range.
 """
 
 from typing import NamedTuple
@@ -83,7 +83,7 @@ class PeakFinder:
         self._rotation = (2 * np.hstack([turns.real, -turns.imag])).astype(np.float32)
 
     def find(self, windows: Candidates, query: Query) -> Peaks:
-        """Find all peaks, at least one of each shot; their order follows the steps."""
+        """Find all peaks, at least one of each shot, in the order of the windows."""
         if query.prior.is_coarse:
             return self._centres(windows, query)
         return self._maxima(windows, query)
@@ -102,25 +102,26 @@ class PeakFinder:
         else:
             outputs = windows.outputs
             along = self._rotation @ np.concatenate([outputs.real, outputs.imag])
-        along, gain = _over_gain(along, windows, query)
+        along, _ = _over_gain(along, windows, query)
         step, window = _inner_maxima(along, Segments.of_keys(windows.shots))
         # The vertex of a parabola through a maximum and the steps beside it.
         before, highest, after = (along[step + side, window] for side in (-1, 0, 1))
         slope, bend = (after - before) / 2, 2 * highest - after - before
-        offset = slope / np.maximum(bend, np.abs(slope) + 1e-9)
-        centre_m, energy = windows.range_m[window], windows.energy[window]
-        range_m = centre_m + self._offsets_m[step] + offset * self._step_m
+        offset_m = slope / np.maximum(bend, np.abs(slope) + 1e-9) * self._step_m
+        found = select(windows._replace(outputs=windows.outputs.T), window)
+        centre_m = found.range_m
+        range_m = centre_m + self._offsets_m[step] + offset_m
         # Within a window, amplitudes decrease with the range.
         scale = centre_m / range_m
-        value = scale * (highest + slope * offset / 2 + energy) - scale**2 * energy
-        outputs = windows.outputs[:, window].T * np.exp(
-            1j * self._carriers * (range_m - centre_m)[:, None])
-        return Peaks(windows.shots[window], windows.cell[window], centre_m, range_m, value,
-                     gain[step, window], outputs)
+        outputs = found.outputs * np.exp(1j * self._carriers * (range_m - centre_m)[:, None])
+        doubled = 2 * scale * query.prior.amplitude(outputs.T)
+        found = found._replace(range_m=range_m, energy=scale**2 * found.energy)
+        (value,), (gain,) = _over_gain(doubled[None], found, query)
+        return Peaks(found.shots, found.cell, centre_m, range_m, value, gain, outputs)
 
 
 def _inner_maxima(along: np.ndarray, of_shot: Segments) -> tuple[np.ndarray, np.ndarray]:
-    """Return step and window of the local maxima of values [S, W], int [P] each.
+    """Return step and window of the local maxima of values [S, W], by window, int [P] each.
 
     The values of a shot have no maximum if the wavelength is far longer than the region. Its
     highest value between the ends of a window is then returned.
@@ -133,7 +134,8 @@ def _inner_maxima(along: np.ndarray, of_shot: Segments) -> tuple[np.ndarray, np.
         values = inner[:, rows]
         is_peak[:, rows][np.unravel_index(values.argmax(), values.shape)] = True
     step, window = np.nonzero(is_peak)
-    return step + 1, window
+    order = np.argsort(window, kind='stable')
+    return step[order] + 1, window[order]
 
 
 def _amplified(turns: np.ndarray, windows: Candidates, query: Query) -> np.ndarray:

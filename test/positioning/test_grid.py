@@ -76,6 +76,29 @@ def test_no_template_promises_more_than_the_maximum(shipped, changes):
         assert np.abs(offsets).max(axis=1).min() < 0.1
 
 
+@pytest.mark.parametrize('gain_std_db', [0.0, 1.0])
+def test_the_value_of_a_peak_is_that_of_its_range_and_of_the_most_likely_gain(
+        shipped, gain_std_db):
+    scenario, rng = Scenario(multipath_to_los_db=-20.0, user_gain_std_db=gain_std_db), (
+        np.random.default_rng(5))
+    likelihood = Likelihood(scenario, shipped)
+    table = TemplateTable(scenario, tabulate(likelihood.model))
+    signals = likelihood.signals(
+        likelihood.model.sample(scenario.sample_positions(10, rng), rng))
+    query = table.query(signals.whitened, likelihood.nuisance, 8.0)
+    peaks = table._peaks(query)[0]
+    scale = peaks.window_m / peaks.range_m
+    assert np.abs(scale - 1).max() > 0.02
+    gain = np.linspace(-5, 5, 2001 if gain_std_db else 1)[:, None] * gain_std_db
+    factor = 10**(-gain / 20)
+    values = (-factor**2 * query.energies[peaks.shots] * bool(gain_std_db)
+              + 2 * factor * scale * peaks.outputs.real.sum(axis=1)
+              + 2 * signals.received[0].size * np.log(factor)
+              - (gain / max(gain_std_db, 1.0))**2 / 2)
+    energy = scale**2 * table.cells.energy_at(peaks.cell, peaks.window_m)
+    np.testing.assert_allclose(peaks.value, values.max(axis=0) - energy, atol=0.5)
+
+
 @pytest.fixture(scope='module')
 def scenario() -> Scenario:
     """Two bands, and a region off boresight with a range extent of 5 m."""
