@@ -51,7 +51,8 @@ def run_lbfgs(
     """Minimise a function that returns its value and gradient, with SciPy's L-BFGS-B.
 
     The values must not be negative; their unit does not affect the steps. In SciPy's result, `fun`
-    and `jac` are relative to the first value that is not 0. `on_step` is called after each step.
+    and `jac` are relative to the first value, unless that is 0. `on_step` is called after each
+    step.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import minimize
@@ -121,7 +122,7 @@ def _round(search: Search, start: np.ndarray, n_pairs: int, steps: int) -> tuple
 
     def on_step() -> None:
         nonlocal done
-        # The last step of the round is recorded with the value for all pairs.
+        # A step is recorded when the next one ends, and the last one with the value for all pairs.
         if done:
             search.on_step()
         done += 1
@@ -187,9 +188,9 @@ def _exchange(search: Search, variables: np.ndarray, max_steps: int) -> str:
 
     Combining vectors are optimised before each sweep over the amplitudes.
     """
-    levels = _top_level(search)
+    top = _top_level(search)
     variables = np.array(variables)
-    variables[:search.n_analog] = np.rint(variables[:search.n_analog] * levels) / levels
+    variables[:search.n_analog] = np.rint(variables[:search.n_analog] * top) / top
     while max_steps > 0:
         used, variables = _digital(search, variables, min(_DIGITAL_STEPS, max_steps))
         max_steps -= used
@@ -210,18 +211,18 @@ def _sweep(search: Search, variables: np.ndarray, max_exchanges: int
     Returns the variables and three numbers: of changes, of failed attempts since the last change,
     and of amplitudes with a level in the direction of descent.
     """
-    levels = _top_level(search)
+    top = _top_level(search)
     value, gradient = search.value_and_gradient(variables)
     by_analog = gradient[:search.n_analog]
-    target = variables[:search.n_analog] - np.sign(by_analog) / levels
+    target = variables[:search.n_analog] - np.sign(by_analog) / top
     # There is no level outside [0, 1].
-    allowed = np.flatnonzero((target > -0.5 / levels) & (target < 1 + 0.5 / levels))
+    allowed = np.flatnonzero((target > -0.5 / top) & (target < 1 + 0.5 / top))
     exchanged = failures = 0
     for entry in allowed[np.argsort(-np.abs(by_analog[allowed]))]:
         if failures == _MAX_FAILURES or exchanged == max_exchanges:
             break
         candidate = np.array(variables)
-        candidate[entry] = np.rint(target[entry] * levels) / levels
+        candidate[entry] = np.rint(target[entry] * top) / top
         lower = search.value(candidate)
         if lower < value:
             value, variables = lower, candidate

@@ -230,7 +230,7 @@ def _unsearched(design: _Design, report: '_Report', reason: str) -> OptimizeResu
     """Return the start as the result."""
     best = dataclasses.replace(
         design.first, analog=on_levels(design.scenario, design.first.analog))
-    # Only the bound is known, which is the objective only if that is 'crlb'.
+    # Only the bound is known, and it is the objective only for 'crlb'.
     value_m2 = (_determined(design.bound_m2(best)) if design.provenance.objective == 'crlb'
                 else np.nan)
     entry = Progress(design.done.steps, design.done.evaluations, value_m2, 0.0)

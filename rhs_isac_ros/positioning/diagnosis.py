@@ -1,4 +1,4 @@
-"""Tests of whether the model explains received signals, in one phase and in the latest cycles.
+"""Tests of whether the model explains received signals, of one shot and in the latest cycles.
 
 Whitened signals y from a position with the whitened mean t differ from t by noise of unit
 variance, so ``2 |y - t|^2`` has a chi-square distribution with two degrees of freedom per
@@ -7,7 +7,7 @@ Possible causes are a user elsewhere, another codebook, or a silent or defective
 
 This test detects only gross errors of the model. The mean energy of many residuals also reveals
 small errors, such as a wrong delay spread, which leave positions plausible but their covariances
-too small. The variance of the energy reveals deviations that differ from phase to phase, such as
+too small. The variance of the energy reveals deviations that differ from shot to shot, such as
 unknown gains of the users, although the best position absorbs the larger part of them
 (`InnovationTest`).
 
@@ -190,19 +190,19 @@ class _Sum(NamedTuple):
 def _terms(energy: float, expected: float, level_std_db: float) -> tuple[_Sum, _Sum]:
     """Return the energy of a residual and the square of its normalised deviation.
 
-    The energy is relative to the median level of the multipath, whose uncertainty causes the
-    common parts.
+    The energy is relative to the median level of the multipath. The uncertainty of the level
+    causes the common parts.
     """
     scale = max(expected, 1.0)
     share = share_of_level(scale, level_std_db)
     shape = scale * (1 - share)
     std = scale / shape**0.5
     deviation = min(max((energy - expected) / std, -_LIMITS.deviation), _LIMITS.deviation)
-    variance = max(expected, 0.0)
+    own_variance = max(expected, 0.0)
     # The square of a normalised gamma variable of shape k has the mean 1 and this variance.
     square_variance = 2 + 6 / shape
-    return (_Sum(1, expected + deviation * std, expected, variance,
-                 (variance * share / (1 - share))**0.5),
+    return (_Sum(1, expected + deviation * std, expected, own_variance,
+                 (own_variance * share / (1 - share))**0.5),
             _Sum(1, min(deviation**2, _LIMITS.square), 1.0, square_variance * (1 - share**2),
                  square_variance**0.5 * share))
 
@@ -210,11 +210,11 @@ def _terms(energy: float, expected: float, level_std_db: float) -> tuple[_Sum, _
 def _fit(residuals: Iterable[tuple[_Sum, _Sum]], probabilities: tuple[float, float]) -> bool:
     """Return whether the p-values of the mean and the variance are at least as high as these."""
     energy, square = (_Sum.of(terms) for terms in zip(*residuals, strict=True))
-    return (_mean_probability(energy) >= probabilities[0]
-            and _spread_probability(square) >= probabilities[1])
+    return (_p_value_of_mean(energy) >= probabilities[0]
+            and _p_value_of_spread(square) >= probabilities[1])
 
 
-def _mean_probability(total: _Sum) -> float:
+def _p_value_of_mean(total: _Sum) -> float:
     """Return the two-sided p-value of a sum of energies."""
     # Every node imports this package, and SciPy takes longer to load than ROS.
     from scipy.special import gammainc, gammaincc
@@ -226,7 +226,7 @@ def _mean_probability(total: _Sum) -> float:
     return 2 * float(min(gammainc(shape, high), gammaincc(shape, max(low, 0.0))))
 
 
-def _spread_probability(total: _Sum) -> float:
+def _p_value_of_spread(total: _Sum) -> float:
     """Return the one-sided p-value of a sum of squared deviations, nearly a gamma variable."""
     from scipy.special import gammaincc
 

@@ -97,7 +97,7 @@ class DrawnPosterior:
         volume = points[:, 0]**2 * grid.widths_m[grid.range_bin] / _boresight(points[:, 1:])
         self._log_volume = np.log(volume) + self._log_area
 
-    def of(self, query: Query, shot: int) -> Fit | None:
+    def fit(self, query: Query, shot: int) -> Fit | None:
         """Compute the posterior of a shot.
 
         Returns None if too few draws are effective, or the table limits signals.
@@ -145,7 +145,7 @@ class DrawnPosterior:
         """Approximate each cell's share of the posterior, as if carrier phases were random."""
         # The average of exp(2 A cos(phase)) is nearly exp(2 A) / sqrt(1 + 4 pi A).
         n_bands, bound = len(self._wavenumbers), query.bound[shot]
-        amplitude = (bound + self._table.cells.energy) / (2 * n_bands)
+        amplitude = (bound + self._table.cells.template_energy) / (2 * n_bands)
         value = self._sampling.power * (bound - n_bands / 2 * np.log1p(4 * np.pi * amplitude))
         value += self._log_volume
         shares: np.ndarray = np.exp(value - value.max(), dtype=float)
@@ -156,14 +156,14 @@ class DrawnPosterior:
         directions = np.empty((len(cells), 3))
         directions[:, 1:] = self._low[cells] + places * self._extent[cells]
         directions[:, 0] = _boresight(directions[:, 1:])
-        windows = self._table.windows(query, shot, cells, directions[:, 1:])
+        windows = self._table.evaluate_windows(query, shot, cells, directions[:, 1:])
         amplitude = np.abs(windows.outputs).sum(axis=1)
         bound = 2 * amplitude - windows.energy
         best = int(np.argmax(bound))
         limit = bound[best] - np.log1p(4 * np.pi * amplitude[best]) / 2 - self._sampling.margin
         windows = select(windows, np.flatnonzero(bound >= limit))
         per_wavelength = max(self._sampling.steps, np.pi * np.sqrt(2 * amplitude[best]))
-        n_steps = int(np.ceil(self._table.window_m / self._wavelength_m * per_wavelength))
+        n_steps = int(np.ceil(self._table.max_width_m / self._wavelength_m * per_wavelength))
         low, high = self._inside(directions)
         rows, n = windows.row, max(self._sampling.block // n_steps, 1)
         parts = [self._integrate(select(windows, slice(k, k + n)), low, high, n_steps)
@@ -175,7 +175,7 @@ class DrawnPosterior:
     def _integrate(self, windows: Windows, low: np.ndarray, high: np.ndarray, n_steps: int
                    ) -> tuple[np.ndarray, ...]:
         """Integrate over windows from `low` to `high` [m]; return the last five `_Rays` fields."""
-        step_m, range_m = self._table.window_m / n_steps, windows.range_m
+        step_m, range_m = self._table.max_width_m / n_steps, windows.range_m
         offsets_m = ((np.arange(n_steps) - (n_steps - 1) / 2) * step_m).astype(np.float32)
         turns = np.exp(1j * self._wavenumbers[:, None] * offsets_m)
         rotation = (2 * np.concatenate([turns.real, -turns.imag])).astype(np.float32)

@@ -81,7 +81,7 @@ class Fit(NamedTuple):
     log_evidence: float  # Logarithm of the likelihood averaged over the region.
     residual: float  # Energy of the whitened residual at the best position.
     expected: float  # Expected residual of signals that match the model.
-    gain: complex  # Gain of the signals at the best position [nepers].
+    gain: float  # Gain of the signals at the best position [nepers].
 
 
 class Estimator(Protocol):

@@ -117,7 +117,7 @@ class SearchEstimator(abc.ABC):
     progress
         Called with the completed share while a table is computed, from any thread.
     lazy
-        Whether the table of the region is computed when it is first needed. With a mixture as
+        Whether the table of the region is computed only when it is first needed. With a mixture as
         prior, it rarely is.
     """
 
@@ -135,9 +135,9 @@ class SearchEstimator(abc.ABC):
         self._load = functools.partial(
             load_table, likelihood.model, codebook.id, table_folder, progress)
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
+        median_db, std_db = scenario.multipath_level_db
         # Median multipath level of users in sight, and the share of a residual's deviation that
         # is due to the level.
-        median_db, std_db = scenario.multipath_level_db
         self._level, self._n_measurements = 10**(median_db / 10), n_measurements
         self._level_share = share_of_level(n_measurements, std_db)
         self._test = FitTest(n_measurements, self._level)
@@ -154,7 +154,7 @@ class SearchEstimator(abc.ABC):
             likelihood if self._refinement.is_exact and not len(prior) else None)
         # Points that represent a standard Gaussian, float64 [128, 3].
         self.normal = standard_normal(N_NORMAL) if lazy else self._region.table.normal
-        self._normal = (
+        self._mode_normal = (
             standard_normal(_LIMITS.informative) if self._phases.is_informative
             else self.normal if prior.is_coarse else self.normal[:_LIMITS.narrow])
 
@@ -175,9 +175,13 @@ class SearchEstimator(abc.ABC):
         _ = self._region
 
     def _scopes(self, bent: Mixture) -> Iterator[Scope]:
-        """Yield where a prior in (r [m], u, v) is, unless the table is there, and the region."""
+        """Yield the part of the grid that a prior in (r [m], u, v) covers, and then the region.
+
+        The part is left out if the table of the region exists.
+        """
         likelihood, grid = self._likelihood, lay_grid(self.scenario)
         chosen = cells_of(bent, grid, likelihood.resolution)
+        # A cached property is in vars() once it is computed.
         if '_region' not in vars(self) and chosen.any():
             part = grid.within(chosen)
             scope = Scope.of(likelihood, tabulate(likelihood.model, grid=part), part)
@@ -195,8 +199,8 @@ class SearchEstimator(abc.ABC):
         """Compute the posterior for the signals of one shot, complex128 [N_B, N_SB F].
 
         The probabilities of users outside or blocked, and the reason why there is no position, are
-        those without the prior. Users outside are considered once the region is searched. Raises
-        `SignalError` if the signals are unusable.
+        those without the prior. Users outside are considered only if the whole region is searched.
+        Raises `SignalError` if the signals are unusable.
 
         Parameters
         ----------
@@ -279,8 +283,9 @@ class SearchEstimator(abc.ABC):
             aligned = scope.alignment.values_of_each(signals.received)
             whitened = self._likelihood.whitened(aligned, signals)
             fits = self._fits(scope, signals, aligned, whitened, draws)
-            for row, (fit, modes), *shot in zip(usable, fits, whitened, aligned, strict=True):
-                estimate = self._judge(scope.alternatives, fit, *shot)
+            for row, (fit, modes), one, values in zip(
+                    usable, fits, whitened, aligned, strict=True):
+                estimate = self._judge(scope.alternatives, fit, one, values)
                 found[row] = estimate, None if estimate.reason else modes
         return found
 
@@ -291,7 +296,7 @@ class SearchEstimator(abc.ABC):
         margin = self._refinement.margin + PRIOR_MARGIN * scope.favoured
         starts, drawn = scope.table.search(
             whitened, self._likelihood.nuisance, GRID_MARGIN + margin,
-            scope.drawn.of if scope.drawn and draws else None)
+            scope.drawn.fit if scope.drawn and draws else None)
         fits: dict[int, tuple[Fit, Modes | None]] = {
             shot: (fit, None) for shot, fit in drawn.items()}
         if len(starts.shots):
@@ -308,21 +313,21 @@ class SearchEstimator(abc.ABC):
         if likelihood.nuisance.is_coarse:
             drawn = concatenate(*(
                 draw_broad_samples(likelihood, of_shot, self._phases, select(signals, [shot]),
-                                   modes.of_shot(shot), self._normal)
+                                   modes.of_shot(shot), self._mode_normal)
                 for shot, of_shot in conditionals.items()))
         else:
-            drawn = draw_samples(modes, self._normal, self._bounds)
+            drawn = draw_samples(modes, self._mode_normal, self._bounds)
         samples = WeightedSamples.of(drawn, modes)
         means, covariances = self._moments(modes, samples)
         # If the model holds, twice the residual energy, averaged over the posterior, has the mean
         # of a chi-square variable. At the best of several modes, it is smaller than the average.
-        excess = self._mean_residual - samples.average(modes.residual)
         # The best mode of each shot comes first.
         residuals = samples.of_shot.first(modes.residual)
+        expected = self._mean_residual - (samples.average(modes.residual) - residuals)
         gains = samples.of_shot.first(modes.values) @ likelihood.nuisance.gain
         for shot, *fit in zip(
                 conditionals, means, covariances, samples.log_evidence.tolist(),
-                residuals.tolist(), (excess + residuals).tolist(), gains.tolist(), strict=True):
+                residuals.tolist(), expected.tolist(), gains.tolist(), strict=True):
             yield shot, (Fit(*fit), modes.of_shot(shot))
 
     def _judge(self, alternatives: Sequence[Alternative], fit: Fit, whitened: np.ndarray,
@@ -336,10 +341,11 @@ class SearchEstimator(abc.ABC):
         reason = self._reason(
             alternatives, whitened * np.exp(-fit.gain), fit.residual, probabilities)
         # Without a fix, only a residual that nothing explains is evidence against the scenario.
-        counts = (reason == self._test.residual_test(fit.residual) if reason
-                  else probabilities[0] >= 1 - _LIMITS.doubt)
+        # The residual is the reason if the texts are equal.
+        is_evidence = (reason == self._test.residual_test(fit.residual) if reason
+                       else probabilities[0] >= 1 - _LIMITS.doubt)
         statistics = {
-            'residual': fit.residual, 'expected_residual': fit.expected if counts else np.nan,
+            'residual': fit.residual, 'expected_residual': fit.expected if is_evidence else np.nan,
             **{f'{one.name}_probability': float(share) for one, share in zip(
                 alternatives, probabilities[1:], strict=True)}}
         if reason:
@@ -360,10 +366,10 @@ class SearchEstimator(abc.ABC):
         # it explains them.
         unexplained = self._test.residual_test(residual) or self._test.weak_test(
             float(np.sum(np.abs(whitened)**2)), residual)
-        inside, *others = probabilities.tolist()
+        in_sight, *others = probabilities.tolist()
         for probability, one in sorted(
                 zip(others, alternatives, strict=True), key=lambda pair: -pair[0]):
-            reason = rejection(one, probability, inside)
+            reason = rejection(one, probability, in_sight)
             if reason and (not unexplained or one.explain(whitened, self._test.max_residual)):
                 return reason
         return unexplained
@@ -411,7 +417,7 @@ def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> Weighted
     if modes is None:
         return None
     samples = WeightedSamples.of(draw_samples(
-        modes, estimator._normal, Resolution.of(estimator.scenario).bounds_m), modes)
+        modes, estimator._mode_normal, Resolution.of(estimator.scenario).bounds_m), modes)
     shares = samples.weights.sum(axis=1)
     order = np.argsort(-shares, kind='stable')[:np.count_nonzero(shares)]
     weights = samples.weights[order] / shares[order, None]

@@ -59,26 +59,26 @@ class FailureLimits(NamedTuple):
     unusual: float = 0.01
     usual_modes: int = 2
     # If it does: largest number of grid points besides the modes, their margin, and number of
-    # sites.
+    # places.
     points: int = 64
     point_margin: float = 30.0
-    sites: int = 64
+    places: int = 64
     # Factor of the share of further failures while sets are ranked.
     remainder: float = 0.3
-    # Number of hypotheses to extend, in all, of the same set, and of the same site.
+    # Number of hypotheses to extend, in all, of the same set, and of the same place.
     extended: int = 16
     per_set: int = 3
-    per_site: int = 4
+    per_place: int = 4
     # Number of extended hypotheses to weigh exactly.
     exact: int = 16
     # Largest number of elements by which a set grows.
     growth: int = 6
-    # Number of sets to try at all sites.
+    # Number of sets to try at all places.
     tried_everywhere: int = 4
     # Hypotheses are dropped if their log-probability is below the best by more than these margins,
     # before and during the exact steps.
     margin: float = 9.0
-    first_margin: float = 27.0
+    step_margin: float = 27.0
     # Largest number of hypotheses to keep.
     hypotheses: int = 48
     # Number of exact steps.
@@ -87,7 +87,7 @@ class FailureLimits(NamedTuple):
 
 LIMITS = FailureLimits()
 
-# A set of failed elements in ascending order, and a hypothesis: a set with the index of a site.
+# A set of failed elements in ascending order, and a hypothesis: a set with the index of a place.
 Failed: TypeAlias = tuple[int, ...]
 Key: TypeAlias = tuple[Failed, int]
 
@@ -138,8 +138,8 @@ class FailedElements:
                 self._likelihood.whitened(aligned, signals), self._likelihood.nuisance,
                 LIMITS.point_margin)
             search.add(found.points[:LIMITS.points], found.values[:LIMITS.points] + aligned)
-            chosen = first_sites(
-                np.stack([site.point for site in search.sites]),
+            chosen = first_places(
+                np.stack([place.point for place in search.places]),
                 self._likelihood.resolution.separation(self._likelihood.nuisance.is_coarse))
             search.grow([((), index) for index in chosen], LIMITS.remainder)
         search.try_neighbours(search.best)
@@ -149,25 +149,25 @@ class FailedElements:
                 ) -> tuple[Modes, Sequence[Conditional]]:
         """Return modes and likelihoods for one shot, N = 1; see `refine`."""
         search = self._search(modes, signals, table)
-        values, best = search.values, max(search.values.values())
+        values, best = search.log_probabilities, max(search.log_probabilities.values())
         keys = sorted((key for key in values if values[key] >= best - LIMITS.margin),
                       key=lambda key: -values[key])[:LIMITS.hypotheses]
         sets = list(dict.fromkeys(failed for failed, _ in keys))
         conditionals = [self._model.failed_set(failed) for failed in sets]
         parts = []
         for number, failed in enumerate(sets):
-            # The most probable sets are tried at the other sites, too.
-            sites = search.sites if number < LIMITS.tried_everywhere else [
-                search.sites[index] for one, index in keys if one == failed]
-            starts = Starts(np.zeros(len(sites), int), np.stack([one.point for one in sites]),
-                            np.stack([one.values for one in sites]))
+            # The most probable sets are tried at the other places, too.
+            places = search.places if number < LIMITS.tried_everywhere else [
+                search.places[index] for one, index in keys if one == failed]
+            starts = Starts(np.zeros(len(places), int), np.stack([one.point for one in places]),
+                            np.stack([one.values for one in places]))
             parts.append(ascend(conditionals[number], self._likelihood, starts, signals,
-                                LIMITS.steps, LIMITS.first_margin, number))
+                                LIMITS.steps, LIMITS.step_margin, number))
         modes = concatenate(*parts)
         return select(modes, modes.order[:LIMITS.hypotheses]), conditionals
 
 
-def first_sites(points: np.ndarray, radii: np.ndarray) -> list[int]:
+def first_places(points: np.ndarray, radii: np.ndarray) -> list[int]:
     """Return indices of points (r, u, v), float64 [P, 3], from which sets of failures grow.
 
     Half of them are the first points. The others are the first points of as many directions as
@@ -179,8 +179,8 @@ def first_sites(points: np.ndarray, radii: np.ndarray) -> list[int]:
     for index, cell in enumerate(map(tuple, np.floor(points[:, 1:] / radii[1:]).tolist())):
         turns[index] = seen[cell]
         seen[cell] += 1
-    turns[:LIMITS.sites // 2] = -1
-    return np.argsort(turns, kind='stable')[:LIMITS.sites].tolist()
+    turns[:LIMITS.places // 2] = -1
+    return np.argsort(turns, kind='stable')[:LIMITS.places].tolist()
 
 
 class FailedSurface(NamedTuple):
@@ -235,7 +235,7 @@ class Whitening(NamedTuple):
     """Factors of the covariance matrices of H sets of failed elements."""
 
     whitener: np.ndarray  # Inverse Cholesky factors, complex128 [N_B, H, N_SB F, N_SB F].
-    log_volume: np.ndarray  # Logarithms of the determinants, float64 [H].
+    log_det: np.ndarray  # Logarithms of the determinants, float64 [H].
     information: np.ndarray  # Information of one covariance about parameters, float64 [Q, Q].
 
     @classmethod
@@ -249,9 +249,10 @@ class Whitening(NamedTuple):
 
 
 class FailedSurfaces:
-    """Signals from surfaces with sets of failed elements; `surface` and `whitening` of each set.
+    """Moments of the signals for sets of failed elements.
 
-    Failures have the share that the scenario of the likelihood declares.
+    `surface` and `whitening` are cached functions of a set. Failures have the share that the
+    scenario of the likelihood declares.
     """
 
     def __init__(self, likelihood: Likelihood) -> None:
@@ -278,9 +279,10 @@ class FailedSurfaces:
     def extensions(self, failed: Failed, remainder: float) -> Whitening:
         """Return the factors for a set with each element added in turn.
 
-        `remainder` times the covariance of the errors of all failures is added to theirs.
+        `remainder` times the covariance of the errors of all failures is added to the covariance
+        of each extended set.
         """
-        # Another thread may replace `_extensions` at any time; none changes a dictionary in it.
+        # Another thread may replace this dictionary at any time, but none changes it in place.
         known = self._extensions
         found = known.get((failed, remainder))
         if found is None:
@@ -308,7 +310,7 @@ class FailedSurfaces:
 
 
 @dataclasses.dataclass(eq=False)
-class Site:
+class Place:
     """A point at which the signals of a shot are evaluated."""
 
     model: 'FailureModel'
@@ -338,7 +340,7 @@ class Site:
 class FailedSet:
     """The likelihood of positions for a set of failed elements: a `Conditional`.
 
-    Its value includes the prior of the set, and is relative to the value of `Likelihood`.
+    Its value includes the prior of the set, and omits the same constant as that of `Likelihood`.
     """
 
     def __init__(self, surfaces: FailedSurfaces, failed: Failed) -> None:
@@ -349,7 +351,7 @@ class FailedSet:
         self._mean_model = MeasurementModel(
             scenario, likelihood.codebook, ElementErrors(np.ones(len(stuck)), stuck))
         intact = scenario.n_elements * float(np.log1p(-scenario.failed_element_share))
-        self._offset = len(failed) * surfaces.log_odds + intact + likelihood.log_volume
+        self._offset = len(failed) * surfaces.log_odds + intact + likelihood.log_det
         self._amplitudes = surfaces.effects.amplitude[[*failed]]
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
@@ -366,33 +368,33 @@ class FailedSet:
         if self._surfaces.intact.elements.is_exact:
             white = np.einsum(
                 'irs,mcis->mcir', whitening.whitener[:, 0], columns, optimize=True)
-            white, log_volume = white.reshape(*columns.shape[:2], -1), whitening.log_volume
+            white, log_det = white.reshape(*columns.shape[:2], -1), whitening.log_det
         else:
-            white, log_volume = whiten_each(
+            white, log_det = whiten_each(
                 self._surfaces.roots_at(self._failed, positions), columns)
         local = assemble(prior, values, Columns.of(white, len(prior), len(failed)),
                          whitening.information)
-        return local._replace(value=local.value + self._offset - log_volume)
+        return local._replace(value=local.value + self._offset - log_det)
 
 
 class FailureModel:
-    """Likelihood of positions and sets of failed elements, for signals at given points."""
+    """Likelihood of positions and sets of failed elements at given points, for one shot."""
 
     def __init__(self, likelihood: Likelihood) -> None:
         self.likelihood, self.surfaces = likelihood, FailedSurfaces(likelihood)
         self.failed_set = functools.lru_cache(maxsize=_MAX_SURFACES)(
             lambda failed: FailedSet(self.surfaces, failed))
 
-    def sites(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> list[Site]:
-        """Return sites at points [P, 3] with parameters [P, Q], for the signals of one shot."""
+    def places(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> list[Place]:
+        """Return places at points [P, 3] with parameters [P, Q], for the signals of one shot."""
         prior = self.likelihood.nuisance
         mean, slopes = self.surfaces.intact.mean_and_jacobian(
             to_positions(points), jacobian(points))
         columns = prior.columns(values, signals.received, mean, slopes)[:, :4 + len(prior)]
-        return [Site(self, *each) for each in zip(points, values, columns, strict=True)]
+        return [Place(self, *each) for each in zip(points, values, columns, strict=True)]
 
     def elements_at(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute `Site.elements` at a point [3]."""
+        """Compute `Place.elements` at a point [3]."""
         scenario, prior = self.likelihood.scenario, self.likelihood.nuisance
         effects, gains = self.surfaces.effects, []
         for band in range(scenario.n_bands):
@@ -405,21 +407,21 @@ class FailureModel:
         changes = np.concatenate([-changes[:, :1], changes[:, 1:], fixed * changes[:, :1]], axis=1)
         return changes, elements[:, 0] * effects.amplitude
 
-    def weigh(self, failed: Failed, sites: Sequence[Site]) -> tuple[np.ndarray, np.ndarray]:
-        """Return a set's log-probability and deviance, [P] each, after a step at each of P sites.
+    def weigh(self, failed: Failed, places: Sequence[Place]) -> tuple[np.ndarray, np.ndarray]:
+        """Return a set's log-probability and deviance, [P] each, after a step at each of P places.
 
-        The log-probability is relative to the prior of an intact surface. The deviance is the
-        energy of the residual plus the cost of the parameters, because an unknown gain can lower
-        any energy.
+        The log-probability is relative to the prior of an intact surface. The deviance, here
+        without the usual factor 2, is the energy of the residual plus the cost of the parameters,
+        because an unknown gain can lower any energy.
         """
         whitening = self.surfaces.whitening(failed)
-        columns = np.stack([np.concatenate(site.columns_of(failed)) for site in sites])
-        value = self._predicted(np.stack([site.values for site in sites]), columns, whitening,
+        columns = np.stack([np.concatenate(place.columns_of(failed)) for place in places])
+        value = self._predicted(np.stack([place.values for place in places]), columns, whitening,
                                 len(failed))
         log_prior = len(failed) * self.surfaces.log_odds
-        return log_prior - whitening.log_volume + value, -value
+        return log_prior - whitening.log_det + value, -value
 
-    def weigh_extensions(self, failed: Failed, site: Site, remainder: float = 0.0) -> np.ndarray:
+    def weigh_extensions(self, failed: Failed, place: Place, remainder: float = 0.0) -> np.ndarray:
         """Weigh a set, as `weigh` does, with each element added in turn, float64 [N_E].
 
         Further elements are assumed to fail with a probability of `remainder` times the declared
@@ -427,15 +429,15 @@ class FailureModel:
         part of the signals has a higher value than one that imitates the sum of several failures.
         """
         extended, (columns, own) = (
-            self.surfaces.extensions(failed, remainder), site.columns_of(failed))
-        changes, amplitudes = site.elements
+            self.surfaces.extensions(failed, remainder), place.columns_of(failed))
+        changes, amplitudes = place.elements
         own = np.broadcast_to(own, (len(changes), *own.shape))
         # In the order of the fields of `Columns`. The mean is linear in the amplitudes of failed
         # elements.
         parts = np.concatenate([columns + changes, own, amplitudes[:, None]], axis=1)
-        values = np.broadcast_to(site.values, (len(changes), len(site.values)))
+        values = np.broadcast_to(place.values, (len(changes), len(place.values)))
         value = self._predicted(values, parts, extended, len(failed) + 1)
-        return (len(failed) + 1) * self.surfaces.log_odds - extended.log_volume + value
+        return (len(failed) + 1) * self.surfaces.log_odds - extended.log_det + value
 
     def _predicted(self, values: np.ndarray, columns: np.ndarray, whitening: Whitening,
                    n_failed: int) -> np.ndarray:
@@ -450,7 +452,7 @@ class FailureModel:
 
 
 class FailureSearch:
-    """Search for sets of failed elements at several sites, for the signals of one shot.
+    """Search for sets of failed elements at several places, for the signals of one shot.
 
     Sets grow by one element at a time. Extended sets are ranked by a likelihood that admits a few
     more failures; see `FailureModel.weigh_extensions`. If it did not, and two elements had failed,
@@ -463,25 +465,25 @@ class FailureSearch:
     def __init__(self, model: FailureModel, signals: Signals) -> None:
         self._model, self._signals = model, signals
         self._usual = energy_limit(int(np.prod(model.likelihood.model.shape)), LIMITS.unusual)
-        self.sites: list[Site] = []
+        self.places: list[Place] = []
         # Logarithm of prior times likelihood of each hypothesis.
-        self.values: dict[Key, float] = {}
+        self.log_probabilities: dict[Key, float] = {}
         self._deviances: dict[Key, float] = {}
 
     @property
     def best(self) -> Key:
         """The most probable hypothesis."""
-        return max(self.values, key=lambda key: self.values[key])
+        return max(self.log_probabilities, key=lambda key: self.log_probabilities[key])
 
     def explains(self, keys: list[Key]) -> bool:
         """Return whether the deviance of any of these hypotheses is no higher than usual."""
         return any(self._deviances[key] <= self._usual for key in keys)
 
     def add(self, points: np.ndarray, values: np.ndarray, failed: Failed = ()) -> list[Key]:
-        """Add a site at each point [P, 3] with parameters [P, Q]; return keys, the best first."""
-        first = len(self.sites)
-        self.sites += self._model.sites(points, values, self._signals)
-        return self._weigh((failed, index) for index in range(first, len(self.sites)))
+        """Add a place at each point [P, 3] with parameters [P, Q]; return keys, the best first."""
+        first = len(self.places)
+        self.places += self._model.places(points, values, self._signals)
+        return self._weigh((failed, index) for index in range(first, len(self.places)))
 
     def grow(self, parents: list[Key], remainder: float = 0.0) -> None:
         """Add failures to hypotheses until the results are improbable; see `FailureSearch`.
@@ -496,8 +498,8 @@ class FailureSearch:
                 # All elements have failed.
                 break
             exact = self._weigh(ranked[:LIMITS.exact])
-            limit = max(self.values[key] for key in found) - LIMITS.margin
-            if self.values[exact[0]] < limit and self.explains(found):
+            limit = max(self.log_probabilities[key] for key in found) - LIMITS.margin
+            if self.log_probabilities[exact[0]] < limit and self.explains(found):
                 break
             found += exact
             parents = _diverse(ranked, LIMITS)
@@ -514,19 +516,19 @@ class FailureSearch:
         """Weigh hypotheses, and return them, the most probable first."""
         keys = list(keys)
         for failed, group in itertools.groupby(
-                sorted(set(keys) - self.values.keys()), key=lambda key: key[0]):
+                sorted(set(keys) - self.log_probabilities.keys()), key=lambda key: key[0]):
             new = list(group)
-            value, deviance = self._model.weigh(failed, [self.sites[index] for _, index in new])
-            self.values.update(zip(new, value.tolist(), strict=True))
+            value, deviance = self._model.weigh(failed, [self.places[index] for _, index in new])
+            self.log_probabilities.update(zip(new, value.tolist(), strict=True))
             self._deviances.update(zip(new, deviance.tolist(), strict=True))
-        return sorted(keys, key=lambda key: -self.values[key])
+        return sorted(keys, key=lambda key: -self.log_probabilities[key])
 
     def _weigh_children(self, parents: list[Key], remainder: float = 0.0) -> list[Key]:
         """Return the hypotheses with one more failed element, the most probable first."""
         children: dict[Key, float] = {}
         # In this order, the covariances of a set are computed once.
         for failed, index in sorted(parents):
-            values = self._model.weigh_extensions(failed, self.sites[index], remainder)
+            values = self._model.weigh_extensions(failed, self.places[index], remainder)
             for element, value in enumerate(values.tolist()):
                 if element not in failed:
                     children[tuple(sorted((*failed, element))), index] = value
@@ -534,11 +536,11 @@ class FailureSearch:
 
 
 def _diverse(ranked: list[Key], limits: FailureLimits) -> list[Key]:
-    """Choose the best hypotheses to extend, but only a few per set and per site."""
+    """Choose the best hypotheses to extend, but only a few per set and per place."""
     chosen: list[Key] = []
     for failed, index in ranked:
         if (sum(other == failed for other, _ in chosen) < limits.per_set
-                and sum(other == index for _, other in chosen) < limits.per_site):
+                and sum(other == index for _, other in chosen) < limits.per_place):
             chosen.append((failed, index))
         if len(chosen) == limits.extended:
             break

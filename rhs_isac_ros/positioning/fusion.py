@@ -80,7 +80,7 @@ class Sighting:
 
     @classmethod
     def of(cls, posterior: Posterior, pose: Pose) -> 'Sighting | None':
-        """Return the likelihood for the signals of one phase; None without a position.
+        """Return the likelihood for the signals of one shot; None without a position.
 
         The modes become Gaussians, which extend beyond the region.
         """
@@ -207,7 +207,7 @@ class _Sheets(NamedTuple):
 
 
 class _Products(NamedTuple):
-    """T products of one component of each surface so far."""
+    """T products, each of one component of every surface so far."""
 
     rows: np.ndarray  # Components, int [T, number of surfaces].
     positions: np.ndarray  # Maxima in the region, float64 [T, 3] [m].
@@ -216,7 +216,7 @@ class _Products(NamedTuple):
 
     @classmethod
     def of(cls, sheets: _Sheets) -> '_Products':
-        """Return the components of one surface."""
+        """Return the components of one surface; `climb` computes curvatures and peaks."""
         n = len(sheets.points)
         return cls(np.arange(n)[:, None], sheets.best_m, np.zeros((n, 3, 3)), np.zeros(n))
 
@@ -262,9 +262,9 @@ class _Products(NamedTuple):
         return self.log_peaks + log_volume(np.linalg.inv(self.curvature))
 
     def heaviest(self, margin: float, number: int, constant: np.ndarray) -> '_Products':
-        """Return the heaviest products, among them one that is not constant; mask [T] `constant`.
+        """Return the heaviest products, at least one of which is not constant.
 
-        Raises ValueError if none of these is finite.
+        `constant`, bool [T], marks the constant ones. Raises ValueError if no other is finite.
         """
         log_weights = self.log_weights
         order = np.argsort(-log_weights, kind='stable')

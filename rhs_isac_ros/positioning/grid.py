@@ -29,14 +29,16 @@ from rhs_isac_ros.positioning.region import move_inside
 from rhs_isac_ros.positioning.segments import Segments, concatenate, select
 from rhs_isac_ros.positioning.templates import Cells, Filters, Query, turns_at
 
-# Returns the posterior of a shot of a query from draws, or None if a search for modes is better.
+# Computes the posterior of one shot of a query from drawn positions, or returns None if a search
+# for modes is better.
 Draw: TypeAlias = Callable[[Query, int], Fit | None]
 
 
 class _Limits(NamedTuple):
     """Numbers that trade the speed of the search for the completeness of its result."""
 
-    # Number of filter outputs in a block, which limits the number of shots in it.
+    # Number of amplitudes in a block, one for each shot, cell and band, which limits the number
+    # of shots in it.
     block: int = 1 << 18
     # Number of cells of a shot that are examined first, to find how likely the others must be.
     first_cells: int = 48
@@ -95,9 +97,9 @@ class TemplateTable:
         self._wavenumbers, self._carriers = (
             subband_wavenumbers(scenario), carrier_wavenumbers(scenario))
         self._bin_turns = turns_at(self._wavenumbers, self.grid.ranges_m).astype(np.complex64)
-        self._windows = RangeWindows(self.grid, self._wavenumbers)
-        self.window_m = self._windows.width_m.max()
-        self._finder = PeakFinder(self.window_m, resolution.wavelength_m, self._carriers)
+        self._range_windows = RangeWindows(self.grid, self._wavenumbers)
+        self.max_width_m = self._range_windows.width_m.max()
+        self._finder = PeakFinder(self.max_width_m, resolution.wavelength_m, self._carriers)
 
     def starts(self, whitened: np.ndarray, prior: NuisancePrior, margin: float | np.ndarray
                ) -> Starts:
@@ -115,7 +117,7 @@ class TemplateTable:
         `draw` is called for it. A shot for which it returns a posterior has no points. These
         posteriors are returned, too, keyed by the shot.
         """
-        n = max(1, _LIMITS.block // (len(self.cells.energy) * len(self._wavenumbers)))
+        n = max(1, _LIMITS.block // (len(self.cells.template_energy) * len(self._wavenumbers)))
         parts, drawn = [], {}
         for first in range(0, len(whitened), n):
             query = self.query(whitened[first:first + n], prior, margin)
@@ -195,35 +197,40 @@ class TemplateTable:
         return points
 
     def _bound(self, query: Query) -> np.ndarray:
-        """Bound the log-likelihood in all cells, as if all bands were in phase, [N, C]."""
+        """Bound the log-likelihood in all cells, as if all bands were in phase, [N, C].
+
+        It is relative to no direct path if the gain is known, and includes the energy of the
+        signals otherwise.
+        """
         grid, outputs = self.grid, query.outputs
         amplitude = np.empty((len(outputs), len(grid.node)), np.float32)
         turns = np.swapaxes(self._bin_turns, 1, 2)
         for nodes, bins, cells in grid.shells:
             by_range = np.abs(np.matmul(turns[:, bins], outputs[..., nodes])).sum(axis=1)
-            dense = ((grid.range_bin[cells] - bins.start) * by_range.shape[2]
+            # Place of each cell among all combinations of bins and templates of the shell.
+            place = ((grid.range_bin[cells] - bins.start) * by_range.shape[2]
                      + grid.node[cells] - nodes.start)
-            amplitude[:, cells] = by_range.reshape(len(outputs), -1)[:, dense]
+            amplitude[:, cells] = by_range.reshape(len(outputs), -1)[:, place]
         if not query.prior.gain_std:
             amplitude *= 2
-            amplitude -= self.cells.energy
+            amplitude -= self.cells.template_energy
             return amplitude
-        n_signals = query.signals[0].size
-        bounds = [query.prior.over_gain(one, energy, n_signals)[0]
+        n_measurements = query.signals[0].size
+        bounds = [query.prior.maximised_over_gain(one, energy, n_measurements)[0]
                   for one, energy in zip(amplitude, query.energies.tolist(), strict=True)]
-        return np.stack(bounds) - self.cells.energy
+        return np.stack(bounds) - self.cells.template_energy
 
     def _peaks_in(self, shots: np.ndarray, cells: np.ndarray, query: Query) -> Peaks:
         """Find all peaks along the range in cells [K] of ascending shots [K]."""
-        row, window = self._windows.of(cells)
-        shots, cells, range_m = shots[row], cells[row], self._windows.range_m[window]
+        row, window = self._range_windows.of_cells(cells)
+        shots, cells, range_m = shots[row], cells[row], self._range_windows.range_m[window]
         # Complex64 [W, N_B, N_SB], then the outputs of the bands, [N_B, W].
         by_subband = query.outputs[shots, :, :, self.grid.node[cells]]
-        of_band = np.einsum('wis,isw->iw', by_subband, self._windows.turns[:, :, window])
-        energy = self.cells.energy_at(cells, range_m)
+        of_band = np.einsum('wis,isw->iw', by_subband, self._range_windows.turns[:, :, window])
+        energy = self.cells.template_energy_at(cells, range_m)
         return self._finder.find(Candidates(shots, cells, range_m, of_band, energy), query)
 
-    def windows(self, query: Query, shot: int, cells: np.ndarray, directions: np.ndarray
+    def evaluate_windows(self, query: Query, shot: int, cells: np.ndarray, directions: np.ndarray
                 ) -> Windows:
         """Evaluate range windows of cells [K] in directions (u, v), [K, 2].
 
@@ -231,19 +238,21 @@ class TemplateTable:
         as quadratic.
         """
         grid, node, cell = self.grid, self.grid.node[cells], select(self.cells, cells)
+        # Templates are linear in 1 / r: r0^2 (1 / r0 - 1 / r).
         node_m, offset = grid.nodes[node, 0], directions - grid.nodes[node, 1:]
         change = np.column_stack([node_m * (1 - node_m / cell.range_m), offset]).astype(np.float32)
         by_subband = np.moveaxis(query.outputs[shot][:, :, node], 2, 0) + np.einsum(
             'iskqf,isf,kq->kis', self.filters.slopes[:, :, node], query.signals[shot], change,
             optimize=True)
-        energy = (cell.mean_energy + np.sum(cell.energy_slope[:, 1:] * offset, axis=1)
+        energy = (cell.energy + np.sum(cell.energy_slope[:, 1:] * offset, axis=1)
                   + likelihood_loss(offset, cell.curvature[:, 1:, 1:]))
-        row, window = self._windows.of(cells)
-        outputs = np.einsum('wis,isw->wi', by_subband[row], self._windows.turns[:, :, window])
-        range_m, cell_m = self._windows.range_m[window], cell.range_m[row]
+        row, window = self._range_windows.of_cells(cells)
+        outputs = np.einsum(
+            'wis,isw->wi', by_subband[row], self._range_windows.turns[:, :, window])
+        range_m, cell_m = self._range_windows.range_m[window], cell.range_m[row]
         energy = (cell_m / range_m)**2 * (energy[row] + cell.along[row] * (range_m - cell_m))
         return Windows(
-            row, range_m, self._windows.width_m[window], outputs, energy.astype(np.float32))
+            row, range_m, self._range_windows.width_m[window], outputs, energy.astype(np.float32))
 
     def _step(self, query: Query, peaks: Peaks, points: np.ndarray, values: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:
@@ -251,21 +260,23 @@ class TemplateTable:
 
         The result is the log-likelihood after the step.
         """
-        cells, range_m, window_m = self.cells, points[:, 0], peaks.window_m
+        cells, range_m, centre_m = self.cells, points[:, 0], peaks.centre_m
         outputs, at_point, slopes = self._outputs(query, peaks, range_m)
         turns, at_window = (np.moveaxis(turns_at(self._wavenumbers, at_m), 2, 0)
-                            for at_m in (range_m, window_m))
-        # At a peak, delays and amplitudes were those at the centre of the window.
-        fading = window_m / range_m
+                            for at_m in (range_m, centre_m))
+        # The value of a peak was computed with the delays of the centre of its window. It also
+        # contains priors and, with an unknown gain, the energy of the signals, so only the part
+        # of the direct path is replaced.
+        fading = centre_m / range_m
         at_window *= (fading[:, None] * np.exp(
-            1j * self._carriers * (range_m - window_m)[:, None]))[..., None]
+            1j * self._carriers * (range_m - centre_m)[:, None]))[..., None]
         if len(query.prior):
             factor = np.exp(-1j * (values @ query.prior.phases.T) - peaks.gain[:, None])[..., None]
             turns, at_window = turns * factor, at_window * factor
         approximate = (2 * np.einsum('pis,pis->p', at_window, outputs).real
-                       - fading**2 * cells.energy_at(peaks.cell, window_m))
+                       - fading**2 * cells.template_energy_at(peaks.cell, centre_m))
         exact = (2 * np.einsum('pis,pis->p', turns, at_point).real
-                 - cells.mean_energy_at(peaks.cell, range_m))
+                 - cells.energy_at(peaks.cell, range_m))
         # The gradient of `exact`. Energies decrease with the squared range.
         gradient = 2 * np.einsum('pis,pisq->pq', turns, slopes).real
         rate = 1j * self._wavenumbers - 1 / range_m[:, None, None]
@@ -279,10 +290,11 @@ class TemplateTable:
 
     def _outputs(self, query: Query, peaks: Peaks, range_m: np.ndarray
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return filter outputs [P, N_B, N_SB] of peaks, without and with the curvature at ranges.
+        """Return filter outputs of peaks, and their derivatives, at ranges [P] [m].
 
-        The curvature of the wavefront in a template is that at its own range. The last result
-        contains the derivatives at the ranges [P], [P, N_B, N_SB, 3].
+        The outputs, [P, N_B, N_SB], are those with the wavefront's curvature at the range of the
+        template, and those with the curvature at the given ranges. The derivatives of the latter
+        are [P, N_B, N_SB, 3].
         """
         n_nodes, nodes = len(self.grid.nodes), self.grid.node[peaks.cell]
         # Many peaks of a shot have the same template.
@@ -292,6 +304,7 @@ class TemplateTable:
                            query.signals[shot])[index]
         outputs, node_m = query.outputs[peaks.shots, :, :, nodes], self.grid.nodes[nodes, 0]
         ratio = node_m / range_m
+        # Linear in 1 / r, as in `evaluate_windows`.
         at_range = outputs + (node_m * (1 - ratio))[:, None, None] * slopes[..., 0]
         slopes[..., 0] *= (ratio**2)[:, None, None]
         return outputs, at_range, slopes
@@ -328,6 +341,7 @@ def separate(shots: np.ndarray, points: np.ndarray, radii: np.ndarray,
         reach = float(np.clip(np.sqrt(_LIMITS.same_mode * variance.max()), 1.0, _LIMITS.reach))
     # Move points of different shots far away from each other.
     scaled[:, 0] += shots * (2 * reach + np.ptp(scaled[:, 0]))
+    # The first index of each pair is the smaller one.
     better, worse = cKDTree(scaled).query_pairs(reach, output_type='ndarray').T
     if curvature is not None:
         offset = points[worse] - points[better]

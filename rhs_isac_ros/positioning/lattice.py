@@ -36,7 +36,7 @@ class _Limits(NamedTuple):
     # model of the mean holds, and radii of an ellipsoid around a mode that contains no other mode.
     step: tuple[float, float] = (0.2, 0.5)
     separation: tuple[float, float] = (0.37, 0.57)
-    # Both in range, in range bins, if the phases of the bands do not constrain the range.
+    # Range component of both, in range bins, if phases of the bands do not constrain the range.
     coarse_bins: float = 0.75
     # Largest value of `Resolution.direction`. It applies to apertures below one wavelength, where
     # the gains of elements and of the user also change with the direction.
@@ -64,7 +64,7 @@ class Resolution(NamedTuple):
     delay_m: float  # Change of the range that turns the edge of a band by 1 rad from its centre.
     nearest_m: float
     farthest_m: float
-    directions: np.ndarray  # Extent of the region in u and in v, float64 [2, 2].
+    direction_bounds: np.ndarray  # Extent of the region in u and in v, float64 [2, 2].
     bounds_m: np.ndarray  # Lower and upper vertex of the region, float64 [2, 3].
 
     @classmethod
@@ -83,7 +83,7 @@ class Resolution(NamedTuple):
             delay_m=SPEED_OF_LIGHT_MPS / (
                 np.pi * scenario.n_subbands * scenario.subband_width_hz),
             nearest_m=max(nearest_m, _LIMITS.nearest * farthest_m), farthest_m=farthest_m,
-            directions=np.stack([lowest, highest], axis=1), bounds_m=bounds)
+            direction_bounds=np.stack([lowest, highest], axis=1), bounds_m=bounds)
 
     def bin_width_m(self, range_m: float) -> float:
         """Return the width of a range bin, in which delays and amplitudes hardly change [m]."""
@@ -106,7 +106,7 @@ class Resolution(NamedTuple):
     def curvature_floor(self) -> np.ndarray:
         """Curvature in (r, u, v) that is added to every log-likelihood, [3]."""
         extent = np.array([self.farthest_m - self.nearest_m,
-                           *(self.directions[:, 1] - self.directions[:, 0])])
+                           *(self.direction_bounds[:, 1] - self.direction_bounds[:, 0])])
         return 12 * _LIMITS.floor / np.maximum(
             extent, _LIMITS.nearest * np.array([self.farthest_m, 1.0, 1.0]))**2
 
@@ -173,17 +173,18 @@ def lay_grid(scenario: Scenario) -> Grid:
     n_shells = len(bins_of_shell.starts)
     range_m = 2 / (1 / edges_m[bins_of_shell.starts] + 1 / edges_m[bins_of_shell.ends])
     has_template = bins_of_shell.max(is_used)
-    number = np.cumsum(has_template).reshape(has_template.shape) - 1
-    shell_of_node, direction = np.nonzero(has_template)
-    nodes = np.column_stack([range_m[shell_of_node], directions[direction]])
-    range_bin, direction = np.nonzero(is_used)
+    # Index of the node of each shell and direction, where there is one.
+    node_at = np.cumsum(has_template).reshape(has_template.shape) - 1
+    shell_of_node, node_direction = np.nonzero(has_template)
+    nodes = np.column_stack([range_m[shell_of_node], directions[node_direction]])
+    range_bin, cell_direction = np.nonzero(is_used)
     shell_of_cell = bins_of_shell.repeat(np.arange(n_shells))[range_bin]
     nodes_of_shell, cells_of_shell = (
         Segments.of_counts(np.bincount(shells, minlength=n_shells))
         for shells in (shell_of_node, shell_of_cell))
     return Grid(
         read_only(nodes), read_only((edges_m[1:] + edges_m[:-1]) / 2), read_only(np.diff(edges_m)),
-        read_only(number[shell_of_cell, direction]), read_only(range_bin),
+        read_only(node_at[shell_of_cell, cell_direction]), read_only(range_bin),
         list(map(Shell, nodes_of_shell.slices, bins_of_shell.slices, cells_of_shell.slices)))
 
 
@@ -201,7 +202,7 @@ def _directions(resolution: Resolution) -> np.ndarray:
     """Return the direction cosines (u, v) of all templates, float64 [V, 2]."""
     steps = 2 * PHASE_ERROR * resolution.direction
     lines = [np.arange(np.floor(first / step), np.ceil(last / step) + 1) * step
-             for (first, last), step in zip(resolution.directions, steps, strict=True)]
+             for (first, last), step in zip(resolution.direction_bounds, steps, strict=True)]
     directions = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 2)
     # Directions slightly beyond the rim of the half space are moved onto it.
     excess = np.maximum(np.hypot(*directions.T) / _LIMITS.sine, 1.0)

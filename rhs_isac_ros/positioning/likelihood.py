@@ -97,7 +97,8 @@ class Columns(NamedTuple):
 
     residual: np.ndarray  # Signals without the factors of the parameters, less the mean, [M, n].
     by_point: np.ndarray  # Derivatives of the mean with respect to the point, [M, 3, n].
-    by_values: np.ndarray  # Derivatives with respect to the parameters for information, [M, Q, n].
+    # Derivatives with respect to the parameters, for the expected information, [M, Q, n].
+    by_values: np.ndarray
     # Derivatives with respect to L further standard normal parameters, in which the mean is
     # linear, [M, L, n].
     linear: np.ndarray
@@ -128,7 +129,7 @@ class NuisancePrior(Exponents):
     """
 
     phase_covariance: np.ndarray  #: Of the declared phases of the bands, float64 [N_B, N_B].
-    relative_phase_std_rad: float  #: Largest one of these phases relative to their mean.
+    relative_phase_std_rad: float  #: Largest standard deviation relative to their mean.
     is_coarse: bool  #: Whether every band is given a uniform phase, by the last parameters.
     needs_search: np.ndarray  #: As in `Nuisance`, bool [Q].
     phases: np.ndarray  #: Phase of each band per unit [rad], float64 [N_B, Q].
@@ -229,28 +230,31 @@ class NuisancePrior(Exponents):
                  for output, std in zip(outputs, self.phase_std_rad, strict=True)]
         return np.sum(parts, axis=0)
 
-    def over_gain(self, amplitude: np.ndarray, energy: float, n_signals: int
-                  ) -> tuple[np.ndarray, np.ndarray]:
-        """Maximise the log-likelihood, without the template's energy, over an unknown gain.
+    def maximised_over_gain(self, amplitude: np.ndarray, energy: float, n_measurements: int
+                            ) -> tuple[np.ndarray, np.ndarray]:
+        """Maximise the log-likelihood, without the template's energy, over the gain.
 
-        If signals y are multiplied by h, the log-likelihood at the amplitude A, of any shape, is
-        ``-h^2 |y|^2 + 2 h A + 2 n log h`` plus the log-prior of the gain g = -log h; n is
-        `n_signals`. Returns its maximum and the gain [nepers].
+        If signals y are multiplied by h, the log-likelihood for an amplitude A, an array of any
+        shape, is ``-h^2 |y|^2 + 2 h A + 2 n log h`` plus the log-prior of the gain, which is
+        ``-log h``; n is `n_measurements`. Returns its maximum and the gain [nepers]; if the gain
+        is known, 2 A and a single 0.
         """
+        if not self.gain_std:
+            return 2 * amplitude, np.zeros(1)
         precision = self.gain_std**-2
         # The maximum without the prior, and its curvature, lead to a start for two Newton steps.
         positive = np.maximum(amplitude, 0)
-        factor = (positive + np.sqrt(positive**2 + 4 * n_signals * energy)) / (2 * energy)
-        curvature = 2 * positive * factor + 4 * n_signals
+        factor = (positive + np.sqrt(positive**2 + 4 * n_measurements * energy)) / (2 * energy)
+        curvature = 2 * positive * factor + 4 * n_measurements
         gain = -np.log(factor) * curvature / (curvature + precision)
         for _ in range(2):
             factor = np.exp(-gain)
-            slope = (2 * factor * (factor * energy - amplitude) - 2 * n_signals
+            slope = (2 * factor * (factor * energy - amplitude) - 2 * n_measurements
                      - precision * gain)
             curvature = 2 * factor * (2 * factor * energy - amplitude) + precision
             gain += slope / np.maximum(curvature, precision)
         factor = np.exp(-gain)
-        return (factor * (2 * amplitude - factor * energy) - 2 * n_signals * gain
+        return (factor * (2 * amplitude - factor * energy) - 2 * n_measurements * gain
                 - precision * gain**2 / 2, gain)
 
     def start(self, outputs: np.ndarray, gain: np.ndarray) -> np.ndarray:
@@ -277,7 +281,7 @@ class Likelihood:
         self.model = MeasurementModel(scenario, codebook, surface).prepare()
         self.nuisance = NuisancePrior(self.model)
         self.resolution = Resolution.of(scenario)
-        self.log_volume = float(log_determinant(self.model.root).sum())
+        self.log_det = float(log_determinant(self.model.root).sum())
 
     def signals(self, received: np.ndarray) -> Signals:
         """Whiten signals [N, N_B, N_SB F]."""
@@ -327,7 +331,7 @@ def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
     parameters. The further parameters of the columns are integrated out.
     """
     n, n_linear = 3 + len(prior), columns.linear.shape[1]
-    # The residual energy, its gradient and information.
+    # The residual energy, and gradient and information of its negative.
     expected = np.concatenate([columns.by_point, columns.by_values, columns.linear], axis=1)
     slopes = expected if columns.observed is columns.by_values else np.concatenate(
         [columns.by_point, columns.observed, columns.linear], axis=1)
@@ -379,7 +383,7 @@ class DispersedLikelihood:
 
     Errors of the direct path are stronger for near users. A surface has a whole number k of failed
     elements, and the covariance of their errors is k / E[k] times the average. The likelihood is
-    averaged over k, and its value is relative to `Likelihood`.
+    averaged over k. Its value omits the same constant as that of `Likelihood`.
     """
 
     def __init__(self, likelihood: Likelihood) -> None:
@@ -392,7 +396,7 @@ class DispersedLikelihood:
             likelihood.surface).prepare()
         self._intact = MeasurementModel(intact, likelihood.codebook, likelihood.surface)
         self._scales, log_weights = _failure_counts(scenario.n_elements, share)
-        self._offsets = log_weights + likelihood.log_volume
+        self._offsets = log_weights + likelihood.log_det
         self._latest: tuple[np.ndarray, list[np.ndarray]] | None = None
         average, least = self._average.covariance(), self._intact.covariance()
         roots = covariance_root(
@@ -421,9 +425,9 @@ class DispersedLikelihood:
         columns = prior.columns(values, signals.received, mean, slopes)
         for roots, offset, information in zip(
                 self._roots_at(points), self._offsets, self._information, strict=True):
-            white, log_volume = whiten_each(roots, columns)
+            white, log_det = whiten_each(roots, columns)
             local = assemble(prior, values, Columns.of(white, len(prior)), information)
-            states.append(local._replace(value=local.value + offset - log_volume))
+            states.append(local._replace(value=local.value + offset - log_det))
         return _average_of(states)
 
     def _roots_at(self, points: np.ndarray) -> list[np.ndarray]:

@@ -32,10 +32,11 @@ class RangeWindows:
         self.range_m = low_m + (self._of_bin.places + 0.5) * self.width_m
         self.turns = turns_at(wavenumbers, self.range_m).astype(np.complex64)
 
-    def of(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def of_cells(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """List the W windows of cells [K].
 
-        Returns the index from 0 to K - 1 of each window's cell, and of the window, int [W].
+        Returns two indices for each window, int [W]: that of its cell, from 0 to K - 1, and its
+        own.
         """
         windows = select(self._of_bin, self._range_bin[cells])
         of_cell = Segments.of_counts(windows.counts)
@@ -58,9 +59,9 @@ class Peaks(NamedTuple):
 
     shots: np.ndarray  # Shot of each, int [P].
     cell: np.ndarray  # Index of the cell in the grid, int [P].
-    window_m: np.ndarray  # Centre of the window of range, float64 [P] [m].
+    centre_m: np.ndarray  # Centre of the window of range, float64 [P] [m].
     range_m: np.ndarray  # Float64 [P] [m].
-    value: np.ndarray  # Log-likelihood, as if delays were those at `window_m`, float [P].
+    value: np.ndarray  # Log-likelihood, as if delays were those at `centre_m`, float [P].
     gain: np.ndarray  # Most likely gain [nepers], float [P].
     outputs: np.ndarray  # Matched-filter outputs of the bands, complex128 [P, N_B].
 
@@ -82,33 +83,34 @@ class PeakFinder:
         # The real part of the product with complex outputs, as a product of real numbers.
         self._rotation = (2 * np.hstack([turns.real, -turns.imag])).astype(np.float32)
 
-    def find(self, windows: Candidates, query: Query) -> Peaks:
+    def find(self, candidates: Candidates, query: Query) -> Peaks:
         """Find all peaks, at least one of each shot, in the order of the windows."""
         if query.prior.is_coarse:
-            return self._centres(windows, query)
-        return self._maxima(windows, query)
+            return self._centres(candidates, query)
+        return self._maxima(candidates, query)
 
-    def _centres(self, windows: Candidates, query: Query) -> Peaks:
+    def _centres(self, candidates: Candidates, query: Query) -> Peaks:
         """Return the centre of every window."""
         turns = np.ones_like(self._turns[:, :1])
-        (value,), (gain,) = _over_gain(_amplified(turns, windows, query), windows, query)
-        return Peaks(windows.shots, windows.cell, windows.range_m, windows.range_m, value, gain,
-                     windows.outputs.T.astype(complex))
+        doubled = _doubled_amplitude(turns, candidates, query)
+        (value,), (gain,) = _over_gain(doubled, candidates, query)
+        return Peaks(candidates.shots, candidates.cell, candidates.range_m, candidates.range_m,
+                     value, gain, candidates.outputs.T.astype(complex))
 
-    def _maxima(self, windows: Candidates, query: Query) -> Peaks:
+    def _maxima(self, candidates: Candidates, query: Query) -> Peaks:
         """Return the local maxima along the range, but not those at the ends of a window."""
         if query.prior.phase_covariance.any():
-            along = _amplified(self._turns, windows, query)
+            along = _doubled_amplitude(self._turns, candidates, query)
         else:
-            outputs = windows.outputs
+            outputs = candidates.outputs
             along = self._rotation @ np.concatenate([outputs.real, outputs.imag])
-        along, _ = _over_gain(along, windows, query)
-        step, window = _inner_maxima(along, Segments.of_keys(windows.shots))
+        along, _ = _over_gain(along, candidates, query)
+        step, window = _inner_maxima(along, Segments.of_keys(candidates.shots))
         # The vertex of a parabola through a maximum and the steps beside it.
         before, highest, after = (along[step + side, window] for side in (-1, 0, 1))
         slope, bend = (after - before) / 2, 2 * highest - after - before
         offset_m = slope / np.maximum(bend, np.abs(slope) + 1e-9) * self._step_m
-        found = select(windows._replace(outputs=windows.outputs.T), window)
+        found = select(candidates._replace(outputs=candidates.outputs.T), window)
         centre_m = found.range_m
         range_m = centre_m + self._offsets_m[step] + offset_m
         # Within a window, amplitudes decrease with the range.
@@ -138,12 +140,12 @@ def _inner_maxima(along: np.ndarray, of_shot: Segments) -> tuple[np.ndarray, np.
     return step[order] + 1, window[order]
 
 
-def _amplified(turns: np.ndarray, windows: Candidates, query: Query) -> np.ndarray:
+def _doubled_amplitude(turns: np.ndarray, candidates: Candidates, query: Query) -> np.ndarray:
     """Return twice the amplitudes after the best rotation of the phases; `turns` are [N_B, S]."""
-    return 2 * query.prior.amplitude(turns[..., None] * windows.outputs[:, None])
+    return 2 * query.prior.amplitude(turns[..., None] * candidates.outputs[:, None])
 
 
-def _over_gain(doubled: np.ndarray, windows: Candidates, query: Query
+def _over_gain(doubled: np.ndarray, candidates: Candidates, query: Query
                ) -> tuple[np.ndarray, np.ndarray]:
     """Maximise the log-likelihood over the gain, for twice the amplitude [S, W].
 
@@ -151,10 +153,10 @@ def _over_gain(doubled: np.ndarray, windows: Candidates, query: Query
     """
     gain = np.broadcast_to(0.0, doubled.shape)
     if query.prior.gain_std:
-        gain, n_signals = np.zeros_like(doubled), query.signals[0].size
-        for part in Segments.of_keys(windows.shots).slices:
-            energy = float(query.energies[windows.shots[part.start]])
-            doubled[:, part], gain[:, part] = query.prior.over_gain(
-                doubled[:, part] / 2, energy, n_signals)
-    doubled -= windows.energy
+        gain, n_measurements = np.zeros_like(doubled), query.signals[0].size
+        for part in Segments.of_keys(candidates.shots).slices:
+            energy = float(query.energies[candidates.shots[part.start]])
+            doubled[:, part], gain[:, part] = query.prior.maximised_over_gain(
+                doubled[:, part] / 2, energy, n_measurements)
+    doubled -= candidates.energy
     return doubled, gain

@@ -210,10 +210,10 @@ class Cells(NamedTuple):
     """
 
     range_m: np.ndarray  # Centre of the range bin, float64 [C] [m].
-    energy: np.ndarray  # Energy of the whitened template, float32 [C].
-    mean_energy: np.ndarray  # Energy of the whitened mean, float32 [C].
-    energy_slope: np.ndarray  # Derivative of `mean_energy`, float32 [C, 3].
-    # Derivative of r^2 E with respect to the range r, divided by r^2, with E = `mean_energy`,
+    template_energy: np.ndarray  # Of the whitened template, float32 [C].
+    energy: np.ndarray  # Of the whitened mean, float32 [C].
+    energy_slope: np.ndarray  # Derivative of `energy`, float32 [C, 3].
+    # Derivative of r^2 E with respect to the range r, divided by r^2, with E = `energy`,
     # float64 [C].
     along: np.ndarray
     curvature: np.ndarray  # Float64 [C, 3, 3].
@@ -236,13 +236,13 @@ class Cells(NamedTuple):
             range_m, arrays['template_energy'], energy, slope, slope[:, 0] + 2 * energy / range_m,
             curvature, np.linalg.inv(curvature).astype(np.float32), loss)
 
-    def energy_at(self, cells: np.ndarray, range_m: np.ndarray) -> np.ndarray:
+    def template_energy_at(self, cells: np.ndarray, range_m: np.ndarray) -> np.ndarray:
         """Return the energies of templates [K] at ranges in their cells, float32 [K]."""
-        return self._at(self.energy[cells], cells, range_m)
+        return self._at(self.template_energy[cells], cells, range_m)
 
-    def mean_energy_at(self, cells: np.ndarray, range_m: np.ndarray) -> np.ndarray:
+    def energy_at(self, cells: np.ndarray, range_m: np.ndarray) -> np.ndarray:
         """Return the energies of means [K] at ranges in their cells, float32 [K]."""
-        return self._at(self.mean_energy[cells], cells, range_m)
+        return self._at(self.energy[cells], cells, range_m)
 
     def _at(self, energy: np.ndarray, cells: np.ndarray, range_m: np.ndarray) -> np.ndarray:
         # Apart from its decrease with the squared range, the energy is linear within a cell.

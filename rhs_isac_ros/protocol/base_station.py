@@ -70,11 +70,11 @@ def _admission(settings: BaseStationSettings) -> Admission:
 
 
 def reply(success: bool, text: str) -> Callable[['BaseStation', Event], None]:
-    """Return a step that answers an operator with `text`, filled in by `BaseStation.fill`."""
-    def reply(role: 'BaseStation', event: Event) -> None:
+    """Return an action that answers an operator with `text`, filled in by `BaseStation.fill`."""
+    def action(role: 'BaseStation', event: Event) -> None:
         role.act(events.Reply(success, role.fill(text)))
 
-    return reply
+    return action
 
 
 reply_resumed = reply(True, 'resumed{waiting}')
@@ -235,7 +235,7 @@ class BaseStation(SignalCollector):
         ready = self._cycle.steering.ready
         return bool(ready) and self._surface(event) not in ready
 
-    # Steps, in the order of a cycle
+    # Actions of the rows: first operation, then a cycle in order
 
     def _store_codebook(self, event: events.CodebookOffered) -> None:
         self._offered = event.codebook
@@ -437,10 +437,10 @@ class BaseStation(SignalCollector):
     _OF_USER = SignalCollector._OF_USER
     _OF_CODEBOOK: Drops = {_wrong_codebook: Outcome.WRONG_CODEBOOK}
     _DELIVERED: Drops = {_not_delivered_uplink: None}
-    _ELSEWHERE: Drops = {_sounds_elsewhere: None}
+    _SOUNDED_HERE: Drops = {_sounds_elsewhere: None}
     # The row that repeats the request of a step, and the row that ends its cycle.
-    _retry = functools.partial(AnyRow, guard=_may_retry, restart_timeout=True)
-    _give_up = functools.partial(AnyRow, target=State.RESTING)
+    _retry_row = functools.partial(AnyRow, guard=_may_retry, restart_timeout=True)
+    _last_row = functools.partial(AnyRow, target=State.RESTING)
     # A beam and its configuration come from two roles of each surface, in either order.
     _ANSWER = (
         AnyRow((State.ESTIMATING,), (_store_answer,), State.STEERING),
@@ -467,7 +467,7 @@ class BaseStation(SignalCollector):
         *on(events.Resumed, 'resumed')(
             Row((State.WAITING, State.PAUSED), (_skip_cycles,))),
         *on(events.PauseRequested, 'pause')(
-            # A pause begins between cycles or after an unanswered beacon; a step runs one cycle.
+            # A pause begins between cycles or after an unanswered beacon.
             Row((State.PAUSED,), (reply(True, 'already paused'),)),
             Row((State.WAITING, State.RESTING), (_pause, reply(True, 'paused')), State.PAUSED),
             Row(ANY, (_pause, reply(True, 'the pause begins after cycle {cycle}')))),
@@ -476,6 +476,7 @@ class BaseStation(SignalCollector):
             Row(ANY, (_resume, reply_resumed), guard=_pausing),
             Row(ANY, (reply(True, 'not paused'),))),
         *on(events.StepRequested, 'step')(
+            # The pause remains requested, so the base station pauses again after the cycle.
             Row((State.PAUSED,), (reply(False, 'waiting for {lacking}'),), guard=_not_ready),
             Row((State.PAUSED,), (_begin_cycle, reply(True, 'cycle {cycle} begins')),
                 State.BEACONING),
@@ -512,32 +513,32 @@ class BaseStation(SignalCollector):
                 guard=_pausing_or_not_ready),
             Row((State.BEACONING,), (_apply_settings, _beacon_again), outcome=Outcome.UNANSWERED,
                 restart_timeout=True),
-            _retry((State.CONFIGURING,), (_command_bands,), outcome=Outcome.RETRY_RHS),
-            _give_up((State.CONFIGURING,), (_abandon,), outcome=Outcome.RHS_SILENT),
+            _retry_row((State.CONFIGURING,), (_command_bands,), outcome=Outcome.RETRY_RHS),
+            _last_row((State.CONFIGURING,), (_abandon,), outcome=Outcome.RHS_SILENT),
             # Repeat the command too, because the channel may have missed the report of the RHS.
-            _retry((State.SOUNDING,), (_command_silent_bands, _request_pilots),
+            _retry_row((State.SOUNDING,), (_command_silent_bands, _request_pilots),
                    outcome=Outcome.RETRY_BAND),
-            _give_up((State.SOUNDING,), (_abandon,), guard=_signals_due,
+            _last_row((State.SOUNDING,), (_abandon,), guard=_signals_due,
                      outcome=Outcome.CHANNEL_SILENT),
-            _give_up((State.SOUNDING,), (_remove_user, _abandon), outcome=Outcome.USER_GONE),
-            _retry((State.ESTIMATING,), (_resend_signals,), outcome=Outcome.RETRY_POSITION),
-            _give_up((State.ESTIMATING,), (_abandon,), outcome=Outcome.POSITIONER_SILENT),
+            _last_row((State.SOUNDING,), (_remove_user, _abandon), outcome=Outcome.USER_GONE),
+            _retry_row((State.ESTIMATING,), (_resend_signals,), outcome=Outcome.RETRY_POSITION),
+            _last_row((State.ESTIMATING,), (_abandon,), outcome=Outcome.POSITIONER_SILENT),
             # The cycle goes on without surfaces that did not answer; the next one does not await
             # them either.
             Row((State.STEERING,), (_begin_transmission,), State.TRANSMITTING, guard=_some_ready),
             # Roles answer a repeated message again, so repeated signals lead to the beam again.
-            _retry((State.STEERING,), (_resend_signals,), outcome=Outcome.RETRY_BEAM),
-            _give_up((State.STEERING,), (_abandon,), outcome=Outcome.TRANSMISSION_SILENT),
+            _retry_row((State.STEERING,), (_resend_signals,), outcome=Outcome.RETRY_BEAM),
+            _last_row((State.STEERING,), (_abandon,), outcome=Outcome.TRANSMISSION_SILENT),
             # The channel may have missed the beam or its configuration, or another surface can
             # carry the data.
-            _retry((State.TRANSMITTING,), (_note_loss, _resend_signals, _send_downlink),
+            _retry_row((State.TRANSMITTING,), (_note_loss, _resend_signals, _send_downlink),
                    outcome=Outcome.RETRY_DATA),
-            _give_up((State.TRANSMITTING,), (_note_loss, _abandon), outcome=Outcome.DATA_LOST)),
+            _last_row((State.TRANSMITTING,), (_note_loss, _abandon), outcome=Outcome.DATA_LOST)),
         *on(m.RhsConfiguration, 'configured')(
             Row(ANY, (_await_surface,), guard=_shown_late, outcome=Outcome.WRONG_CYCLE)),
         *on(m.RhsConfiguration, 'configured',
-              _ELSEWHERE | SignalCollector._OF_CYCLE | _OF_CODEBOOK)(
-            # A report concerns the configurations that sound a band, or that of the beam.
+              _SOUNDED_HERE | SignalCollector._OF_CYCLE | _OF_CODEBOOK)(
+            # A report concerns the configurations for positioning in a band, or that of the beam.
             Row((State.CONFIGURING,), (_store_configured, _request_pilots), State.SOUNDING,
                 guard=_last_configuration),
             Row((State.CONFIGURING, State.SOUNDING), (_store_configured,), guard=_for_positioning),
@@ -552,13 +553,14 @@ class BaseStation(SignalCollector):
         *on(m.FeedSignals, 'signals', SignalCollector._OF_SIGNALS)(
             Row((State.SOUNDING,), (SignalCollector._store_signals, _send_signals),
                 State.ESTIMATING, guard=SignalCollector._last_signals),
+            # Each band restarts the timeout and the retries.
             Row((State.SOUNDING,), (SignalCollector._store_signals,), State.SOUNDING)),
         *on(m.PositionEstimate, 'estimate', _OF_USER | _OF_CODEBOOK)(
             Row((State.ESTIMATING,), (_store_estimate,), State.STEERING),
             Row((State.STEERING,), (_store_estimate,)),
             Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
         *on(m.NoFix, 'no_fix', _OF_USER | _OF_CODEBOOK)(
-            _give_up((State.ESTIMATING,), (_abandon,), outcome=Outcome.NO_FIX)),
+            _last_row((State.ESTIMATING,), (_abandon,), outcome=Outcome.NO_FIX)),
         *on(m.Beam, 'beam')(
             Row(ANY, (_await_surface,), guard=SignalCollector._wrong_cycle,
                 outcome=Outcome.WRONG_CYCLE)),

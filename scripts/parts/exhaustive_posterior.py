@@ -102,7 +102,8 @@ class _Posterior:
                                 np.conj(np.swapaxes(means, 1, 2)))
             amplitude = prior.amplitude(outputs)
             energies = np.sum(np.abs(self._whitened)**2, axis=(1, 2))
-            doubled = np.stack([prior.over_gain(one, float(energy), self._whitened[0].size)[0]
+            n = self._whitened[0].size
+            doubled = np.stack([prior.maximised_over_gain(one, float(energy), n)[0]
                                 for one, energy in zip(amplitude, energies, strict=True)])
             means = np.swapaxes(means, 0, 1)
         return doubled - np.sum(np.abs(means)**2, axis=(1, 2))

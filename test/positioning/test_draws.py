@@ -33,7 +33,7 @@ def found_and_exact(scenario, codebook, n=N, sampling=SAMPLING):
     received = simulate_received(scenario, codebook, scenario.sample_positions(n, rng), rng)
     whitened = likelihood.signals(received).whitened
     query = table.query(whitened, likelihood.nuisance, 8.0)
-    found = [drawn.of(query, shot) for shot in range(n)]
+    found = [drawn.fit(query, shot) for shot in range(n)]
     low, high = likelihood.resolution.bounds_m
     positions = low + (high - low) * qmc.Sobol(3, seed=0).random(1 << 15)
     means = likelihood.model.whiten(likelihood.model.mean(positions)).reshape(len(positions), -1)
@@ -89,14 +89,14 @@ def test_limited_signals_leave_no_draws(codebook):
     drawn, table, query = table_and_query(
         codebook, noise_psd_dbm_hz=-174.0, multipath_to_los_db=-60.0)
     assert not table.filters.is_exact
-    assert drawn.of(query, 0) is None
+    assert drawn.fit(query, 0) is None
 
 
 def test_narrow_peaks_leave_too_few_effective_draws(codebook):
     drawn, table, query = table_and_query(
         codebook, SAMPLING._replace(draws=10), noise_psd_dbm_hz=-105.0, multipath_to_los_db=-60.0)
     assert table.filters.is_exact
-    assert drawn.of(query, 0) is None
+    assert drawn.fit(query, 0) is None
 
 
 def test_estimates_from_draws_agree_with_those_from_modes(codebook):

@@ -17,7 +17,7 @@ from rhs_isac_ros.positioning.failures import (
     Whitening,
     _diverse,
     can_enumerate,
-    first_sites,
+    first_places,
 )
 from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
 
@@ -109,7 +109,7 @@ def test_the_likelihood_has_the_moments_of_surfaces_with_a_given_set(codebook, m
     average = np.linalg.slogdet(MeasurementModel(SCENARIO, codebook).covariance())[1].sum()
     assert local.value[0] == pytest.approx(log_prior - energy - volume + average, rel=1e-6)
 
-    value, deviance = model.weigh(failed, model.sites(POINT[None], NO_VALUES[None], signals))
+    value, deviance = model.weigh(failed, model.places(POINT[None], NO_VALUES[None], signals))
     # The step exceeds no limit here.
     gain = gradient @ np.linalg.solve(information + floor, gradient) / 2
     prior = 2 * np.log(0.02 / 0.98)
@@ -131,7 +131,7 @@ def test_element_errors_have_their_covariance_at_the_position(codebook):
     expected = DispersedLikelihood(alone).local(points, values, alone.signals(received))
     for name in ('gradient', 'information', 'residual'):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6)
-    shift = both.log_volume - alone.log_volume + 36 * np.log(0.98)
+    shift = both.log_det - alone.log_det + 36 * np.log(0.98)
     np.testing.assert_allclose(found.value, expected.value + shift, rtol=1e-6)
 
 
@@ -143,7 +143,7 @@ def weighing(request, codebook):
     received = MeasurementModel(scenario, codebook).sample(
         POSITION[None], np.random.default_rng(3))
     model = FailureModel(Likelihood(scenario, codebook))
-    (site,) = model.sites(
+    (site,) = model.places(
         POINT[None], np.full((1, len(request.param)), 0.1), model.likelihood.signals(received))
     return model, site
 
@@ -227,8 +227,8 @@ def test_sets_grow_to_the_true_one_or_to_one_that_is_more_probable(ambiguous):
         failed = tuple(sorted(rng.choice(36, 3, replace=False).tolist()))
         search, sites = search_at_the_truth(ambiguous, sample_with(ambiguous, failed, seed))
         search.grow(sites, 0.3)
-        (true,), _ = ambiguous.weigh(failed, search.sites[:1])
-        assert search.values[search.best] >= true - 1e-6
+        (true,), _ = ambiguous.weigh(failed, search.places[:1])
+        assert search.log_probabilities[search.best] >= true - 1e-6
 
 
 def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):
@@ -239,7 +239,7 @@ def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):
     strong = 100 * MeasurementModel(scenario, codebook).mean(POSITION[None])
     search, sites = search_at_the_truth(model, strong)
     search.grow(sites)
-    assert max(len(failed) for failed, _ in search.values) == 4
+    assert max(len(failed) for failed, _ in search.log_probabilities) == 4
 
 
 def test_few_hypotheses_of_each_set_and_of_each_site_are_extended():
@@ -247,14 +247,14 @@ def test_few_hypotheses_of_each_set_and_of_each_site_are_extended():
     chosen = _diverse(ranked, LIMITS._replace(extended=len(ranked)))
     sets, sites = (collections.Counter(one) for one in zip(*chosen, strict=True))
     assert max(sets.values()) == LIMITS.per_set
-    assert max(sites.values()) == LIMITS.per_site
+    assert max(sites.values()) == LIMITS.per_place
     assert _diverse(ranked, LIMITS._replace(extended=2)) == ranked[:2]
 
 
 def test_neighbours_differ_by_one_element(ambiguous):
     search, sites = search_at_the_truth(ambiguous, sample_with(ambiguous, (3, 17), 0))
     search.try_neighbours(((3, 17), sites[0][1]))
-    sets = [set(failed) for failed, _ in search.values if failed]
+    sets = [set(failed) for failed, _ in search.log_probabilities if failed]
     assert {3} in sets
     assert {17} in sets
     assert all(len(one ^ {3, 17}) <= 2 for one in sets)
@@ -264,10 +264,10 @@ def test_neighbours_differ_by_one_element(ambiguous):
 def test_sets_grow_from_the_best_points_and_from_the_best_of_each_direction():
     # 100 ranges in each of three directions, the more probable direction first.
     points = np.array([(4 + 0.01 * n, u, 0.1) for u in (0.05, 0.35, 0.65) for n in range(100)])
-    chosen = first_sites(points, np.array([0.1, 0.1, 0.1]))
+    chosen = first_places(points, np.array([0.1, 0.1, 0.1]))
     assert len(set(chosen)) == 64
     assert chosen[:32] == list(range(32))
     # The first direction has had its turns.
     assert chosen[32:] == [n for pair in zip(range(100, 116), range(200, 216), strict=True)
                            for n in pair]
-    assert first_sites(points[:5], np.ones(3)) == list(range(5))
+    assert first_places(points[:5], np.ones(3)) == list(range(5))

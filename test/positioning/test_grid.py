@@ -87,7 +87,7 @@ def test_the_value_of_a_peak_is_that_of_its_range_and_of_the_most_likely_gain(
         likelihood.model.sample(scenario.sample_positions(10, rng), rng))
     query = table.query(signals.whitened, likelihood.nuisance, 8.0)
     peaks = table._peaks(query)[0]
-    scale = peaks.window_m / peaks.range_m
+    scale = peaks.centre_m / peaks.range_m
     assert np.abs(scale - 1).max() > 0.02
     gain = np.linspace(-5, 5, 2001 if gain_std_db else 1)[:, None] * gain_std_db
     factor = 10**(-gain / 20)
@@ -95,7 +95,7 @@ def test_the_value_of_a_peak_is_that_of_its_range_and_of_the_most_likely_gain(
               + 2 * factor * scale * peaks.outputs.real.sum(axis=1)
               + 2 * signals.received[0].size * np.log(factor)
               - (gain / max(gain_std_db, 1.0))**2 / 2)
-    energy = scale**2 * table.cells.energy_at(peaks.cell, peaks.window_m)
+    energy = scale**2 * table.cells.template_energy_at(peaks.cell, peaks.centre_m)
     np.testing.assert_allclose(peaks.value, values.max(axis=0) - energy, atol=0.5)
 
 
@@ -121,8 +121,8 @@ def test_windows_have_the_outputs_and_energies_of_their_centres(scenario, likeli
     model = likelihood.model
     y = model.whiten(model.mean(scenario.sample_positions(1, np.random.default_rng(5))))
     query = table.query(y, likelihood.nuisance, 10.0)
-    cells = np.arange(len(table.cells.energy))
-    windows = table.windows(query, 0, cells, table.grid.nodes[table.grid.node, 1:])
+    cells = np.arange(len(table.cells.template_energy))
+    windows = table.evaluate_windows(query, 0, cells, table.grid.nodes[table.grid.node, 1:])
     assert len(windows.row) > len(cells)
     directions = table.grid.nodes[table.grid.node[windows.row], 1:]
     means = model.whiten(model.mean(to_positions(np.column_stack([windows.range_m, directions]))))

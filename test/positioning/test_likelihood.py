@@ -201,6 +201,6 @@ def test_the_profile_over_the_gain_is_the_maximum_with_its_prior(codebook):
     gain = np.linspace(-4 * std, 4 * std, 20_001)
     values = (-np.exp(-2 * gain) * energy + 2 * np.exp(-gain) * amplitude[:, None]
               - 2 * n_rows * gain - gain**2 / (2 * std**2))
-    value, found = prior.over_gain(amplitude, energy, n_rows)
+    value, found = prior.maximised_over_gain(amplitude, energy, n_rows)
     np.testing.assert_allclose(value, values.max(axis=1), atol=0.05)
     np.testing.assert_allclose(found, gain[values.argmax(axis=1)], atol=0.05 * std)
