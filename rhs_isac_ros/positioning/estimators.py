@@ -295,7 +295,7 @@ class SearchEstimator(abc.ABC):
         # Margin of modes in each cell, beyond the usual one.
         margin = self._refinement.margin + PRIOR_MARGIN * scope.favoured
         starts, drawn = scope.table.search(
-            whitened, self._likelihood.nuisance, GRID_MARGIN + margin,
+            whitened, self._likelihood.nuisance, GRID_MARGIN + scope.alignment.margin + margin,
             scope.drawn.fit if scope.drawn and draws else None)
         fits: dict[int, tuple[Fit, Modes | None]] = {
             shot: (fit, None) for shot, fit in drawn.items()}

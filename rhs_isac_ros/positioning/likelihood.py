@@ -51,6 +51,10 @@ class _Search(NamedTuple):
     reach: float = 4.0  # In standard deviations.
     points: tuple[int, ...] = (513, 49, 13, 5)  # Per parameter, for 1, 2, 3 and more parameters.
     refinements: int = 4  # Of the best point.
+    # Errors of the estimates, in standard deviations, whose effect the margin covers, and largest
+    # margin. Nearby users have stronger signals than the average, on which the effect depends.
+    deviation: float = 6.0
+    margin: float = 200.0
 
 
 _SEARCH = _Search()
@@ -191,6 +195,11 @@ class NuisancePrior(Exponents):
         operators = self._multiplying(root, whitener)
         both = operators + adjoint(operators)
         return np.einsum('aimn,binm->ab', both, both, optimize=True).real
+
+    def direct_information(self, spread: np.ndarray) -> np.ndarray:
+        """Compute the information of whitened means with second moments `spread`, [Q, Q]."""
+        return 2 * np.einsum('aimn,ino,bimo->ab', self._operators, spread, self._operators.conj(),
+                             optimize=True).real
 
     def _multiplying(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
         """Compute W P W^-1, which applies P to whitened signals, [Q, N_B, N_SB F, N_SB F]."""
@@ -490,7 +499,8 @@ class Alignment:
 
     Offsets of carrier and timing move the multipath out of the nulls of its covariance, so they
     must be known before the search. `spread`, from `tabulate`, contains the second moments of the
-    whitened means over the region, and accounts for the unknown position.
+    whitened means over the region, and accounts for the unknown position. `margin` is the loss of
+    log-likelihood that errors of the estimates may cause at the true position.
     """
 
     def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:
@@ -499,6 +509,12 @@ class Alignment:
         least = np.maximum(_MIN_SPREAD * np.trace(spread, axis1=1, axis2=2).real, 1.0)
         roots = np.linalg.cholesky(spread + least[:, None, None] * np.eye(spread.shape[1]))
         self._whitener = np.linalg.solve(roots, likelihood.model.whitener)
+        moves = np.ix_(*2 * [self._prior.moves_multipath])
+        known = self._prior.information_of(likelihood.model.root @ roots, self._whitener)
+        precision = (known + np.diag(self._prior.precision))[moves]
+        loss = np.trace(np.linalg.solve(
+            precision, self._prior.direct_information(spread)[moves])) / 2
+        self.margin = min(_SEARCH.deviation**2 * float(loss), _SEARCH.margin)
 
     def values_of_each(self, received: np.ndarray) -> np.ndarray:
         """Estimate the parameters [N, Q] that move the multipath; all others are 0."""

@@ -286,8 +286,10 @@ def test_a_region_far_shorter_than_the_wavelength_has_a_mode_for_all_signals(ran
     {'roi_size_m': (10, 10, 0), 'roi_center_m': (10, 0, -2)}, {'delay_spread_s': 0.0},
     {'delay_spread_s': 1e-9}, {'delay_spread_s': 0.0, 'multipath_to_los_db': -20.0},
     {'roi_center_m': (1, 20, 5), 'roi_size_m': (1.5, 10, 2)},
-    {'roi_center_m': (0.3, 5, 0), 'roi_size_m': (0.5, 6, 2)}], ids=str)
-def test_regions_contain_users_on_lines_and_planes_in_flat_channels_and_at_wide_angles(
+    {'roi_center_m': (0.3, 5, 0), 'roi_size_m': (0.5, 6, 2)},
+    {'multipath_to_los_db': -20.0, 'user_gain_std_db': 1.0},
+    {'multipath_to_los_db': -25.0, 'timing_std_s': 20e-9}], ids=str)
+def test_regions_contain_users_on_lines_in_flat_channels_at_wide_angles_and_with_strong_signals(
         changes, shipped):
     scenario, rng = Scenario(**changes), np.random.default_rng(1)
     positions = scenario.sample_positions(400, rng)
