@@ -69,6 +69,15 @@ def test_it_does_not_claim_validity_where_ranges_are_ambiguous(shipped):
     assert not compare(scenario, true, shipped, places).valid.any()
 
 
+@pytest.mark.parametrize(('before_m', 'behind_m', 'valid'), [
+    (0.3, 0.3, True), (0.6, 0.3, False), (0.3, 0.6, False)])
+def test_an_ambiguity_on_the_border_of_the_region_counts(shipped, before_m, behind_m, valid):
+    scenario = Scenario(
+        multipath_to_los_db=-6.0, roi_center_m=(5 + (behind_m - before_m) / 2, 0, 0),
+        roi_size_m=(before_m + behind_m, 6, 6))
+    assert compare(scenario, scenario, shipped, np.array([[5, 0.3, 0.2]])).valid == [valid]
+
+
 @pytest.mark.slow
 def test_it_does_not_claim_validity_where_signals_are_refused(plan, positions):
     scenario, codebook = plan
