@@ -92,11 +92,12 @@ def test_check_names_the_size_that_differs(small, changes, words):
         small.codebook.check(dataclasses.replace(small.scenario, **changes))
 
 
-def test_check_finds_one_wrong_frame(small):
+@pytest.mark.parametrize(('factor', 'power'), [(1.001, r'0\.001001'), (0.999, r'0\.000999')])
+def test_check_finds_one_wrong_frame(small, factor, power):
     digital = small.codebook.digital.copy()
-    digital[0, :, 1] *= np.sqrt(1.001)
+    digital[0, :, 1] *= np.sqrt(factor)
     codebook = Codebook(small.codebook.analog, digital)
-    with pytest.raises(CodebookError, match=r'digital: a frame has power 0\.001001 W'):
+    with pytest.raises(CodebookError, match=rf'digital: a frame has power {power} W'):
         codebook.check(small.scenario)
     Codebook(small.codebook.analog, small.codebook.digital * (1 + 1e-8)).check(small.scenario)
 
