@@ -117,6 +117,32 @@ def test_elements_are_exact_if_their_errors_are_known_or_absent(small, damaged):
                                np.zeros(n)).is_exact == (rank == 0)
 
 
+def test_an_estimate_adds_the_covariance_of_its_errors(random_beams):
+    """To first order in the errors of gains, offsets and bands: one term for each column of F."""
+    scenario = Scenario(elements_per_side=3, n_feeds=2, n_subbands=2)
+    rng = np.random.default_rng(5)
+    beams, positions = random_beams(scenario, rng), scenario.sample_positions(2, rng)
+    estimate = rng.normal(size=(9 + 9 + 2, 2)) @ [1, 1j]
+    factor = rng.normal(size=(20, 3, 2)) @ [1, 1j]
+
+    def model(gains, offsets, bands, factor=factor[:, :0]):
+        return MeasurementModel(
+            scenario, beams, SurfaceEstimate(gains, offsets, bands, factor, np.zeros(9)))
+
+    def of_errors(errors):
+        gains, offsets, bands = np.split(errors, [9, 18])
+        return model(estimate[:9] + gains, estimate[9:18] + offsets, estimate[18:] * (1 + bands))
+
+    expected = of_errors(0 * estimate).covariance_at(positions)
+    for column in factor.T:
+        slope = (of_errors(column).mean(positions) - of_errors(-column).mean(positions)) / 2
+        scattered = model(column[:9], column[9:18], estimate[18:]).covariance()
+        expected += slope[..., None] * slope[..., None, :].conj() + (
+            scattered - scenario.noise_power_w * np.eye(scattered.shape[-1]))
+    found = model(*np.split(estimate, [9, 18]), factor).covariance_at(positions)
+    np.testing.assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
+
+
 def test_both_simulations_use_a_given_surface(small, damaged):
     surface = draw_surface(damaged, np.random.default_rng(9))
     quiet = dataclasses.replace(damaged, noise_psd_dbm_hz=-200, multipath_to_los_db=-100)

@@ -7,7 +7,14 @@ import pytest
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model import geometry as g
-from rhs_isac_ros.model.geometry import jacobian, polar_bounds, to_polar, to_positions
+from rhs_isac_ros.model.geometry import (
+    jacobian,
+    polar_bounds,
+    polar_derivative,
+    region_information,
+    to_polar,
+    to_positions,
+)
 
 
 def test_positions_and_frequencies_match_the_vectors(case):
@@ -64,6 +71,8 @@ def test_jacobian_matches_finite_differences():
     points, step = to_polar(positions_in_front(20, 2)), 1e-6
     matrices = jacobian(points)
     assert matrices.shape == (20, 3, 3)
+    np.testing.assert_allclose(
+        polar_derivative(points) @ matrices, np.tile(np.eye(3), (20, 1, 1)), atol=1e-10)
     for a in range(3):
         shift = step * np.eye(3)[a]
         difference = (to_positions(points + shift) - to_positions(points - shift)) / (2 * step)
@@ -77,3 +86,8 @@ def test_polar_bounds_are_the_extrema_inside():
     low, high = polar_bounds(bounds)
     np.testing.assert_allclose(low, points.min(axis=0), rtol=1e-12)
     np.testing.assert_allclose(high, points.max(axis=0), rtol=1e-12)
+
+
+def test_the_prior_of_the_region_has_its_variances(small):
+    np.testing.assert_allclose(np.linalg.inv(region_information(small.scenario)),
+                               np.diag(np.square(small.scenario.roi_size_m) / 12))
