@@ -431,13 +431,16 @@ def test_starts_use_the_levels():
 
 
 def test_other_amplitudes_do_not_fit():
-    codebook = random_codebook(SCENARIO, np.random.default_rng(0))
+    codebook, levels = random_codebook(SCENARIO, np.random.default_rng(0)), with_levels(3)
     codebook.check(SCENARIO)
-    with pytest.raises(CodebookError, match=r'^analog: 0\.\d+, expected one of amplitude_levels = '
-                                            '3 levels from 0 to 1'):
-        codebook.check(with_levels(3))
-    rounded = Codebook(on_levels(with_levels(3), codebook.analog), codebook.digital)
-    rounded.check(with_levels(3))
+    rounded = Codebook(on_levels(levels, codebook.analog), codebook.digital)
+    rounded.check(levels)
+    for one in (0.499, 0.501):
+        analog = rounded.analog.copy()
+        analog[0, 1, 2] = one
+        with pytest.raises(CodebookError, match=rf'^analog: {one}, expected one of '
+                                                'amplitude_levels = 3 levels from 0 to 1'):
+            Codebook(analog, codebook.digital).check(levels)
 
 
 @pytest.mark.parametrize('method', ['alternating', 'direct'])

@@ -32,7 +32,7 @@ MALFORMED = {
     'masked': np.ma.array(GOOD, mask=[[False, True, False]]), 'unmasked': np.ma.array(GOOD),
     'masked entry': [[8.0, np.ma.masked, 0.2]], 'objects': np.array([[8.0, None, 0.2]]),
     'ragged': [[8.0, 1.0], [0.2]], 'not finite': [[8.0, np.nan, 0.2]],
-    'enormous': [[1e200, 1.0, 0.2]]}
+    'enormous': [[1e200, 1.0, 0.2]], 'enormous and negative': [[8.0, -1e200, 0.2]]}
 
 
 @pytest.fixture(scope='module')
