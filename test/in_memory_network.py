@@ -192,6 +192,7 @@ class Network:
     codebook, which takes `make_s`; `ordered` keeps the order of messages of a class from one role
     to another. `plain_beams` replaces the optimisation of beams, which takes most of a cycle, by a
     simple function. The roles have the `library`, except for those in `without_library`.
+    `world_rate` is the speed of the clock that stamps the signals, relative to that of the roles.
     """
 
     def __init__(
@@ -199,8 +200,9 @@ class Network:
             transport: Transport = on_time, ordered: bool = True, make=None, make_s: float = 0.0,
             absent: Iterable[str] = (), begin_s: float = 0.0, plain_beams: bool = True,
             positioner=None, library=EMPTY, without_library: Iterable[str] = (),
-            **settings: Any) -> None:
+            world_rate: float = 1.0, **settings: Any) -> None:
         self._positioner, self._library = positioner, library
+        self._world_rate = world_rate
         self._without_library = frozenset(without_library)
         self.scenario, self.seed = scenario, seed
         self._beams: dict[str, Any] = PLAIN_BEAMS if plain_beams else {}
@@ -249,6 +251,9 @@ class Network:
 
     def __contains__(self, name: str) -> bool:
         return name in self._roles
+
+    def world_s(self) -> float:
+        return self._world_rate * self.now_s
 
     def add_user(self, user: int, place, suffix: str = '') -> None:
         """Start a user; with the suffix ``_twin``, it may have the number of another user."""
@@ -333,6 +338,8 @@ class Network:
         m.check(message, self.scenario)
         if sender in self.instances:
             message = dataclasses.replace(message, sender=self.instances[sender])
+        if isinstance(message, m.FeedSignals) and self._world_rate != 1.0:
+            message = dataclasses.replace(message, stamp_ns=int(1e9 * self.world_s()))
         self.log.append(Sent(self.now_s, sender, message))
         if isinstance(message, m.Grant) and self._kind(sender) == 'bs':
             self._noise[message.cycle_id] = self._roles[sender]._settings.in_use.receiver_noise
@@ -477,13 +484,13 @@ class Network:
                 first = 1_000_000 * self._n_starts + 1
                 self._n_starts += 1
                 return BaseStation(
-                    scenario, self.settings, rng, self._receive, first, library)
+                    scenario, self.settings, rng, self._receive, first, library, self.world_s)
             case 'rhs_controller':
                 return RhsController(library)
             case 'user':
                 return user_role.User(
                     self._mobilities[name], step_s, BEACON_TIMEOUT_S,
-                    self.instances[name], pose=scenario.pose)
+                    self.instances[name], self.world_s, scenario.pose)
             case 'channel':
                 # Two channels differ in their multipath. Without memory, the expected signals
                 # depend on the seed alone.

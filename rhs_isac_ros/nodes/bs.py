@@ -213,7 +213,7 @@ class BsNode(RoleNode[BaseStation]):
         rng = streams.generator(values.seed, streams.BASE_STATION)
         self.start(BaseStation(
             self.scenario, self.make_settings(values), rng, combiner(self.scenario, values.seed),
-            values.first_cycle or _cycle_from_clock(), self.library))
+            values.first_cycle or _cycle_from_clock(), self.library, self.clocks.world_s))
         self._locate: LocateServer | None = None
         self._begin_locate()
         self._reply = events.Reply(False, '')

@@ -93,6 +93,9 @@ class BaseStation(SignalCollector):
     library
         Codebooks besides the offered one, which is for the whole region. The codebook of a cycle
         is chosen at the grant, and its id in the messages of the cycle selects it in every role.
+    world_s
+        Returns the time in which users move [s], with an arbitrary epoch; by default that of the
+        role. Proposals of codebooks, which follow from tracks, hold for some of this time.
     """
 
     SENDS = (m.Beacon, m.Grant, m.RhsCommand, m.PilotRequest, m.ReceivedSignals, m.Data,
@@ -106,7 +109,8 @@ class BaseStation(SignalCollector):
 
     def __init__(
             self, scenario: Scenario, settings: BaseStationSettings, rng: np.random.Generator,
-            receiver: Combine, first_cycle_id: int = 1, library: Library = EMPTY) -> None:
+            receiver: Combine, first_cycle_id: int = 1, library: Library = EMPTY,
+            world_s: Callable[[], float] | None = None) -> None:
         super().__init__(State.WAITING, scenario, receiver, Cycle(first_cycle_id - 1))
         self._scenario = scenario
         self._users = UserRegistry(settings.policy, rng)
@@ -115,6 +119,7 @@ class BaseStation(SignalCollector):
         self._pause_requested = False  # whether a pause begins after the current cycle
         self._offered: Codebook | None = None  # codebook for the next beacon
         self._proposals = Proposals(library)
+        self._world_s = world_s or (lambda: self.now_s)
         # Roles that are missing; None before the first report.
         self._missing: tuple[str, ...] | None = None
         self._carriers = Carriers()
@@ -323,7 +328,7 @@ class BaseStation(SignalCollector):
         self._cycle.user = self._users.select()
         self._cycle.user_instance = self._users.owner(self._cycle.user)
         self._cycle.codebook = self._proposals.take(
-            self._cycle.user, self._cycle.user_instance, self.now_s) or self._cycle.codebook
+            self._cycle.user, self._cycle.user_instance, self._world_s()) or self._cycle.codebook
         self._send(m.Grant)
         self._command_bands(event)
         self._announce(m.Phase.POSITIONING)
@@ -371,7 +376,7 @@ class BaseStation(SignalCollector):
         self.send(self._cycle.received)
 
     def _store_estimate(self, event: m.PositionEstimate) -> None:
-        self._proposals.add(event, self.now_s)
+        self._proposals.add(event, self._world_s())
 
     def _store_answer(self, event: m.Beam | m.RhsConfiguration) -> None:
         self._cycle.steering.add(self._surface(event), event)

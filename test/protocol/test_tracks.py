@@ -177,6 +177,13 @@ def test_codebooks_follow_a_walk(net, library, region):
     assert not any('wrong' in reason for c in network.counters().values() for reason in c)
 
 
+def test_codebooks_follow_in_a_slow_simulation(net, library):
+    network = net(world_rate=0.1)
+    network.run_cycles(6)
+    assert network.served() == [1] * 6
+    assert set(used(network)[2:]) <= set(library.by_id)
+
+
 class Jump:
     """A user that is 3 m away after a time [s]."""
 
