@@ -465,9 +465,11 @@ def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
     if options.estimator and options.estimator != [BayesEstimator.name]:
         given.append('estimator')
     if given:
-        names = ', '.join(f'{options.namespace.rstrip("/")}/{name}' for name in networks.surfaces)
-        raise ToolError(f'--{given[0]}: not available for a whole site; select one of its '
-                        f'surfaces with --namespace: {names}')
+        # Only the leading surface has whole cycles.
+        surfaces = [*networks.surfaces][:None if options.publish else 1]
+        names = ', '.join(f'{options.namespace.rstrip("/")}/{name}' for name in surfaces)
+        raise ToolError(f'--{given[0]}: not available for a whole site; select a surface with '
+                        f'--namespace: {names}')
     recording = SiteRecording(options.file, options.namespace, networks)
     command.print_now(f'{len(recording.truths)} cycles')
     again = recording.located(default_folder())
@@ -491,6 +493,8 @@ def _conflict(options: argparse.Namespace) -> str:
         return 'arguments --topic, --rate and --timeout: expected together with --publish'
     if options.track and BayesEstimator.name not in estimators:
         return 'argument --track: expected together with --estimator bayes'
+    if options.track_speed is not None and not options.track:
+        return 'argument --track-speed: expected together with --track'
     if options.model and 'neural' not in estimators:
         return 'argument --model: expected together with --estimator neural'
     return ''
@@ -520,7 +524,8 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
             for codebook_id, codebook in codebooks.items()}
         rows.append(_row(name, errors_m(recording, estimators)))
         if options.track and name == BayesEstimator.name:
-            rows.append(_row('track', errors_m(recording, estimators, options.track_speed)))
+            rows.append(_row('track', errors_m(
+                recording, estimators, options.track_speed or Motion.speed_mps)))
     _print_table(rows)
     return 0
 
@@ -564,8 +569,8 @@ def _parser() -> argparse.ArgumentParser:
         choices=(*ESTIMATORS, *plugins.names(plugins.ESTIMATORS)),
         help='may be repeated (default: bayes)')
     add('--track', action='store_true', help='also track the users with the estimator bayes')
-    add('--track-speed', type=positive_float, default=Motion.speed_mps, metavar='MPS',
-        help='typical speed of the users (default: 1 m/s)')
+    add('--track-speed', type=positive_float, metavar='MPS',
+        help=f'typical speed of the users (default: {Motion.speed_mps:g} m/s)')
     command.add_files(parser, 'codebook', 'config', 'calibration')
     add('--model', type=input_file, metavar='FILE', help='model of the estimator neural')
     add('--namespace', default='/', help='namespace of the recorded network (default: /)')

@@ -278,9 +278,9 @@ def test_a_replay_locates_the_users_of_each_surface_and_of_the_fusion_again(reco
 
 
 @pytest.mark.parametrize(('arguments', 'code', 'expected'), [
-    (['--publish'], 1, '--publish: not available for a whole site; select one of its surfaces '
-     'with --namespace: /front, /side'),
-    (['--estimator', 'ml'], 1, '--estimator: not available for a whole site'),
+    (['--publish'], 1, '--publish: not available for a whole site; select a surface with '
+     '--namespace: /front, /side\n'),
+    (['--estimator', 'ml'], 1, 'select a surface with --namespace: /front\n'),
     (['--namespace', '/side'], 2, 'no complete cycle in the namespace /side'),
     (['--namespace', '/lab'], 2, 'no position of the fusion in the namespace /lab')])
 def test_a_replay_of_a_site_names_what_is_not_available(
