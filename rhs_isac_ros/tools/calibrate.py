@@ -348,6 +348,16 @@ def _conflict(options: argparse.Namespace) -> str:
         if getattr(options, name) not in (None, False, '/')]
     if options.site and others:
         return f'argument --site: not allowed with {", ".join(others)}'
+    if options.calibration and not options.multipath:
+        return 'argument --calibration: expected together with --multipath'
+    if options.states and options.codebook:
+        return 'argument --codebook: not allowed with --states'
+    if options.namespace != '/' and not options.file:
+        return ('argument --namespace: expected together with a recording; for a running '
+                'network, --ros-args -r __ns:=/lab selects the namespace')
+    if (options.file or options.states) and (options.cycles, options.timeout) != (
+            _CYCLES, _TIMEOUT_S):
+        return 'arguments --cycles and --timeout: expected for a running network'
     return ''
 
 
