@@ -20,9 +20,18 @@ import numpy as np
 import rclpy
 from rclpy.utilities import try_shutdown
 
+from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.codebook.library import Library
-from rhs_isac_ros.frontend import RADIOS, SURFACES
+from rhs_isac_ros.frontend import (
+    RADIOS,
+    SURFACES,
+    Air,
+    Waveform,
+    make_radio,
+    make_surface,
+    parse_options,
+)
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog, CycleRecord
@@ -37,6 +46,7 @@ from rhs_isac_ros.ros.processes import MAX_USER_NODES, Processes
 from rhs_isac_ros.ros.recording import CycleObserver, Recorder, RecordingError
 from rhs_isac_ros.ros.roster import MEMBERS, networks
 from rhs_isac_ros.ros.run import StartError, init, starting
+from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
@@ -47,7 +57,9 @@ from rhs_isac_ros.support.arguments import (
     positive_int,
     seed,
 )
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.exits import on_end_signals, print_error
+from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.pictures import write_picture
 from rhs_isac_ros.tools.command import choose_scenario, text_table
 from rhs_isac_ros.tools.pictures import compose_cycles, prepare_drawing
@@ -282,6 +294,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     'rhs_isac_ros.codebook --scenario FILE --output FILE', parser.prog)
     except (ScenarioError, SiteError, RecordingError, StartError) as error:
         print_error(error, parser.prog)
+    except MissingLibraryError as error:
+        print_error(error, parser.prog)
+        return 1
     return 2
 
 
@@ -295,6 +310,22 @@ def follow(options: argparse.Namespace) -> None:
         options.codebook = options.codebook or folder / 'codebook_bandplan.yaml'
 
 
+def _check_front_end(options: argparse.Namespace, scenario: Scenario) -> None:
+    """Raise StartError if the options select a surface or a radio that `channel` would refuse."""
+    causes = ValueError, plugins.PluginError
+    with translated(causes, StartError):
+        load_surface(str(options.calibration or ''), scenario)
+    with translated(causes, StartError, 'argument --surface'):
+        port = {'port': options.port} if options.port else {}
+        make_surface(options.surface, scenario.n_elements, **port).close()
+    with translated(causes, StartError, 'argument --radio'):
+        radio = make_radio(options.radio, scenario, Air(scenario, np.random.default_rng(0)),
+                           **parse_options(options.radio_options or ''))
+    radio.close()
+    if options.samples and not isinstance(radio.modem, Waveform):
+        raise StartError(f'argument --samples: the radio {options.radio} has no samples')
+
+
 class _Demonstration:
     """A network with one surface: its parameters, observer, recording and report."""
 
@@ -306,6 +337,7 @@ class _Demonstration:
         self.scenario, codebook_file = load_files(options.config, options.codebook)
         if options.follow:
             Library.load(options.follow).check(self.scenario)
+        _check_front_end(options, self.scenario)
         self.files = {'scenario_file': options.config, 'codebook_file': codebook_file}
         self.options = options
         self.recorder = Recorder(options.record, self.scenario) if options.record else None
