@@ -14,6 +14,7 @@ from rhs_isac_ros.model.arrays import position_problem
 from rhs_isac_ros.model.pose import rotation_matrix
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user import User
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.ros.frames import vector
 from rhs_isac_ros.ros.parameters import ODOMETRY, ROBOTS
@@ -191,6 +192,10 @@ class UserNode(RoleNode[User]):
     def _mobilities(self) -> dict[int, mobility.Mobility]:
         values = self.values
         count = values.user_count
+        if values.user_id + count - 1 > MAX_USERS:
+            raise ParameterError(
+                f'user_count: {count}, expected at most {MAX_USERS - values.user_id + 1} with '
+                f'user_id {values.user_id}, because user numbers end at {MAX_USERS}')
         starts = self._points('position_m')
         if len(starts) not in (0, count):
             one = 'one or none' if count == 1 else f'{count}, one for each user, or none'

@@ -187,6 +187,7 @@ def test_nodes_share_declarations_of_equal_names():
     ({'mobility': 'waypoints', 'waypoints_m': [10.0]}, r'waypoints_m: 1 numbers'),
     ({'mobility': 'waypoints', 'waypoints_m': [10.0, 0.0, 0.0, 0.0, 6.0, 0.0]},
      r'waypoints_m: .* x > 0'),
+    ({'user_id': 4096, 'user_count': 2}, 'user_count: 2, expected at most 1 with user_id 4096'),
     ({'user_count': 2, 'position_m': [9.0, 1.0, -0.5]},
      'position_m: 1 points, expected 2, one for each user, or none'),
     ({'user_count': 2, 'mobility': 'waypoints', 'waypoints_m': [9.0, 1.0, -0.5]},
