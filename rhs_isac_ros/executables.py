@@ -1,17 +1,10 @@
-"""Entry points of the executables, which handle signals before any slow import.
+"""Entry points of the executables, which handle signals before any slow import."""
 
-Importing ROS, NumPy and the nodes takes a moment. During the imports, a signal ends the process
-with exit code 0; the default handler of SIGINT would print a traceback.
-"""
-
-import importlib
 import importlib.util
-import os
-import signal
 from collections.abc import Callable
 from pathlib import Path
 
-from rhs_isac_ros.support.exits import exit_code_of, on_end_signals, print_error
+from rhs_isac_ros.support.exits import exit_code_of, import_main, print_error
 
 # All other executables are modules of `nodes`.
 _TOOLS = ('calibrate', 'demo', 'record', 'replay', 'snapshot', 'view', 'watch')
@@ -26,18 +19,15 @@ def __getattr__(name: str) -> Callable[[], int]:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
     def main() -> int:
-        on_end_signals(lambda *_: os._exit(0))
         try:
-            module = importlib.import_module(f'rhs_isac_ros.{EXECUTABLES[name]}.{name}')
+            run = import_main(f'rhs_isac_ros.{EXECUTABLES[name]}.{name}')
         except ModuleNotFoundError as error:
             missing = str(error.name).partition('.')[0]
             if missing == 'rhs_isac_ros':
                 raise
             print_error(f'needs {_what_provides(missing)}', name)
             return 1
-        on_end_signals(signal.SIG_DFL)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        return exit_code_of(module.main, program=name)
+        return exit_code_of(run, program=name)
     return main
 
 

@@ -88,20 +88,24 @@ def test_any_other_name_is_an_attribute_error(name):
         getattr(executables, name)
 
 
-def test_a_signal_during_the_imports_ends_the_process_without_a_traceback():
-    code = """
-import importlib, signal, sys
+@pytest.mark.parametrize(('call', 'module'), [
+    ('executables.bs()', 'nodes.bs'),
+    ("sys.argv = ['', 'topic']; runpy.run_module('rhs_isac_ros.tools', run_name='__main__')",
+     'tools.topic')])
+def test_a_signal_during_the_imports_ends_the_process_without_a_traceback(call, module):
+    code = f"""
+import importlib, runpy, signal, sys
 from rhs_isac_ros import executables
 def slow(name):
     print('importing', name, flush=True)
     signal.pause()
 importlib.import_module = slow
-executables.bs()
+{call}
 """
     process = subprocess.Popen(
         [sys.executable, '-c', code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env={**os.environ, 'PYTHONPATH': os.pathsep.join(map(str, [ROOT, *sys.path]))})
-    assert process.stdout.readline() == 'importing rhs_isac_ros.nodes.bs\n'
+    assert process.stdout.readline() == f'importing rhs_isac_ros.{module}\n'
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (0, '')

@@ -1,5 +1,6 @@
 """Ends of commands: signals, errors of one line, exit codes, and streams that are closed."""
 
+import importlib
 import io
 import os
 import signal
@@ -16,6 +17,19 @@ def on_end_signals(handler: Callable[[int, Any], Any] | signal.Handlers) -> None
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, handler)
+
+
+def import_main(module: str) -> Callable[[], int]:
+    """Import a module and return its function ``main``.
+
+    During the import, which may take a second, a signal ends the process with exit code 0; the
+    default handler of SIGINT would print a traceback.
+    """
+    on_end_signals(lambda *_: os._exit(0))
+    main: Callable[[], int] = importlib.import_module(module).main
+    on_end_signals(signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    return main
 
 
 def print_error(error: object, program: str = '') -> None:
