@@ -9,7 +9,6 @@ from typing import Any
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rcl_interfaces.srv import SetParameters
-from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
@@ -58,16 +57,10 @@ class CodebookParameterService(ParameterService):
             response: SetParameters.Response) -> SetParameters.Response:
         parameters = [Parameter.from_parameter_msg(message) for message in request.parameters]
         group = [p for p in parameters if p.name.startswith(CODEBOOK_PREFIX)]
-        group_result = self._set(group) if group else None
-        response.results = [group_result if p in group else self._set([p]) for p in parameters]
+        set_together = self._get_node().set_parameters_atomically  # type: ignore[no-untyped-call]
+        group_result = set_together(group) if group else None
+        response.results = [group_result if p in group else set_together([p]) for p in parameters]
         return response
-
-    def _set(self, parameters: list[Parameter]) -> Any:
-        try:
-            node = self._get_node()  # type: ignore[no-untyped-call]
-            return node.set_parameters_atomically(parameters)
-        except ParameterNotDeclaredException as error:
-            return SetParametersResult(successful=False, reason=str(error))
 
 
 def ros_parameters(values: Mapping[str, Any]) -> list[Parameter]:

@@ -490,9 +490,13 @@ class ParameterizedNode(Node):
             self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """Set all parameters or none; the parameter services call this method, too.
 
-        Unlike in rclpy, the reason for a rejection contains the value and the valid range, and
-        read-only parameters are accepted if they keep their values, as in a dump of the node.
+        Unlike in rclpy, the reason for a rejection contains the value and the valid range, or the
+        name of an unknown parameter, and read-only parameters are accepted if they keep their
+        values, as in a dump of the node.
         """
+        if unknown := [p.name for p in parameter_list if not self.has_parameter(p.name)]:
+            return SetParametersResult(successful=False, reason=(
+                f'{", ".join(unknown)}: not a parameter of this node'))
         changes = [p for p in parameter_list if not self._is_kept(p)]
         if not changes:
             return SetParametersResult(successful=True)

@@ -71,6 +71,14 @@ def wrong_values(p):
         yield 'nonsense', p.expected
 
 
+def test_the_reason_for_a_rejection_contains_the_names_of_unknown_parameters(make):
+    node = make('bs')
+    before = node.get_parameter('rest_s').value
+    result = set_together(node, rest_s=before + 1, reset_s=2.0)
+    assert (result.successful, result.reason) == (False, 'reset_s: not a parameter of this node')
+    assert node.get_parameter('rest_s').value == before
+
+
 @pytest.mark.parametrize('executable', KINDS)
 def test_an_invalid_value_is_rejected_with_a_reason(make, executable):
     node = make(executable)
