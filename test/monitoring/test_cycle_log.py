@@ -94,20 +94,6 @@ def test_a_cycle_without_a_position_is_given_up_but_has_not_failed():
     assert log.failed == log.complete == []
 
 
-@pytest.mark.parametrize('kind', [
-    m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Capacity])
-def test_a_served_cycle_is_complete_once_its_last_message_arrives(network, kind):
-    net = network()
-    net.run_cycles(1)
-    log = log_of(net, without=kind)
-    assert log.complete == log.given_up == []
-    (ended,) = log.ended
-    assert ended.completed() is None
-    log.add(net.sent(kind)[0], 99.0)
-    (record,) = log.complete
-    assert record.ended_s == net.log[-1].time_s
-
-
 def test_the_order_of_topics_does_not_matter(network):
     net = network(2)
     net.run_cycles(3)

@@ -65,16 +65,6 @@ def test_phases_follow_each_other_and_have_their_start_times(network):
     assert starts.items() <= seen.items()
 
 
-def test_a_cycle_that_is_given_up_has_a_reason():
-    overview = Overview()
-    overview.add(m.Beacon(cycle_id=7, attempt=0), 1.0)
-    overview.add(ended(7, 3, m.Phase.POSITIONING, ''), 1.1)
-    overview.add(ended(7, 3, m.Phase.BEACONING, 'rhs_silent'), 2.1)
-    assert (overview.served, overview.given_up) == (0, 1)
-    assert overview.last_failure == 'cycle 7 of user 3: rhs_silent'
-    assert overview.phase == RESTING
-
-
 def test_the_rate_is_averaged_over_ten_seconds():
     overview = Overview()
     for cycle_id in range(1, 101):
@@ -97,18 +87,6 @@ def test_the_overview_does_not_grow_with_the_cycles(network):
     assert (overview._log.complete, overview._log.ended) == ([], [])
     overview.rate_hz(1e9)
     assert not overview._served_s
-
-
-def test_nodes_have_counts_and_become_silent():
-    overview = Overview()
-    values = {'phase': 'resting', 'cycles.served': '9', 'cycles.no_fix': '2',
-              'dropped.late_ack': '3', 'dropped.duplicate': '0', 'handling_ms.p50': '0.3'}
-    overview.add_report('bs', Report(True, '1 dropped', values), 5.0)
-    status = overview.nodes['bs']
-    assert status.counts('dropped') == {'late_ack': 3}
-    assert status.counts('cycles') == {'served': 9, 'no_fix': 2}
-    assert not status.silent(6.1)
-    assert status.silent(9.0)
 
 
 # The scene

@@ -38,6 +38,7 @@ def test_the_view_shows_faults_and_silent_nodes_within_80_columns():
     overview.add_report('lab/bs', Report(True, 'waiting for positioner', {
         'phase': 'waiting', 'dropped.late_ack': '3', 'cycles.no_fix': '2'}), 1.0)
     overview.add_report('lab/channel', Report(False, 'no fault', {}), 3.0)
+    assert (overview.served, overview.given_up) == (0, 1)
     text = text_of(overview, 5.0)
     assert 'beaconing for 2.00 s, cycle 1795288682617' in text
     assert 'last given up: cycle 1795288682616 of user 12: rhs_silent' in text
