@@ -26,7 +26,7 @@ KEYS = {'docutils': 'python3-sphinx', 'threadpoolctl': 'python3-sklearn'} | {
 # mcap requires lz4 and zstandard.
 PIP_ONLY = {
     'adi': None, 'distributed': 'distributed', 'jax': None, 'lz4': 'mcap', 'mcap': 'mcap',
-    'mcap_ros2': 'mcap-ros2-support', 'pymoo': 'pymoo', 'rerun': 'rerun-sdk==0.22.1',
+    'pymoo': 'pymoo', 'rerun': 'rerun-sdk==0.22.1',
     'rosbags': 'rosbags', 'sigmf': 'sigmf', 'sionna': None, 'zstandard': 'mcap',
 }
 

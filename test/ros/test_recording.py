@@ -86,28 +86,6 @@ def test_messages_are_read_back(recording):
     assert read_networks(path).scenario == Scenario(n_frames=2)
 
 
-def test_another_decoder_needs_only_the_file(recording):
-    """Like Foxglove, it takes the message definitions from the file."""
-    mcap_ros2 = pytest.importorskip('mcap_ros2.decoder', reason='there is no mcap_ros2 here')
-    from mcap.reader import make_reader
-    path, sent = recording
-    with open(path, 'rb') as stream:
-        reader = make_reader(stream, decoder_factories=[mcap_ros2.DecoderFactory()])
-        assert reader.get_header().profile == 'ros2'
-        summary = reader.get_summary()
-        found = [message for *_, message in reader.iter_decoded_messages()]
-    assert {channel.topic for channel in summary.channels.values()} == {
-        f'/{name.lstrip("/")}' for name in recorded_topics()}
-    offered = {channel.topic: yaml.safe_load(channel.metadata['offered_qos_profiles'])
-               for channel in summary.channels.values()}
-    assert [offered[topic][0]['durability'] for topic in ('/codebook', '/pilot')] == [
-        'transient_local', 'volatile']
-    assert {profile['reliability'] for (profile,) in offered.values()} == {'reliable'}
-    assert [list(message.signals.re) for message in (found[0], found[2])] == [
-        list(message.signals.re) for message in (sent[0], sent[2])]
-    assert list(found[1].covariance_m2) == list(range(9))
-
-
 def test_an_observer_logs_the_cycles_that_it_records(bench, probe, tmp_path):
     recorder = Recorder(tmp_path / 'run.mcap', Scenario())
     observer = bench.add(CycleObserver, recorder)
@@ -329,10 +307,10 @@ def test_rosbags_reads_all_topics(bench, probe, tmp_path):
                 for connection in reader.connections} == {
             topic: (type_name(type(messages[0])), len(messages))
             for topic, messages in sent.items()}
-        assert {connection.topic: [policy.durability.name.lower()
+        assert {connection.topic: [(policy.durability.name, policy.reliability.name)
                                    for policy in connection.ext.offered_qos_profiles]
                 for connection in reader.connections} == {
-            f'/{name.lstrip("/")}': [profile.durability.short_key]
+            f'/{name.lstrip("/")}': [(profile.durability.name, 'RELIABLE')]
             for name, (_, profile) in recorded_topics().items()}
         for connection, _, content in reader.messages():
             ours = sent[connection.topic].pop(0)
