@@ -415,26 +415,18 @@ def test_a_node_of_another_scenario_changes_nothing(bench, add_channel):
     assert changes == []
 
 
-def test_in_a_site_the_base_station_needs_the_fusion_but_no_other_node_beside_it(bench):
-    reports, rivals, others = [], [], {}
-
-    def announce(role, namespace):
-        node = bench.add(Node, role, namespace=namespace)
-        found = others[namespace, role] = Peers(
-            node, role, time.time_ns(), Scenario(), lambda missing: None,
-            lambda stands_by: None)
-        found.take_role()
+def test_in_a_site_the_base_station_needs_the_fusion_but_no_other_node_beside_it(bench, announce):
+    reports, rivals = [], []
     own = Peers(bench.add(Node, 'bs', namespace='/front'), 'bs', time.time_ns(), Scenario(),
                 reports.append, rivals.append, site_prefix='/')
     for role in ROSTER['bs'].needed:
-        announce(role, '/front')
+        announce(role, namespace='/front')
     # Another network.
-    announce('bs', '/')
+    announce('bs', namespace='/')
     bench.until(lambda: ('fusion',) in reports, 'the nodes of the surface')
-    announce('fusion', '/')
+    fusion = announce('fusion', namespace='/')
     bench.until(lambda: reports[-1] == (), 'the fusion')
-    others.pop(('/', 'fusion')).close()
+    fusion.close()
     bench.until(lambda: reports[-1] == ('fusion',), 'its absence')
-    for found in (own, *others.values()):
-        found.close()
+    own.close()
     assert rivals == []

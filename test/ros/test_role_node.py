@@ -12,7 +12,7 @@ from ros_messages import to_ros
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, Send, Timeout
 from rhs_isac_ros.protocol.role import Role
-from rhs_isac_ros.ros import convert, role_node, topics
+from rhs_isac_ros.ros import convert, role_node
 from rhs_isac_ros.ros.role_node import Clocks, RoleNode
 
 
@@ -57,26 +57,19 @@ def feed_signals(**changes):
 NAN = np.where(np.arange(96).reshape(4, 8, 3) == 5, math.nan, 1.0 + 0j)
 
 
-@pytest.mark.parametrize(('changes', 'text'), [
-    ({'signals': NAN}, 'FeedSignals.signals: not finite'),
-    ({'signals': np.full((4, 8, 3), complex(0, math.inf))}, 'FeedSignals.signals: not finite'),
-    ({'signals': np.ones((3, 8), complex)},
-     'FeedSignals.signals: shape [3, 8], expected [F = 4, N_SB = 8, K = 3]'),
-    ({'band': 2}, 'FeedSignals.band: 2, expected 0 to 1'),
-])
-def test_a_malformed_message_is_dropped_counted_and_logged_once(
-        each_bench, start, capfd, changes, text):
+def test_a_malformed_message_is_dropped_counted_and_logged_once(each_bench, start, capfd):
     role = Scripted(receives=[m.FeedSignals])
     start(each_bench, role)
     publisher = each_bench.publisher(each_bench.add(Node, 'probe'), m.FeedSignals)
-    for message in (feed_signals(**changes), feed_signals(**changes), feed_signals(user=7)):
-        publisher.publish(to_ros(message, None))
+    for changes in ({'signals': NAN}, {'signals': NAN}, {'user': 7}):
+        publisher.publish(to_ros(feed_signals(**changes), None))
     each_bench.until(lambda: role.events, 'the good message')
     (event, _), = role.events
     assert event.user == 7
     assert role.counters == {'malformed': 2}
     log = capfd.readouterr().err
-    assert log.count('dropped: ') == log.count(f'dropped: {text}') == 1
+    assert log.count('dropped: ') == 1
+    assert 'dropped: FeedSignals.signals: not finite' in log
     assert '[ERROR]' in log
 
 
@@ -235,16 +228,6 @@ def test_an_earlier_deadline_replaces_a_later_one(each_bench, start):
     assert role.ticks_s[0] >= role.deadlines_s[1]
 
 
-def test_a_later_deadline_replaces_an_earlier_one(each_bench, start):
-    role = deadlines(0.02, 0.3)
-    node = start(each_bench, role)
-    node.dispatch(m.Ack(cycle_id=1, user=1))
-    node.dispatch(m.Ack(cycle_id=1, user=1))
-    each_bench.until(lambda: role.ticks_s, 'the tick')
-    assert role.ticks_s[0] >= role.deadlines_s[1]
-    assert len(role.events) == 3
-
-
 def test_a_cancelled_deadline_causes_no_tick(each_bench, start):
     cancelled, later = deadlines(0.02, None), deadlines(0.2)
     node = start(each_bench, cancelled)
@@ -318,9 +301,3 @@ def test_messages_of_another_scenario_are_dropped_counted_and_logged_once(
     log = capfd.readouterr().err
     assert log.count('Ack dropped: sent with scenario other, expected sc') == 1
     assert '[WARN]' in log
-
-
-def test_every_message_has_the_listed_topic(bench, start, probe):
-    start(bench, Scripted(sends=topics.NAMES))
-    for name in topics.NAMES.values():
-        bench.until(lambda name=name: probe.count_publishers(f'/{name}'), name)

@@ -64,18 +64,6 @@ def test_the_codebook_arrives_once_and_bit_for_bit(bench, follow, shipped):
     assert len(got) == len(later) == 1
 
 
-def test_a_client_waits_for_the_optimizer(bench, follow, shipped):
-    got = follow()
-    # Its first requests have failed by the time another client has its codebook.
-    other = follow(name='other', namespace='/there')
-    bench.add(OptimizerNode, namespace='/there')
-    bench.until(lambda: other, 'the codebook in the other namespace')
-    assert not got
-    bench.add(OptimizerNode)
-    bench.until(lambda: got, 'the codebook')
-    assert ids(got) == [shipped.id]
-
-
 def test_the_last_of_many_changes_is_fetched(bench, follow, optimizer_of, random_beams, small):
     optimizer = optimizer_of('first')
     got = follow(small.scenario)
@@ -155,13 +143,3 @@ def test_a_codebook_that_does_not_fit_is_rejected_with_one_error(
     log.append(capfd.readouterr().err)
     assert sum('[client]' in line and 'rejected' in line
                for line in ''.join(log).splitlines()) == 1
-
-
-def test_a_restarted_optimizer_is_followed(bench, follow, optimizer_of, stored, small):
-    optimizer = optimizer_of('first')
-    got = follow(small.scenario)
-    bench.until(lambda: got, 'the first codebook')
-    bench.remove(optimizer)
-    optimizer_of('second')
-    bench.until(lambda: len(got) == 2, 'the codebook of the new optimizer')
-    assert ids(got) == [stored['first'].id, stored['second'].id]
