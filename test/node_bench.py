@@ -17,7 +17,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.type_support import check_for_type_support
-from ros_messages import from_ros
+from ros_messages import from_ros, parameters
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.ros import convert, topics
@@ -40,8 +40,10 @@ class Bench:
         self._executor = make_executor(context=self.context)
         self._nodes = []
 
-    def add(self, kind, *args, **options):
-        """Create a node, and include it in all later spinning."""
+    def add(self, kind, *args, values=None, **options):
+        """Create a node with values of parameters, and include it in all later spinning."""
+        if values:
+            options['parameter_overrides'] = parameters(values)
         node = kind(*args, context=self.context, **options)
         self._nodes.append(node)
         self._executor.add_node(node)

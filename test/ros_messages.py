@@ -1,6 +1,9 @@
-"""Messages of the protocol as ROS messages, as another program publishes and receives them."""
+"""Messages of the protocol as ROS messages, as another program has them, and parameters."""
+
+from pathlib import Path
 
 import numpy as np
+from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rhs_isac_ros.protocol import messages as m
@@ -26,3 +29,9 @@ def from_ros(kind, message):
 
 def codebook_from_ros(message):
     return from_ros(convert.CodebookMessage, message).codebook()
+
+
+def parameters(values):
+    """Return ROS parameters of a mapping; paths are strings."""
+    return [Parameter(name, value=str(value) if isinstance(value, Path) else value)
+            for name, value in values.items()]

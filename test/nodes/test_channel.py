@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from ros_messages import to_ros
 
 from rhs_isac_ros.frontend import OpenSourceRis, SurfaceFault
@@ -29,10 +28,9 @@ def make_node(bench, tmp_path):
     (tmp_path / 'scenario.yaml').write_text(FILE, encoding='utf-8')
 
     def make(surface, options, **others):
-        return bench.add(ChannelNode, parameter_overrides=[
-            Parameter(name, value=value) for name, value in (
-                ('scenario_file', str(tmp_path / 'scenario.yaml')), ('surface', surface),
-                ('surface_options', options), *others.items())])
+        return bench.add(ChannelNode, values={
+            'scenario_file': tmp_path / 'scenario.yaml', 'surface': surface,
+            'surface_options': options, **others})
     return make
 
 
@@ -79,9 +77,9 @@ def test_the_board_shows_each_frame_before_the_signals_are_sent(bench, node, boa
         np.testing.assert_array_equal(board.configuration, random_analog(cycle_id)[-1])
 
 
+# All faults of the driver are in test_opensourceris.py.
 @pytest.mark.parametrize(('fault', 'kind', 'pattern'), [
-    ('silence', 'silence', 0), ('flipped bit', 'mismatch', 1), ('restart', 'restart', 2),
-    ('late', 'silence', 1), ('closed', 'closed', 0), ('occupied', 'closed', 2)])
+    ('flipped bit', 'mismatch', 1), ('late', 'silence', 2), ('closed', 'closed', 0)])
 def test_a_fault_sends_no_signals_and_ends(
         bench, node, board, fault, kind, pattern):
     cycle = Cycle(bench)
@@ -90,7 +88,7 @@ def test_a_fault_sends_no_signals_and_ends(
     bench.until(lambda: node.role.counters, 'a fault')
     assert node.role.counters == {f'surface_{kind}': 1}
     assert cycle.answers == []
-    if fault in ('closed', 'occupied'):
+    if fault == 'closed':
         board.plug()
     cycle.ask(2, random_analog(2))
     assert cycle.answer(2).cycle_id == 2
@@ -155,15 +153,19 @@ def test_a_front_end_that_cannot_be_released_is_logged(make_node, monkeypatch, c
     assert 'surface or radio not released: OSError: the cable is broken' in capfd.readouterr().err
 
 
-@pytest.mark.parametrize(('surface', 'options', 'expected'), [
-    ('nothing', '', "surface: 'nothing', expected one of emulated, opensourceris or a plug-in"),
-    ('emulated', 'port=x', "surface: emulated: .* 'port'"),
-    ('opensourceris', '', "surface: opensourceris: .* 'port'"),
-    ('opensourceris', 'x', "surface_options: 'x', expected NAME=VALUE"),
-    ('opensourceris', 'port=x timeout_s=-1', 'surface: timeout_s: -1')])
-def test_an_invalid_surface_ends_the_start(make_node, surface, options, expected):
+@pytest.mark.parametrize(('surface', 'options', 'others', 'expected'), [
+    ('nothing', '', {}, "surface: 'nothing', expected one of emulated, opensourceris or a plug-"),
+    ('opensourceris', 'x', {}, "surface_options: 'x', expected NAME=VALUE"),
+    ('opensourceris', 'port=x timeout_s=-1', {}, 'surface: timeout_s: -1'),
+    ('emulated', '', {'radio': 'nothing'},
+     "radio: 'nothing', expected one of emulated, waveform, sigmf or "),
+    ('emulated', '', {'radio_options': 'gain_db=3'}, "radio: emulated: .* 'gain_db'"),
+    ('emulated', '', {'radio': 'waveform'},
+     'radio: frame_duration_s: 4e-06 s, expected at least 3.6e-05 s with a wave'),
+    ('emulated', '', {'samples_folder': '.'}, 'samples_folder: .*: modem EmulatedRadio, ')])
+def test_an_invalid_front_end_ends_the_start(make_node, surface, options, others, expected):
     with pytest.raises(ParameterError, match=expected):
-        make_node(surface, options)
+        make_node(surface, options, **others)
 
 
 LAB = """
@@ -191,17 +193,3 @@ def test_recorded_samples_are_played_back_as_the_same_signals(bench, make_node, 
     assert np.any(signals[1] != signals[2])
     np.testing.assert_array_equal(signals[11], signals[1])
     np.testing.assert_array_equal(signals[12], signals[2])
-
-
-def test_a_radio_without_samples_is_not_recorded(make_node, tmp_path):
-    with pytest.raises(ParameterError, match='samples_folder: .*: modem EmulatedRadio, expected'):
-        make_node('emulated', '', samples_folder=str(tmp_path))
-
-
-@pytest.mark.parametrize(('radio', 'options', 'expected'), [
-    ('nothing', '', "radio: 'nothing', expected one of emulated, waveform, sigmf or "),
-    ('emulated', 'gain_db=3', "radio: emulated: .* 'gain_db'"),
-    ('waveform', '', 'radio: frame_duration_s: 4e-06 s, expected at least 3.6e-05 s with a wave')])
-def test_an_invalid_radio_ends_the_start(make_node, radio, options, expected):
-    with pytest.raises(ParameterError, match=expected):
-        make_node('emulated', '', radio=radio, radio_options=options)

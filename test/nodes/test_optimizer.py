@@ -11,7 +11,7 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
-from ros_messages import codebook_from_ros
+from ros_messages import codebook_from_ros, parameters
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
@@ -55,8 +55,8 @@ def latched(bench, node):
 
 
 def as_parameters(codebook, **changes):
-    values = codebook.to_parameters() | {f'codebook.{k}': v for k, v in changes.items()}
-    return [Parameter(name, value=value) for name, value in values.items()]
+    return parameters(
+        codebook.to_parameters() | {f'codebook.{k}': v for k, v in changes.items()})
 
 
 def held(optimizer):

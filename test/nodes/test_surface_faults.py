@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import yaml
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
@@ -37,12 +36,10 @@ def observed(module_bench, board, tmp_path_factory):
     random_codebook(SCENARIO, np.random.default_rng(0)).save(folder / 'codebook.yaml')
 
     def add(kind, **values):
-        values = {'scenario_file': str(folder / 'scenario.yaml'), **values}
-        bench.add(kind, parameter_overrides=[
-            Parameter(name, value=value) for name, value in values.items()])
-    add(OptimizerNode, codebook_file=str(folder / 'codebook.yaml'))
+        bench.add(kind, values={'scenario_file': folder / 'scenario.yaml', **values})
+    add(OptimizerNode, codebook_file=folder / 'codebook.yaml')
     add(RhsControllerNode)
-    add(PositionerNode, table_folder=str(folder))
+    add(PositionerNode, table_folder=folder)
     add(TransmissionNode)
     add(ChannelNode, surface='opensourceris', surface_options=f'port={board.port}')
     add(UserNode, position_m=[3.0, 0.1, 0.2])
@@ -64,16 +61,15 @@ def served(module_bench, observed):
     return wait
 
 
-# Each fault, at a pattern of the first band, of the second one or of the beam.
+# At a pattern of the first band, of the second one or of the beam.
 @pytest.mark.parametrize(('fault', 'pattern'), [
-    (fault, number % 3 * SCENARIO.n_frames) for number, fault in enumerate(
-        ['silence', 'flipped bit', 'restart', 'late', 'closed', 'occupied'])])
+    ('late', 0), ('occupied', SCENARIO.n_frames), ('restart', 2 * SCENARIO.n_frames)])
 def test_users_are_served_again_after_a_fault(module_bench, board, served, fault, pattern):
     served()
     occurs = board.n_patterns + pattern
     board.faults = {occurs: fault}
     module_bench.until(lambda: board.n_patterns > occurs, 'the fault')
-    if fault in ('closed', 'occupied'):
+    if fault == 'occupied':
         board.plug()
     served()
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import yaml
 from nav_msgs.msg import Path
-from rclpy.parameter import Parameter
 from ros_messages import position_estimate, to_ros
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -22,10 +21,9 @@ ROOT = FilePath(__file__).parents[2]
 @pytest.fixture
 def shown(bench, probe, bench_files, request):
     """Dictionary of the latest markers of the node, by namespace and id."""
-    bench.add(VisualizerNode, parameter_overrides=[
-        Parameter('scenario_file', value=str(bench_files / 'scenario.yaml')),
-        Parameter('period_s', value=0.02),
-        Parameter('forget_s', value=getattr(request, 'param', 60.0))])
+    bench.add(VisualizerNode, values={
+        'scenario_file': bench_files / 'scenario.yaml', 'period_s': 0.02,
+        'forget_s': getattr(request, 'param', 60.0)})
     latest = {}
 
     def receive(array):

@@ -7,7 +7,6 @@ import importlib.util
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from rclpy.parameter import Parameter
 from rclpy.time import Time as RosTime
 from ros_messages import position_estimate, to_ros
 from visualization_msgs.msg import Marker
@@ -192,8 +191,8 @@ def test_two_networks_share_one_tree(bench, probe, tmp_path):
     for space, position_m in poses.items():
         file = tmp_path / f'{space}.yaml'
         file.write_text(f'pose: {{position_m: {position_m}}}', encoding='utf-8')
-        bench.add(VisualizerNode, namespace=f'/{space}', parameter_overrides=[
-            Parameter('frame_id', value='odom'), Parameter('scenario_file', value=str(file))])
+        bench.add(VisualizerNode, namespace=f'/{space}', values={
+            'frame_id': 'odom', 'scenario_file': file})
         estimates = probe.create_publisher(
             convert.ros_type(m.PositionEstimate), f'/{space}/position_estimate', EXCHANGE)
         estimate = to_ros(position_estimate(2), Time())

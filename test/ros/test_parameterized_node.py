@@ -6,6 +6,7 @@ import math
 import pytest
 import yaml
 from rclpy.parameter import Parameter
+from ros_messages import parameters
 
 from rhs_isac_ros.calibration import calibrate
 from rhs_isac_ros.model import Scenario
@@ -39,8 +40,7 @@ def make(bench, bench_files, tmp_path, monkeypatch):
                 'surfaces': {'front': {'scenario': str(bench_files / 'scenario.yaml'),
                                        'codebook': str(bench_files / 'first.yaml')}}}),
                 encoding='utf-8')
-        node = bench.add(KINDS[executable], parameter_overrides=[
-            Parameter(name, value=value) for name, value in values.items()])
+        node = bench.add(KINDS[executable], values=values)
         node.offered = []
 
         def record(event):
@@ -52,8 +52,7 @@ def make(bench, bench_files, tmp_path, monkeypatch):
 
 
 def set_together(node, **values):
-    return node.set_parameters_atomically(
-        [Parameter(name, value=value) for name, value in values.items()])
+    return node.set_parameters_atomically(parameters(values))
 
 
 def wrong_values(p):

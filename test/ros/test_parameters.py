@@ -55,9 +55,8 @@ def make(module_bench):
     nodes = []
 
     def make(**values):
-        overrides = [Parameter(name, value=value) for name, value in values.items()]
         nodes.append(module_bench.add(
-            Node, f'probe_{len(nodes)}', parameter_overrides=overrides, enable_rosout=False,
+            Node, f'probe_{len(nodes)}', values=values, enable_rosout=False,
             start_parameter_services=False))
         return nodes[-1]
     yield make
@@ -196,9 +195,8 @@ def test_nodes_share_declarations_of_equal_names():
      r'speed_mps: 5.6, expected at most max_user_speed_mps = 5.55'),
 ])
 def test_values_of_a_user_that_contradict_the_scenario_are_rejected(bench, values, text):
-    overrides = [Parameter(name, value=value) for name, value in values.items()]
     with pytest.raises(ParameterError, match=text):
-        bench.add(UserNode, parameter_overrides=overrides)
+        bench.add(UserNode, values=values)
 
 
 @pytest.mark.parametrize(('values', 'position'), [
@@ -210,8 +208,7 @@ def test_values_of_a_user_that_contradict_the_scenario_are_rejected(bench, value
     ({'position_m': [20.0, -6.0, 1.1]}, (20.0, -6.0, 1.1)),
 ])
 def test_the_parameters_of_a_user_set_its_initial_position(bench, values, position):
-    overrides = [Parameter(name, value=value) for name, value in values.items()]
-    bench.add(UserNode, parameter_overrides=overrides)
+    bench.add(UserNode, values=values)
     truths = bench.collect(bench.add(Node, 'probe'), m.GroundTruth)
     bench.until(lambda: truths, 'the true position')
     assert truths[0].position == pytest.approx(position, abs=1e-12)
@@ -220,9 +217,8 @@ def test_the_parameters_of_a_user_set_its_initial_position(bench, values, positi
 
 def test_the_users_of_a_node_have_consecutive_ids_and_one_message_for_all_positions(bench):
     places = [[9.0, 1.0, -0.5], [8.0, 0.0, 0.5]]
-    bench.add(UserNode, parameter_overrides=[
-        Parameter('user_id', value=7), Parameter('user_count', value=2),
-        Parameter('position_m', value=[*places[0], *places[1]])])
+    bench.add(UserNode, values={
+        'user_id': 7, 'user_count': 2, 'position_m': [*places[0], *places[1]]})
     probe = bench.add(Node, 'probe')
     each, several = bench.collect(probe, m.GroundTruth), bench.collect(probe, m.GroundTruths)
     bench.until(lambda: several, 'the true positions')
@@ -232,11 +228,9 @@ def test_the_users_of_a_node_have_consecutive_ids_and_one_message_for_all_positi
 
 
 def test_the_users_of_a_node_walk_as_they_would_alone(bench):
-    walk = [Parameter('mobility', value='random_walk'), Parameter('speed_mps', value=0.0),
-            Parameter('seed', value=3)]
-    bench.add(UserNode, 'users', parameter_overrides=[
-        *walk, Parameter('user_count', value=2)])
-    bench.add(UserNode, 'alone', parameter_overrides=[*walk, Parameter('user_id', value=2)])
+    walk = {'mobility': 'random_walk', 'speed_mps': 0.0, 'seed': 3}
+    bench.add(UserNode, 'users', values=walk | {'user_count': 2})
+    bench.add(UserNode, 'alone', values=walk | {'user_id': 2})
     probe = bench.add(Node, 'probe')
     alone, several = bench.collect(probe, m.GroundTruth), bench.collect(probe, m.GroundTruths)
     bench.until(lambda: several and alone, 'the true positions')
@@ -245,7 +239,7 @@ def test_the_users_of_a_node_walk_as_they_would_alone(bench):
 
 def test_a_user_without_a_position_starts_in_the_region(bench):
     bench.add(UserNode)
-    bench.add(UserNode, 'second', parameter_overrides=[Parameter('user_id', value=2)])
+    bench.add(UserNode, 'second', values={'user_id': 2})
     truths = bench.collect(bench.add(Node, 'probe'), m.GroundTruth)
     bench.until(lambda: {truth.user for truth in truths} == {1, 2}, 'both true positions')
     low, high = Scenario().roi_bounds_m
@@ -271,12 +265,11 @@ def nothing(scenario, speed_mps, rng, start):
 '''
 
 
-@pytest.mark.parametrize(('position', 'place'), [([], (10, 0, 0)), ([9.0, 1.0, -0.5],) * 2])
+@pytest.mark.parametrize(('position', 'place'), [
+    ({}, (10, 0, 0)), ({'position_m': [9.0, 1.0, -0.5]}, (9.0, 1.0, -0.5))])
 def test_a_plug_in_moves_the_user(bench, install, position, place):
     install('moves', MOBILITIES, {plugins.MOBILITIES: {'climb': 'Climb'}})
-    values = {'mobility': 'climb', 'speed_mps': 0.5, 'position_m': position}
-    overrides = [Parameter(name, value=value) for name, value in values.items() if value]
-    bench.add(UserNode, parameter_overrides=overrides)
+    bench.add(UserNode, values={'mobility': 'climb', 'speed_mps': 0.5, **position})
     truths = bench.collect(bench.add(Node, 'probe'), m.GroundTruth)
     bench.until(lambda: truths, 'the true position')
     assert tuple(truths[0].position) == tuple(place)
@@ -292,7 +285,7 @@ def test_a_plug_in_moves_the_user(bench, install, position, place):
 def test_an_invalid_mobility_is_rejected(bench, install, name, words):
     install('moves', MOBILITIES, {plugins.MOBILITIES: {'climb': 'Climb', 'nothing': 'nothing'}})
     with pytest.raises(ParameterError, match=words):
-        bench.add(UserNode, parameter_overrides=[Parameter('mobility', value=name)])
+        bench.add(UserNode, values={'mobility': name})
 
 
 @pytest.mark.parametrize('words', [

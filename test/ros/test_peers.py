@@ -9,9 +9,8 @@ import pytest
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
-from ros_messages import to_ros
+from ros_messages import parameters, to_ros
 from rosgraph_msgs.msg import Clock
 
 import rhs_isac_msgs.msg as ros
@@ -137,15 +136,6 @@ def test_a_node_that_was_killed_is_missing_until_its_successor_has_the_role(
     bench.until(lambda: 'positioner' not in reports[-1], 'presence of the successor')
 
 
-def test_only_the_own_namespace_counts(bench, monitor, announce):
-    announce('optimizer', namespace='/b')
-    reports = monitor('transmission', '-r', '__ns:=/a')
-    bench.until(lambda: reports, 'a report')
-    assert reports == [('optimizer',)]
-    announce('optimizer', namespace='/a')
-    bench.until(lambda: reports[-1] == (), 'presence')
-
-
 def test_a_node_is_reported_as_present_when_it_is_ready(bench, monitor):
     """The channel is ready at once; the positioner subscribes when it has an estimator."""
     reports = monitor('bs')
@@ -186,7 +176,7 @@ def test_what_a_role_lacks_is_reported_with_the_missing_roles(bench):
 
 def test_a_simulation_without_a_clock_is_waited_for(bench, monkeypatch, capfd):
     monkeypatch.setattr(clock_watch, 'STILL_S', 0.2)
-    node = bench.add(ChannelNode, parameter_overrides=[Parameter('use_sim_time', value=True)])
+    node = bench.add(ChannelNode, values={'use_sim_time': True})
     bench.until(lambda: 'waiting for /clock' in node.report().summary, 'the report')
     assert node.report().fault
     clock = bench.add(Node, 'simulator').create_publisher(Clock, '/clock', 10)
@@ -204,7 +194,7 @@ def test_a_simulation_without_a_clock_is_waited_for(bench, monkeypatch, capfd):
 
 def test_nodes_in_different_times_report_each_other(bench, add_channel, announce, capfd):
     node = add_channel()
-    announce('optimizer', parameter_overrides=[Parameter('use_sim_time', value=True)])
+    announce('optimizer', values={'use_sim_time': True})
     bench.until(lambda: 'conflict.clock' in node.report().values, 'the report')
     assert node.report().fault
     assert '/optimizer: use_sim_time true, expected' in node.report().summary
@@ -310,8 +300,7 @@ def test_a_node_announces_itself_periodically_also_while_it_computes(bench, prob
     probe.create_subscription(ros.Presence, topics.PRESENCE, received.append, PRESENCES)
     # Nobody executes the callbacks of this node.
     busy = type(bench)(EventsExecutor)
-    node = busy.add(RoleNode, 'channel', parameter_overrides=[
-        Parameter('use_sim_time', value=True)])
+    node = busy.add(RoleNode, 'channel', values={'use_sim_time': True})
     node.start(Radio())
     bench.until(lambda: len(received) >= 3, 'the announcements')
     busy.close()
@@ -357,9 +346,9 @@ def test_the_own_standstill_is_no_silence_of_others(bench, add_channel, monkeypa
 
 def test_the_newer_of_two_optimizers_is_followed_until_it_has_gone(bench, bench_files, small):
     def add(name):
-        return bench.add(OptimizerNode, parameter_overrides=[
-            Parameter('scenario_file', value=str(bench_files / 'scenario.yaml')),
-            Parameter('codebook_file', value=str(bench_files / f'{name}.yaml'))])
+        return bench.add(OptimizerNode, values={
+            'scenario_file': bench_files / 'scenario.yaml',
+            'codebook_file': bench_files / f'{name}.yaml'})
     first, second = (Codebook.load(bench_files / f'{name}.yaml').id
                      for name in ('first', 'second'))
     got, late = [], []
@@ -381,9 +370,9 @@ def test_the_newer_of_two_optimizers_is_followed_until_it_has_gone(bench, bench_
 def test_a_codebook_that_no_optimizer_holds_is_not_used(bench, probe, bench_files, small):
     """An optimizer that was suspended may announce its codebook for a moment."""
     first, second = (Codebook.load(bench_files / f'{name}.yaml') for name in ('first', 'second'))
-    optimizer = bench.add(OptimizerNode, parameter_overrides=[
-        Parameter('scenario_file', value=str(bench_files / 'scenario.yaml')),
-        Parameter('codebook_file', value=str(bench_files / 'first.yaml'))])
+    optimizer = bench.add(OptimizerNode, values={
+        'scenario_file': bench_files / 'scenario.yaml',
+        'codebook_file': bench_files / 'first.yaml'})
     got = []
     client = CodebookClient(bench.add(Node, 'client'), small.scenario,
                             lambda codebook: got.append(codebook.id))
@@ -396,8 +385,7 @@ def test_a_codebook_that_no_optimizer_holds_is_not_used(bench, probe, bench_file
     optimizer._publish(first)
     bench.until(lambda: not client._announced_id, 'the announcement of the optimizer')
     assert got == [first.id]
-    optimizer.set_parameters_atomically(
-        [Parameter(name, value=value) for name, value in second.to_parameters().items()])
+    optimizer.set_parameters_atomically(parameters(second.to_parameters()))
     bench.until(lambda: got == [first.id, second.id], 'the next codebook')
 
 

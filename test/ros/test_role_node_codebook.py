@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from rclpy.node import Node
-from rclpy.parameter import Parameter
+from ros_messages import parameters
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
@@ -28,10 +28,9 @@ def follow(bench):
 def optimizer_of(bench, bench_files):
     """Return a function that creates an optimizer with a codebook of the small scenario."""
     def optimizer_of(name, **options):
-        files = {'scenario_file': 'scenario', 'codebook_file': name}
-        return bench.add(OptimizerNode, parameter_overrides=[
-            Parameter(key, value=str(bench_files / f'{file}.yaml'))
-            for key, file in files.items()], **options)
+        return bench.add(OptimizerNode, values={
+            'scenario_file': bench_files / 'scenario.yaml',
+            'codebook_file': bench_files / f'{name}.yaml'}, **options)
     return optimizer_of
 
 
@@ -45,8 +44,7 @@ def stored(bench_files):
 
 
 def change(optimizer, codebook):
-    result = optimizer.set_parameters_atomically(
-        [Parameter(name, value=value) for name, value in codebook.to_parameters().items()])
+    result = optimizer.set_parameters_atomically(parameters(codebook.to_parameters()))
     assert result.successful, result.reason
 
 
