@@ -108,21 +108,6 @@ def test_estimates_are_close_to_the_user(cycles):
     assert np.median(errors) < 2.5
 
 
-def test_a_late_user_is_served_and_both_users_take_turns(network, join):
-    watch = network.watch
-    join(1)
-    watch.until_served(2, user=1)
-    late = join(2)
-    for user in (2, 1, 2):
-        watch.until_served(2, user=user, processes=[late])
-    # Each is located at its own position.
-    for user in (1, 2):
-        places = [estimate.position for estimate in watch.received[m.PositionEstimate]
-                  if estimate.user == user][-4:]
-        distances = [math.dist(place, POSITIONS[user]) for place in places]
-        assert np.median(distances) < 3.5
-
-
 def test_a_user_that_crashes_in_its_cycle_is_served_after_its_restart(network, join):
     watch, interrupted = network.watch, None
 

@@ -1,4 +1,6 @@
-"""A network in one process: its diagnostics, and parameters that change between cycles."""
+"""A network in one process: its diagnostics, its parameters, and another one on its domain."""
+
+import types
 
 import numpy as np
 import pytest
@@ -64,6 +66,38 @@ def running(make_watch, module_processes, small_files):
     running = Running(process, make_watch(f'/{NAMESPACE}'))
     running.watch.until_served(2, processes=[process])
     return running
+
+
+@pytest.fixture(scope='module')
+def other(make_watch, module_processes, small_files):
+    """Another network, with one user, another seed and the second codebook."""
+    process = module_processes.start(
+        'network', namespace='/other', users=1, seed=2, rest_s=0.02,
+        scenario_file=small_files / 'scenario.yaml', codebook_file=small_files / 'second.yaml')
+    return types.SimpleNamespace(process=process, watch=make_watch('/other'))
+
+
+def test_each_network_serves_its_users_and_none_of_the_other(running, other, small_files):
+    positions = []
+    for network, users in ((running, {1, 2}), (other, {1})):
+        watch = network.watch
+        for user in users:
+            watch.until_served(2, user, [network.process])
+        watch.until(lambda watch=watch, users=users: users <= {
+            truth.user for truth in watch.received[m.GroundTruth]}, 'all true positions')
+        assert {end.user for end in watch.served} == users
+        positions.append({tuple(truth.position) for truth in watch.received[m.GroundTruth]})
+    assert not positions[0] & positions[1]
+    assert {signals.codebook_id for signals in other.watch.received[m.ReceivedSignals]} == {
+        Codebook.load(small_files / 'second.yaml').id}
+    names = {'network', *UNIQUE, 'user_1', 'watch'}
+    expected = {'/other': names, f'/{NAMESPACE}': {*names, 'user_2'}}
+
+    def nodes():
+        found = running.watch.node.get_node_names_and_namespaces()
+        return {space: {name for name, where in found if where == space} for space in expected}
+    # The names of nodes arrive independently of their messages.
+    running.watch.until(lambda: nodes() == expected, 'the names of the nodes')
 
 
 def test_every_node_reports_its_state_its_cycles_and_the_codebook(running, small_files):
@@ -152,11 +186,23 @@ def test_band_and_impairments_change(running):
     assert running.set('channel', double_probability=0.0, delay_s=0.0).successful
 
 
-def test_the_codebook_in_use_is_reported(running, small_files):
-    second = Codebook.load(small_files / 'second.yaml')
-    assert running.set('optimizer', **second.to_parameters()).successful
-    running.until_reported('optimizer', 'bs', 'rhs_controller', 'positioner', 'transmission',
-                           codebook_id=second.id, pending__codebook_id=None)
+def test_a_new_codebook_is_used_from_one_cycle_to_the_next(running, small_files):
+    watch, begin = running.watch, running.watch.until_served(2)[-1].cycle_id
+    first, second = (Codebook.load(small_files / f'{name}.yaml') for name in ('first', 'second'))
+    for codebook in (second, first):
+        assert running.set('optimizer', **codebook.to_parameters()).successful
+        running.until_reported('optimizer', 'bs', 'rhs_controller', 'positioner', 'transmission',
+                               codebook_id=codebook.id, pending__codebook_id=None)
+    last, used = watch.until_served(2)[-1].cycle_id, {}
+    for kind in (m.RhsCommand, m.RhsConfiguration, m.ReceivedSignals, m.PositionEstimate, m.Beam,
+                 m.Capacity):
+        for message in watch.received[kind]:
+            if begin <= message.cycle_id <= last:
+                used.setdefault(message.cycle_id, set()).add(message.codebook_id)
+    assert all(len(names) == 1 for names in used.values())
+    in_order = [name for cycle_id in sorted(used) for name in used[cycle_id]]
+    assert [name for name, before in zip(in_order, ['', *in_order], strict=False)
+            if name != before] == [first.id, second.id, first.id]
 
 
 def test_the_base_station_can_be_paused_stepped_and_resumed(running):

@@ -234,7 +234,7 @@ def recorded(running, built_scripts, tmp_path_factory):
             lambda: all('recorder' in [one.node_name for one in
                         running.fused.node.get_subscriptions_info_by_topic(f'{space}/presence')]
                         for space in ('', '/front', '/side')), 'the recorder')
-        estimates = running.until_fused(BOTH, 6 * N_USERS)
+        estimates = running.until_fused(BOTH, 4 * N_USERS)
         process.send_signal(signal.SIGINT)
         output = process.communicate(timeout=60)[0]
     assert process.returncode == 0, output
@@ -351,7 +351,7 @@ def test_a_surface_that_has_moved_is_named_and_its_pose_is_found(
     set_channel(running, surface_shift_m=0.3)
     running.until_fused(BOTH, 2)
     done = subprocess.run(
-        [ROOT / 'scripts' / 'calibrate', '--site', running.site_file, '--cycles', '60',
+        [ROOT / 'scripts' / 'calibrate', '--site', running.site_file, '--cycles', '40',
          '--output', tmp_path / 'found.yaml'], capture_output=True, text=True, timeout=120,
         check=False)
     assert (done.returncode, done.stderr) == (0, '')
@@ -359,7 +359,6 @@ def test_a_surface_that_has_moved_is_named_and_its_pose_is_found(
     assert reports[-1]['warning.poses'] == 'surfaces front, side disagree: a pose is wrong'
     assert 'surfaces front, side disagree' in running.running['/', 'fusion'].log
     set_channel(running, surface_shift_m=0.0)
-    running.until(lambda: 'warning.poses' not in reports[-1], 'the end of the warning')
     declared, found = (site.surfaces['side'].pose for site in (
         running.site, Site.from_yaml(tmp_path / 'found.yaml')))
     # The left of the surface is the negative x of the site.

@@ -36,7 +36,7 @@ def network(processes, make_watch, tmp_path):
         codebook_file=tmp_path / 'codebook.yaml', position_m='[4.0, 0.3, 0.1]', **common)
     watch.until_served(2, STATIC, [network])
     walking = processes.start(
-        'user', name=f'user_{WALKING}', user_id=WALKING, mobility='waypoints', speed_mps=2.0,
+        'user', name=f'user_{WALKING}', user_id=WALKING, mobility='waypoints', speed_mps=4.0,
         waypoints_m='[4.0, 0.0, 0.0, 4.0, 6.0, 0.0]', **common)
     return watch, [network, walking]
 
