@@ -5,18 +5,14 @@ import dataclasses
 import io
 import re
 import subprocess
-import time
 import types
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import Trigger
 
 from rhs_isac_ros.calibration import Calibration
 from rhs_isac_ros.codebook import Codebook
@@ -26,7 +22,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.settings import Impairments
 from rhs_isac_ros.ros.recording import CycleObserver, Recorder
 from rhs_isac_ros.support import streams
-from rhs_isac_ros.tools.calibrate import main
+from rhs_isac_ros.tools import calibrate
 
 pytest.importorskip('mcap', reason='mcap is not installed')
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -48,24 +44,44 @@ def process(module_processes):
 
 
 @pytest.fixture(scope='module')
-def recording(process, tmp_path_factory):
-    """A recording of the network before any calibration."""
+def watch(make_watch):
+    return make_watch(NAMESPACE)
+
+
+def request(watch, service):
+    """Pause or resume the network, whose cycles would slow the calibrations down."""
+    client = watch.node.create_client(Trigger, f'bs/{service}')
+    assert watch.call(client, lambda client: client.call_async(Trigger.Request())).success
+
+
+@pytest.fixture(scope='module')
+def recording(process, watch, module_bench, tmp_path_factory):
+    """A recording of the network before any calibration; the network is paused then."""
     path = tmp_path_factory.mktemp('recording') / 'run.mcap'
-    recorder, context = Recorder(path, SCENARIO), Context()
-    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
-    observer = CycleObserver(recorder, context=context, namespace=NAMESPACE)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(observer)
-    end_s = time.monotonic() + TIMEOUT_S
-    while sum(record.outcome == 'no_fix' for record in observer.log.ended) < N_PILOTS:
-        executor.spin_once(timeout_sec=1.0)
-        assert process.running and time.monotonic() < end_s, process.log
-    executor.shutdown()
-    observer.destroy_node()
-    rclpy.shutdown(context=context)
+    watch.until(lambda: watch.received[m.NoFix], 'the first cycle', [process])
+    recorder = Recorder(path, SCENARIO)
+    observer = module_bench.add(CycleObserver, recorder, namespace=NAMESPACE)
+    module_bench.until(lambda: sum(
+        record.outcome == 'no_fix' for record in observer.log.ended) >= N_PILOTS, 'the pilots')
+    module_bench.remove(observer)
     recorder.close()
+    request(watch, 'pause')
     assert len(observer.log.complete) < N_PILOTS / 5
     return path
+
+
+@pytest.fixture
+def cycles(watch, recording):
+    """The network runs during the test."""
+    request(watch, 'resume')
+    yield
+    request(watch, 'pause')
+
+
+@pytest.fixture
+def two_folds(monkeypatch):
+    """Two instead of five groups of places are left out: each is a survey, which takes long."""
+    monkeypatch.setattr(calibrate, '_N_FOLDS', 2)
 
 
 @pytest.fixture(scope='module')
@@ -78,7 +94,7 @@ def surface():
 def call(*arguments):
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main([*map(str, arguments)])
+        code = calibrate.main([*map(str, arguments)])
     return types.SimpleNamespace(code=code, out=out.getvalue(), err=err.getvalue())
 
 
@@ -90,7 +106,7 @@ def calibrated(recording):
 
 
 def test_a_calibration_restores_the_accuracy_of_a_running_network(
-        process, calibrated, surface, make_watch):
+        process, calibrated, surface, watch, cycles):
     """Errors come close to those of an estimator that knows the surface exactly."""
     file, done = calibrated
     assert (done.code, done.err) == (0, '')
@@ -101,7 +117,6 @@ def test_a_calibration_restores_the_accuracy_of_a_running_network(
     assert re.search(r'pilots after: [\d.]+ m rms, 0 of \d+ without a fix', done.out)
     assert done.out.endswith(f'{file}: calibration {Calibration.load(file).id}\n')
 
-    watch = make_watch(NAMESPACE)
     for node in ('positioner', 'transmission'):
         client = AsyncParameterClient(watch.node, node)
         response = watch.call(client, lambda client: client.set_parameters_atomically(
@@ -135,7 +150,7 @@ def compare(watch, estimates, surface):
     return np.array(live), np.array(exact)
 
 
-def test_the_pilots_may_come_from_the_running_network(built_scripts, process, recording, tmp_path):
+def test_the_pilots_may_come_from_the_running_network(built_scripts, cycles, tmp_path):
     done = subprocess.run(
         [CONFIG.parent / 'scripts' / 'calibrate', '--config', CONFIG / 'quick.yaml', '--cycles',
          '5', '--output', 'live.npz', '--ros-args', '-r', f'__ns:={NAMESPACE}'], cwd=tmp_path,
@@ -144,7 +159,7 @@ def test_the_pilots_may_come_from_the_running_network(built_scripts, process, re
     assert 5 <= Calibration.load(tmp_path / 'live.npz').about['pilots'] < 50
 
 
-def test_a_recording_is_a_survey_of_the_multipath(recording, calibrated, tmp_path):
+def test_a_recording_is_a_survey_of_the_multipath(recording, calibrated, two_folds, tmp_path):
     hall = tmp_path / 'hall.npz'
     done = call(recording, '--namespace', NAMESPACE, '--output', hall, '--multipath',
                 '--calibration', calibrated[0])
@@ -158,7 +173,7 @@ def test_a_recording_is_a_survey_of_the_multipath(recording, calibrated, tmp_pat
     assert done.out.splitlines()[-1].startswith(f'{hall}: multipath {estimate.digest}; ')
 
 
-def test_arrays_are_a_survey_of_the_multipath(tmp_path):
+def test_arrays_are_a_survey_of_the_multipath(two_folds, tmp_path):
     rng = np.random.default_rng(0)
     positions = SCENARIO.sample_positions(12, rng)
     received = simulate_received(SCENARIO, CODEBOOK, positions, rng)
@@ -184,7 +199,7 @@ def test_arrays_are_a_survey_of_the_multipath(tmp_path):
 
 @pytest.mark.parametrize(('arguments', 'error'), [
     (['--namespace', '/lab'], 'no received signals with a true position'),
-    (['--namespace', NAMESPACE, '--config', CONFIG / 'table1.yaml'], 'codebook: analog: shape'),
+    (['--namespace', NAMESPACE, '--config', CONFIG / 'table1.yaml'], ': shape '),
     (['--states=1,-1'], 'run.mcap: expected no file with --states')])
 def test_an_unusable_recording_is_named(recording, tmp_path, arguments, error):
     done = call(recording, '--output', tmp_path / 'x.npz', *arguments)
@@ -207,5 +222,5 @@ def test_known_states_need_no_pilots(tmp_path):
 @pytest.mark.parametrize('states', ['1', '1,2,3', '1,x', 'nan,1', ''])
 def test_states_are_two_numbers(states, capsys):
     with pytest.raises(SystemExit):
-        main([f'--states={states}'])
+        calibrate.main([f'--states={states}'])
     assert f'--states: {states!r}, expected two numbers such as 1,-1' in capsys.readouterr().err

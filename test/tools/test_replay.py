@@ -26,6 +26,7 @@ from rhs_isac_ros.tools.replay import Recording, errors_m, load, main
 pytest.importorskip('mcap', reason='mcap is not installed')
 CONFIG = Path(__file__).parents[2] / 'config'
 SCRIPTS = CONFIG.parent / 'scripts'
+N_MANY = EXCHANGE.depth + 22
 
 
 def rows(text):
@@ -48,9 +49,19 @@ def test_the_recorded_cycles_match_those_observed_live(run):
         codebook.id for codebook in recording.codebooks.values()]
 
 
-def test_the_same_estimator_has_the_same_errors(run, run_script):
+@pytest.fixture
+def replayed(run, capsys):
+    """Function that replays the recording with arguments, and returns the rows and the errors."""
+    def call(*arguments):
+        assert main([str(run.path), *map(str, arguments)]) == 0
+        out, err = capsys.readouterr()
+        return rows(out), err
+    return call
+
+
+def test_the_same_estimator_has_the_same_errors(run, replayed):
     """All printed digits agree; those of another estimator differ."""
-    found = rows(run_script(f'{SCRIPTS}/replay {run.path} --estimator bayes --estimator ml'))
+    found, _ = replayed('--estimator', 'bayes', '--estimator', 'ml')
     live = np.array([cycle.error_m for cycle in run.cycles])
     assert found['bayes'] == found['live bayes'] != found['ml']
     assert found['live bayes'] == [
@@ -69,7 +80,7 @@ def test_errors_do_not_depend_on_the_pose_of_the_surface(run):
     np.testing.assert_allclose(*errors, rtol=1e-9)
 
 
-def test_users_are_tracked_beside_single_cycles(run, run_script):
+def test_users_are_tracked_beside_single_cycles(run, replayed):
     """The first estimate of each user is that of a single cycle; later ones differ."""
     recording = load(run.path)
     estimators = {key: make_estimator('bayes', recording.scenario, codebook)
@@ -81,25 +92,22 @@ def test_users_are_tracked_beside_single_cycles(run, run_script):
     assert len(first) < len(users)
     np.testing.assert_array_equal(np.delete(tracked != alone, first), True)
     np.testing.assert_array_equal(tracked[first], alone[first])
-    found = rows(run_script(f'{SCRIPTS}/replay {run.path} --track'))
+    found, _ = replayed('--track')
     assert found['track'] == [
         f'{np.median(tracked):.6f}', 'm', f'{np.sqrt(np.mean(tracked**2)):.6f}', 'm', '0']
 
 
-def test_an_estimator_of_a_plugin_is_available(run, install, capsys):
+def test_an_estimator_of_a_plugin_is_available(replayed, install):
     install('guesses', 'from rhs_isac_ros.positioning import BayesEstimator as Mine',
             {plugins.ESTIMATORS: {'mine': 'Mine'}})
-    assert main([str(run.path), '--estimator', 'mine']) == 0
-    found = rows(capsys.readouterr().out)
+    found, _ = replayed('--estimator', 'mine')
     assert found['mine'] == found['live bayes']
 
 
-def test_another_codebook_is_assumed_with_a_warning(run, random_beams, tmp_path, capsys):
+def test_another_codebook_is_assumed_with_a_warning(replayed, random_beams, tmp_path):
     other = random_beams(Scenario.from_yaml(CONFIG / 'quick.yaml'), np.random.default_rng(0))
     other.save(tmp_path / 'other.yaml')
-    assert main([str(run.path), '--codebook', str(tmp_path / 'other.yaml')]) == 0
-    out, err = capsys.readouterr()
-    found = rows(out)
+    found, err = replayed('--codebook', tmp_path / 'other.yaml')
     assert found['bayes'] != found['live bayes']
     assert err.endswith(f'are evaluated with {other.id}\n')
 
@@ -187,7 +195,7 @@ def test_a_running_positioner_reproduces_the_recorded_estimates(run, received, p
 
 @pytest.fixture
 def many(run, tmp_path):
-    """A recording with more signals than a queue holds."""
+    """A recording with more signals than the queue of a subscription holds."""
     from mcap.writer import Writer
     kinds = recorded_topics()
     path = tmp_path / 'many.mcap'
@@ -201,7 +209,7 @@ def many(run, tmp_path):
     writer.add_message(channels['codebook'], 0, codebook, 0)
     signals = convert.from_bytes(m.ReceivedSignals, next(
         found for _, found, _ in read(run.path, ['/received_signals'])))
-    for number in range(1, 301):
+    for number in range(1, N_MANY + 1):
         time_ns = number * 10**8
         writer.add_message(channels['received_signals'], time_ns, convert.to_bytes(
             dataclasses.replace(signals, cycle_id=number), time_ns,
@@ -211,7 +219,7 @@ def many(run, tmp_path):
 
 
 def test_no_signals_are_lost_at_any_rate(many, publish):
-    assert publish(many, '100000', 300) == '300 messages published\n'
+    assert publish(many, '100000', N_MANY) == f'{N_MANY} messages published\n'
 
 
 def test_signals_that_nobody_answers_are_counted(many, bench):
@@ -223,7 +231,7 @@ def test_signals_that_nobody_answers_are_counted(many, bench):
     probe.create_publisher(convert.ros_type(m.PositionEstimate), 'position_estimate', EXCHANGE)
     with publishing(many, '--rate', '100000', '--timeout', '5', namespace='/silent') as process:
         # The rest would take a minute.
-        bench.until(lambda: len({message.cycle_id for message in signals}) > 4, 'the signals')
+        bench.until(lambda: len({message.cycle_id for message in signals}) > 1, 'the signals')
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=30)
     assert process.returncode == 1, err
