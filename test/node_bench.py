@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import gc
+import importlib
 import time
 import warnings
 
@@ -48,6 +49,11 @@ class Bench:
         self._nodes.append(node)
         self._executor.add_node(node)
         return node
+
+    def add_role(self, role, *args, **options):
+        """Create the node of a role, whose class is named after it, as by `add`."""
+        module = importlib.import_module(f'rhs_isac_ros.nodes.{role}')
+        return self.add(getattr(module, f'{role.title().replace("_", "")}Node'), *args, **options)
 
     def remove(self, node):
         self._nodes.remove(node)

@@ -23,12 +23,13 @@ from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.signals import SignalHandlerOptions
 from rclpy.type_support import check_for_type_support
+from ros_messages import parameters
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import EXCHANGE, OBSERVATION
+from rhs_isac_ros.ros.endpoints import OBSERVATION
 from rhs_isac_ros.ros.environment import claim_domain
 from rhs_isac_ros.ros.processes import with_parent
 
@@ -153,6 +154,8 @@ class Watch:
         self.served = []
         # Functions by message class, called with each message.
         self.hooks = {}
+        # Clients of parameters by node.
+        self._clients = {}
         for kind, name in topics.NAMES.items():
             self.node.create_subscription(
                 convert.ros_type(kind), name,
@@ -198,18 +201,18 @@ class Watch:
             return next((future for future in futures if future.done()), None)
         return self.until(response, 'the response', processes).result()
 
+    def set_parameters(self, node, values, processes=()):
+        """Set parameters of a node together and return the result."""
+        if node not in self._clients:
+            self._clients[node] = AsyncParameterClient(self.node, node)
+        return self.call(self._clients[node], lambda client: client.set_parameters_atomically(
+            parameters(values)), processes).result
+
     def wait_for_nodes(self, *names):
         """Wait until the parameter services of nodes respond, so that they have started."""
         for name in names:
             client = AsyncParameterClient(self.node, name)
             self.call(client, lambda client: client.list_parameters([], 1))
-
-    def publisher(self, kind, n_others=1):
-        """Return a publisher of a message once it has other subscribers than this observer."""
-        publisher = self.node.create_publisher(
-            convert.ros_type(kind), topics.NAMES[kind], EXCHANGE)
-        self.until(lambda: publisher.get_subscription_count() > n_others, 'the subscribers')
-        return publisher
 
     def of_cycle(self, kind, cycle_id):
         return list(self._of_cycle[kind, cycle_id])

@@ -88,16 +88,6 @@ def test_errors_and_measured_noise_are_those_of_theory(snr_db, n_subbands):
         phase_rad * 125e3 / (2 * np.pi), rel=0.3)
 
 
-def test_a_band_without_noise_is_recovered_exactly():
-    rng = np.random.default_rng(1)
-    signals = response(LAB, 0.3e-6, rng)
-    symbols = np.exp(2j * np.pi * rng.random(16))
-    radio = radio_of(with_snr(LAB, 200), rng)
-    found = received(radio, captured(radio, signals, symbols), symbols=symbols)
-    np.testing.assert_allclose(
-        without_phase_and_delay(found, signals), signals, atol=1e-3)
-
-
 def test_the_difference_of_the_delays_of_two_bands_survives():
     """It contains the range; it would vanish if the timing was estimated for each band."""
     rng = np.random.default_rng(RNG_SEED)

@@ -3,7 +3,6 @@
 import itertools
 import math
 
-import numpy as np
 import pytest
 
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CycleLog
@@ -83,12 +82,10 @@ def test_a_cycle_that_is_given_up_has_a_reason_and_no_result(network):
     assert record.durations_s()[m.Phase.ESTIMATING] == pytest.approx(1.0)
 
 
-def test_a_cycle_without_a_position_is_given_up_but_has_not_failed():
+def test_a_cycle_without_a_position_is_given_up_but_has_not_failed(example):
     log = CycleLog()
     log.add(m.Beacon(cycle_id=7, attempt=1), 0.0)
-    log.add(m.ProtocolState(
-        cycle_id=7, user=1, phase=m.Phase.ESTIMATING, outcome='no_fix', began_s=np.zeros(4),
-        elapsed_s=1.0), 1.0)
+    log.add(example(m.ProtocolState, cycle_id=7, outcome='no_fix'), 1.0)
     (record,) = log.given_up
     assert (record.cycle_id, record.outcome) == (7, 'no_fix')
     assert log.failed == log.complete == []

@@ -11,12 +11,6 @@ from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
 
 
-def ended(cycle_id, user, phase, outcome):
-    return m.ProtocolState(
-        cycle_id=cycle_id, user=user, phase=phase, outcome=outcome, began_s=np.zeros(4),
-        elapsed_s=0.0)
-
-
 def overview_of(net, until_s=np.inf):
     overview = Overview()
     for sent in net.log:
@@ -65,12 +59,12 @@ def test_phases_follow_each_other_and_have_their_start_times(network):
     assert starts.items() <= seen.items()
 
 
-def test_the_rate_is_averaged_over_ten_seconds():
+def test_the_rate_is_averaged_over_ten_seconds(example):
     overview = Overview()
     for cycle_id in range(1, 101):
         now_s = 0.5 * cycle_id
         overview.add(m.Beacon(cycle_id=cycle_id, attempt=0), now_s - 0.1)
-        overview.add(ended(cycle_id, 1, m.Phase.BEACONING, 'served'), now_s)
+        overview.add(example(m.ProtocolState, cycle_id=cycle_id, outcome='served'), now_s)
         if cycle_id == 4:
             assert overview.rate_hz(2.4) == pytest.approx(4 / 2.0)
     assert overview.rate_hz(50.2) == pytest.approx(2.0)

@@ -90,15 +90,6 @@ def test_a_goal_can_be_cancelled_in_each_phase(bench, action, phases):
     action.server.observe(estimate(1))
 
 
-def test_two_goals_are_reached_at_once(bench, action):
-    goals = {user: action.send(user) for user in (1, 2)}
-    for user, cycle_id in ((2, 8), (1, 9)):
-        action.server.observe(state(user, m.Phase.POSITIONING, cycle_id=cycle_id))
-        action.server.observe(estimate(user, cycle_id))
-        result = finish(bench, goals[user], GoalStatus.STATUS_SUCCEEDED)
-        assert (result.cycle_id, result.pose.pose.pose.position.y) == (cycle_id, user)
-
-
 def test_a_cycle_that_began_before_the_goal_does_not_end_it(bench, action):
     goal = action.send(1)
     action.server.observe(state(1, m.Phase.ESTIMATING))

@@ -17,13 +17,6 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import complex_normal
 from rhs_isac_ros.model.surface import combine, element_signals, feed_signals
-from rhs_isac_ros.nodes.bs import BsNode
-from rhs_isac_ros.nodes.channel import ChannelNode
-from rhs_isac_ros.nodes.optimizer import OptimizerNode
-from rhs_isac_ros.nodes.positioner import PositionerNode
-from rhs_isac_ros.nodes.rhs_controller import RhsControllerNode
-from rhs_isac_ros.nodes.transmission import TransmissionNode
-from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Send
 from rhs_isac_ros.protocol.user import State
@@ -73,15 +66,12 @@ def test_a_network_with_the_radio_serves_the_user_without_repetitions(
     file, codebook_file = bench_files / 'scenario.yaml', bench_files / 'first.yaml'
     scenario, codebook = Scenario.from_yaml(file), Codebook.load(codebook_file)
     hardware = Hardware(scenario)
-
-    def add(kind, **values):
-        bench.add(kind, values={'scenario_file': file, **values})
-    add(OptimizerNode, codebook_file=codebook_file)
-    add(RhsControllerNode)
-    add(PositionerNode, table_folder='')
-    add(TransmissionNode)
-    add(BsNode, receiver_noise=False, rest_s=0.0)
-    add(lambda **options: example.RadioNode(hardware.measure, hardware.carry, **options))
+    for role, values in {
+            'optimizer': {'codebook_file': codebook_file}, 'rhs_controller': {},
+            'positioner': {'table_folder': ''}, 'transmission': {},
+            'bs': {'receiver_noise': False, 'rest_s': 0.0}}.items():
+        bench.add_role(role, values={'scenario_file': file, **values})
+    bench.add(example.RadioNode, hardware.measure, hardware.carry, values={'scenario_file': file})
     receiver = bench.add(Node, 'receiver')
     states, received, requests = (bench.collect(receiver, kind) for kind in (
         m.ProtocolState, m.ReceivedSignals, m.PilotRequest))
@@ -136,8 +126,8 @@ def check_endpoints(node):
 
 def test_one_message_by_hand_is_answered(bench, probe):
     """As ``ros2 topic pub --once`` sends it: when there is a subscriber, and once."""
-    user = bench.add(UserNode, values={'user_id': 4})
-    bench.add(ChannelNode)
+    user = bench.add_role('user', values={'user_id': 4})
+    bench.add_role('channel')
     answers = bench.collect(probe, m.Ack)
     # A node by hand announces its role, as ``ros2 topic pub presence`` does.
     presence = probe.create_publisher(ros.Presence, topics.PRESENCE, LATCHED)

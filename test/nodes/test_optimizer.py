@@ -6,10 +6,9 @@ import re
 
 import numpy as np
 import pytest
-import yaml
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rclpy.node import Node
-from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from ros_messages import codebook_from_ros, parameters
 
@@ -164,23 +163,6 @@ def test_a_codebook_file_can_be_loaded_at_run_time(
     assert held(optimizer).id == new.id
     assert held(optimizer).average_crlb_m2 == pytest.approx(new.average_crlb_m2, nan_ok=True)
     assert held(optimizer).provenance == new.provenance
-
-
-def test_a_dump_can_be_loaded_again(bench, optimizer, client, probe, shipped, other, tmp_path):
-    """It also contains read-only parameters, which keep their values."""
-    names = bench.result(client.list_parameters()).result.names
-    values = bench.result(client.get_parameters(names)).values
-    assert {'scenario_file', 'codebook_file', 'use_sim_time'} <= set(names)
-    path = tmp_path / 'dump.yaml'
-    path.write_text(yaml.dump({'/optimizer': {'ros__parameters': {
-        name: parameter_value_to_python(value)
-        for name, value in zip(names, values, strict=True)}}}), encoding='utf-8')
-    received = latched(bench, probe)
-    bench.result(client.set_parameters_atomically(as_parameters(other)))
-    response = bench.result(client.load_parameter_file(str(path)))
-    assert all(result.successful for result in response.results), response
-    bench.until(lambda: received[-1].codebook_id == shipped.id, 'the codebook of the dump')
-    assert held(optimizer).provenance == shipped.provenance
 
 
 def test_a_part_of_a_codebook_is_refused_with_the_names_of_what_is_missing(

@@ -168,15 +168,12 @@ def test_a_mobility_moves_with_the_clock_of_the_simulation(driven):
 
 
 def test_an_action_returns_the_position_of_each_user(driven):
-    watch, feedback = driven.watch, {1: [], 2: [], 9: []}
+    watch = driven.watch
     driven.robot.drives = True
     client = ActionClient(watch.node, Locate, topics.LOCATE)
     watch.until(client.server_is_ready, 'the action', driven.running)
-    # At once, and for a user that does not exist.
-    sent = {user: client.send_goal_async(
-        Locate.Goal(user=user, timeout_s=60.0),
-        lambda message, user=user: feedback[user].append(message.feedback.phase))
-        for user in feedback}
+    sent = {user: client.send_goal_async(Locate.Goal(user=user, timeout_s=60.0))
+            for user in (1, 2)}
     watch.until(lambda: all(future.done() for future in sent.values()), 'the goals')
     results = {user: future.result().get_result_async() for user, future in sent.items()}
     for user in (1, 2):
@@ -189,10 +186,4 @@ def test_an_action_returns_the_position_of_each_user(driven):
         assert estimate.user == user
         assert Time.from_msg(found.result.pose.header.stamp).nanoseconds == estimate.stamp_ns
         assert_at(found.result.pose, estimate)
-        watch.until(lambda user=user: [*dict.fromkeys(feedback[user])] == [
-            m.Phase.BEACONING, m.Phase.POSITIONING, m.Phase.ESTIMATING], 'the feedback')
-    sent[9].result().cancel_goal_async()
-    ended = watch.until(lambda: results[9].done() and results[9].result(), 'the end')
-    assert ended.status == GoalStatus.STATUS_CANCELED
-    assert feedback[9] == [m.Phase.BEACONING]
     client.destroy()

@@ -11,8 +11,6 @@ import yaml
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from policy_rules import permissions, rules, used
-from rclpy.parameter import Parameter
-from rclpy.parameter_client import AsyncParameterClient
 from scipy.stats import chi2
 
 import rhs_isac_msgs.msg as ros
@@ -334,21 +332,13 @@ def test_the_others_continue_without_nodes_of_one_surface(running, roles):
     assert not running.front.given_up
 
 
-def set_channel(running, **values):
-    """Set parameters of the channel of the second surface."""
-    client = AsyncParameterClient(running.side.node, 'channel')
-    result = running.side.call(client, lambda client: client.set_parameters(
-        [Parameter(name, value=value) for name, value in values.items()]))
-    assert [one.successful for one in result.results] == [True] * len(values)
-
-
 def test_a_surface_that_has_moved_is_named_and_its_pose_is_found(
         running, built_scripts, tmp_path):
     reports = []
     subscribe_reports(running.fused.node, lambda name, report: reports.append(report.values))
     running.until(lambda: reports and 'agreement.front.side' in reports[-1], 'the references')
     assert 'warning.poses' not in reports[-1]
-    set_channel(running, surface_shift_m=0.3)
+    assert running.side.set_parameters('channel', {'surface_shift_m': 0.3}).successful
     running.until_fused(BOTH, 2)
     done = subprocess.run(
         [ROOT / 'scripts' / 'calibrate', '--site', running.site_file, '--cycles', '40',
@@ -358,7 +348,7 @@ def test_a_surface_that_has_moved_is_named_and_its_pose_is_found(
     running.until(lambda: 'warning.poses' in reports[-1], 'the warning')
     assert reports[-1]['warning.poses'] == 'surfaces front, side disagree: a pose is wrong'
     assert 'surfaces front, side disagree' in running.running['/', 'fusion'].log
-    set_channel(running, surface_shift_m=0.0)
+    assert running.side.set_parameters('channel', {'surface_shift_m': 0.0}).successful
     declared, found = (site.surfaces['side'].pose for site in (
         running.site, Site.from_yaml(tmp_path / 'found.yaml')))
     # The left of the surface is the negative x of the site.

@@ -8,13 +8,6 @@ from rclpy.node import Node
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.nodes.bs import BsNode
-from rhs_isac_ros.nodes.channel import ChannelNode
-from rhs_isac_ros.nodes.optimizer import OptimizerNode
-from rhs_isac_ros.nodes.positioner import PositionerNode
-from rhs_isac_ros.nodes.rhs_controller import RhsControllerNode
-from rhs_isac_ros.nodes.transmission import TransmissionNode
-from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.protocol import messages as m
 
 SCENARIO = Scenario(
@@ -34,16 +27,12 @@ def observed(module_bench, board, tmp_path_factory):
     bench, folder = module_bench, tmp_path_factory.mktemp('network')
     (folder / 'scenario.yaml').write_text(yaml.safe_dump(SCENARIO.changes()), encoding='utf-8')
     random_codebook(SCENARIO, np.random.default_rng(0)).save(folder / 'codebook.yaml')
-
-    def add(kind, **values):
-        bench.add(kind, values={'scenario_file': folder / 'scenario.yaml', **values})
-    add(OptimizerNode, codebook_file=folder / 'codebook.yaml')
-    add(RhsControllerNode)
-    add(PositionerNode, table_folder=folder)
-    add(TransmissionNode)
-    add(ChannelNode, surface='opensourceris', surface_options=f'port={board.port}')
-    add(UserNode, position_m=[3.0, 0.1, 0.2])
-    add(BsNode, rest_s=0.02)
+    for role, values in {
+            'optimizer': {'codebook_file': folder / 'codebook.yaml'}, 'rhs_controller': {},
+            'positioner': {'table_folder': folder}, 'transmission': {},
+            'channel': {'surface': 'opensourceris', 'surface_options': f'port={board.port}'},
+            'user': {'position_m': [3.0, 0.1, 0.2]}, 'bs': {'rest_s': 0.02}}.items():
+        bench.add_role(role, values={'scenario_file': folder / 'scenario.yaml', **values})
     receiver = bench.add(Node, 'receiver')
     return bench.collect(receiver, m.ProtocolState), bench.collect(receiver, m.PositionEstimate)
 

@@ -35,11 +35,6 @@ def shown(bench, probe, bench_files, request):
     return latest
 
 
-def test_the_scene_is_shown_before_any_message(bench, shown):
-    bench.until(lambda: shown, 'markers')
-    assert set(shown) == {('region', 0), ('board', 0)}
-
-
 def ground_truth(user, x):
     return m.GroundTruth(cycle_id=0, user=user, position=np.array([x, user, 0.0]),
         velocity=np.zeros(3))
@@ -51,6 +46,8 @@ def beam(sizes):
 
 
 def test_users_and_estimates_are_shown_at_their_positions(bench, probe, shown):
+    bench.until(lambda: shown, 'markers')
+    assert set(shown) == {('region', 0), ('board', 0)}
     truths, estimates = (
         bench.publisher(probe, kind) for kind in (m.GroundTruth, m.PositionEstimate))
     stamp = probe.get_clock().now().to_msg()

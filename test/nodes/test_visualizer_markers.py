@@ -49,22 +49,6 @@ def test_an_ellipsoid_keeps_its_axes():
     assert of(an_estimate(np.zeros((3, 3)))[0].scale).min() > 0
 
 
-def test_each_user_has_one_hue_for_truth_and_estimate():
-    hues = set()
-    for user in (1, 2, 2**32 - 1):
-        position = np.array([user % 7, 0.0, 0.0], float)
-        ball, _ = shapes.truth(m.GroundTruth(
-            cycle_id=0, user=user, position=position, velocity=np.zeros(3)))
-        one = scene.marker('truth', user, ball, STAMP)
-        other, _ = an_estimate(np.eye(3), user)
-        assert of(one.pose.position) == pytest.approx(position)
-        assert (one.ns, one.id) != (other.ns, other.id)
-        assert rgb(one.color) == rgb(other.color)
-        assert one.color.a == 1 > other.color.a > 0
-        hues.add(rgb(one.color))
-    assert len(hues) == 3
-
-
 def test_lines_join_the_points_of_each_strip():
     strips = np.arange(9.0).reshape(3, 3), np.arange(6.0).reshape(2, 3)
     marker = scene.marker('traced', 1, shapes.Lines(strips, (0.5, 0.25, 1.0), 1.0), STAMP)

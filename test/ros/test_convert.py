@@ -17,7 +17,7 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.messages import MessageError, check
+from rhs_isac_ros.protocol.messages import MessageError
 from rhs_isac_ros.ros import cdr, convert, topics
 from rhs_isac_ros.ros.convert import CodebookMessage
 from rhs_isac_ros.ros.frames import Frame
@@ -222,13 +222,6 @@ def test_an_array_that_does_not_fill_its_shape_is_rejected(where, array):
     setattr(message, field, array)
     with pytest.raises(MessageError, match=rf'^{where}: .'):
         from_ros(kind, message)
-
-
-def test_a_value_without_a_shape_is_not_a_vector():
-    message = to_ros(random_message(m.Beam, np.random.default_rng(0)), STAMP)
-    message.analog = ros.RealArray(data=[1.0])
-    with pytest.raises(MessageError, match=r'^Beam.analog: shape \[\], expected \[N_E = 100\]'):
-        check(from_ros(m.Beam, message), Scenario())
 
 
 @pytest.mark.parametrize(('kind', 'field', 'number'), [

@@ -1,6 +1,5 @@
 """Endpoints that the middleware refuses, topics of single users, and jobs in the background."""
 
-import importlib
 import threading
 
 import pytest
@@ -89,18 +88,10 @@ def refused(monkeypatch):
     return names
 
 
-@pytest.fixture
-def make(bench):
-    def make(executable):
-        module = importlib.import_module(f'rhs_isac_ros.nodes.{executable}')
-        kind = getattr(module, f'{executable.title().replace("_", "")}Node')
-        return bench.add(kind, **({'name': 'user_1'} if executable == 'user' else {}))
-    return make
-
-
 @pytest.mark.parametrize('role', sorted(ROSTER))
-def test_a_role_runs_without_what_was_refused(bench, make, refused, capfd, role):
-    member, node = ROSTER[role], make(role)
+def test_a_role_runs_without_what_was_refused(bench, refused, capfd, role):
+    member = ROSTER[role]
+    node = bench.add_role(role, **({'name': 'user_1'} if role == 'user' else {}))
     if member.has_codebook:
         node._on_codebook(Codebook.load(default_codebook_file()))
     if role == 'positioner':
@@ -121,8 +112,8 @@ def test_a_role_runs_without_what_was_refused(bench, make, refused, capfd, role)
     assert capfd.readouterr().err.count('was refused') == len(texts)
 
 
-def test_a_simulation_whose_time_was_refused_is_not_used(bench, make, refused):
-    node = make('bs')
+def test_a_simulation_whose_time_was_refused_is_not_used(bench, refused):
+    node = bench.add_role('bs')
     result = node.set_parameters_atomically([Parameter('use_sim_time', value=True)])
     assert (result.successful, result.reason) == (
         False, 'subscription to /clock was refused: /clock not found in allow rule')
@@ -130,8 +121,8 @@ def test_a_simulation_whose_time_was_refused_is_not_used(bench, make, refused):
     assert not node.get_parameter('use_sim_time').value
 
 
-def test_the_visualizer_runs_without_what_was_refused(make, refused):
-    node = make('visualizer')
+def test_the_visualizer_runs_without_what_was_refused(bench, refused):
+    node = bench.add_role('visualizer')
     node._on_message(position_estimate())
     node._show()
     assert {topics.MARKERS, topics.PATH.format(user=1), topics.TRUE_PATH.format(user=1)} <= {

@@ -14,12 +14,10 @@ from rhs_isac_ros.ros.environment import (
 
 
 @pytest.mark.parametrize(('name', 'value', 'expected'), [
-    # rcl would read 8, 16, 5, 5 and 0.
+    # rcl would read 8, 16 and 5.
     ('ROS_DOMAIN_ID', '010', 'an integer from 0 to 232'),
     ('ROS_DOMAIN_ID', '0x10', 'an integer from 0 to 232'),
     ('ROS_DOMAIN_ID', ' 5', 'an integer from 0 to 232'),
-    ('ROS_DOMAIN_ID', '5x', 'an integer from 0 to 232'),
-    ('ROS_DOMAIN_ID', '-1', 'an integer from 0 to 232'),
     ('ROS_DOMAIN_ID', '233', 'an integer from 0 to 232'),
     ('ROS_DOMAIN_ID', '٣', 'an integer from 0 to 232'),
     ('ROS_AUTOMATIC_DISCOVERY_RANGE', 'localhost', 'OFF, LOCALHOST, SUBNET or SYSTEM_DEFAULT'),
@@ -36,7 +34,7 @@ def test_an_invalid_environment_variable_is_named(name, value, expected, monkeyp
 
 
 @pytest.mark.parametrize(('name', 'value'), [
-    *(('ROS_DOMAIN_ID', value) for value in ('', '0', '9', '10', '99', '199', '232')),
+    *(('ROS_DOMAIN_ID', value) for value in ('', '0', '10', '232')),
     ('ROS_STATIC_PEERS', '127.0.0.1;localhost'), ('ROS_AUTOMATIC_DISCOVERY_RANGE', 'OFF'),
     ('ROS_SECURITY_ENABLE', 'false')])
 def test_a_valid_environment_variable_is_accepted(name, value, monkeypatch):

@@ -16,10 +16,6 @@ from rosgraph_msgs.msg import Clock
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.nodes.channel import ChannelNode
-from rhs_isac_ros.nodes.optimizer import OptimizerNode
-from rhs_isac_ros.nodes.positioner import PositionerNode
-from rhs_isac_ros.nodes.rhs_controller import RhsControllerNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import presences
 from rhs_isac_ros.protocol.role import Role
@@ -139,8 +135,8 @@ def test_a_node_that_was_killed_is_missing_until_its_successor_has_the_role(
 def test_a_node_is_reported_as_present_when_it_is_ready(bench, monitor):
     """The channel is ready at once; the positioner subscribes when it has an estimator."""
     reports = monitor('bs')
-    bench.add(ChannelNode)
-    positioner = bench.add(PositionerNode)
+    bench.add_role('channel')
+    positioner = bench.add_role('positioner')
     bench.until(lambda: reports and 'channel' not in reports[-1], 'presence of the channel')
     assert 'positioner' in reports[-1]
     positioner.subscribe()
@@ -148,10 +144,10 @@ def test_a_node_is_reported_as_present_when_it_is_ready(bench, monitor):
 
 
 def test_a_node_without_an_optimizer_reports_it(bench, capfd):
-    node = bench.add(RhsControllerNode)
+    node = bench.add_role('rhs_controller')
     bench.until(lambda: node.report().summary == 'waiting for optimizer', 'the report')
     assert node.report().fault
-    optimizer = bench.add(OptimizerNode)
+    optimizer = bench.add_role('optimizer')
     bench.until(lambda: not node._statistics.missing, 'the optimizer')
     bench.until(lambda: node._codebook_client.codebook_id, 'the codebook')
     bench.remove(optimizer)
@@ -163,20 +159,11 @@ def test_a_node_without_an_optimizer_reports_it(bench, capfd):
     assert log.count('optimizer is present again') == 1
 
 
-def test_what_a_role_lacks_is_reported_with_the_missing_roles(bench):
-    node = bench.add(RhsControllerNode)
-    # What is missing is not known yet.
-    node.set_lacking('power')
-    bench.until(lambda: node._statistics.missing == ('optimizer', 'power'), 'the report')
-    node.set_lacking('')
-    assert node._statistics.missing == ('optimizer',)
-
-
 # Simulated time
 
 def test_a_simulation_without_a_clock_is_waited_for(bench, monkeypatch, capfd):
     monkeypatch.setattr(clock_watch, 'STILL_S', 0.2)
-    node = bench.add(ChannelNode, values={'use_sim_time': True})
+    node = bench.add_role('channel', values={'use_sim_time': True})
     bench.until(lambda: 'waiting for /clock' in node.report().summary, 'the report')
     assert node.report().fault
     clock = bench.add(Node, 'simulator').create_publisher(Clock, '/clock', 10)
@@ -204,31 +191,27 @@ def test_nodes_in_different_times_report_each_other(bench, add_channel, announce
 
 # Quality of service
 
-@pytest.mark.parametrize('publishes', [True, False])
-def test_endpoints_with_incompatible_qos_are_named_once(bench, probe, publishes, capfd):
-    node = bench.add(ChannelNode)
-    text = '/feed_signals: no messages between this node and /observer: '
-    observer = bench.add(Node, 'observer')
-    if publishes:
-        observer.create_subscription(
-            TYPES['feed_signals'], 'feed_signals', lambda message: None, LATCHED)
-        key = 'conflict.qos.feed_signals.observer'
-    else:
-        observer.create_publisher(TYPES['pilot'], 'pilot', qos_profile_sensor_data)
-        key, text = 'conflict.qos.pilot.observer', text.replace('feed_signals', 'pilot')
-    bench.until(lambda: key in node.report().values, 'the report')
+def test_endpoints_with_incompatible_qos_are_named_once(bench, capfd):
+    node, observer = bench.add_role('channel'), bench.add(Node, 'observer')
+    observer.create_subscription(
+        TYPES['feed_signals'], 'feed_signals', lambda message: None, LATCHED)
+    observer.create_publisher(TYPES['pilot'], 'pilot', qos_profile_sensor_data)
+    reasons = {'feed_signals': 'Volatile publisher and transient local subscription',
+               'pilot': 'Best effort publisher and reliable subscription'}
+    keys = {f'conflict.qos.{topic}.observer' for topic in reasons}
+    bench.until(lambda: keys <= node.report().values.keys(), 'the report')
     assert node.report().fault
-    assert text in node.report().summary
     log = capfd.readouterr().err
-    assert log.count(text) == 1
-    assert ('Volatile publisher and transient local' if publishes else
-            'Best effort publisher and reliable') + ' subscription' in log
+    for topic, reason in reasons.items():
+        text = f'/{topic}: no messages between this node and /observer: '
+        assert text in node.report().summary
+        assert log.count(text) == log.count(reason) == 1
     bench.remove(observer)
-    bench.until(lambda: key not in node.report().values, 'its end')
+    bench.until(lambda: not keys & node.report().values.keys(), 'its end')
 
 
 def test_compatible_observers_are_no_conflict(bench):
-    node = bench.add(ChannelNode)
+    node = bench.add_role('channel')
     observer = bench.add(Node, 'observer')
     observer.create_subscription(
         TYPES['feed_signals'], 'feed_signals', lambda message: None, 10)
@@ -346,7 +329,7 @@ def test_the_own_standstill_is_no_silence_of_others(bench, add_channel, monkeypa
 
 def test_the_newer_of_two_optimizers_is_followed_until_it_has_gone(bench, bench_files, small):
     def add(name):
-        return bench.add(OptimizerNode, values={
+        return bench.add_role('optimizer', values={
             'scenario_file': bench_files / 'scenario.yaml',
             'codebook_file': bench_files / f'{name}.yaml'})
     first, second = (Codebook.load(bench_files / f'{name}.yaml').id
@@ -370,7 +353,7 @@ def test_the_newer_of_two_optimizers_is_followed_until_it_has_gone(bench, bench_
 def test_a_codebook_that_no_optimizer_holds_is_not_used(bench, probe, bench_files, small):
     """An optimizer that was suspended may announce its codebook for a moment."""
     first, second = (Codebook.load(bench_files / f'{name}.yaml') for name in ('first', 'second'))
-    optimizer = bench.add(OptimizerNode, values={
+    optimizer = bench.add_role('optimizer', values={
         'scenario_file': bench_files / 'scenario.yaml',
         'codebook_file': bench_files / 'first.yaml'})
     got = []

@@ -1,6 +1,5 @@
 """The surface and the site of a node, from its parameters and namespace."""
 
-import dataclasses
 import types
 from pathlib import Path
 
@@ -105,8 +104,3 @@ def test_a_place_that_does_not_exist_is_named(options, text):
     with pytest.raises(ParameterError) as error:
         place(**options)
     assert text in str(error.value)
-
-
-def test_only_the_pose_distinguishes_two_surfaces_of_equal_scenarios(site):
-    front, side = (one.scenario for one in site.surfaces.values())
-    assert dataclasses.replace(side, pose=front.pose).id == front.id

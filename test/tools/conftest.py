@@ -21,7 +21,7 @@ CYCLES = 4
 
 
 @pytest.fixture(scope='session')
-def make_cycles():
+def make_cycles(example):
     """Function that returns served cycles of users in turn, who walk through the region.
 
     The errors are 0.5 m, and their bounds 0.2 m.
@@ -33,19 +33,15 @@ def make_cycles():
             truth = np.array([6.0 + 8 * k / n, 3.0 - about['user'] % 5, 0.5])
             cycles.append(CompleteCycle(
                 **about,
-                state=m.ProtocolState(
-                    **about, phase=m.Phase.BEACONING, outcome='served',
-                    began_s=np.array([0, 0.01, 0.03, 0.06]), elapsed_s=0.1),
-                truth=m.GroundTruth(**about, position=truth, velocity=np.zeros(3)),
-                signals=m.ReceivedSignals(
-                    **about, codebook_id='cb', signals=np.zeros((2, 8, 4), complex)),
+                state=example(m.ProtocolState, **about, outcome='served', elapsed_s=0.1,
+                              began_s=np.array([0, 0.01, 0.03, 0.06])),
+                truth=example(m.GroundTruth, **about, position=truth),
+                signals=example(m.ReceivedSignals, **about, codebook_id='cb'),
                 estimate=m.PositionEstimate(
                     **about, codebook_id='cb', position=truth + [0.3, 0.4, 0],
                     covariance_m2=np.array([[0.6, 0.2, 0.05], [0.2, 0.3, 0.0], [0.05, 0.0, 0.1]]),
                     crlb_m2=0.04, estimator='bayes', latency_s=0.01),
-                capacity=m.Capacity(
-                    **about, codebook_id='cb', band=0, expected_bps=1e6, at_estimate_bps=1e6,
-                    actual_bps=1e6, perfect_bps=1e6, loss_bps=0.0, loss_percent=0.0)))
+                capacity=example(m.Capacity, **about, codebook_id='cb', actual_bps=1e6)))
         return cycles
     return make
 

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rclpy.parameter import Parameter
-from rclpy.parameter_client import AsyncParameterClient
 from std_srvs.srv import Trigger
 
 from rhs_isac_ros.calibration import Calibration
@@ -118,10 +116,8 @@ def test_a_calibration_restores_the_accuracy_of_a_running_network(
     assert done.out.endswith(f'{file}: calibration {Calibration.load(file).id}\n')
 
     for node in ('positioner', 'transmission'):
-        client = AsyncParameterClient(watch.node, node)
-        response = watch.call(client, lambda client: client.set_parameters_atomically(
-            [Parameter('calibration_file', value=str(file))]), [process])
-        assert response.result.successful, response.result.reason
+        result = watch.set_parameters(node, {'calibration_file': file}, [process])
+        assert result.successful, result.reason
     watch.until(lambda: process.log.count('bayes is ready') == 2, 'the estimator', [process])
     first = len(watch.received[m.PositionEstimate])
     watch.until(lambda: len(watch.received[m.PositionEstimate]) >= first + N_FRESH

@@ -277,7 +277,8 @@ def test_record_writes_all_topics_until_it_is_interrupted(
             line = process.stderr.readline()
             assert line, f'no messages of {missing}'
             missing.discard(line.rpartition('first message of ')[2].strip())
-        process.send_signal(signal.SIGINT)
+        # The signal of a terminal that is closed.
+        process.send_signal(signal.SIGHUP)
         out, err = process.communicate(timeout=30)
     assert process.returncode == 0, err
     messages = list(read(path))

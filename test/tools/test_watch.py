@@ -51,10 +51,6 @@ def test_watch_refreshes_the_terminal_until_it_is_interrupted(built_scripts, net
     assert text.rstrip().endswith(b'\x1b[?1049l')
 
 
-def test_watch_exits_when_the_reader_closes_the_pipe(network, run_script):
-    assert run_script(f'{{ {SCRIPT}; echo $? >&3; }} 3>&1 >&1 | head -n 1; true')
-
-
 @pytest.mark.parametrize(('arguments', 'missing'), [
     (['watch', '--once'], 'no complete cycle'), (['snapshot'], 'no user found'),
     (['calibrate'], '0 of 200 pilots')])

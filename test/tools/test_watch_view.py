@@ -24,16 +24,11 @@ def text_of(overview, now_s, width=80):
     return page.export_text()
 
 
-def ended(cycle_id, user, outcome):
-    return m.ProtocolState(
-        cycle_id=cycle_id, user=user, phase=m.Phase.BEACONING, outcome=outcome,
-        began_s=np.zeros(4), elapsed_s=0.0)
-
-
-def test_the_view_shows_faults_and_silent_nodes_within_80_columns():
+def test_the_view_shows_faults_and_silent_nodes_within_80_columns(example):
     overview = Overview()
     overview.add(m.Beacon(cycle_id=1795288682616, attempt=0), 1.0)
-    overview.add(ended(1795288682616, 12, 'rhs_silent'), 2.0)
+    overview.add(example(
+        m.ProtocolState, cycle_id=1795288682616, user=12, outcome='rhs_silent'), 2.0)
     overview.add(m.Beacon(cycle_id=1795288682617, attempt=0), 3.0)
     overview.add_report('lab/bs', Report(True, 'waiting for positioner', {
         'phase': 'waiting', 'dropped.late_ack': '3', 'cycles.no_fix': '2'}), 1.0)
@@ -67,7 +62,7 @@ def test_users_keep_their_rows_which_fit_into_80_columns(scenario, codebooks, pl
     assert '…' not in text
 
 
-def test_the_view_shows_a_pause():
+def test_the_view_shows_a_pause(example):
     overview = Overview()
     assert text_of(overview, 0.0).startswith('waiting for a base station')
     paused = Report(False, 'paused', {'phase': 'paused'})
@@ -75,14 +70,14 @@ def test_the_view_shows_a_pause():
     assert text_of(overview, 2.0).startswith('paused')
     overview.add(m.Beacon(cycle_id=1, attempt=0), 3.0)
     assert text_of(overview, 4.0).startswith('beaconing for 1.00 s')
-    overview.add(ended(1, 1, 'served'), 5.0)
+    overview.add(example(m.ProtocolState, cycle_id=1, outcome='served'), 5.0)
     overview.add_report('bs', paused, 6.0)
     assert text_of(overview, 7.0).startswith('paused for 2.00 s, cycle 1')
 
 
-def test_received_strings_are_neither_markup_nor_control_sequences():
+def test_received_strings_are_neither_markup_nor_control_sequences(example):
     overview = Overview()
-    overview.add(ended(1, 2, '\x1b[2J[/red]'), 1.0)
+    overview.add(example(m.ProtocolState, cycle_id=1, user=2, outcome='\x1b[2J[/red]'), 1.0)
     overview.add_report('a[/b]\x1b[31m', Report(True, '[bold]\n[/x]', {
         'phase': '[/', 'dropped.[/]\x07': '3', 'dropped.long': '9' * 5000}), 1.0)
     text = text_of(overview, 2.0, width=120)
