@@ -46,7 +46,7 @@ def make_cycles(example):
     return make
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope='package')
 def network(tmp_path_factory):
     """A running network of the small scenario, two users in one process."""
     logs = tmp_path_factory.mktemp('logs')
@@ -56,7 +56,7 @@ def network(tmp_path_factory):
         yield processes
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope='package')
 def shared_session(network):
     """A session that has discovered the network, so that not every command has to."""
     with Session() as session:
@@ -70,7 +70,7 @@ def shared_session(network):
         yield session
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope='package')
 def spin_until(shared_session):
     """Function that spins a node until a condition holds, and then destroys it."""
     def spin(node, condition):
@@ -83,7 +83,7 @@ def spin_until(shared_session):
     return spin
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope='package')
 def run(spin_until, tmp_path_factory):
     """A recording of some cycles of two users, and the cycles as they were observed live."""
     pytest.importorskip('mcap', reason='mcap is not installed')

@@ -1,0 +1,1 @@
+"""Tests of the commands, which share a running network."""
