@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from forked import Forked
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from policy_rules import permissions, rules, used
@@ -21,7 +22,9 @@ from rhs_isac_ros.protocol.fusion import sighting_of
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
 from rhs_isac_ros.ros.endpoints import EXCHANGE
+from rhs_isac_ros.ros.processes import Processes
 from rhs_isac_ros.ros.roster import FOLLOWING, ROSTER
+from rhs_isac_ros.tools import demo
 
 ROOT = Path(__file__).parents[2]
 BOTH, FRONT = 'fusion of front, side', 'fusion of front'
@@ -60,16 +63,21 @@ def site_file(make_site_file):
 
 # First, while no other site runs.
 def test_the_demonstration_compares_all_surfaces_with_the_fusion_and_counts_their_data(
-        built_scripts, make_site_file, tmp_path):
+        make_site_file, monkeypatch, capsys):
+    def fork(processes, name):
+        processes._running[name] = Forked(
+            processes._commands[name], processes._logs / f'{name}.log', processes._environment)
+    monkeypatch.setattr(Processes, '_spawn', fork)
+    # The environment of this process remains as it is.
+    monkeypatch.setattr(demo, 'private_domain', dict)
     names = ('side', 'front')
-    done = subprocess.run(
-        [ROOT / 'scripts' / 'demo', '--site', make_site_file(*names), '--cycles', '4',
-         '--prior', 'track'],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
+    code = demo.main(
+        ['--site', str(make_site_file(*names)), '--cycles', '4', '--prior', 'track'])
+    out, err = capsys.readouterr()
+    assert code == 0, err
     for text in (*(f'{name}: ' for name in names), 'fused: 4 positions, root mean square error'):
-        assert text in done.stdout
-    carried, handovers = done.stdout.splitlines()[-1].removeprefix('data: ').split('; ')
+        assert text in out
+    carried, handovers = out.splitlines()[-1].removeprefix('data: ').split('; ')
     assert sum(int(one.split(' over ')[0]) for one in carried.split(', ')) == 4
     assert re.fullmatch(r'\d handovers?', handovers)
 
