@@ -138,13 +138,6 @@ def test_arrays_of_other_numbers_are_converted(field, dtype, expected):
     assert np.array_equal(received, values)
 
 
-@pytest.mark.parametrize('kind', KINDS)
-def test_fields_are_those_of_the_ros_type(kind):
-    names = [name for name in convert.ros_type(kind).get_fields_and_field_types()
-             if name != 'header']
-    assert [field.name for field in dataclasses.fields(kind) if field.name != 'stamp_ns'] == names
-
-
 def test_every_message_has_a_ros_type_and_every_ros_type_a_message():
     kinds = {kind.__name__ for kind in KINDS}
     assert kinds == {kind.__name__ for kind in m.Message.__subclasses__()}
