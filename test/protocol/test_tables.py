@@ -118,10 +118,11 @@ def test_the_base_station_gives_up_exactly_with_the_lost_outcomes():
 
 
 @each_role
-def test_a_message_that_the_role_does_not_receive_is_an_error(machine, example):
-    message = f'ProtocolState is not an event of {type(machine).__name__}'
-    with pytest.raises(TypeError, match=message):
-        machine.handle(example(m.ProtocolState), 0.0)
+def test_an_event_that_no_row_awaits_is_an_error(machine, example):
+    for event in (example(m.ProtocolState), events.Immediately()):
+        message = f'{type(event).__name__} is not an event of {type(machine).__name__}'
+        with pytest.raises(TypeError, match=message):
+            machine.handle(event, 0.0)
 
 
 def snapshot(thing):
@@ -173,6 +174,7 @@ def random_event(rng, subject, example, codebooks):
 @each_role
 def test_machines_take_the_first_row_that_matches(
         machine, name, seed, example, codebooks, scenario, monkeypatch):
+    """Its target, timeout and outcome apply, and then rows without an event."""
     taken = []
     take = StateMachine._take
     monkeypatch.setattr(StateMachine, '_take', lambda self, row, event: (
@@ -183,6 +185,7 @@ def test_machines_take_the_first_row_that_matches(
         event = random_event(rng, machine, example, codebooks)
         now_s += rng.exponential(0.05)
         state, memory, counters = machine.state, snapshot(machine), machine.counters.copy()
+        deadline_s, repeats = machine.next_deadline(), machine.repeats
         machine.now_s = now_s
         matching = [row for row in rows_for(machine.TABLE, state, type(event))
                     if row.guard(machine, event)]
@@ -205,14 +208,21 @@ def test_machines_take_the_first_row_that_matches(
             if isinstance(action, events.Send):
                 m.check(action.message, scenario)
                 sent.add(type(action.message))
+        for row in taken:
+            state, repeats = row.target or state, (
+                0 if row.target else repeats + row.restart_timeout)
+            counters[row.outcome.value if row.outcome else None] += 1
+            if row.target or row.restart_timeout:
+                timeout_s = machine.timeout_s(state)
+                deadline_s = None if timeout_s is None else now_s + timeout_s
+        # Actions may count more.
+        del counters[None]
+        assert machine.counters >= counters
+        assert (machine.state, machine.repeats, machine.next_deadline()) == (
+            state, repeats, deadline_s)
         visited.add(machine.state)
-        if machine.state is not state:
-            # The first deadline is set by the first change of state.
-            timeout_s = machine.timeout_s(machine.state)
-            assert machine.next_deadline() == (
-                None if timeout_s is None else now_s + timeout_s)
     assert len(visited) >= min(3, len(machine.STATES))
-    assert sent
+    assert sent and sent <= {*machine.SENDS}
     # An idle RHS controller rejects all beams but one without a codebook. A receiver that listens
     # has the signals of all bands of its latest cycle.
     assert unexpected or name in ('rhs_controller', 'receiver')
