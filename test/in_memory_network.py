@@ -536,7 +536,7 @@ def places(scenario) -> np.ndarray:
     return scenario.sample_positions(5, np.random.default_rng(7))
 
 
-@pytest.fixture
+@pytest.fixture(scope='session')
 def network(scenario, codebooks, places):
     """Function that returns a network; `users` is a number of users or a mapping."""
     def make(users=1, codebook=codebooks[0], **options) -> Network:

@@ -160,7 +160,7 @@ def test_the_old_estimator_is_kept_if_the_new_one_cannot_be_built(network, make_
 
 
 def test_the_last_of_several_estimators_is_used(network):
-    net = network(make_s=0.5, step_timeout_s=2.0)
+    net = network(make_s=0.5, step_timeout_s=2.0, rest_s=0.5)
     net.run_cycles(1)
     net.change('positioner', estimator='neural')
     net.change('positioner', **UNFIT)

@@ -43,14 +43,14 @@ def rates(net):
     return [net.served()[first:].count(user) for user in (1, 2)]
 
 
-@pytest.fixture
+@pytest.fixture(scope='module')
 def usual(network):
     """Number of cycles that serve each of two users that are alone."""
     return min(rates(network(2)))
 
 
 @pytest.mark.parametrize(('n', 'policy'), [
-    *((n, 'round_robin') for n in (1, 4, 30)), (30, 'first'), (30, 'random')])
+    (1, 'round_robin'), (30, 'round_robin'), (30, 'first'), (30, 'random')])
 def test_numbers_that_complete_no_cycle_take_at_most_half_of_the_time(attack, usual, n, policy):
     served = rates(attack(n, policy=policy))
     worst = 2 * min(served) if policy == 'round_robin' else sum(served)

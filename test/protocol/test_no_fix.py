@@ -1,5 +1,8 @@
 """Cycles without a position estimate."""
 
+import itertools
+import types
+
 import numpy as np
 import pytest
 from in_memory_network import Fault
@@ -9,23 +12,18 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 
 
-class NoFixInCycles:
-    """An estimator without a fix in the given cycles."""
-
-    name = 'no_fix'
-
-    def __init__(self, cycles):
-        self._cycles, self._cycle = cycles, 0
-
-    def estimate(self, received):
-        self._cycle += 1
-        if self._cycle in self._cycles:
-            return Estimate(np.full(3, np.nan), np.full((3, 3), np.nan), 'nothing fits')
-        return Estimate(np.array([10.0, 0.0, 0.0]), np.eye(3))
+@pytest.fixture
+def make():
+    """Function that returns an estimator without a fix in the second cycle."""
+    found = Estimate(np.array([10.0, 0.0, 0.0]), np.eye(3))
+    nothing = Estimate(np.full(3, np.nan), np.full((3, 3), np.nan), 'nothing fits')
+    results = itertools.chain([found, nothing], itertools.repeat(found))
+    return lambda codebook: types.SimpleNamespace(
+        name='no_fix', estimate=lambda received: next(results))
 
 
-def test_without_a_fix_the_cycle_ends_at_once_without_a_position(network):
-    net = network(make=lambda codebook: NoFixInCycles({2}))
+def test_without_a_fix_the_cycle_ends_at_once_without_a_position(network, make):
+    net = network(make=make)
     net.run_cycles(3)
     assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'no_fix'), (3, 1, 'served')]
     assert [e.cycle_id for e in net.sent(m.PositionEstimate)] == [1, 3]
@@ -37,13 +35,15 @@ def test_without_a_fix_the_cycle_ends_at_once_without_a_position(network):
     (end_s,) = [s.time_s for s in net.log if isinstance(s.message, m.ProtocolState)
                 and s.message.outcome == 'no_fix']
     assert end_s - signals_s < 0.01
+    assert net.logged('bs') == [
+        'cycle 2 of user 1 given up: no_fix', 'cycle 3: user 1 served again after: no_fix']
     assert net.counters() == {
         'bs': {'no_fix': 1}, 'positioner': {'no_fix': 1}, 'user1': {'abandoned': 1}}
     net.verify()
 
 
-def test_a_lost_no_fix_costs_the_timeout_of_one_step(network):
-    net = network(make=lambda codebook: NoFixInCycles({2}), transport=Fault(m.NoFix, 'bs', n=1))
+def test_a_lost_no_fix_costs_the_timeout_of_one_step(network, make):
+    net = network(make=make, transport=Fault(m.NoFix, 'bs', n=1))
     net.run_cycles(3)
     assert net.transport.n_affected
     assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'positioner_silent'), (3, 1, 'served')]
