@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+import functools
 import heapq
 import itertools
 import types
@@ -56,29 +57,19 @@ BEACON_TIMEOUT_S = 3.0
 UNFIT = 'unfit'
 
 
-class Centre:
-    """An estimator that always returns the center of the region."""
-
-    def __init__(self, scenario: Scenario, name: str = 'centre') -> None:
-        self._position, self.name = np.array(scenario.roi_center_m), name
-
-    def estimate(self, received: np.ndarray) -> Estimate:
-        return Estimate(self._position, np.eye(3))
-
-
 FIXED_PLACE = np.array([8.0, -2.0, 0.5])
 # Means of the mixture in an example of a posterior [m].
 PLACES_OF_MODES = np.array([FIXED_PLACE, [8.0, -2.5, 0.5]])
 
 
 class Fixed:
-    """An estimator with a fixed result, whose name contains the id of its codebook."""
+    """An estimator that always returns the same position."""
 
-    def __init__(self, codebook: Codebook) -> None:
-        self.name = f'fixed {codebook.id}'
+    def __init__(self, name: str, position: Sequence[float] = FIXED_PLACE) -> None:
+        self.name, self._position = name, np.array(position)
 
     def estimate(self, received: np.ndarray) -> Estimate:
-        return Estimate(FIXED_PLACE, 4 * np.eye(3))
+        return Estimate(self._position, np.eye(3))
 
 
 def plain_choice(scenario: Scenario, position: np.ndarray, covariance_m2: np.ndarray,
@@ -324,7 +315,8 @@ class Network:
                 raise ModelError('model_file: unfit')
             # The default estimator has a name of its own.
             usual = action.settings == PositionerSettings()
-            return Centre(self.scenario, 'centre' if usual else action.settings.estimator)
+            return Fixed('centre' if usual else action.settings.estimator,
+                         self.scenario.roi_center_m)
         event = build_estimator(
             action.codebook, self._make or centre, lambda: self.now_s)
         if not self._make_s:
@@ -465,6 +457,7 @@ class Network:
         return signals + noise
 
     @staticmethod
+    @functools.cache
     def _kind(name: str) -> str:
         return name.rpartition('/')[2].removesuffix('_twin').rstrip('0123456789')
 

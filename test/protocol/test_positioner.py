@@ -54,7 +54,7 @@ def locate(positioner, codebooks, example):
 
 def ready(codebook, estimate=None):
     """Return the event that an estimator is built; `estimate` takes the place of its method."""
-    estimator = Fixed(codebook)
+    estimator = Fixed(f'fixed {codebook.id}')
     estimator.estimate = estimate or estimator.estimate
     return EstimatorBuilt(codebook, estimator, 1.5)
 
@@ -77,7 +77,7 @@ def test_the_codebook_of_the_signals_selects_the_estimator(
         assert (estimate.cycle_id, estimate.user, estimate.codebook_id, estimate.estimator,
                 estimate.latency_s) == (5, 2, codebook.id, f'fixed {codebook.id}', 1.0)
         assert (estimate.position == PLACE).all()
-        assert (estimate.covariance_m2 == 4 * np.eye(3)).all()
+        assert (estimate.covariance_m2 == np.eye(3)).all()
         assert estimate.crlb_m2 == pytest.approx(crlb(scenario, codebook, PLACE[None])[0])
 
 
@@ -243,6 +243,7 @@ def test_an_error_while_an_estimator_is_built_is_an_event(codebooks, error):
 
 def test_a_built_estimator_is_returned_with_its_duration(codebooks):
     watch = iter([3.0, 5.5])
-    event = build_estimator(codebooks[0], Fixed, lambda: next(watch))
+    event = build_estimator(
+        codebooks[0], lambda codebook: Fixed(codebook.id), lambda: next(watch))
     assert (event.codebook, event.elapsed_s) == (codebooks[0], 2.5)
-    assert event.estimator.name == f'fixed {codebooks[0].id}'
+    assert event.estimator.name == codebooks[0].id

@@ -1,5 +1,7 @@
 """The residuals of all users and of each user."""
 
+import types
+
 import numpy as np
 import pytest
 
@@ -7,9 +9,7 @@ from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.positioning import Estimate, TrackEstimate, make_estimator
 from rhs_isac_ros.positioning.diagnosis import MIN_FIXES, MIN_RETURN, WINDOW
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import SettingsOffered
 from rhs_isac_ros.protocol.positioner import ResidualWatch
-from rhs_isac_ros.protocol.settings import PositionerSettings
 
 EXPECTED = 62.5
 PLACE = np.array([10.0, 0.0, 0.0])
@@ -82,33 +82,13 @@ def test_users_who_may_be_outside_are_not_compared():
     assert watch.status() == {}
 
 
-class Residuals:
-    """An estimator whose residuals and fixes the test sets."""
-
-    name = 'residuals'
-
-    def __init__(self):
-        self.factor, self.reason, self.blocked = 1.0, '', 0.0
-
-    def estimate(self, received):
-        if self.reason:
-            nothing = np.full(3, np.nan), np.full((3, 3), np.nan)
-            return Estimate(*nothing, self.reason, 9.0, np.nan)
-        if self.blocked:
-            return TrackEstimate(PLACE, np.eye(3), blocked_probability=self.blocked,
-                                 velocity=np.zeros(3), velocity_covariance=np.eye(3),
-                                 is_predicted=True)
-        return estimate(self.factor)
-
-
 @pytest.fixture
-def estimator():
-    return Residuals()
-
-
-@pytest.fixture
-def net(network, estimator):
-    return network(make=lambda codebook: estimator, rest_s=0.0)
+def net(network):
+    """A network whose positioner finds the estimate `result`."""
+    net = network(rest_s=0.0, make=lambda codebook: types.SimpleNamespace(
+        name='residuals', estimate=lambda received: net.result))
+    net.result = estimate(1.0)
+    return net
 
 
 def warnings(net):
@@ -119,27 +99,14 @@ def texts(net):
     return [text for text in net.logged('positioner') if 'ready for codebook' not in text]
 
 
-def test_the_positioner_warns_while_the_residuals_deviate(net, estimator):
-    net.run_cycles(MIN_FIXES)
-    assert warnings(net) == ''
-    estimator.factor = 3.0
-    net.run_cycles(2 * MIN_FIXES)
-    assert warnings(net) != ''
-    estimator.factor = 1.0
-    net.run_cycles(MIN_RETURN)
-    assert warnings(net) == ''
-    begin, end = texts(net)
-    assert begin.startswith('the signals do not match the scenario')
-    assert end == 'the residuals match the scenario again'
-    assert set(net.served()) == {1}
-
-
-def test_a_prediction_through_a_blockage_is_logged_once_with_its_probability(net, estimator):
+def test_a_prediction_through_a_blockage_is_logged_once_with_its_probability(net):
     net.run_cycles(1)
-    estimator.blocked = 0.97
+    net.result = TrackEstimate(
+        PLACE, np.eye(3), blocked_probability=0.97, velocity=np.zeros(3),
+        velocity_covariance=np.eye(3), is_predicted=True)
     net.run_cycles(3)
     assert net['positioner'].status()['probability.blocked'] == '0.970'
-    estimator.blocked = 0.0
+    net.result = estimate(1.0)
     net.run_cycles(2)
     assert texts(net) == [
         'cycle 2: the track of user 1 predicts its position: blocked 97 %',
@@ -147,26 +114,26 @@ def test_a_prediction_through_a_blockage_is_logged_once_with_its_probability(net
     assert {message.blocked_probability for message in net.sent(m.PositionEstimate)} == {0, 0.97}
 
 
-def test_the_diagnostics_name_the_likely_cause_of_missing_fixes(net, estimator):
+def test_the_diagnostics_name_the_likely_cause_of_missing_fixes(net):
     net.run_cycles(2)
     assert 'no_fix.cause' not in net['positioner'].status()
-    estimator.reason = 'blocked: probability 0.9, expected at most 0.5'
+    net.result = Estimate(np.full(3, np.nan), np.full((3, 3), np.nan),
+                          'blocked: probability 0.9, expected at most 0.5', 9.0, np.nan)
     net.run_cycles(3)
     values = net['positioner'].status()
     assert values['no_fix.cause'] == 'blocked'
     assert values['no_fix.share'] == '3 of 5'
 
 
-def test_a_new_codebook_or_new_settings_begin_anew(net, estimator, codebooks):
-    estimator.factor = 3.0
-    net.run_cycles(MIN_FIXES)
-    assert warnings(net) != ''
-    estimator.factor = 1.0
-    net.offer(codebooks[1])
-    assert warnings(net) == ''
-    net.run_cycles(2)
-    estimator.factor = 3.0
-    net.run_cycles(MIN_FIXES)
-    assert warnings(net) != ''
-    net.dispatch('positioner', SettingsOffered(PositionerSettings(reject_outside=False)))
-    assert warnings(net) == ''
+def test_the_positioner_warns_until_a_new_codebook_or_new_settings_are_used(net, codebooks):
+    def new_settings():
+        net.change('positioner', reject_outside=False)
+
+    net.result = estimate(3.0)
+    for number, replace in enumerate((lambda: net.offer(codebooks[1]), new_settings), start=1):
+        net.run_cycles(MIN_FIXES)
+        assert warnings(net) != ''
+        assert len(texts(net)) == number
+        replace()
+        assert warnings(net) == ''
+    assert texts(net)[0].startswith('the signals do not match the scenario')

@@ -60,7 +60,7 @@ def test_no_sequence_of_messages_raises_an_error(
         for event in events:
             for action in role.handle(event, float(n)):
                 if isinstance(action, BuildEstimator):
-                    built = EstimatorBuilt(action.codebook, Fixed(action.codebook), 0.0)
+                    built = EstimatorBuilt(action.codebook, Fixed('fixed'), 0.0)
                     events.append(built)
                     continue
                 if isinstance(action, ApplyPatterns):
