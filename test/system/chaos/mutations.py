@@ -11,8 +11,6 @@ import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 
 _FLOATS = (0.0, -0.0, 1.0, -1.0, 0.5, 1e-300, -1e300, math.nan, math.inf, -math.inf)
-_UNSIGNED_BITS = {'uint8': 8, 'uint16': 16, 'uint32': 32, 'uint64': 64, 'char': 8}
-_SIGNED_BITS = {'int8': 8, 'int16': 16, 'int32': 32, 'int64': 64}
 _TYPE_CODES = {'uint8': 'B', 'uint16': 'H', 'uint32': 'I', 'uint64': 'Q'}
 _STRINGS = ('', 'a', 'cb', '\u00e9\u4e2d', 'x' * 3000, '../../etc', '%s%n', '\x1b[2J', '\x00')
 _ARRAY = re.compile(r'(.+)\[(\d+)\]$')
@@ -85,18 +83,13 @@ def _value(field_type: str, rng: np.random.Generator) -> Any:
         return bool(rng.integers(2))
     if field_type == 'octet':
         return bytes([rng.integers(256)])
-    if field_type in _UNSIGNED_BITS:
-        top = 2**_UNSIGNED_BITS[field_type] - 1
-        return _choice((0, 1, 2, 3, 5, min(1000, top), top // 2, top // 2 + 1, top - 1, top), rng)
-    if field_type in _SIGNED_BITS:
-        top = 2**(_SIGNED_BITS[field_type] - 1) - 1
-        return _choice((0, 1, -1, top, -top - 1), rng)
-    package, name = field_type.split('/')
-    return random_message(getattr(importlib.import_module(f'{package}.msg'), name), rng)
-
-
-def _choice(values: Sequence[int], rng: np.random.Generator) -> int:
-    # Unlike numpy.random.Generator.choice, this takes integers of more than 63 bits.
+    if '/' in field_type:
+        package, name = field_type.split('/')
+        return random_message(getattr(importlib.import_module(f'{package}.msg'), name), rng)
+    low, top = np.iinfo(field_type).min, np.iinfo(field_type).max
+    values = (low, max(low, -1), 0, 1, 2, 3, 5, min(1000, top), top // 2, top // 2 + 1, top - 1,
+              top)
+    # Unlike this index, numpy.random.Generator.choice takes no integers of more than 63 bits.
     return values[rng.integers(len(values))]
 
 
