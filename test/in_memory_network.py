@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from system.invariants import RECEIVES, InvariantChecker
 
 from rhs_isac_ros.codebook import Codebook, random_codebook
 from rhs_isac_ros.codebook.library import EMPTY
@@ -105,16 +106,17 @@ def on_time(message: m.Message, recipient: str) -> list[tuple[float, m.Message]]
 
 
 class Fault:
-    """Affects the first `n` messages of a class to a recipient, which have the given fields.
+    """Affects `n` messages of a class to a recipient, which have the given fields.
 
-    They arrive once after each of the delays, or not at all; `alter` changes those that arrive.
+    The first `skip` of them are on time. The others arrive once after each of the delays, or not
+    at all; `alter` changes those that arrive.
     """
 
     def __init__(self, kind: type[m.Message], recipient: str, *delays_s: float, n: float = np.inf,
-                 alter: Callable[[Any], m.Message] = lambda message: message,
+                 skip: int = 0, alter: Callable[[Any], m.Message] = lambda message: message,
                  **fields: Any) -> None:
         self.kind, self.recipient, self.delays_s, self.alter = kind, recipient, delays_s, alter
-        self.n, self.fields, self.n_affected = n, fields, 0
+        self.n, self.fields, self.n_affected = n, fields, -skip
 
     def affects(self, message: m.Message, recipient: str) -> bool:
         return (self.n_affected < self.n and recipient == self.recipient
@@ -125,6 +127,8 @@ class Fault:
         if not self.affects(message, recipient):
             return on_time(message, recipient)
         self.n_affected += 1
+        if self.n_affected <= 0:
+            return on_time(message, recipient)
         return [(delay_s, self.alter(message)) for delay_s in self.delays_s]
 
 
@@ -357,8 +361,8 @@ class Network:
             since_s, events = (since_s, events + 1) if self.now_s == since_s else (self.now_s, 0)
             assert events < 10_000, f'time does not advance; counters {self.counters()}'
             due_s, name = min(
-                ((role.next_deadline(), name) for name, role in self._roles.items()
-                 if role.next_deadline() is not None), default=(np.inf, ''))
+                ((deadline_s, name) for name, role in self._roles.items()
+                 if (deadline_s := role.next_deadline()) is not None), default=(np.inf, ''))
             arrival_s = self._queue[0][0] if self._queue else np.inf
             if min(due_s, arrival_s) > end_s:
                 self.now_s = end_s
@@ -438,6 +442,24 @@ class Network:
                 case m.Capacity():
                     key = (message.cycle_id, message.user, message.codebook_id)
                     assert key in beams
+
+    def checker(self) -> InvariantChecker:
+        """Return a checker of invariants that knows the codebooks."""
+        checker = InvariantChecker(self.scenario)
+        for codebook in self.codebooks.values():
+            checker.add_codebook(codebook)
+        return checker
+
+    def check_invariants(self, messages: Iterable[m.Message] | None = None) -> InvariantChecker:
+        """Return a checker that has checked the results among all messages, or the given ones."""
+        checker = self.checker()
+        for message in [sent.message for sent in self.log] if messages is None else messages:
+            if isinstance(message, RECEIVES):
+                checker.add(message, 0.0)
+        # Belongs to no cycle; its late arrival makes all earlier results due.
+        checker.add(m.Grant(cycle_id=0, user=1), 1e9)
+        assert checker.checked
+        return checker
 
     def expected_signals(
             self, cycle_id: int, user: int, codebook_id: str, position: np.ndarray) -> np.ndarray:

@@ -23,10 +23,8 @@ NEEDS_MCAP = pytest.mark.skipif(
 # in a folder with the files of the fixture `folder`.
 CALLS = [
     ('tools.demo', ['--users', '0'], 'argument --users: 0, expected 1 to 4096'),
-    ('tools.demo', ['--users', '-3'], 'argument --users: -3, expected 1 to 4096'),
     ('tools.demo', ['--users', 'many'], "argument --users: 'many', expected an integer"),
     ('tools.demo', ['--users', '100000'], 'argument --users: 100000, expected 1 to 4096'),
-    ('tools.demo', ['--cycles', '1e3'], "argument --cycles: '1e3', expected an integer"),
     ('tools.demo', ['--cycles', str(10**30)], 'expected 1 to 1000000000'),
     ('tools.demo', ['--seed', '2147483648'], 'expected 0 to 2147483647'),
     ('tools.demo', ['--picture', 'x.xyz'], 'ends in .png, .pdf, .svg'),
@@ -77,7 +75,6 @@ CALLS = [
     pytest.param('tools.replay', ['garbage'], 'garbage: not a complete recording',
                  marks=NEEDS_MCAP),
     ('tools.replay', ['garbage', '--estimator', 'magic'], "invalid choice: 'magic'"),
-    ('tools.replay', ['garbage', '--publish', '--rate', 'nan'], 'nan, expected above 0'),
     ('tools.replay', ['garbage', '--publish', '--estimator', 'ml'], 'not allowed with'),
     ('tools.replay', ['garbage', '--estimator', 'neural', '--calibration', 'garbage'],
      'not allowed with --estimator neural'),
@@ -89,20 +86,16 @@ CALLS = [
     ('tools.replay', ['garbage', '--model', 'good.yaml'], 'together with --estimator neural'),
     ('tools.snapshot', ['--output', 'x.jpg'], 'ends in .png, .pdf, .svg'),
     ('tools.snapshot', ['--timeout', '-1'], '-1.0, expected at least 0'),
-    ('tools.snapshot', ['--timeout', 'inf'], 'inf, expected at least 0'),
     ('tools.snapshot', ['--config', QUICK_CODEBOOK], 'unknown field'),
-    ('tools.watch', ['--timeout', 'x'], "argument --timeout: 'x'"),
     ('tools.watch', ['--once', 'twice'], 'unrecognized arguments: twice'),
     ('tools.topic', ['show'], "invalid choice: 'show'"),
     ('tools.topic', ['echo'], 'required: topic_name'),
-    ('tools.topic', ['hz'], 'required: topic_name'),
     ('tools.topic', ['list', '--spin-time', 'nan'], 'nan, expected at least 0'),
     ('tools.param', ['get', 'bs'], 'required: parameter_name'),
     ('tools.param', ['list', '--timeout', 'x'], 'expected a number, at least 0'),
     ('codebook.__main__', ['--output', '.'], '.: a directory, expected a file'),
     ('codebook.__main__', ['--plot', 'p.xyz'], 'ends in .png, .pdf, .svg'),
     ('codebook.__main__', ['--output', 'a.pdf', '--plot', 'a.pdf'], 'a file other than --output'),
-    ('codebook.__main__', ['--positions', '0'], '0, expected 1 to'),
     ('codebook.__main__', ['--steps', '-1'], '-1, expected 1 to 1000000000'),
     ('codebook.__main__', ['--start', 'none'], "'none', expected an existing file"),
     ('codebook.__main__', ['--start', QUICK_CODEBOOK], 'analog: shape (2, 3, 36)'),
@@ -130,7 +123,6 @@ CALLS = [
     ('nodes.network', ['--ros-args', '--params-file', 'garbage'], "'--params-file garbage'"),
     ('nodes.optimizer', ['--push', '--push-file', 'good.yaml'], 'not allowed with --push'),
     ('nodes.optimizer', ['--push-file', 'garbage'], 'garbage: cannot be read'),
-    ('nodes.optimizer', ['--push-file', 'none.yaml'], 'none.yaml'),
 ]
 # The scripts, as processes.
 PROCESSES = [

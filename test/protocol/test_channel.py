@@ -287,47 +287,37 @@ def test_users_are_served_within_three_seconds_after_a_fault_at_any_pattern(netw
     net.verify()
 
 
-DEVIATING = {
-    'user_gain_std_db': 3.0, 'phase_std_rad': 7.0, 'band_phase_std_rad': 7.0,
-    'timing_std_s': 1e-6, 'carrier_offset_std_hz': 1e4, 'element_error_rms': 0.2,
-    'failed_element_share': 0.3}
-
-
 def make_deviating(scenario, **impairments):
     """Return a channel without multipath."""
     silent = dataclasses.replace(scenario, multipath_to_los_db=-200.0)
     return Channel(silent, 0, Impairments(**impairments))
 
 
-@pytest.mark.parametrize('name', DEVIATING)
-def test_a_deviation_changes_the_signals_and_can_be_switched_off(scenario, codebooks, name):
+# Whether the deviation is the same in another cycle of the user, and for another user.
+@pytest.mark.parametrize(('name', 'strength', 'same_user', 'same_surface'), [
+    ('user_gain_std_db', 3.0, True, False), ('carrier_offset_std_hz', 1e4, True, False),
+    ('phase_std_rad', 7.0, False, False), ('band_phase_std_rad', 7.0, False, False),
+    ('timing_std_s', 1e-6, False, False), ('element_error_rms', 0.2, True, True),
+    ('failed_element_share', 0.3, True, True)])
+def test_a_deviation_of_the_surface_the_user_or_the_cycle_can_be_switched_off(
+        scenario, codebooks, name, strength, same_user, same_surface):
     analog = codebooks[0].analog[0]
     plain = signals_of(make_deviating(scenario), analog, 1)
-    impaired = make_deviating(scenario, **{name: DEVIATING[name]})
-    assert not np.allclose(signals_of(impaired, analog, 1), plain, rtol=1e-3)
-    declared = make_deviating(dataclasses.replace(scenario, **{name: DEVIATING[name]}))
+    impaired = make_deviating(scenario, **{name: strength})
+    declared = make_deviating(dataclasses.replace(scenario, **{name: strength}))
+    first, again, other = (signals_of(impaired, analog, cycle_id, user)
+                           for user, cycle_id in ((1, 1), (1, 2), (2, 3)))
+    assert not np.allclose(first, plain, rtol=1e-3)
+    assert np.allclose(again, first, rtol=1e-6) == same_user
+    assert np.allclose(other, first, rtol=1e-6) == same_surface
     # The little multipath that is left differs.
-    np.testing.assert_allclose(
-        signals_of(declared, analog, 2), signals_of(impaired, analog, 2), rtol=1e-6)
+    np.testing.assert_allclose(signals_of(declared, analog, 2), again, rtol=1e-6)
     for channel in (impaired, declared):
         channel.handle(SettingsOffered(Impairments(**{name: 0.0})), 0.0)
         np.testing.assert_allclose(signals_of(channel, analog), plain, rtol=1e-6)
         channel.handle(SettingsOffered(Impairments()), 0.0)
     np.testing.assert_allclose(signals_of(impaired, analog, 4), plain, rtol=1e-6)
     assert not np.allclose(signals_of(declared, analog, 4), plain, rtol=1e-3)
-
-
-@pytest.mark.parametrize(('name', 'same_user', 'same_surface'), [
-    ('user_gain_std_db', True, False), ('carrier_offset_std_hz', True, False),
-    ('phase_std_rad', False, False), ('timing_std_s', False, False),
-    ('element_error_rms', True, True), ('failed_element_share', True, True)])
-def test_deviations_belong_to_the_surface_the_user_or_the_cycle(
-        scenario, codebooks, name, same_user, same_surface):
-    channel = make_deviating(scenario, **{name: DEVIATING[name]})
-    first, again, other = (signals_of(channel, codebooks[0].analog[0], cycle_id, user)
-                           for user, cycle_id in ((1, 1), (1, 2), (2, 3)))
-    assert np.allclose(again, first, rtol=1e-6) == same_user
-    assert np.allclose(other, first, rtol=1e-6) == same_surface
 
 
 def test_gain_and_element_errors_change_the_capacity(scenario, truth, beam, applied, downlink):

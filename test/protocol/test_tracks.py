@@ -78,10 +78,6 @@ def locate(estimator, signals):
     return locate
 
 
-def test_each_user_has_a_track(locate):
-    assert [locate(n, user=1 + n % 2).n_phases for n in range(6)] == [1, 1, 2, 2, 3, 3]
-
-
 def test_a_replaced_user_starts_a_new_track(locate):
     assert [locate(n, user_instance=7).n_phases for n in range(3)] == [1, 2, 3]
     assert [locate(n, user_instance=8).n_phases for n in range(3, 5)] == [1, 2]
@@ -115,7 +111,7 @@ def test_a_gap_ends_a_track(locate):
     assert len(locate.tracks._tracks) == 1
 
 
-def test_the_number_of_tracks_is_bounded(monkeypatch, locate):
+def test_each_user_has_a_track_and_their_number_is_bounded(monkeypatch, locate):
     monkeypatch.setattr(locate.tracks._tracks, 'max_size', 2)
     counts = [locate(n, user=user, now_s=n / 10).n_phases
               for n, user in enumerate([1, 2, 1, 3, 1, 2])]

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from in_memory_network import feed, plain_choice
 
-from rhs_isac_ros.link import Beam, CapacityReport, capacity, choose_beam, steer
+from rhs_isac_ros.link import (
+    Beam,
+    CapacityReport,
+    capacity,
+    choose_beam,
+    expected_capacities,
+    steer,
+)
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered, LogMessage, SettingsOffered, Timeout
 from rhs_isac_ros.protocol.settings import TransmissionSettings
@@ -52,17 +59,24 @@ def beam(transmission, estimate):
 def test_the_beam_is_that_of_the_posterior(beam, scenario, estimate):
     choice = choose_beam(scenario, estimate.position, estimate.covariance_m2)
     assert (beam.band, beam.expected_bps) == (choice.beam.band, choice.expected_bps)
+    assert beam.expected_bps == pytest.approx(expected_capacities(
+        scenario, [choice.beam], estimate.position, estimate.covariance_m2)[0])
     assert (beam.cycle_id, beam.user, beam.codebook_id) == (3, 1, estimate.codebook_id)
     np.testing.assert_array_equal(beam.analog, choice.beam.analog)
 
 
-def test_the_transmission_reports_the_capacity_of_the_applied_beam(
-        transmission, scenario, truth, beam):
+def test_the_transmission_reports_the_capacities_of_the_beam_and_of_the_applied_one(
+        transmission, scenario, truth, estimate, beam):
     (*_, (report, _)) = feed(transmission, [truth, configured(beam, 0.5), Timeout()])
     used = Beam(beam.analog / 2, beam.digital, beam.band)
+    sent = Beam(beam.analog, beam.digital, beam.band)
+    assert (report.band, report.expected_bps) == (beam.band, beam.expected_bps)
+    assert report.at_estimate_bps == pytest.approx(
+        capacity(scenario, sent, estimate.position[None])[0])
     assert report.actual_bps == pytest.approx(capacity(scenario, used, PLACE[None])[0])
     assert report.actual_bps < report.perfect_bps
     assert report.loss_bps == report.perfect_bps - report.actual_bps
+    assert report.loss_percent == pytest.approx(100 * report.loss_bps / report.perfect_bps)
 
 
 @pytest.mark.parametrize('other', [{'cycle_id': 2}, {'cycle_id': 4}, {'user': 2}])

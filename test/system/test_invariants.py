@@ -9,9 +9,6 @@ import pytest
 from rhs_isac_ros.protocol import messages as m
 from system.invariants import RECEIVES, InvariantChecker
 
-# Belongs to no cycle; its late arrival makes all earlier results due.
-END = m.Grant(cycle_id=0, user=1)
-
 
 @pytest.fixture
 def net(network):
@@ -21,22 +18,12 @@ def net(network):
     return result
 
 
-def check(net, messages, codebooks=True):
-    checker = InvariantChecker(net.scenario)
-    for codebook in net.codebooks.values() if codebooks else ():
-        checker.add_codebook(codebook)
-    for message in messages:
-        checker.add(message, 0.0)
-    checker.add(END, 1e9)
-    return checker
-
-
 def messages_of(net):
     return [sent.message for sent in net.log if isinstance(sent.message, RECEIVES)]
 
 
 def test_a_correct_network_has_no_violations(net):
-    checker = check(net, messages_of(net))
+    checker = net.check_invariants()
     assert checker.checked == len(net.sent(m.PositionEstimate)) + len(net.sent(m.Capacity))
     assert checker.checked == 8
     assert checker.violations == []
@@ -45,15 +32,13 @@ def test_a_correct_network_has_no_violations(net):
 def test_messages_may_repeat_and_arrive_in_any_order(net):
     messages = messages_of(net) * 2
     np.random.default_rng(0).shuffle(messages)
-    checker = check(net, messages)
+    checker = net.check_invariants(messages)
     assert checker.checked == 16
     assert checker.violations == []
 
 
 def test_a_result_is_checked_after_the_settling_time(net):
-    checker = InvariantChecker(net.scenario)
-    for codebook in net.codebooks.values():
-        checker.add_codebook(codebook)
+    checker = net.checker()
     first = [message for message in messages_of(net) if message.cycle_id == 1]
     for message in sorted(first, key=lambda message: not isinstance(message, m.PositionEstimate)):
         checker.add(message, 5.0)
@@ -112,37 +97,36 @@ def test_a_fault_is_reported_once_for_each_result_of_its_cycle(net, case):
             arrays = {name: getattr(message, name) * factor for name, factor in changes.items()
                       if name in ('signals', 'analog')}
             messages.append(dataclasses.replace(message, **changes | arrays))
-    checker = check(net, messages)
+    checker = net.check_invariants(messages)
     assert any(re.search(text, fault) for fault in checker.violations), checker.violations
     assert len(checker.violations) <= 2
     assert all('of cycle 2,' in fault for fault in checker.violations)
 
 
 def test_a_codebook_must_have_been_offered(net):
-    checker = check(net, messages_of(net), codebooks=False)
+    net.codebooks.clear()
+    checker = net.check_invariants()
     assert len(checker.violations) == 4
     assert all('never offered' in fault for fault in checker.violations)
 
 
 def test_messages_of_an_undiscovered_publisher_may_be_missing(net):
-    checker = InvariantChecker(net.scenario)
-    for codebook in net.codebooks.values():
-        checker.add_codebook(codebook)
+    (codebook_id,), checker, end = net.codebooks, net.checker(), m.Grant(cycle_id=0, user=1)
     checker.expect_rediscovery([m.PositionEstimate])
     for message in messages_of(net):
         # The first estimate that arrives is that of cycle 3.
         if not (isinstance(message, m.PositionEstimate) and message.cycle_id < 3):
             checker.add(message, 0.0)
-    checker.add(END, 1e9)
+    checker.add(end, 1e9)
     assert checker.violations == []
     assert (checker.checked, checker.unverified) == (6, 2)
     # After the discovery, a missing estimate is a violation.
     for message in messages_of(net):
         if not isinstance(message, m.PositionEstimate) and message.cycle_id == 4:
             checker.add(dataclasses.replace(message, cycle_id=5), 0.0)
-    checker.add(END, 1e9)
+    checker.add(end, 1e9)
     assert checker.violations == [
-        f'Capacity of cycle 5, user 2, codebook {next(iter(net.codebooks))}: no such estimate']
+        f'Capacity of cycle 5, user 2, codebook {codebook_id}: no such estimate']
 
 
 def test_a_node_that_replaces_another_may_be_discovered_late(net):
