@@ -22,7 +22,7 @@ from rhs_isac_ros.support import plugins
 # Fixtures that several folders share. Processes and nodes need ROS; the pure layers do not.
 pytest_plugins = ['in_memory_network']
 if importlib.util.find_spec('rclpy'):
-    pytest_plugins += ['node_processes', 'node_bench']
+    pytest_plugins += ['node_bench', 'node_processes']
 HERE = Path(__file__).resolve().parent
 # A session without a terminal may ignore it, and the processes of the tests would inherit this.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)

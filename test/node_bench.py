@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import gc
 import importlib
+import sys
 import time
 import warnings
 
@@ -29,7 +30,8 @@ with warnings.catch_warnings():
     warnings.simplefilter('ignore', DeprecationWarning)
     check_for_type_support(ros.Beacon)
 
-TIMEOUT_S = 30.0
+# Generous: starting ten processes takes long on a loaded machine.
+TIMEOUT_S = 60.0
 
 
 class Bench:
@@ -38,7 +40,10 @@ class Bench:
     def __init__(self, make_executor):
         self.context = Context()
         rclpy.init(args=[], context=self.context, signal_handler_options=SignalHandlerOptions.NO)
-        self._executor = make_executor(context=self.context)
+        # An executor may require a standard error with a descriptor, which pytest may have
+        # replaced.
+        with contextlib.redirect_stderr(sys.__stderr__):
+            self._executor = make_executor(context=self.context)
         self._nodes = []
 
     def add(self, kind, *args, values=None, **options):
@@ -64,14 +69,21 @@ class Bench:
         """Spin once; as in a node's process, exceptions of callbacks are raised."""
         self._executor.spin_once(timeout_sec=0.01)
 
-    def until(self, condition, what='the condition'):
-        """Spin until a condition holds and return its value."""
+    def spin(self):
+        """Spin between two checks of a condition."""
+        # The queue may still hold a request to a node that was removed.
+        with contextlib.suppress(InvalidHandle):
+            self._executor.spin_once(timeout_sec=0.1)
+
+    def until(self, condition, what='the condition', processes=()):
+        """Spin until a condition holds and return its value; no process may end before."""
         end_s = time.monotonic() + TIMEOUT_S
         while not (value := condition()):
-            assert time.monotonic() < end_s, f'{what}: not within {TIMEOUT_S:g} s'
-            # The queue may still hold a request to a node that was removed.
-            with contextlib.suppress(InvalidHandle):
-                self._executor.spin_once(timeout_sec=0.1)
+            for process in processes:
+                assert process.running, f'ended with {process.wait()}\n{process.log}'
+            assert time.monotonic() < end_s, '\n'.join(
+                [f'{what}: not within {TIMEOUT_S:g} s', *(process.log for process in processes)])
+            self.spin()
         return value
 
     def result(self, future):
@@ -79,11 +91,12 @@ class Bench:
         self.until(future.done, 'the answer')
         return future.result()
 
-    def publisher(self, node, kind):
-        """Return a publisher of a message once there is a subscriber."""
+    def publisher(self, node, kind, n_others=0):
+        """Return a publisher of a message once it has more than `n_others` subscribers."""
         publisher = node.create_publisher(
             convert.ros_type(kind), topics.NAMES[kind], EXCHANGE)
-        self.until(publisher.get_subscription_count, f'a subscriber of {kind.__name__}')
+        self.until(lambda: publisher.get_subscription_count() > n_others,
+                   f'a subscriber of {kind.__name__}')
         return publisher
 
     def collect(self, node, kind):

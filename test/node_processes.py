@@ -6,26 +6,20 @@ import math
 import os
 import signal
 import subprocess
-import sys
 import time
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
 import yaml
 from ament_index_python.packages import get_package_prefix
 from forked import Forked
-from rclpy.context import Context
+from node_bench import TIMEOUT_S, Bench
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.signals import SignalHandlerOptions
-from rclpy.type_support import check_for_type_support
 from ros_messages import parameters
 
-import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
@@ -36,13 +30,6 @@ from rhs_isac_ros.ros.processes import with_parent
 # Set before rclpy reads them; the child processes inherit them.
 os.environ['ROS_DOMAIN_ID'] = claim_domain()
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-# Type supports load a parser that uses deprecated modules.
-with warnings.catch_warnings():
-    warnings.simplefilter('ignore', DeprecationWarning)
-    check_for_type_support(ros.Beacon)
-
-# Generous: starting ten processes takes long on a loaded machine.
-TIMEOUT_S = 60.0
 # Time without a response after which a request is repeated, which may then be handled twice [s].
 REQUEST_S = 10.0
 # Texts that show an uncaught exception.
@@ -137,17 +124,12 @@ class Processes:
             process.end()
 
 
-class Watch:
+class Watch(Bench):
     """An observer in this process that receives all messages of a namespace."""
 
     def __init__(self, namespace='/'):
-        self._context = Context()
-        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self.node = Node('watch', namespace=namespace, context=self._context)
-        # The executor requires a standard error with a descriptor, which pytest may have replaced.
-        with contextlib.redirect_stderr(sys.__stderr__):
-            self._executor = EventsExecutor(context=self._context)
-        self._executor.add_node(self.node)
+        super().__init__(EventsExecutor)
+        self.node = self.add(Node, 'watch', namespace=namespace)
         self.received = {kind: [] for kind in topics.NAMES}
         self._of_cycle = collections.defaultdict(list)
         # Final states of the served cycles, in order.
@@ -176,17 +158,6 @@ class Watch:
         while (left_s := end_s - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=left_s)
 
-    def until(self, condition, what, processes=()):
-        """Spin until a condition holds and return its value."""
-        end_s = time.monotonic() + TIMEOUT_S
-        while not (value := condition()):
-            for process in processes:
-                assert process.running, f'ended with {process.wait()}\n{process.log}'
-            assert time.monotonic() < end_s, '\n'.join(
-                [f'{what}: not within {TIMEOUT_S:g} s', *(process.log for process in processes)])
-            self.spin()
-        return value
-
     def call(self, client, request, processes=()):
         """Return the response to a request of a client; lost requests are repeated."""
         ready = getattr(client, 'services_are_ready', None) or client.service_is_ready
@@ -214,6 +185,10 @@ class Watch:
             client = AsyncParameterClient(self.node, name)
             self.call(client, lambda client: client.list_parameters([], 1))
 
+    def publisher(self, kind, n_others=1):
+        """Return a publisher of a message once it has other subscribers than this observer."""
+        return super().publisher(self.node, kind, n_others)
+
     def of_cycle(self, kind, cycle_id):
         return list(self._of_cycle[kind, cycle_id])
 
@@ -231,11 +206,6 @@ class Watch:
             ends = [end for end in self.served[before:] if user in (None, end.user)]
             return ends if len(ends) >= n else None
         return self.until(new_ends, f'{n} more cycles of user {user}', processes)
-
-    def close(self):
-        self._executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self._context)
 
 
 @pytest.fixture(scope='session')
