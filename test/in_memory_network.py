@@ -453,9 +453,11 @@ class Network:
     def check_invariants(self, messages: Iterable[m.Message] | None = None) -> InvariantChecker:
         """Return a checker that has checked the results among all messages, or the given ones."""
         checker = self.checker()
-        for message in [sent.message for sent in self.log] if messages is None else messages:
+        timed = [(sent.time_s, sent.message) for sent in self.log] if messages is None else [
+            (0.0, message) for message in messages]
+        for time_s, message in timed:
             if isinstance(message, RECEIVES):
-                checker.add(message, 0.0)
+                checker.add(message, time_s)
         # Belongs to no cycle; its late arrival makes all earlier results due.
         checker.add(m.Grant(cycle_id=0, user=1), 1e9)
         assert checker.checked

@@ -1,6 +1,5 @@
 """The guarantees of the protocol hold under losses, duplicates, delays, crashes and restarts."""
 
-import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -109,7 +108,9 @@ def run_and_check(codebooks):
         net.change('bs', policy='round_robin')
         check_end(net)
         net.verify()
-        check_results(net)
+        assert net.check_invariants().violations == []
+        # The model file of this estimator does not fit.
+        assert not net.sent(m.PositionEstimate, estimator='neural')
     return run
 
 
@@ -134,30 +135,6 @@ def check_end(net):
     before = len(net.served())
     net.run(lambda: {1, 2} <= set(net.served()[before:]), RECOVERY_S)
     net.run_to(State.BEACONING, limit_s=RECOVERY_S)
-
-
-def check_results(net):
-    """Check that each cycle has one user, one position and one codebook."""
-    cycles = {}
-    for _, _, message in net.log:
-        if message.cycle_id and isinstance(message, (
-                m.Grant, m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Beam,
-                m.Capacity)):
-            cycles.setdefault(message.cycle_id, []).append(message)
-    for messages in cycles.values():
-        assert len({message.user for message in messages}) == 1
-        ids = {message.codebook_id for message in messages if hasattr(message, 'codebook_id')}
-        assert len(ids) <= 1
-        estimators = {message.estimator for message in messages
-                      if isinstance(message, m.PositionEstimate)}
-        assert 'neural' not in estimators
-        places = {tuple(message.position) for message in messages
-                  if isinstance(message, m.GroundTruth)}
-        assert len(places) <= 1
-        beams = [message for message in messages if isinstance(message, m.Beam)]
-        for beam, report in itertools.product(
-                beams, [message for message in messages if isinstance(message, m.Capacity)]):
-            assert (report.band, report.expected_bps) == (beam.band, beam.expected_bps)
 
 
 @given(affected=FAULTS, crashes=CRASHES, offers=OFFERS, changes=CHANGES, ordered=st.booleans(),
