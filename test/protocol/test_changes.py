@@ -280,4 +280,7 @@ def test_a_codebook_offered_while_nobody_answers_costs_no_cycle(network, codeboo
     net.run_cycles(2)
     assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'served')]
     assert ids(net, 1) == ids(net, 2) == {codebooks[1].id}
+    attempts = [beacon.attempt for beacon in net.sent(m.Beacon, cycle_id=1)]
+    assert attempts == [*range(net['bs'].counters['unanswered'] + 1)]
+    assert [beacon.attempt for beacon in net.sent(m.Beacon, cycle_id=2)] == [0]
     net.verify()

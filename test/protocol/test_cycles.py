@@ -143,19 +143,6 @@ def test_the_position_is_estimated_without_the_true_one(network, places):
     assert honest.sent(m.Capacity)[0].actual_bps != deceived.sent(m.Capacity)[0].actual_bps
 
 
-def test_a_user_that_joins_an_empty_network_is_served(network, places):
-    net = network(0)
-    net.run(limit_s=5.0)
-    assert net.outcomes() == []
-    assert net['bs'].counters['unanswered'] == 50
-    assert {b.cycle_id for b in net.sent(m.Beacon)} == {1}
-    assert [b.attempt for b in net.sent(m.Beacon)] == list(range(51))
-    net.add_user(1, places[0])
-    net.run_cycles(2)
-    assert net.served() == [1, 1]
-    assert [b.attempt for b in net.sent(m.Beacon, cycle_id=2)] == [0]
-
-
 def test_one_band_and_one_frame_are_enough(random_beams):
     scenario = Scenario(
         center_frequencies_hz=(2.5e9,), n_subbands=1, n_frames=1, n_feeds=1, elements_per_side=4)

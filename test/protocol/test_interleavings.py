@@ -109,6 +109,9 @@ def run_and_check(codebooks):
         check_end(net)
         net.verify()
         assert net.check_invariants().violations == []
+        # One true position in each cycle.
+        places = {(truth.cycle_id, *truth.position) for truth in net.sent(m.GroundTruth)}
+        assert len(places) == len({cycle_id for cycle_id, *_ in places})
         # The model file of this estimator does not fit.
         assert not net.sent(m.PositionEstimate, estimator='neural')
     return run

@@ -176,18 +176,6 @@ def test_a_user_that_is_always_late_does_not_delay_the_users_of_other_ranges(mak
         assert max(np.diff([-1, *turns, len(served)])) <= len(others) + 1
 
 
-def test_only_invited_users_miss_a_beacon(make):
-    registry = make()
-    served_in_turn(registry, range(1, 101), 100)
-    for _ in range(5):
-        registry.invite(0)
-        registry.add_answer(1)
-        lost = registry.remove_absent()
-        assert set(lost) <= {*range(1, INVITED + 1)}
-        registry.select()
-    assert len(registry) > 100 - 2 * INVITED
-
-
 # Seniors
 
 SENIORS, OTHERS = [*range(1, INVITED + 1)], [*range(101, 121)]
