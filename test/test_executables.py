@@ -1,6 +1,5 @@
 """The entry points of the executables, and signals while they are imported."""
 
-import ast
 import importlib
 import os
 import re
@@ -34,10 +33,7 @@ def test_the_table_lists_the_installed_executables():
 @pytest.mark.parametrize(('name', 'folder'), executables.EXECUTABLES.items())
 def test_each_executable_has_a_module_with_a_main_function(name, folder):
     source = (ROOT / 'rhs_isac_ros' / folder / f'{name}.py').read_text(encoding='utf-8')
-    defined = {part.id for node in ast.parse(source).body if isinstance(node, ast.Assign)
-               for part in ast.walk(node) if isinstance(part, ast.Name)} | {
-        node.name for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)}
-    assert 'main' in defined
+    assert re.search(r'^(def )?main\b', source, re.MULTILINE)
 
 
 @pytest.mark.parametrize(('name', 'folder'), executables.EXECUTABLES.items())

@@ -90,16 +90,17 @@ def test_a_step_is_repeated_at_most_as_often_as_configured(network, retries, out
 
 @pytest.mark.parametrize(('lost', 'commands', 'requests', 'retried'), [
     # Pilots are requested once all configurations are reported.
-    ([Fault(m.RhsConfiguration, 'bs', n=1, mode=POSITIONING, band=1)], [0, 1, 1], [0],
+    ([(m.RhsConfiguration, 'bs', {'mode': POSITIONING, 'band': 1})], [0, 1, 1], [0],
      {'retry_rhs': 1}),
     # Signals that arrived are not requested again.
-    ([Fault(m.FeedSignals, 'bs', n=1, band=0)], [0, 1, 0], [0, 0], {'retry_band': 1}),
-    ([Fault(m.FeedSignals, 'bs', n=1, band=1)], [0, 1, 1], [0, 1], {'retry_band': 1}),
+    ([(m.FeedSignals, 'bs', {'band': 0})], [0, 1, 0], [0, 0], {'retry_band': 1}),
+    ([(m.FeedSignals, 'bs', {'band': 1})], [0, 1, 1], [0, 1], {'retry_band': 1}),
     # They begin a new step: one repetition is due for each band.
-    ([Fault(m.PilotRequest, 'user1', n=1), Fault(m.Pilot, 'channel', n=1, band=1)],
+    ([(m.PilotRequest, 'user1', {}), (m.Pilot, 'channel', {'band': 1})],
      [0, 1, 0, 1, 1], [0, 0, 1], {'retry_band': 2})])
 def test_only_what_lacks_is_requested_again(network, lost, commands, requests, retried):
-    net = network(transport=faults(*lost), retries=1)
+    net = network(retries=1, transport=faults(*(
+        Fault(kind, recipient, n=1, **fields) for kind, recipient, fields in lost)))
     net.run_cycles(1)
     assert net.ends() == ['served']
     assert [command.band for command in net.sent(m.RhsCommand)] == commands

@@ -112,6 +112,7 @@ def test_a_disconnected_user_logs_it_and_sends_nothing(user, state):
         LogMessage('waiting for channel, bs', warning=True, key='peers', holds=True)]
     assert user.state is State.DISCONNECTED
     assert user.handle(beacon(), 1.0) == []
+    assert user.counters == {}
     assert user.handle(PeersChanged(()), 2.0) == [
         LogMessage('listening for beacons', key='peers', holds=False)]
     assert user.state is State.LISTENING
