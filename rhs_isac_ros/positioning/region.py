@@ -35,6 +35,10 @@ class _Limits(NamedTuple):
     distant: float = 5.0
     # Width of an interval below which the density in it is constant.
     constant: float = 1e-4
+    # Distance between both sides of the last axis on the sphere from which they are separate, and
+    # decrease of the log-likelihood up to which the far side counts.
+    separate: float = 1.0
+    far_side: float = 8.0
 
 
 _LIMITS = _Limits()
@@ -131,7 +135,45 @@ class Restricted(NamedTuple):
             np.add(log_ratio, ratio, out=log_ratio)
             return mean + std * deviations
 
-        return np.moveaxis(self._positions(truncated, len(normal)), 0, 2), log_ratio
+        sides = None
+        if (two_sided := self._is_two_sided()).any():
+            # Half of the samples are on either side of the last axis' zero.
+            sides = np.zeros((len(two_sided), len(normal)))
+            sides[two_sided] = np.where(np.arange(len(normal)) < len(normal) // 2, 1.0, -1.0)
+            low_m, high_m = self._side_limits(sides)
+            share = (high_m - low_m)[two_sided] / (self.high_m - self.low_m)[two_sided, 2:]
+            log_ratio[two_sided] = np.log(2 * share)
+        positions = self._positions(truncated, len(normal), sides)
+        return np.moveaxis(positions, 0, 2), log_ratio
+
+    def _is_two_sided(self) -> np.ndarray:
+        """Mark Gaussians with samples on either side of the last axis' zero, bool [M].
+
+        A sphere meets a line along this axis at two points. They are apart if the region is thin
+        along the other axes, and similarly likely if the directions are hardly known.
+        """
+        last, range_m, axis = self.direction[:, 2], self.points[:, 0], self.order[:, 2]
+        found = (self.low_m[:, 2] < 0) & (self.high_m[:, 2] > 0)
+        by_range = self.curvature[:, 0, 0] * last**2
+        total = np.maximum(self.precision[:, 2, 2], by_range)
+        found &= 2 * by_range * range_m * np.abs(last) > _LIMITS.separate * np.sqrt(total)
+        rows = np.flatnonzero(found)
+        if len(rows):
+            far_side = to_positions(self.points[rows])
+            far_side[np.arange(len(rows)), axis[rows]] *= -1
+            likelihood = select(self, rows).logarithm(far_side[:, None])[:, 0]
+            found[rows] = likelihood > -_LIMITS.far_side
+        return found
+
+    def _side_limits(self, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the limits of the last axis on the same side of zero as the point, [M, S] [m].
+
+        `sides` is 1 for this side, -1 for the other one, and 0 for both.
+        """
+        signs = np.copysign(sides, sides * self.direction[:, 2:])
+        low, high = self.low_m[:, 2:], self.high_m[:, 2:]
+        return (np.where(signs > 0, np.maximum(low, 0.0), low),
+                np.where(signs < 0, np.minimum(high, 0.0), high))
 
     def logarithm(self, positions: np.ndarray) -> np.ndarray:
         """Evaluate the logarithms of the Gaussians at positions [M, S, 3] [m], float64 [M, S]."""
@@ -148,8 +190,11 @@ class Restricted(NamedTuple):
             total += slope * offsets[first]
         return total
 
-    def _positions(self, choose: _Choice, n: int) -> np.ndarray:
-        """Choose n positions for each Gaussian, axis by axis, float64 [3, M, n] [m]."""
+    def _positions(self, choose: _Choice, n: int, sides: np.ndarray | None = None) -> np.ndarray:
+        """Choose n positions for each Gaussian, axis by axis, float64 [3, M, n] [m].
+
+        `sides`, [M, n], is that of `_side_limits`.
+        """
         chosen = np.empty((3, len(self.points), n))
         offsets: list[np.ndarray] = []
         for axis in range(3):
@@ -157,9 +202,11 @@ class Restricted(NamedTuple):
             for before, offset in enumerate(offsets):
                 mean = mean - self.coupling[:, axis, before, None] * offset
             std = self.std_m[:, axis, None]
-            if axis == 2:
-                mean, std = self._on_sphere(chosen, mean)
             low, high = self.low_m[:, axis, None], self.high_m[:, axis, None]
+            if axis == 2:
+                mean, std = self._on_sphere(chosen, mean, sides)
+                if sides is not None:
+                    low, high = self._side_limits(sides)
             # Rounding may lead to values just outside. These two are faster than `np.clip`.
             np.maximum(choose(axis, mean, std, low, high), low, out=chosen[axis])
             np.minimum(chosen[axis], high, out=chosen[axis])
@@ -168,7 +215,8 @@ class Restricted(NamedTuple):
         positions[self.order.T, np.arange(len(self.points))] = chosen
         return positions
 
-    def _on_sphere(self, chosen: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _on_sphere(self, chosen: np.ndarray, mean: np.ndarray, sides: np.ndarray | None
+                   ) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation of the last axis, given the other two, [M, n].
 
         The mean is on the sphere of the range that the tangent plane has at `mean`. Where the
@@ -182,6 +230,8 @@ class Restricted(NamedTuple):
         by_range = precision * np.maximum(rest_m2 / square_m2, least)
         total = by_range + np.maximum(self.precision[:, 2, 2, None] - precision * last**2, 0.0)
         on_sphere = np.copysign(np.sqrt(rest_m2), last)
+        if sides is not None:
+            on_sphere = np.where(sides < 0, -on_sphere, on_sphere)
         return mean + by_range / total * (on_sphere - mean), 1 / np.sqrt(total)
 
 

@@ -102,6 +102,24 @@ def test_a_grazing_direction_determines_the_range_along_the_wall():
     assert weights.sum()**2 / (weights**2).sum() > 0.5 * len(weights)
 
 
+@pytest.mark.parametrize('side', [1.0, -1.0])
+@pytest.mark.parametrize('extents', [(0, 0, 1), (1e-3, 0, 1), (0, 1e-3, 1)], ids=str)
+def test_a_gaussian_without_direction_reaches_both_sides_of_a_line(extents, side):
+    """The elements of a row along y do not tell z from -z."""
+    bounds = bounds_of(extents, np.array([10.0, 1.0, 0.2]))
+    inside = np.array([10.0, 1.0, 0.7 * side])
+    point, curvature = to_polar(inside), np.diag([1e6, 3e2, 1e-2])
+    positions, log_weights = Restricted.of(
+        point[None], np.zeros((1, 3)), curvature[None], bounds).sample(NORMAL)
+    reference = grid(bounds)
+    expected = np.exp(-likelihood_loss(to_polar(reference) - point, curvature[None]))
+    weights = np.exp(log_weights[0] - likelihood_loss(
+        to_polar(positions[0]) - point, curvature[None]))
+    assert weights.mean() == pytest.approx(expected.mean(), rel=0.05)
+    assert np.average(positions[0, :, 2] < 0, weights=weights) == pytest.approx(
+        np.average(reference[:, 2] < 0, weights=expected), abs=0.02)
+
+
 def test_a_distant_gaussian_is_sampled_on_the_border():
     bounds = bounds_of((1, 1, 1))
     centre = to_polar(np.array([10.0, 4.0, 9.0]))
