@@ -7,6 +7,7 @@ import re
 import secrets
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -16,6 +17,8 @@ import yaml
 
 from rhs_isac_ros.support.fields import DECIMAL
 
+# Methods by which NumPy stores arrays. Others have errors whose types some Pythons lack.
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # Maximum sizes [bytes] of the arrays of an archive, and of a YAML file. The memory needed to read
 # a YAML file is up to 240 times its size.
 _MAX_BYTES, _MAX_YAML_BYTES = 2**28, 2**24
@@ -164,13 +167,15 @@ def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np
             if names is not None and (set(found) - {'about'} != names or any(
                     member.compress_type for member in members)):
                 return {}
+            if any(member.compress_type not in _METHODS for member in members):
+                raise ValueError('compressed by another method than NumPy uses')
             if sum(member.file_size for member in members) > _MAX_BYTES:
                 raise ValueError('more than 256 MiB of arrays')
             return {key: file[key] for key in found}
     # Reading verifies the checksum of every array. A header may declare any shape.
     # `zipfile` raises RuntimeError for an entry that is marked as encrypted.
     except (OSError, ValueError, EOFError, RuntimeError, SyntaxError, KeyError, MemoryError,
-            OverflowError, zipfile.BadZipFile) as error:
+            OverflowError, zipfile.BadZipFile, zlib.error) as error:
         raise ArchiveError(f'{path}: cannot be read: {_reason(error)}') from error
 
 

@@ -1,7 +1,9 @@
 """Atomic writing of files, and files of arrays with a description."""
 
+import io
 import json
 import os
+import zipfile
 
 import numpy as np
 import pytest
@@ -103,6 +105,19 @@ def test_a_flipped_bit_is_an_error_or_changes_no_content(file):
             np.testing.assert_array_equal(arrays['one'], np.arange(3.0))
             assert (arrays['two'], about) == (2.0, {'text': 'é'})
     assert n_errors > len(content) / 2
+
+
+@pytest.mark.parametrize('compression', [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA])
+def test_damaged_compressed_arrays_are_an_error(tmp_path, compression):
+    array, path = io.BytesIO(), tmp_path / 'file.npz'
+    np.save(array, np.arange(200.0))
+    with zipfile.ZipFile(path, 'w', compression) as archive:
+        archive.writestr('one.npy', array.getvalue())
+    content = path.read_bytes()
+    for place in range(40, len(content) // 2, 3):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 255]) + content[place + 1:])
+        with pytest.raises(ArchiveError, match='cannot be read'):
+            read_arrays(path)
 
 
 @pytest.mark.parametrize(('text', 'value'), [
