@@ -24,6 +24,7 @@ from rhs_isac_ros.codebook.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.objective import OBJECTIVES, sobol
 from rhs_isac_ros.codebook.optimize import optimize
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import numbers
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
@@ -135,7 +136,12 @@ class Library:
         with translated(ArchiveError, CodebookError):
             arrays, about = read_archive(path, 'library of codebooks', _FORMAT, {*_ARRAYS})
         with translated((ValueError, TypeError), CodebookError, path):
-            lengths = {len(array) for array in arrays.values()}
+            for name in ('centres_m', 'spreads_m'):
+                arrays[name] = numbers(name, arrays[name])
+            if not (arrays['spreads_m'] > 0).all():
+                raise CodebookError(
+                    f'spreads_m: {arrays["spreads_m"].min():g}, expected lengths above 0')
+            lengths = {len(np.atleast_1d(array)) for array in arrays.values()}
             if len(lengths) != 1 or arrays['centres_m'].shape[1:] != (3,):
                 raise CodebookError(f'lengths {sorted(lengths)}, expected one for all arrays')
             fields: dict[str, Any] = {

@@ -85,6 +85,17 @@ def test_a_damaged_file_is_an_error(built, tmp_path):
     assert str(caught.value).count(str(path)) == 1
 
 
+@pytest.mark.parametrize(('name', 'value'), [
+    ('centres_m', np.nan), ('centres_m', 1j), ('spreads_m', np.inf), ('spreads_m', -0.2),
+    ('spreads_m', 0.0)])
+def test_cells_without_a_place_or_a_spread_are_an_error(built, tmp_path, name, value):
+    path = tmp_path / 'library.npz'
+    cells = np.full_like(getattr(built, name), value, type(value))
+    dataclasses.replace(built, **{name: cells}).save(path)
+    with pytest.raises(CodebookError, match=f'^{path}: {name}: '):
+        Library.load(path)
+
+
 def test_a_library_for_another_scenario_or_an_incomplete_one_is_an_error(built):
     other = dataclasses.replace(SCENARIO, roi_size_m=(2.0, 1.0, 0.4))
     with pytest.raises(CodebookError, match='^scenario: '):
