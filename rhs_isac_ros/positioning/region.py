@@ -28,6 +28,9 @@ class _Limits(NamedTuple):
     # directions contain no information about x.
     floor: float = 1e-3
     extent: float = 1e-3
+    # Smallest standard deviation of the position that range and directions have, relative to the
+    # extent of the region. If they are known better, rounding exceeds the floor.
+    exact: float = 3e-7
     # The others are in standard deviations. Distance from a Gaussian's centre beyond which samples
     # follow a Gaussian that is nearer. Its distribution function is then accurate.
     deviation: float = 6.0
@@ -70,6 +73,12 @@ class Restricted(NamedTuple):
         positions, derivative = to_positions(points), polar_derivative(points)
         transposed = np.swapaxes(derivative, 1, 2)
         extent = bounds[1] - bounds[0]
+        # Metres per unit of r, u and v.
+        metres = np.column_stack([np.ones(len(points)), points[:, :1], points[:, :1]])
+        known = np.sqrt(np.diagonal(curvature, axis1=1, axis2=2)) / metres
+        widening = 1 / np.maximum(known * _LIMITS.exact * np.linalg.norm(extent), 1.0)
+        gradient = widening * gradient
+        curvature = widening[:, :, None] * curvature * widening[:, None]
         precision = np.matmul(np.matmul(transposed, curvature), derivative)
         precision += np.diag(
             12 * _LIMITS.floor / np.maximum(extent, _LIMITS.extent * extent.max())**2)

@@ -120,6 +120,16 @@ def test_a_gaussian_without_direction_reaches_both_sides_of_a_line(extents, side
         np.average(reference[:, 2] < 0, weights=expected), abs=0.02)
 
 
+def test_a_range_without_error_leaves_unknown_directions_unknown():
+    """Strong signals at two elements along z tell nothing about y."""
+    bounds = np.array([[0.2, -1.4, 0.3], [1.1, -1.1, 0.7]])
+    point, curvature = to_polar(bounds.mean(axis=0)), np.diag([1e24, 1e-3, 1e15])
+    positions, log_weights = Restricted.of(
+        point[None], np.zeros((1, 3)), curvature[None], bounds).sample(NORMAL)
+    assert np.isfinite(log_weights).all()
+    assert np.ptp(positions[0, :, 1]) == pytest.approx(0.3, rel=0.05)
+
+
 def test_a_distant_gaussian_is_sampled_on_the_border():
     bounds = bounds_of((1, 1, 1))
     centre = to_polar(np.array([10.0, 4.0, 9.0]))
