@@ -43,9 +43,9 @@ def test_the_calibration_restores_the_fixes_of_all_users(printed):
     text = printed('calibration')
     (failed,) = re.findall(r'^failed elements: (.*)$', text, re.MULTILINE)
     assert f'failed elements found: {failed}\n' in text
-    assert 'before: 0 of 500 users with a fix' in text
+    assert 'before: 0 of 200 users with a fix' in text
     assert 'deviates\n' in text
-    assert 'after: 500 of 500 users with a fix' in text
+    assert 'after: 200 of 200 users with a fix' in text
     (after,) = re.findall(r'after.*as expected\n +mean squared error (\S+) ±.*m², (\S+) %', text)
     (ideal,) = set(re.findall(r'ideal.*\n +mean squared error (\S+) ±.*m², \S+ %', text))
     assert float(ideal) <= float(after[0]) < 2 * float(ideal)
