@@ -56,15 +56,6 @@ def test_the_scale_of_the_combining_vectors_has_no_effect(problem, small):
 START = np.full(20, 0.5)
 
 
-def test_a_search_provides_limits_bounds_start_and_generator(quadratic, search_of):
-    search = search_of(quadratic(0), 7, seed=3)
-    assert search.max_steps == 7
-    assert search.n_analog == 10
-    assert search.bounds == [(0.0, 1.0)] * 10 + [(None, None)] * 10
-    np.testing.assert_array_equal(search.start, START)
-    assert search.rng.integers(1000) == np.random.default_rng(3).integers(1000)
-
-
 @pytest.mark.parametrize('seed', range(3))
 def test_keeps_the_best_point_of_both_kinds_of_evaluation(quadratic, search_of, seed):
     problem, rng = quadratic(seed), np.random.default_rng(seed)

@@ -56,10 +56,6 @@ def numbers_run_again(folder, jobs=JOBS):
     return worker.seen
 
 
-def test_results_come_in_the_order_of_the_jobs(tmp_path):
-    assert numbers_run_again(tmp_path / 'new' / 'folder') == [0, 1, 2, 3]
-
-
 def test_other_processes_with_one_thread_take_one_job_at_a_time(tmp_path):
     def meet(number):
         """Wait for the other job of a pair, which needs another process."""

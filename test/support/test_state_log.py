@@ -99,6 +99,6 @@ def test_a_state_of_the_group_that_holds_is_older_than_a_new_cause(log):
 
 
 def test_the_memory_is_bounded(log):
-    for number in range(5000):
+    for number in range(1100):
         log.event(str(number), Line('dropped', True), 0.0)
     assert len(log._records) == 1024
