@@ -87,9 +87,7 @@ def flat() -> Quadratic:
 @pytest.fixture
 def search_of():
     """Callable that creates a search for a problem, by default from the middle of the bounds."""
-    def make(problem, max_steps=10, max_evaluations=None, *, start=None, seed=0, progress=None,
-             done=(0, 0)) -> Search:
+    def make(problem, max_steps=10, *, start=None, seed=0) -> Search:
         start = np.full(20, 0.5) if start is None else start
-        return Search(problem, start, max_steps, max_evaluations, np.random.default_rng(seed),
-                      progress, done)
+        return Search(problem, start, max_steps, None, np.random.default_rng(seed), None)
     return make

@@ -1,10 +1,10 @@
-"""Problem P1: variables and constraints; and the search: best point, history and budget."""
+"""Problem P1: variables and constraints; and the search: the best point, and repeated ones."""
 
 import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import AverageCrlb
-from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Progress
+from rhs_isac_ros.codebook.problem import Problem
 
 
 @pytest.fixture(scope='module')
@@ -101,48 +101,3 @@ def test_a_repeated_point_is_not_evaluated_again(quadratic, search_of):
     moved = search.value_and_gradient(point)
     assert len(problem.points) == 2
     assert moved[0] == quadratic(0).value(point)
-
-
-def test_history_counts_steps_and_evaluations(quadratic, search_of):
-    seen = []
-    search = search_of(quadratic(0), progress=seen.append)
-    search.value(START)
-    search.on_step()
-    search.value_and_gradient(START - 0.1)
-    search.value(START + 0.1)
-    search.on_step()
-    assert search.history == seen
-    assert all(isinstance(entry, Progress) for entry in seen)
-    assert [entry.step for entry in seen] == [0, 1]
-    assert [entry.evaluations for entry in seen] == [1, 3]
-    assert seen[0].value_m2 == quadratic(0).value(START)
-    assert seen[1].value_m2 == search.value_m2 <= seen[0].value_m2
-    assert 0 <= seen[0].elapsed_s <= seen[1].elapsed_s < 60
-
-
-@pytest.mark.parametrize('budget', [1, 2, 5])
-@pytest.mark.parametrize('name', ['value', 'value_and_gradient'])
-def test_no_evaluation_is_done_beyond_the_budget(quadratic, search_of, budget, name):
-    problem = quadratic(0)
-    search = search_of(problem, max_evaluations=budget)
-    for n in range(budget):
-        getattr(search, name)(START + n)
-    for _ in range(2):
-        with pytest.raises(BudgetSpent):
-            getattr(search, name)(START - 1)
-    assert len(problem.points) == budget
-    search.on_step()
-    assert search.history[-1].evaluations == budget
-
-
-def test_limits_include_the_steps_and_evaluations_of_the_resumed_search(quadratic, search_of):
-    search = search_of(quadratic(0), 10, 7, done=(4, 5))
-    assert search.max_steps == 6
-    search.value(START)
-    search.on_step()
-    search.value(START)
-    with pytest.raises(BudgetSpent):
-        search.value(START)
-    search.on_step()
-    assert [entry.step for entry in search.history] == [4, 5]
-    assert [entry.evaluations for entry in search.history] == [6, 7]
