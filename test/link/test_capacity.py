@@ -217,11 +217,11 @@ def test_both_cuts_contain_the_strongest_direction(small):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('azimuth_deg', [-30.0, 0.0, 25.0])
+@pytest.mark.parametrize('azimuth_deg', [-30.0, 25.0])
 def test_the_strongest_direction_is_the_direction_of_steering(azimuth_deg):
     scenario, azimuth = Scenario(), np.radians(azimuth_deg)
     position = 10.0 * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    found = beam_pattern(scenario, steer(scenario, position), 10.0, step_deg=1.0)
+    found = beam_pattern(scenario, steer(scenario, position), 10.0, step_deg=2.5)
     angles, power = found.azimuth_cut()
     assert np.degrees(angles[np.argmax(power)]) == pytest.approx(azimuth_deg, abs=5.0)
 

@@ -73,17 +73,6 @@ def test_the_default_uncertainty_is_2_cm_and_a_fifth_of_a_degree():
                                [0.02] * 3 + [np.radians(0.2)] * 3)
 
 
-def test_an_exact_pose_adds_nothing():
-    np.testing.assert_array_equal(Pose(uncertainty=(0.0, 0.0)).spread(PLACES), 0.0)
-
-
-def test_a_shift_adds_its_covariance_everywhere():
-    covariance = np.zeros((6, 6))
-    covariance[:3, :3] = np.diag([1e-4, 4e-4, 9e-4])
-    spread = Pose((3.0, 0.0, 0.0), uncertainty=covariance).spread(PLACES)
-    np.testing.assert_allclose(spread, [covariance[:3, :3]] * 2)
-
-
 def test_a_turn_acts_across_the_line_of_sight_in_proportion_to_the_range():
     spread = Pose(uncertainty=(0.0, 1.0)).spread(np.array([[10.0, 0.0, 0.0]]))
     variance = (10 * np.radians(1.0))**2
