@@ -173,6 +173,7 @@ def test_users_around_the_region_get_no_fix_or_a_probability_outside(name, shipp
     np.testing.assert_array_equal(found.mean[found.fix], plain.mean[found.fix])
     np.testing.assert_array_equal(found.covariance[found.fix], plain.covariance[found.fix])
     assert np.isnan(plain.outside_probability).all()
+    assert np.isnan(plain.blocked_probability).all()
     assert (found.outside_probability < 0.05).mean() > 0.9
     np.testing.assert_array_equal(
         np.isfinite(found.expected_residual[found.fix]),
@@ -301,11 +302,6 @@ def test_the_inflation_of_a_survey_makes_no_user_in_sight_blocked(shipped):
     usual = np.isfinite(expected) & (expected < 10)
     assert usual.mean() > 0.8
     np.testing.assert_allclose(sizes[0][usual], expected[usual], rtol=1e-6)
-
-
-def test_without_the_field_users_are_in_sight(shipped, table1_estimator):
-    _, received, _ = signals_of(DECLARED, shipped, 2)
-    assert np.isnan(table1_estimator.estimate(received).blocked_probability).all()
 
 
 def test_a_track_continues_through_a_blockage(shipped):

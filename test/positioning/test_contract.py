@@ -84,14 +84,6 @@ def test_an_empty_batch_gives_empty_estimates(estimator, received):
     assert estimate.reason == ()
 
 
-def test_silence_gives_no_fix(estimator, received):
-    estimate = estimator.estimate(0 * received[:3])
-    assert not estimate.fix.any()
-    assert np.isnan(estimate.mean).all()
-    assert np.isnan(estimate.covariance).all()
-    assert all('expected at least' in reason for reason in estimate.reason)
-
-
 @pytest.mark.parametrize(('signals', 'message'), [
     (np.zeros((2, 7)), r'^received: shape \(2, 7\), expected \[N_B, N_SB F\] = \(2, 8\)'),
     (np.zeros(16), r'^received: shape \(16,\), expected '),

@@ -146,18 +146,24 @@ def energies(n, scale=1.0, seed=0):
     return scale * gamma(EXPECTED).rvs(n, random_state=np.random.default_rng(seed))
 
 
-def filled(values):
-    test = InnovationTest()
+def filled(values, *arguments, expected=EXPECTED):
+    test = InnovationTest(*arguments)
     for value in values:
-        test.add(float(value), EXPECTED)
+        test.add(float(value), expected)
+    return test
+
+
+def without_warning(values, *arguments, expected=EXPECTED):
+    """Return a test after residuals, none of which causes a warning."""
+    test = InnovationTest(*arguments)
+    for value in values:
+        test.add(float(value), expected)
+        assert not test.drifts
     return test
 
 
 def test_residuals_of_the_model_cause_no_warning():
-    test = InnovationTest()
-    for value in energies(5000):
-        test.add(float(value), EXPECTED)
-        assert not test.drifts
+    test = without_warning(energies(5000))
     assert test.n_fixes == WINDOW
     assert test.ratio == pytest.approx(1, abs=0.03)
 
@@ -187,42 +193,28 @@ def test_residuals_that_vary_too_much_cause_a_warning():
 def test_the_variance_of_the_model_causes_no_warning(shape):
     """Energies of few measurements have a skewed distribution."""
     rng = np.random.default_rng(4)
-    for window in rng.standard_gamma(shape, (200, MIN_RETURN)):
-        test = InnovationTest(MIN_RETURN)
-        for value in window:
-            test.add(float(value), shape)
-            assert not test.drifts
+    for window in rng.standard_gamma(shape, (100, MIN_RETURN)):
+        without_warning(window, MIN_RETURN, expected=shape)
 
 
 @pytest.mark.parametrize('level_db', [-4.5, -3.0, -1.0])
 def test_a_user_at_rest_may_have_any_usual_level(level_db):
     """The level of a measured covariance differs among users, here by 1 dB, and stays the same."""
     values = energies(WINDOW, 10**(level_db / 10))
-    test = InnovationTest(WINDOW, (-3.0, 1.0))
-    for value in values:
-        test.add(float(value), EXPECTED)
-        assert not test.drifts
+    test = without_warning(values, WINDOW, (-3.0, 1.0))
     assert test.ratio == pytest.approx(10**((level_db + 3) / 10), rel=0.03)
-    known = InnovationTest(WINDOW, (-3.0, 0.0))
-    for value in values:
-        known.add(float(value), EXPECTED)
-    assert known.drifts == (level_db != -3.0)
+    assert filled(values, WINDOW, (-3.0, 0.0)).drifts == (level_db != -3.0)
 
 
 def test_levels_of_many_users_are_no_excess_of_the_variance():
     levels = 10**(np.random.default_rng(1).normal(0, 0.1, WINDOW))
-    test = InnovationTest(WINDOW, (0.0, 1.0))
-    for value in levels * energies(WINDOW):
-        test.add(float(value), EXPECTED)
+    test = filled(levels * energies(WINDOW), WINDOW, (0.0, 1.0))
     assert not test.drifts
     assert test.spread == pytest.approx(1, abs=0.2)
 
 
 def test_a_level_far_from_the_survey_causes_a_warning():
-    test = InnovationTest(WINDOW, (-3.0, 1.0))
-    for value in energies(MIN_FIXES, 10**-1.3):
-        test.add(float(value), EXPECTED)
-    assert test.drifts
+    assert filled(energies(MIN_FIXES, 10**-1.3), WINDOW, (-3.0, 1.0)).drifts
 
 
 def test_few_residuals_are_not_judged():
@@ -259,9 +251,7 @@ def test_residuals_are_forgotten_on_request():
 @pytest.mark.parametrize(('energy', 'expected'), [
     (math.nan, EXPECTED), (1e6, math.nan), (1e6, math.inf), (math.nan, math.nan)])
 def test_estimates_without_a_residual_or_an_expectation_are_ignored(energy, expected):
-    test = InnovationTest()
-    for _ in range(WINDOW):
-        test.add(energy, expected)
+    test = filled([energy] * WINDOW, expected=expected)
     assert not test.drifts
     assert test.n_fixes == 0
 

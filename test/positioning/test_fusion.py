@@ -82,16 +82,6 @@ def test_the_posterior_is_the_integral_of_the_product(others):
     assert_moments(fuse(sightings, BOUNDS), *integrated(sightings))
 
 
-def test_a_sheet_is_bent_around_its_surface():
-    # A metre away from the mean of the first mode, its sheet is 5 cm from the tangent plane.
-    aside = PLACE + [-0.05, 1.0, 0.0]
-    sightings = [sheets(FRONT, PLACE), sheets(SIDE, aside)]
-    mean = fuse(sightings, BOUNDS).mixture.moments()[0]
-    assert abs(np.linalg.norm(mean) - np.linalg.norm(PLACE)) < STD[0]
-    range_m = np.linalg.norm(aside - SIDE.origin)
-    assert abs(np.linalg.norm(mean - SIDE.origin) - range_m) < STD[0]
-
-
 def test_only_modes_that_agree_remain():
     # The wrong modes of one surface are at other places than those of the other one.
     front = sheets(FRONT, [PLACE, PLACE + [0.6, 0.0, 0.0]], [0.0, 1.0])
@@ -106,26 +96,6 @@ def test_the_order_of_the_surfaces_does_not_matter():
     one, other = fuse(sightings, BOUNDS), fuse(sightings[::-1], BOUNDS)
     assert_moments(one, *other.mixture.moments(), tolerance=0.02)
     np.testing.assert_allclose(one.log_agreement, other.log_agreement, atol=0.02)
-
-
-def test_the_site_may_have_any_frame():
-    # Everything moves and turns together.
-    frame = Pose((3.0, -2.0, 1.0), (0.0, 0.0, 1.0, 1.0))
-    sightings = [sheets(FRONT, PLACE), sheets(SIDE, PLACE + [0.1, 0.0, 0.0])]
-    moved = []
-    for one in sightings:
-        rotation = frame.rotation @ one.pose.rotation
-        yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
-        pose = Pose(frame.to_site(one.pose.origin),
-                    (0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)), EXACT)
-        mixture = one.mixture._replace(
-            means=frame.to_site(one.mixture.means),
-            covariances=frame.covariances_to_site(one.mixture.covariances))
-        moved.append(Sighting(pose, mixture, one.missing))
-    corners = np.sort(frame.to_site(BOUNDS), axis=0)
-    mean, covariance = fuse(sightings, BOUNDS).mixture.moments()
-    assert_moments(fuse(moved, corners), frame.to_site(mean),
-                   frame.covariances_to_site(covariance))
 
 
 def test_positions_are_inside_the_region():

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import trapezoid
 from scipy.stats import multivariate_normal
 
 from rhs_isac_ros.positioning.mixture import Mixture
@@ -45,34 +44,13 @@ def test_samples_have_the_moments_of_the_mixture():
     np.testing.assert_allclose(np.cov(samples.T), covariance, atol=0.02 * scale)
 
 
-def test_a_product_is_the_product_of_the_densities():
-    first, second = mixture(6), mixture(7, n=2)
-    points = np.random.default_rng(8).normal(size=(20, 3))
+@pytest.mark.parametrize('size', [3, 6], ids=['positions', 'positions and velocities'])
+def test_a_product_is_the_product_of_the_densities(size):
+    """A likelihood of positions also updates velocities."""
+    first, second = mixture(6, size=size), mixture(7, n=2)
+    points = np.random.default_rng(8).normal(size=(20, size))
     np.testing.assert_allclose(first.product(second).log_density(points),
-                               first.log_density(points) + second.log_density(points))
-
-
-def test_the_mass_of_a_product_is_its_integral():
-    # With independent axes, the integral over y and z is known.
-    covariances = np.array([np.diag([1.0, 1.0, 1.0]), np.diag([0.25, 1.0, 1.0])])
-    first = Mixture(np.log([0.3, 0.7]), np.array([[0.0, 0, 0], [2.0, 0, 0]]), covariances)
-    second = one([0.7, 0.0, 0.0], np.diag([0.5, 1.0, 1.0]))
-    x = np.linspace(-8.0, 10.0, 20_001)
-    points = np.stack([x, 0 * x, 0 * x], axis=1)
-    # Over y and over z, the product of two unit Gaussians integrates to 1 / sqrt(4 pi), and its
-    # value at 0 is 1 / (2 pi).
-    integral = trapezoid(np.exp(first.log_density(points) + second.log_density(points)), x)
-    np.testing.assert_allclose(
-        np.exp(first.product(second).log_mass), integral * (2 * np.pi)**2 / (4 * np.pi))
-
-
-def test_a_likelihood_of_positions_also_updates_velocities():
-    joint = mixture(9, n=2, size=6)
-    likelihood = mixture(10, n=2)
-    points = np.random.default_rng(11).normal(size=(20, 6))
-    np.testing.assert_allclose(
-        joint.product(likelihood).log_density(points),
-        joint.log_density(points) + likelihood.log_density(points[:, :3]))
+                               first.log_density(points) + second.log_density(points[:, :3]))
 
 
 def test_the_position_is_a_marginal():

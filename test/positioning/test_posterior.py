@@ -16,7 +16,7 @@ from rhs_isac_ros.positioning.search import Modes
 SCENARIO = Scenario(
     center_frequencies_hz=(2.5e9, 2.54e9, 2.6e9), elements_per_side=6, angular_spread_deg=2.0,
     roi_center_m=(8, 0, 0), roi_size_m=(8, 2, 1), band_phase_std_rad=0.8)
-N_PHASES, LOG2_POINTS, N_HARMONICS = 15, 14, 6
+N_PHASES, LOG2_POINTS, N_HARMONICS = 8, 14, 6
 UNIFORM_RAD = 2 * np.pi
 
 

@@ -119,7 +119,7 @@ def test_the_posterior_is_the_prior_times_the_likelihood(table1_estimator, model
         prior = around(place + 0.1 * rng.standard_normal(3), 0.1)
         signals = model.sample(np.array([place]), rng)[0]
         found = table1_estimator.posterior(signals, prior, wrong=1e-9)
-        points = prior.sample(60_000, rng)
+        points = prior.sample(30_000, rng)
         residual = model.whiten(signals - model.mean(points))
         logs = -np.sum(np.abs(residual)**2, axis=(1, 2))
         weights = np.exp(logs - logs.max())
@@ -133,7 +133,7 @@ def test_the_posterior_is_the_prior_times_the_likelihood(table1_estimator, model
             atol=0.5)
         mean_of_mixture, _ = found.mixture.moments()
         np.testing.assert_allclose(mean_of_mixture, found.estimate.mean, atol=0.02)
-    # The reference has an effective number of about a hundred points.
+    # The reference has an effective number of about fifty points.
     assert np.mean(errors) < 0.1
 
 

@@ -56,7 +56,7 @@ def test_samples_have_the_moments_and_the_mass_of_the_gaussian_in_the_region(ext
     """Some modes have their unrestricted maxima outside, on other sides of the border."""
     bounds, reference = bounds_of(extents), grid(bounds_of(extents))
     rng = np.random.default_rng(3)
-    for inside in rng.uniform(*bounds, (4, 3)):
+    for inside in rng.uniform(*bounds, (2, 3)):
         centre = to_polar(inside) + shift
         positions, log_weights = restricted(centre, bounds).sample(NORMAL)
         weights = np.exp(log_weights[0] + log_density(positions[0], centre))
@@ -73,7 +73,7 @@ def test_samples_have_the_moments_and_the_mass_of_the_gaussian_in_the_region(ext
 def test_steps_inside_the_region_reach_the_most_likely_position(extents):
     bounds = bounds_of(extents)
     reference, rng = grid(bounds), np.random.default_rng(4)
-    for inside in rng.uniform(*bounds, (4, 3)):
+    for inside in rng.uniform(*bounds, (2, 3)):
         centre = to_polar(inside) + [0.01, 0.1, -0.2]
         found = restricted(centre, bounds).nearest()[0]
         # Points of the grid miss the maximum by a few centimetres.

@@ -148,37 +148,26 @@ def test_a_track_starts_with_the_estimate_of_the_estimator(tracker, table1_estim
     assert first.n_phases == 1
 
 
-def test_position_and_velocity_of_a_walk_converge(follow):
-    times_s = np.arange(30) * PERIOD_S
-    estimate = follow(times_s)
-    assert error(estimate, START + times_s[-1] * VELOCITY) < 0.4
-    assert np.linalg.norm(estimate.velocity - VELOCITY) < 0.6
-    assert estimate.n_phases == 30
-    assert np.trace(estimate.covariance) < 0.2
-    for covariance in (estimate.covariance, estimate.velocity_covariance):
-        assert np.linalg.eigvalsh(covariance).min() > 0
-
-
 @pytest.mark.slow
 def test_errors_and_covariances_of_walks(table1_estimator, sample):
-    """Over 12 walks of 3 s, errors are half of those of single phases and have 95 % regions."""
+    """Over 8 walks of 2 s, errors are half of those of single phases and have 95 % regions."""
     rng = np.random.default_rng(5)
     squares, normalised, alone = [], [], []
-    for start in Scenario(roi_size_m=(4.0, 4.0, 1.0)).sample_positions(12, rng):
+    for start in Scenario(roi_size_m=(4.0, 4.0, 1.0)).sample_positions(8, rng):
         tracker, angle = Tracker(table1_estimator), rng.uniform(0, 2 * np.pi)
         velocity = np.array([np.cos(angle), np.sin(angle), 0.0])
-        for step in range(30):
+        for step in range(20):
             position = start + step * PERIOD_S * velocity
             signals = sample(position)
             estimate = tracker.update(step * PERIOD_S, signals)
-            if step >= 20 and step % 3 == 0:
+            if step >= 12 and step % 3 == 0:
                 offset = estimate.mean - position
                 squares.append(offset @ offset)
                 normalised.append(offset @ np.linalg.solve(estimate.covariance, offset))
                 alone.append(error(table1_estimator.estimate(signals), position)**2)
     assert np.mean(squares) < 0.45**2
     assert np.mean(squares) < np.mean(alone) / 4
-    # 48 estimates, of which about 12 are independent.
+    # 24 estimates, of which about 8 are independent.
     assert np.mean(np.array(normalised) <= REGION_RADIUS) > 0.8
     # The median of the chi-square distribution with three degrees of freedom is 2.4.
     assert 1 < np.median(normalised) < 5
