@@ -144,8 +144,7 @@ def test_templates_cover_all_ranges():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('name', ['bayes', 'ml'])
-def test_users_around_the_region_get_no_fix_or_a_probability_outside(name, shipped):
+def test_users_around_the_region_get_no_fix_or_a_probability_outside(shipped, table1_estimator):
     """The shell extends from 0.5 m to 20 m."""
     scenario, rng = Scenario(), np.random.default_rng(2)
     low, high = scenario.roi_bounds_m
@@ -154,7 +153,7 @@ def test_users_around_the_region_get_no_fix_or_a_probability_outside(name, shipp
     positions = positions[(distance >= 0.5) & (distance <= 20)][:200]
     assert len(positions) == 200
     received = MeasurementModel(scenario, shipped).sample(positions, rng)
-    estimator = make_estimator(name, scenario, shipped, reject_outside=True)
+    estimator = make_estimator('bayes', scenario, shipped, reject_outside=True)
     estimate = estimator.estimate(received)
     fix = estimate.fix
     assert fix.mean() < 0.03
@@ -169,7 +168,7 @@ def test_users_around_the_region_get_no_fix_or_a_probability_outside(name, shipp
     assert (found.outside_probability <= LIMIT)[found.fix].all()
     # Residuals of users who may be outside are not compared with an expectation.
     # Position and covariance are those of a user inside.
-    plain = make_estimator(name, scenario, shipped).estimate(inside)
+    plain = table1_estimator.estimate(inside)
     np.testing.assert_array_equal(found.mean[found.fix], plain.mean[found.fix])
     np.testing.assert_array_equal(found.covariance[found.fix], plain.covariance[found.fix])
     assert np.isnan(plain.outside_probability).all()
