@@ -158,21 +158,46 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
                      moves)
 
     modes, gain = step(starts)
+    # Points that the latest steps started from, and the known log-likelihoods there.
+    origins, known = starts, modes.log_likelihood - gain
     for number in range(n_steps):
         chosen = _prune(likelihood, modes, gain, margin)
-        modes, gain = select(modes, chosen), gain[chosen]
+        modes, origins, gain, known = (
+            select(modes, chosen), select(origins, chosen), gain[chosen], known[chosen])
         (moving,) = np.nonzero(np.abs(gain) > _ASCENT.gain)
         if not len(moving) or number == n_steps - 1:
             break
-        moved, gain[moving] = step(select(modes, moving).starts())
-        modes.replace(moving, moved)
+        moved, new_gain = step(select(modes, moving).starts())
+        reached = moved.log_likelihood - new_gain
+        too_long = reached < known[moving] - _ASCENT.gain
+        short, long = moving[~too_long], moving[too_long]
+        origins.points[short], origins.values[short] = modes.points[short], modes.values[short]
+        known[short], gain[short] = reached[~too_long], new_gain[~too_long]
+        modes.replace(short, select(moved, ~too_long))
+        if len(long):
+            _halve(modes, origins, gain, long)
     # Before convergence, the predicted likelihood may be arbitrarily wrong.
     (moving,) = np.nonzero((np.abs(gain) > _ASCENT.gain) | (len(likelihood.nuisance) > 0))
     if len(moving):
         modes.replace(moving, step(select(modes, moving).starts(), moves=False)[0])
+        (worse,) = np.nonzero(modes.log_likelihood < known - _ASCENT.gain)
+        if len(worse):
+            modes.replace(worse, step(select(origins, worse), moves=False)[0])
         gain[moving] = 0.0
         modes = select(modes, _prune(likelihood, modes, gain, margin))
     return modes
+
+
+def _halve(modes: Modes, origins: Starts, gain: np.ndarray, rows: np.ndarray) -> None:
+    """Halve the steps from the origins to the modes in `rows`, and predict their gains."""
+    # Between two positions in the region, all others are in the region, too.
+    modes.points[rows] = to_polar(
+        (to_positions(origins.points[rows]) + to_positions(modes.points[rows])) / 2)
+    modes.values[rows] = (origins.values[rows] + modes.values[rows]) / 2
+    # The gain of a quadratic function over half of the step to its maximum is 3/4 of the whole.
+    modes.log_likelihood[rows] -= gain[rows] / 4
+    modes.residual[rows] += gain[rows] / 4
+    gain[rows] *= 3 / 4
 
 
 def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
