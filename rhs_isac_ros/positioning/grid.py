@@ -284,11 +284,11 @@ class TemplateTable:
         decrease = ((cells.range_m[peaks.cell] / range_m)**2)[:, None]
         gradient -= decrease * cells.energy_slope[peaks.cell]
         step = np.einsum('pij,pj->pi', cells.inverse[peaks.cell], gradient) / decrease
-        # No position explains more than all of the energy; only approximations seem to.
-        value = np.minimum(exact + np.sum(gradient * step, axis=1) / 2,
-                           np.exp(-2 * peaks.gain) * query.energies[peaks.shots])
+        most = query.explained_at_most(peaks.shots, peaks.gain)
+        change = (np.minimum(exact + np.sum(gradient * step, axis=1) / 2, most)
+                  - np.minimum(approximate, most))
         limits = self._resolution.step_limits(query.prior.is_coarse)
-        return np.clip(step, -limits, limits), peaks.value + value - approximate
+        return np.clip(step, -limits, limits), peaks.value + change
 
     def _outputs(self, query: Query, peaks: Peaks, range_m: np.ndarray
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -116,9 +116,11 @@ class PeakFinder:
         # Within a window, amplitudes decrease with the range.
         scale = centre_m / range_m
         outputs = found.outputs * np.exp(1j * self._carriers * (range_m - centre_m)[:, None])
-        doubled = 2 * scale * query.prior.amplitude(outputs.T)
+        amplitude = scale * query.prior.amplitude(outputs.T)
         found = found._replace(range_m=range_m, energy=scale**2 * found.energy)
-        (value,), (gain,) = _over_gain(doubled[None], found, query)
+        (value,), (gain,) = _over_gain(2 * amplitude[None], found, query)
+        explained = 2 * np.exp(-gain) * amplitude - found.energy
+        value -= np.maximum(explained - query.explained_at_most(found.shots, gain), 0)
         return Peaks(found.shots, found.cell, centre_m, range_m, value, gain, outputs)
 
 

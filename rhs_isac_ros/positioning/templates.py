@@ -262,6 +262,14 @@ class Query(NamedTuple):
     # Negative logarithm of the share of the posterior that may be left out, [1] or for each cell.
     margin: np.ndarray
 
+    def explained_at_most(self, shots: np.ndarray, gain: np.ndarray) -> np.ndarray:
+        """Return the energies of shots [P] without their gains [nepers], float64 [P].
+
+        No position explains more than all of the energy; only approximations seem to.
+        """
+        energies: np.ndarray = np.exp(-2 * gain) * self.energies[shots]
+        return energies
+
 
 def turns_at(wavenumbers: np.ndarray, ranges_m: np.ndarray) -> np.ndarray:
     """Return ratios of conjugate means to conjugate templates at ranges, [N_B, N_SB, R]."""
