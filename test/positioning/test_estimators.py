@@ -281,6 +281,21 @@ def test_a_region_far_shorter_than_the_wavelength_has_a_mode_for_all_signals(ran
     assert all(tracker.update(0.1 * n, one).fix for n, one in enumerate(received))
 
 
+def test_few_and_strong_measurements_locate_users(random_beams):
+    """Approximations on the grid must not displace the true position."""
+    scenario = Scenario(
+        center_frequencies_hz=(2.58e9,), n_subbands=2, subband_width_hz=271e3, n_feeds=1,
+        elements_per_side=(8, 10), element_interval_wavelengths=1.0, multipath_to_los_db=-100.0,
+        max_user_speed_mps=100.0, roi_center_m=(11.7, 0, 0), roi_size_m=(5.2, 15.7, 6.0))
+    codebook, rng = random_beams(scenario, np.random.default_rng(0)), np.random.default_rng(1)
+    positions = scenario.sample_positions(100, rng)
+    estimate = make_estimator('bayes', scenario, codebook).estimate(
+        simulate_received(scenario, codebook, positions, rng))
+    assert estimate.fix.mean() > 0.97
+    squares = squared_normalised(estimate.mean - positions, estimate.covariance)[estimate.fix]
+    assert np.mean(squares < chdtri(3, 0.05)) > 0.88
+
+
 @pytest.mark.parametrize('changes', [
     {'roi_size_m': (10, 0, 0)}, {'roi_size_m': (0, 10, 2)}, {'roi_size_m': (0, 10, 0)},
     {'roi_size_m': (10, 10, 0), 'roi_center_m': (10, 0, -2)}, {'delay_spread_s': 0.0},

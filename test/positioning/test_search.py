@@ -68,6 +68,24 @@ def test_the_true_position_is_not_more_likely_than_the_best_mode(setting):
     assert 0.5 < np.mean(best - truths) < 4
 
 
+def test_no_ascent_ends_below_its_start(random_beams):
+    """With few measurements, the likelihood is far from quadratic."""
+    scenario = dataclasses.replace(
+        SCENARIO, center_frequencies_hz=(2.5e9,), n_subbands=1, n_frames=2)
+    rng = np.random.default_rng(4)
+    likelihood = Likelihood(scenario, random_beams(scenario, rng))
+    signals = likelihood.signals(
+        likelihood.model.sample(scenario.sample_positions(1, rng), rng))
+    starts = scenario.sample_positions(200, rng)
+    points, values = to_polar(starts), np.zeros((1, 0))
+    before = likelihood.local(
+        points, np.zeros((len(points), 0)), select(signals, np.zeros(len(points), int))).value
+    for start, value in zip(points, before, strict=True):
+        mode = ascend(likelihood, likelihood, Starts(np.zeros(1, int), start[None], values),
+                      signals, 8, np.inf)
+        assert mode.log_likelihood[0] > value - 0.1
+
+
 def test_modes_that_mirror_each_other_have_the_same_order_on_all_machines():
     """If both halves of the surface are the same, u and -u are, up to rounding, equally likely."""
     places = element_positions(SCENARIO)
