@@ -71,10 +71,11 @@ def _admission(settings: BaseStationSettings) -> Admission:
 
 def reply(success: bool, text: str) -> Callable[['BaseStation', Event], None]:
     """Return an action that answers an operator with `text`, filled in by `BaseStation.fill`."""
-    def action(role: 'BaseStation', event: Event) -> None:
+    # Tables and diagrams show its name.
+    def reply(role: 'BaseStation', event: Event) -> None:
         role.act(events.Reply(success, role.fill(text)))
 
-    return action
+    return reply
 
 
 reply_resumed = reply(True, 'resumed{waiting}')
