@@ -39,6 +39,8 @@ class _Sampling(NamedTuple):
     # because the average over the range nearly removes the effect of this phase.
     spacing: float = 1.5
     common: int = 8
+    # Golden ratio, for the draws of a range.
+    ratio: float = 0.6180339887498949
     # Largest standard deviation of a wrapped phase: it is nearly uniform, and one wrap suffices.
     phase_std_rad: float = 3.0
 
@@ -140,9 +142,9 @@ def draw_broad_samples(
             likely = evidence >= evidence.max() - _SAMPLING.margin
             outputs = likelihood.outputs(points[likely], values[likely], signals)
             turns = np.exp(1j * (likelihood.nuisance.phases @ values[likely].T))
-            log_factors, offsets_m = phases.factors(outputs.T * turns)
+            log_factors, shares = phases.factors(outputs.T * turns)
             evidence[likely] += log_factors
-            points[likely, 0] += offsets_m
+            points[likely, 0] += phases.drawn_m(shares)
             positions[rows] = np.clip(
                 to_positions(points), *bounds).reshape(len(rows), -1, 3)
         log_weights[rows] += evidence.reshape(len(rows), -1)
@@ -188,7 +190,7 @@ class BandPhases:
         shared = max(prior.phase_covariance.min(), 0.0) if len(wavenumbers) > 1 else 0.0
         spacing = _SAMPLING.spacing * self._std / np.sqrt(len(wavenumbers))
         n_ranges = int(np.ceil(2 * np.pi / spacing))
-        self._ranges_m = (((np.arange(n_ranges) + 0.5) / n_ranges - 0.5)
+        self.offsets_m = (((np.arange(n_ranges) + 0.5) / n_ranges - 0.5)
                           * 2 * np.pi / wavenumbers.mean())
         self._wavenumbers = wavenumbers
         self._common, self._log_weights = _common_phase(np.sqrt(shared))
@@ -197,16 +199,24 @@ class BandPhases:
         """Multiply the bands' factors at P positions, and average over one wavelength of range.
 
         `outputs`, [N_B, P], are the outputs of the matched filters. Returns the logarithm of the
-        average, and the mean offset in range [m], [P] each.
+        average, [P], and the shares of the offsets `offsets_m` in range, [P, R].
         """
-        all_turns = self._wavenumbers[:, None, None] * self._ranges_m[:, None] + self._common
+        all_turns = self._wavenumbers[:, None, None] * self.offsets_m[:, None] + self._common
         log_factor = np.zeros((outputs.shape[1], *all_turns.shape[1:]))
         for output, turns in zip(outputs, all_turns, strict=True):
             std = self._broadened(np.abs(output))[:, None, None]
             log_factor += _log_density(np.angle(output)[:, None, None] + turns, std)
-        log_factor += self._log_weights - np.log(len(self._ranges_m))
+        log_factor += self._log_weights - np.log(len(self.offsets_m))
         weights, log_total = mixture_weights(log_factor, axis=(1, 2))
-        return log_total, weights.sum(axis=2) @ self._ranges_m
+        return log_total, weights.sum(axis=2)
+
+    def drawn_m(self, shares: np.ndarray) -> np.ndarray:
+        """Draw an offset for each of P positions with these shares, [P, R] [m]."""
+        # Multiples of the golden ratio, modulo 1, are evenly spread.
+        levels = (np.arange(len(shares)) + 0.5) * _SAMPLING.ratio % 1
+        cumulative = np.cumsum(shares, axis=1)
+        chosen = np.count_nonzero(cumulative < levels[:, None], axis=1)
+        return self.offsets_m[np.minimum(chosen, shares.shape[1] - 1)]
 
     def _broadened(self, magnitude: np.ndarray) -> np.ndarray:
         """Return the limited standard deviation of the phase of noisy outputs, as `magnitude`."""

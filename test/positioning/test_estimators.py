@@ -303,7 +303,8 @@ def test_few_and_strong_measurements_locate_users(random_beams):
     {'roi_center_m': (1, 20, 5), 'roi_size_m': (1.5, 10, 2)},
     {'roi_center_m': (0.3, 5, 0), 'roi_size_m': (0.5, 6, 2)},
     {'multipath_to_los_db': -20.0, 'user_gain_std_db': 1.0},
-    {'multipath_to_los_db': -25.0, 'timing_std_s': 20e-9}], ids=str)
+    {'multipath_to_los_db': -25.0, 'timing_std_s': 20e-9},
+    {'multipath_to_los_db': -40.0, 'band_phase_std_rad': 1.0}], ids=str)
 def test_regions_contain_users_on_lines_in_flat_channels_at_wide_angles_and_with_strong_signals(
         changes, shipped):
     scenario, rng = Scenario(**changes), np.random.default_rng(1)

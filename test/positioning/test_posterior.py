@@ -99,7 +99,8 @@ def test_the_factors_average_the_series_over_a_wavelength_and_the_shared_phase(
     likelihood = Likelihood(scenario, random_beams(scenario, np.random.default_rng(1)))
     rng = np.random.default_rng(4)
     outputs = rng.uniform(5, 20, (3, 25)) * np.exp(1j * rng.uniform(-np.pi, np.pi, (3, 25)))
-    found, offsets_m = BandPhases(likelihood).factors(outputs)
+    phases = BandPhases(likelihood)
+    found, shares = phases.factors(outputs)
     wavenumbers = 2 * np.pi * np.array(frequencies_hz) / 299792458
     wavelength = 2 * np.pi / wavenumbers.mean()
     ranges = np.linspace(-0.5, 0.5, 100, endpoint=False) * wavelength
@@ -111,7 +112,10 @@ def test_the_factors_average_the_series_over_a_wavelength_and_the_shared_phase(
     likely = np.exp(log_factors(turned, 0.8).sum(axis=3)) @ weights / weights.sum()
     np.testing.assert_allclose(found, np.log(likely.mean(axis=1)), atol=tolerance)
     np.testing.assert_allclose(
-        offsets_m, likely @ ranges / likely.sum(axis=1), atol=wavelength / 10)
+        shares @ phases.offsets_m, likely @ ranges / likely.sum(axis=1), atol=wavelength / 10)
+    drawn_m = phases.drawn_m(np.repeat(shares[:1], 1000, axis=0))
+    np.testing.assert_allclose(
+        np.mean(drawn_m[:, None] == phases.offsets_m, axis=0), shares[0], atol=0.01)
 
 
 @pytest.mark.parametrize('std_rad', [0.3, 1.5, 3.0])
