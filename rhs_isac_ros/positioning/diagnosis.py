@@ -30,7 +30,7 @@ from rhs_isac_ros.positioning.estimate import Estimate
 # Numbers of residuals: in the window, required to end a warning, and required to begin one.
 WINDOW = 400
 MIN_RETURN = 100
-MIN_FIXES = 10
+MIN_RESIDUALS = 10
 
 
 class _Limits(NamedTuple):
@@ -148,11 +148,11 @@ class InnovationTest:
             if len(latest) == MIN_RETURN and _fit(latest, _LIMITS.end):
                 self.clear()
                 self._residuals.extend(latest)
-        elif len(self._residuals) >= MIN_FIXES:
+        elif len(self._residuals) >= MIN_RESIDUALS:
             self.drifts = not _fit(self._residuals, _LIMITS.begin)
 
     @property
-    def n_fixes(self) -> int:
+    def n_residuals(self) -> int:
         """Number of residuals in the window."""
         return len(self._residuals)
 
@@ -266,7 +266,7 @@ def _cause(estimates: Collection[Estimate], subject: str, deviates: bool,
         (one.residual, one.expected_residual) for one in estimates
         if one.residual > 0 and one.expected_residual > 0]).reshape(-1, 2).T
     is_alternative = subject in {kind.reason for kind in ALTERNATIVES}
-    if len(residual) < MIN_FIXES or is_alternative and not deviates:
+    if len(residual) < MIN_RESIDUALS or is_alternative and not deviates:
         return subject
     # The energy of n complex measurements has the relative variance 1 / n; levels add to it.
     n = float(np.mean(expected))

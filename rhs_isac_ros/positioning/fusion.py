@@ -56,12 +56,16 @@ class _Limits(NamedTuple):
     # sheets that touch have a product with more weight at its borders.
     samples: int = 128
     spread: float = 1.2
+    # Information of a uniform prior in the region that narrows their Gaussian, as a share of it.
+    narrowing: float = 0.25
     # Information of a prior that keeps matrices invertible, relative to a uniform one in the
     # region, and smallest extent of the region along an axis [m].
     floor: float = 1e-3
     extent_m: float = 0.01
-    # Smallest cosine of the angle between boresight and the maximum of a mode.
+    # Smallest cosine of the angle between boresight and the maximum of a mode, and largest change
+    # of the range from the mode's point to its maximum, as a share.
     cosine: float = 0.05
+    change: float = 0.5
 
 
 _LIMITS = _Limits()
@@ -90,7 +94,7 @@ class Sighting:
         points = modes.centres
         # The maximum of a mode on the border of the region may be far outside.
         valid = np.sum(points[:, 1:]**2, axis=1) < 1 - _LIMITS.cosine**2
-        valid &= np.abs(points[:, 0] / modes.points[:, 0] - 1) < 0.5
+        valid &= np.abs(points[:, 0] / modes.points[:, 0] - 1) < _LIMITS.change
         points = np.where(valid[:, None], points, modes.points)
         rise = np.sum(modes.gradient * (points - modes.points), axis=1) / 2
         by_point = jacobian(points)
@@ -278,7 +282,7 @@ class _Products(NamedTuple):
     def restricted(self, sheets: Sequence[_Sheets], bounds_m: np.ndarray) -> Mixture:
         """Return the mixture of the products inside the bounds, with the moments of samples."""
         normal = standard_normal(_LIMITS.samples)
-        information = self.curvature + _region_information(bounds_m, 0.25)
+        information = self.curvature + _region_information(bounds_m, _LIMITS.narrowing)
         covariances = _LIMITS.spread**2 * np.linalg.inv(information)
         roots = np.linalg.cholesky(covariances)
         positions, log_density = self._bent(

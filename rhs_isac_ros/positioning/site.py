@@ -44,7 +44,7 @@ class SiteSurface:
 class Site:
     """Surfaces by their names, and the region of interest in the frame of the site.
 
-    Raises SiteError without surfaces, if a name is no name of a ROS namespace, if two surfaces
+    Raises SiteError without surfaces, if a name is not valid in a ROS namespace, if two surfaces
     have the same scenario and pose, if a codebook does not fit, or if the region of a scenario
     does not contain that of the site.
     """
@@ -143,6 +143,7 @@ class SiteEstimator:
             if sightings:
                 fuser = Fuser(self._site.bounds_m)
                 agreements.append(pair_agreements(sightings, fuser))
+                # In the order of the pairs, so that products are reused.
                 fused = fuser.fuse([one for _, one in sorted(sightings.items())])
                 places.append(fused.mixture.moments()[0])
         return agreements, np.array(places).reshape(-1, 3)
@@ -163,7 +164,7 @@ def site_text(path: str | Path, poses: Mapping[str, Pose], folder: Path) -> str:
         surface.update({key: os.path.relpath(Path(path).parent / surface[key], folder)
                         for key in ('scenario', 'codebook')})
         if name in poses:
-            # Of JSON, because YAML would refer to values that occur twice.
+            # A copy through JSON shares no values, for which YAML would write anchors and aliases.
             surface['pose'] = json.loads(json.dumps(dataclasses.asdict(poses[name])))
     return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
 
@@ -179,7 +180,8 @@ def _surface(name: str, value: Any, folder: Path, bounds_m: np.ndarray) -> SiteS
         scenario = Scenario.from_yaml(folder / content['scenario'])
         if 'pose' in content:
             scenario = dataclasses.replace(scenario, pose=content['pose'])
-        # Rounded, so that errors of the rotation do not change the identifier of the scenario.
+        # Rounded, so that errors of the rotation do not change the identifier of the scenario; the
+        # sum turns -0.0 into 0.0.
         places = np.round(scenario.pose.to_surface(_corners(bounds_m)), _DECIMALS) + 0.0
         low, high = places.min(axis=0), places.max(axis=0)
         scenario = dataclasses.replace(

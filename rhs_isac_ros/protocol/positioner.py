@@ -171,10 +171,10 @@ class ResidualWatch:
         ``warning.residual`` is the text of the current warning.
         """
         values = diagnose(self._estimates, bool(self._warning), self._level_db[1])
-        if self._all.n_fixes:
+        if self._all.n_residuals:
             values |= {'residual.ratio': f'{self._all.ratio:.3f}',
                        'residual.spread': f'{self._all.spread:.3f}',
-                       'residual.fixes': str(self._all.n_fixes)}
+                       'residual.fixes': str(self._all.n_residuals)}
         return values | ({'warning.residual': self._warning} if self._warning else {})
 
     def _describe(self) -> str:
@@ -188,7 +188,7 @@ class ResidualWatch:
 
 def _deviation(prefix: str, monitor: InnovationTest) -> str:
     return (f'{prefix}residuals {monitor.ratio:.3g} times as strong as expected, with '
-            f'{monitor.spread:.3g} times the variance, over {monitor.n_fixes} cycles')
+            f'{monitor.spread:.3g} times the variance, over {monitor.n_residuals} cycles')
 
 
 class _Loss(enum.Enum):

@@ -19,7 +19,7 @@ from rhs_isac_ros.positioning.alternatives import (
 )
 from rhs_isac_ros.positioning.diagnosis import (
     LEVEL,
-    MIN_FIXES,
+    MIN_RESIDUALS,
     MIN_RETURN,
     SPREAD,
     WINDOW,
@@ -164,14 +164,14 @@ def without_warning(values, *arguments, expected=EXPECTED):
 
 def test_residuals_of_the_model_cause_no_warning():
     test = without_warning(energies(5000))
-    assert test.n_fixes == WINDOW
+    assert test.n_residuals == WINDOW
     assert test.ratio == pytest.approx(1, abs=0.03)
 
 
 @pytest.mark.parametrize('scale', [0.93, 1.07])
 def test_slightly_wrong_residuals_cause_a_warning_after_some_fixes(scale):
     values = energies(4 * WINDOW, scale)
-    assert not filled(values[:MIN_FIXES]).drifts
+    assert not filled(values[:MIN_RESIDUALS]).drifts
     # A small deviation does not come and go.
     for n in range(1, 5):
         test = filled(values[:n * WINDOW])
@@ -214,12 +214,12 @@ def test_levels_of_many_users_are_no_excess_of_the_variance():
 
 
 def test_a_level_far_from_the_survey_causes_a_warning():
-    assert filled(energies(MIN_FIXES, 10**-1.3), WINDOW, (-3.0, 1.0)).drifts
+    assert filled(energies(MIN_RESIDUALS, 10**-1.3), WINDOW, (-3.0, 1.0)).drifts
 
 
 def test_few_residuals_are_not_judged():
-    assert not filled([1e6] * (MIN_FIXES - 1)).drifts
-    assert filled([1e6] * MIN_FIXES).drifts
+    assert not filled([1e6] * (MIN_RESIDUALS - 1)).drifts
+    assert filled([1e6] * MIN_RESIDUALS).drifts
 
 
 @pytest.mark.parametrize('window', [-1, 0, MIN_RETURN - 1])
@@ -235,7 +235,7 @@ def test_a_warning_ends_after_some_residuals_of_the_model():
     test = filled([*bad, *values])
     assert not test.drifts
     # What preceded the end of the warning is forgotten.
-    assert test.n_fixes < WINDOW
+    assert test.n_residuals < WINDOW
     assert filled([*bad, *values, *energies(MIN_RETURN, 2.0, 1)]).drifts
 
 
@@ -243,7 +243,7 @@ def test_residuals_are_forgotten_on_request():
     test = filled(energies(WINDOW, 2.0))
     test.clear()
     assert not test.drifts
-    assert test.n_fixes == 0
+    assert test.n_residuals == 0
     assert math.isnan(test.ratio)
     assert math.isnan(test.spread)
 
@@ -253,7 +253,7 @@ def test_residuals_are_forgotten_on_request():
 def test_estimates_without_a_residual_or_an_expectation_are_ignored(energy, expected):
     test = filled([energy] * WINDOW, expected=expected)
     assert not test.drifts
-    assert test.n_fixes == 0
+    assert test.n_residuals == 0
 
 
 @pytest.mark.slow
@@ -323,7 +323,7 @@ def test_signals_of_the_model_have_no_cause(shipped, table1_estimator):
 def test_few_residuals_leave_the_reason_as_the_cause():
     nothing = np.full(3, np.nan), np.full((3, 3), np.nan)
     estimate = Estimate(*nothing, 'residual energy: 9, expected at most 5', 9.0, 3.0)
-    values = diagnose([estimate] * (MIN_FIXES - 1), True)
+    values = diagnose([estimate] * (MIN_RESIDUALS - 1), True)
     assert values['no_fix.cause'] == 'residual energy'
     assert diagnose([Estimate(np.zeros(3), np.eye(3))], True) == {}
 

@@ -7,7 +7,7 @@ import pytest
 
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.positioning import Estimate, TrackEstimate, make_estimator
-from rhs_isac_ros.positioning.diagnosis import MIN_FIXES, MIN_RETURN, WINDOW
+from rhs_isac_ros.positioning.diagnosis import MIN_RESIDUALS, MIN_RETURN, WINDOW
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import ResidualWatch
 
@@ -43,7 +43,7 @@ def test_a_deviation_is_logged_when_it_begins_and_when_it_ends():
 
 def test_one_user_does_not_hide_among_many():
     watch, logged = ResidualWatch(), []
-    for _ in range(2 * MIN_FIXES):
+    for _ in range(2 * MIN_RESIDUALS):
         for user in range(1, 65):
             logged.append(watch.add(user, estimate(1.3 if user == 7 else 1.0))[0])
     (text,) = filter(None, logged)
@@ -53,7 +53,7 @@ def test_one_user_does_not_hide_among_many():
 
 def test_many_deviating_users_make_one_line_of_bounded_length():
     watch = ResidualWatch()
-    logged = [line for user in range(1, 20) for line in add(watch, user, MIN_FIXES, 3.0)]
+    logged = [line for user in range(1, 20) for line in add(watch, user, MIN_RESIDUALS, 3.0)]
     assert len(logged) == 1
     text = watch.status()['warning.residual']
     assert 'user 8: ' in text
@@ -131,7 +131,7 @@ def test_the_positioner_warns_until_a_new_codebook_or_new_settings_are_used(net,
 
     net.result = estimate(3.0)
     for number, replace in enumerate((lambda: net.offer(codebooks[1]), new_settings), start=1):
-        net.run_cycles(MIN_FIXES)
+        net.run_cycles(MIN_RESIDUALS)
         assert warnings(net) != ''
         assert len(texts(net)) == number
         replace()
