@@ -134,7 +134,12 @@ class _Posterior:
         prior, value = likelihood.nuisance, np.empty(len(points))
         values = np.repeat(self._aligned[shot][None], len(points), axis=0)
         outputs = likelihood.outputs(points, values, select(self._signals, [shot]))
-        values += prior.start(outputs.T, np.zeros(len(points))) if len(prior) else 0.0
+        if len(prior):
+            # The steps of `marginal_at` begin near the most likely gain.
+            whitened = self._whitened[shot]
+            _, gain = prior.maximised_over_gain(
+                prior.amplitude(outputs.T), float(np.sum(np.abs(whitened)**2)), whitened.size)
+            values += prior.start(outputs.T, np.broadcast_to(gain, len(points)))
         for start in range(0, len(points), _BLOCK):
             block = slice(start, start + _BLOCK)
             value[block], values[block] = marginal_at(
