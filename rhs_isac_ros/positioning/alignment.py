@@ -231,8 +231,8 @@ class _Pairs(NamedTuple):
         turned = pose.vectors_to_site(self.local_m)
         offsets = self.means_m - turned - pose.origin
         covariances = self.covariances + pose.covariances_to_site(self.local_covariances)
-        precisions, log_volumes = _inverses(covariances + width_m**2 * np.eye(3))
-        logs = (self.log_weights - likelihood_loss(offsets, precisions) - log_volumes / 2
+        precisions, log_dets = _inverses(covariances + width_m**2 * np.eye(3))
+        logs = (self.log_weights - likelihood_loss(offsets, precisions) - log_dets / 2
                 - 1.5 * np.log(2 * np.pi))
         highest = np.maximum(self.of_user.max(logs), self.log_outlier)
         densities = np.exp(logs - self.of_user.repeat(highest))

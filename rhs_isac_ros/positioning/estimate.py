@@ -48,7 +48,7 @@ class Estimate:
 
     @classmethod
     def without_fix(cls, reason: str, **statistics: float) -> 'Estimate':
-        """Return an estimate of one shot without a position, and its other fields."""
+        """Return an estimate of one shot that has a reason in place of a position."""
         return cls(np.full(3, np.nan), np.full((3, 3), np.nan), reason, **statistics)
 
     @classmethod

@@ -46,8 +46,9 @@ _MIN_GAIN_STD = 1e-9
 
 
 class _Search(NamedTuple):
-    """Grid on which parameters with several maxima are compared."""
+    """Estimation of parameters from the signals alone, and the margin for its errors."""
 
+    # Grid on which parameters with several maxima are compared.
     reach: float = 4.0  # In standard deviations.
     points: tuple[int, ...] = (513, 49, 13, 5)  # Per parameter, for 1, 2, 3 and more parameters.
     refinements: int = 4  # Of the best point.

@@ -91,16 +91,15 @@ class PeakFinder:
 
     def _centres(self, candidates: Candidates, query: Query) -> Peaks:
         """Return the centre of every window."""
-        turns = np.ones_like(self._turns[:, :1])
-        doubled = _doubled_amplitude(turns, candidates, query)
-        (value,), (gain,) = _over_gain(doubled, candidates, query)
+        value, gain = _valued(query.prior.amplitude(candidates.outputs), candidates, query)
         return Peaks(candidates.shots, candidates.cell, candidates.range_m, candidates.range_m,
                      value, gain, candidates.outputs.T.astype(complex))
 
     def _maxima(self, candidates: Candidates, query: Query) -> Peaks:
         """Return the local maxima along the range, but not those at the ends of a window."""
         if query.prior.phase_covariance.any():
-            along = _doubled_amplitude(self._turns, candidates, query)
+            along = 2 * query.prior.amplitude(
+                self._turns[..., None] * candidates.outputs[:, None])
         else:
             outputs = candidates.outputs
             along = self._rotation @ np.concatenate([outputs.real, outputs.imag])
@@ -118,9 +117,7 @@ class PeakFinder:
         outputs = found.outputs * np.exp(1j * self._carriers * (range_m - centre_m)[:, None])
         amplitude = scale * query.prior.amplitude(outputs.T)
         found = found._replace(range_m=range_m, energy=scale**2 * found.energy)
-        (value,), (gain,) = _over_gain(2 * amplitude[None], found, query)
-        explained = 2 * np.exp(-gain) * amplitude - found.energy
-        value -= np.maximum(explained - query.explained_at_most(found.shots, gain), 0)
+        value, gain = _valued(amplitude, found, query)
         return Peaks(found.shots, found.cell, centre_m, range_m, value, gain, outputs)
 
 
@@ -142,9 +139,13 @@ def _inner_maxima(along: np.ndarray, of_shot: Segments) -> tuple[np.ndarray, np.
     return step[order] + 1, window[order]
 
 
-def _doubled_amplitude(turns: np.ndarray, candidates: Candidates, query: Query) -> np.ndarray:
-    """Return twice the amplitudes after the best rotation of the phases; `turns` are [N_B, S]."""
-    return 2 * query.prior.amplitude(turns[..., None] * candidates.outputs[:, None])
+def _valued(amplitude: np.ndarray, found: Candidates, query: Query
+            ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the log-likelihoods of windows with amplitudes [W], and the gains [nepers], [W]."""
+    (value,), (gain,) = _over_gain(2 * amplitude[None], found, query)
+    explained = 2 * np.exp(-gain) * amplitude - found.energy
+    return value - np.maximum(
+        explained - query.explained_at_most(found.shots, gain), 0), gain
 
 
 def _over_gain(doubled: np.ndarray, candidates: Candidates, query: Query

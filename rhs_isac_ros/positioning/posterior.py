@@ -219,7 +219,7 @@ class BandPhases:
         return self.offsets_m[np.minimum(chosen, shares.shape[1] - 1)]
 
     def _broadened(self, magnitude: np.ndarray) -> np.ndarray:
-        """Return the limited standard deviation of the phase of noisy outputs, as `magnitude`."""
+        """Return the standard deviation of the phase of noisy outputs, up to one wrap."""
         # Noise gives the phase a von Mises density, which is approximated by the wrapped normal
         # density with the same first harmonic.
         from scipy.special import i0e, i1e
