@@ -1,7 +1,6 @@
 """All roles on one bus in memory, with a virtual clock, faults and a log of all messages."""
 
 import dataclasses
-import enum
 import functools
 import heapq
 import itertools
@@ -11,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from example_messages import FIXED_PLACE, example_message
 from system.invariants import RECEIVES, InvariantChecker
 
 from rhs_isac_ros.codebook import Codebook, random_codebook
@@ -56,11 +56,6 @@ LATENCY_S = 1e-3
 BEACON_TIMEOUT_S = 3.0
 # A model file that does not match any codebook.
 UNFIT = 'unfit'
-
-
-FIXED_PLACE = np.array([8.0, -2.0, 0.5])
-# Means of the mixture in an example of a posterior [m].
-PLACES_OF_MODES = np.array([FIXED_PLACE, [8.0, -2.5, 0.5]])
 
 
 class Fixed:
@@ -558,44 +553,4 @@ def example(scenario):
 
     Positions are in front of the surface, and symbols have unit magnitude.
     """
-    def make(kind: type[m.Message], rng: np.random.Generator | None = None, **given) -> m.Message:
-        sizes, values = scenario.sizes, {}
-        if kind is m.GroundTruths:
-            given = {'users': np.array([1, 2])} | given
-        if kind is m.Posterior:
-            given = {'log_weights': np.log([0.25, 0.75]), 'means': PLACES_OF_MODES.copy(),
-                     'covariances_m2': 0.01 * np.stack([np.eye(3), 4 * np.eye(3)]),
-                     'missing_probability': 1e-3, 'outside_probability': 0.25,
-                     'blocked_probability': 0.0,
-                     'surface_quaternion': np.array([0.6, 0.0, 0.0, 0.8]),
-                     'surface_uncertainty': 1e-4 * np.eye(6)} | given
-        fields = dataclasses.fields(kind)
-        for field in fields:
-            meta = field.metadata
-            if 'equals' in meta:
-                values[field.name] = sizes[meta['equals']]
-            elif 'index_of' in meta:
-                size = sizes[meta['index_of']]
-                values[field.name] = 0 if rng is None else int(rng.integers(size))
-            elif issubclass(field.type, enum.Enum):
-                members = list(field.type)
-                values[field.name] = members[0 if rng is None else rng.integers(len(members))]
-            elif field.type is str:
-                values[field.name] = ''
-            elif field.type in (int, float):
-                low = meta['declared'].low if 'declared' in meta else 0
-                values[field.name] = field.type(low if rng is None else rng.integers(1, 4))
-        values |= given
-        sizes |= kind.own_sizes(types.SimpleNamespace(**values), sizes)
-        for field in fields:
-            if 'dims' in field.metadata and field.name not in given:
-                shape = [sizes[d] if d in sizes else int(d) for d in field.metadata['dims']]
-                values[field.name] = np.zeros(shape, field.metadata['declared'].kind)
-                if rng is not None:
-                    values[field.name] += rng.random(shape)
-                if field.metadata['in_front']:
-                    values[field.name][..., 0] += 1
-                if field.name == 'symbols':
-                    values[field.name] = np.exp(1j * values[field.name])
-        return kind(**values)
-    return make
+    return functools.partial(example_message, scenario)

@@ -7,6 +7,7 @@ Several surfaces of one site share the frame of the site. A pose converts betwee
 import dataclasses
 import functools
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,8 @@ class Pose:
     """
 
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: p, x, y, z [m].
-    #: Quaternion x, y, z, w of any length but 0: the rotation R from the surface to the site.
+    #: Quaternion of any length but 0: the rotation R from the surface to the site. A mapping of x,
+    #: y, z and w is converted.
     quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     #: Standard deviations of each coordinate of t [m] and of a [deg], or the covariance [6, 6] of
     #: t [m] and a [rad]. 0 for a pose that is known exactly.
@@ -39,13 +41,17 @@ class Pose:
 
     def __post_init__(self) -> None:
         """Convert every field to tuples of floats, and check it."""
+        parts: Any = self.quaternion
+        if isinstance(parts, Mapping):
+            if parts.keys() != set('xyzw'):
+                raise ValueError(f'quaternion: {parts!r}, expected x, y, z and w')
+            object.__setattr__(self, 'quaternion', tuple(parts[name] for name in 'xyzw'))
         position, quaternion, uncertainty = (
             numbers(field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
         for name, array, size in (('position_m', position, 3), ('quaternion', quaternion, 4)):
             if array.shape != (size,):
                 raise ValueError(f'{name}: shape {array.shape}, expected [{size}]')
-        if not quaternion.any():
-            raise ValueError('quaternion: zeros, expected a length other than 0')
+        unit_quaternion(quaternion)
         if uncertainty.shape not in ((2,), (6, 6)):
             raise ValueError(f'uncertainty: shape {uncertainty.shape}, expected two standard '
                              'deviations [m, deg] or a covariance [6, 6]')
@@ -65,7 +71,7 @@ class Pose:
     @functools.cached_property
     def unit_quaternion(self) -> np.ndarray:
         """The quaternion x, y, z, w of length 1, float64 [4], read-only."""
-        return read_only(np.array(self.quaternion) / np.linalg.norm(self.quaternion))
+        return read_only(unit_quaternion(np.array(self.quaternion)))
 
     @functools.cached_property
     def rotation(self) -> np.ndarray:
@@ -120,7 +126,7 @@ class Pose:
         angle = float(np.linalg.norm(turn))
         half = np.append(turn * np.sinc(angle / (2 * math.pi)) / 2, math.cos(angle / 2))
         moved = _nested(self.origin + shift)
-        turned = _nested(quaternion_product(half, np.array(self.quaternion)))
+        turned = _nested(quaternion_product(half, self.unit_quaternion))
         return dataclasses.replace(self, position_m=moved, quaternion=turned)
 
     def error_of(self, other: 'Pose') -> np.ndarray:
@@ -136,9 +142,20 @@ class Pose:
         return np.append(shift, turn[:3] * (angle / sine if sine else 2.0))
 
 
+def unit_quaternion(quaternion: np.ndarray) -> np.ndarray:
+    """Return a quaternion [4] of any length except 0 with the length 1, or raise ValueError."""
+    largest = np.abs(quaternion).max()
+    if not 0 < largest < np.inf:
+        raise ValueError(f'quaternion: {quaternion.tolist()}, expected finite numbers and a '
+                         'length other than 0')
+    # Squares of the given numbers may underflow or overflow.
+    scaled = quaternion / largest
+    return scaled / np.linalg.norm(scaled)
+
+
 def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix [3, 3] of a quaternion x, y, z, w of any length except 0."""
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
+    """Return the rotation matrix [3, 3] of a quaternion x, y, z, w, as `unit_quaternion`."""
+    x, y, z, w = unit_quaternion(quaternion)
     return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
                      [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
                      [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])

@@ -114,14 +114,15 @@ def follow_odometry(
                             f'{frame!r}', message.header.frame_id)
             return
         turn = message.pose.pose.orientation
-        orientation = np.array([turn.x, turn.y, turn.z, turn.w])
-        if not np.linalg.norm(orientation) > 0:
-            mobility.reject(f'orientation {orientation.tolist()}, expected a quaternion')
+        try:
+            rotation = rotation_matrix(np.array([turn.x, turn.y, turn.z, turn.w]))
+        except ValueError as error:
+            mobility.reject(f'orientation: {error}')
             return
         # The velocity is in the frame of the robot.
         mobility.put(Time.from_msg(message.header.stamp).nanoseconds,
                      vector(message.pose.pose.position),
-                     rotation_matrix(orientation) @ vector(message.twist.twist.linear))
+                     rotation @ vector(message.twist.twist.linear))
     # Drivers and simulators often publish best effort.
     endpoints.subscribe(node, Odometry, topic, receive, endpoints.SENSOR, overridable=True)
     return mobility

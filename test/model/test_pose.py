@@ -63,9 +63,24 @@ def test_the_error_of_a_displaced_pose_is_its_displacement(turn):
     np.testing.assert_allclose(TILTED.error_of(TILTED.displaced(error)), error, atol=1e-12)
 
 
-def test_the_length_of_the_quaternion_does_not_matter():
-    half = Pose(SIDE.position_m, (0.0, 0.0, 0.5, 0.5))
-    np.testing.assert_allclose(half.to_site(PLACES), SIDE.to_site(PLACES), atol=1e-12)
+# The squares of most of these lengths are 0 or infinite.
+@pytest.mark.parametrize('length', [0.5, 5e-324, 1e-200, 1e200, 1.7e308])
+def test_the_length_of_the_quaternion_does_not_matter(length):
+    scaled = Pose(SIDE.position_m, (0.0, 0.0, length, length))
+    np.testing.assert_allclose(scaled.to_site(PLACES), SIDE.to_site(PLACES), atol=1e-12)
+    np.testing.assert_allclose(scaled.displaced(np.zeros(6)).error_of(SIDE), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize('value', [0.0, np.nan, np.inf])
+def test_numbers_without_a_direction_are_no_quaternion(value):
+    with pytest.raises(ValueError, match='quaternion: .*expected finite numbers'):
+        rotation_matrix(np.array([0.0, 0.0, value, 0.0]))
+
+
+def test_a_quaternion_with_named_parts_has_no_order():
+    assert Pose(quaternion={'w': 4, 'x': 1, 'y': 2, 'z': 3}) == Pose(quaternion=(1, 2, 3, 4))
+    with pytest.raises(ValueError, match="quaternion: {'x': 1}, expected x, y, z and w"):
+        Pose(quaternion={'x': 1})
 
 
 def test_the_default_uncertainty_is_2_cm_and_a_fifth_of_a_degree():
@@ -108,7 +123,7 @@ def test_equal_poses_have_equal_hashes():
     ('position_m', (1.0, 2.0), r'position_m: shape \(2,\), expected \[3\]'),
     ('position_m', (1.0, np.nan, 2.0), 'position_m: not finite'),
     ('quaternion', (0.0, 0.0, 1.0), r'quaternion: shape \(3,\), expected \[4\]'),
-    ('quaternion', (0.0, 0.0, 0.0, 0.0), 'quaternion: zeros, expected a length other than 0'),
+    ('quaternion', (0.0, 0.0, 0.0, 0.0), 'quaternion: .* a length other than 0'),
     ('uncertainty', (0.1, -1.0), 'uncertainty: -1, expected at least 0'),
     ('uncertainty', (0.1, 0.1, 0.1), r'uncertainty: shape \(3,\), expected two standard'),
     ('uncertainty', np.diag([1.0, 1, 1, 1, 1, -1]), 'uncertainty: smallest eigenvalue -1'),

@@ -100,8 +100,10 @@ def test_odometry_is_read_in_the_frame_of_the_robot(bench):
         publisher.publish(message)
         return mobility.lack
     bench.until(lambda: lack().endswith(
-        ': orientation [0.0, 0.0, 0.0, 0.0], expected a quaternion'), 'the reason')
-    message.pose.pose.orientation.z = message.pose.pose.orientation.w = 0.5
+        ': orientation: quaternion: [0.0, 0.0, 0.0, 0.0], expected finite numbers and a length '
+        'other than 0'), 'the reason')
+    # Of any length but 0, also where squares are 0.
+    message.pose.pose.orientation.z = message.pose.pose.orientation.w = 1e-200
     bench.until(lambda: not lack(), 'the odometry')
     np.testing.assert_allclose(mobility.state(0.0)[1], [0.0, 2.0, 0.0], atol=1e-12)
 

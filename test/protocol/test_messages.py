@@ -157,7 +157,7 @@ MALFORMED = [
      'eigenvalue 0, expected positive eigenvalues'),
     (m.Posterior, {'means': -np.ones((2, 3))}, 'means: x = -1 m, expected x > 0'),
     (m.Posterior, {'means': np.zeros((3, 3))}, 'expected [COMPONENTS = 2, 3]'),
-    (m.Posterior, {'surface_quaternion': np.zeros(4)}, 'expected a length other than 0'),
+    (m.Posterior, {'surface_quaternion': np.zeros(4)}, 'a length other than 0'),
     (m.Posterior, {'surface_uncertainty': -np.eye(6)}, 'without negative eigenvalues'),
     (m.Posterior, {'log_weights': np.zeros(257), 'means': np.zeros((257, 3)),
                    'covariances_m2': np.tile(np.eye(3), (257, 1, 1))}, 'expected at most 256'),

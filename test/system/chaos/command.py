@@ -94,7 +94,8 @@ def _run(
         return soaked.figures(), soaked.passed
     if options.fuzz:
         fuzzed = fuzzing.fuzz(
-            observer, processes, scenario, options.fuzz, np.random.default_rng(options.seed),
+            observer, processes, scenario, Codebook.load(codebook_file), options.fuzz,
+            np.random.default_rng(options.seed),
             lambda n: _progress(f'{n} of {options.fuzz} mutations'))
         return dataclasses.asdict(fuzzed), fuzzed.passed
     crashes_chosen = options.nodes is not None or options.phases is not None

@@ -1,33 +1,39 @@
-"""Fuzzing: publish random and mutated messages on every topic, and compare the counters."""
+"""Fuzzing: publish random and mutated messages on every topic, and compare the counters.
+
+The messages that are mutated are examples, not those of the running network, so all mutations of a
+seed are the same in each run.
+"""
 
 import collections
 import dataclasses
+import itertools
+import json
 import time
 from collections.abc import Callable, Mapping
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
+from example_messages import example_message
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
 from visualization_msgs.msg import MarkerArray
 
 import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.role import NewestDict
+from rhs_isac_ros.protocol.presences import Presence
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES, profile_for, subscribe
+from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES, profile_for
 from rhs_isac_ros.ros.processes import Processes
 from system.chaos.mutations import mutate
-from system.chaos.trial import ChaosError, both_served
+from system.chaos.trial import ChaosError, both_served, wait_for_service
 from system.observer import NetworkObserver
 
-# Mutations on one topic between checks; the queues of the nodes hold four times as many messages.
-_BATCH = 32
+# Mutations on one topic between checks; the queues of the nodes hold more messages.
+_BATCH = 8
 _TIMEOUT_S = 30.0
-_MAX_ORIGINALS = 32
-_MAX_PUBLISHED = 100 * _BATCH
+_N_ORIGINALS = 8
 # Messages of the protocol by topic.
 _PROTOCOL = {name: kind for kind, name in topics.NAMES.items()}
 # Topics with other messages.
@@ -38,9 +44,6 @@ _OTHERS = {
     topics.DIAGNOSTICS: (DiagnosticArray, EXCHANGE),
     topics.MARKERS: (MarkerArray, EXCHANGE),
 }
-# Topics without messages in a correct network with one codebook, a node for each user and no
-# visualizer.
-_UNUSED = {topics.NAMES[m.NoFix], topics.NAMES[m.GroundTruths], topics.MARKERS}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +59,8 @@ class FuzzResult:
     traces: tuple[str, ...]  #: Lines of logs that belong to unhandled errors.
     #: From the last mutation until both users have been served again [s]; None if never.
     recovery_s: float | None
+    #: Latest mutations on the topics of the nodes that failed, each as ``<topic> <bytes>``.
+    suspects: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -63,31 +68,19 @@ class FuzzResult:
         return not self.ended and not self.traces and self.malformed == self.counted
 
 
-class _Mutator:
-    """Publishes mutations of the messages of a topic."""
-
-    def __init__(self, node: Node, name: str, kind: type, profile: QoSProfile) -> None:
-        self.name = name
-        self.originals: collections.deque[bytes] = collections.deque(maxlen=_MAX_ORIGINALS)
-        self._kind = kind
-        self._publisher = node.create_publisher(kind, name, profile)
-        # On a busy machine, the observer receives its own messages late.
-        self._published: NewestDict[bytes, None] = NewestDict(_MAX_PUBLISHED)
-        subscribe(node, kind, name, self._receive, profile, raw=True)
-
-    def publish(self, rng: np.random.Generator) -> bytes:
-        """Publish a mutation, and return it."""
-        # Diagnostics are random messages, not mutations: a mutation could carry the name of a node
-        # and falsify the counters, which are read from the diagnostics.
-        originals = () if self.name == topics.DIAGNOSTICS else self.originals
-        content = mutate(self._kind, originals, rng)
-        self._published.put(content, None)
-        self._publisher.publish(content)
-        return content
-
-    def _receive(self, content: bytes) -> None:
-        if content not in self._published:
-            self.originals.append(content)
+def originals(scenario: Scenario, codebook: Codebook, rng: np.random.Generator
+              ) -> dict[str, list[bytes]]:
+    """Return the messages to mutate on each topic; none where messages are random instead."""
+    identity = 1, scenario.id
+    presence = Presence(*identity, 'bs', '/other', json.dumps(scenario.fields()))
+    found = {name: [convert.to_bytes(example_message(scenario, kind, rng), 1, identity)
+                    for _ in range(_N_ORIGINALS)] for name, kind in _PROTOCOL.items()}
+    # A mutation of diagnostics could have the name of a node, and falsify its counters.
+    return found | {
+        topics.CODEBOOK: [convert.to_bytes(convert.CodebookMessage.of(codebook, *identity), 1)],
+        topics.PRESENCE: [convert.to_bytes(presence, 1)],
+        topics.POSITION: [serialize_message(PoseWithCovarianceStamped())],
+        topics.DIAGNOSTICS: [], topics.MARKERS: []}
 
 
 class _Counters:
@@ -112,6 +105,15 @@ class _Counters:
                 if key.startswith(('received.', 'dropped.'))}
         return found
 
+    def malformed(self) -> dict[str, int]:
+        """Return the number of messages that each node has dropped as malformed."""
+        return {node: counts.get('dropped.malformed', 0)
+                for node, counts in self.current().items()}
+
+    def wrong(self, malformed: Mapping[str, int]) -> set[str]:
+        """Return the nodes that have not counted the given numbers of malformed messages."""
+        return {node for node, n in self.malformed().items() if n != malformed.get(node, 0)}
+
     def all_received(self, sent: collections.Counter[str]) -> bool:
         """Return whether every subscriber has received the mutations sent on its topics."""
         due: collections.Counter[tuple[str, str]] = collections.Counter()
@@ -124,39 +126,45 @@ class _Counters:
 
 
 def fuzz(
-        observer: NetworkObserver, processes: Processes, scenario: Scenario, n: int,
-        rng: np.random.Generator, on_progress: Callable[[int], None]) -> FuzzResult:
+        observer: NetworkObserver, processes: Processes, scenario: Scenario, codebook: Codebook,
+        n: int, rng: np.random.Generator, on_progress: Callable[[int], None]) -> FuzzResult:
     """Publish `n` mutations to a network, and call `on_progress` with their number so far.
 
-    Raises ChaosError if a topic has no messages, or a node does not receive all mutations.
+    Ends early if a node fails. Raises ChaosError if the network serves no users, a node does not
+    receive all mutations, or a mutation causes an error in this process.
     """
-    mutators = [_Mutator(observer, name, convert.ros_type(kind), profile_for(kind))
-                for name, kind in _PROTOCOL.items()]
-    mutators += [_Mutator(observer, name, kind, profile)
-                 for name, (kind, profile) in _OTHERS.items()]
-
-    def silent() -> list[str]:
-        return [mutator.name for mutator in mutators
-                if mutator.name not in _UNUSED and not mutator.originals]
-    if not observer.spin_until(lambda: not silent(), _TIMEOUT_S):
-        raise ChaosError(f'no messages on {silent()} within {_TIMEOUT_S:g} s')
+    types = {name: (convert.ros_type(kind), profile_for(kind))
+             for name, kind in _PROTOCOL.items()} | _OTHERS
+    publishers = {name: observer.create_publisher(kind, name, profile)
+                  for name, (kind, profile) in types.items()}
+    stored = originals(scenario, codebook, rng)
+    wait_for_service(observer)
     counters = _Counters(observer)
     sent: collections.Counter[str] = collections.Counter()
     malformed: collections.Counter[str] = collections.Counter()
-    while sent.total() < n and not processes.ended():
-        for _ in range(min(_BATCH * len(mutators), n - sent.total())):
-            mutator = mutators[sent.total() % len(mutators)]
-            content = mutator.publish(rng)
-            sent[mutator.name] += 1
-            kind = _PROTOCOL.get(mutator.name)
+    failed: set[str] = set()
+    while sent.total() < n and not failed:
+        latest: list[tuple[str, bytes]] = []
+        for name in itertools.islice(
+                itertools.cycle(types), min(_BATCH * len(types), n - sent.total())):
+            content = mutate(types[name][0], stored[name], rng)
+            publishers[name].publish(content)
+            latest.append((name, content))
+            sent[name] += 1
+            kind = _PROTOCOL.get(name)
             if kind and _is_malformed(kind, content, scenario):
-                malformed.update(counters.subscribers[mutator.name])
+                malformed.update(counters.subscribers[name])
         # Queues overflow unless every node has received all mutations before the next ones.
-        if not observer.spin_until(
-                lambda: bool(processes.ended()) or counters.all_received(sent), _TIMEOUT_S):
+        observer.spin_until(lambda: bool(processes.ended()) or (
+            counters.all_received(sent) and not counters.wrong(malformed)), _TIMEOUT_S)
+        failed = counters.wrong(malformed) | {*processes.ended()}
+        if not failed and not counters.all_received(sent):
             raise ChaosError(f'not all mutations were received within {_TIMEOUT_S:g} s')
         on_progress(sent.total())
-    return _result(observer, processes, counters, sent, malformed)
+    result = _result(observer, processes, counters, sent, malformed)
+    return dataclasses.replace(result, suspects=tuple(
+        f'{name} {content.hex()}' for name, content in latest
+        if failed.intersection(counters.subscribers.get(name, failed))))
 
 
 def _subscribers(observer: NetworkObserver, name: str) -> set[str]:
@@ -173,6 +181,8 @@ def _is_malformed(kind: type[m.Message], content: bytes, scenario: Scenario) -> 
             m.check(message, scenario)
     except m.MessageError:
         return True
+    except Exception as error:
+        raise ChaosError(f'{error!r} from {kind.__name__} {content.hex()}') from error
     return False
 
 
@@ -191,7 +201,7 @@ def _result(
         for key, count in counts.items():
             if key.startswith('dropped.'):
                 dropped[key.removeprefix('dropped.')] += count
-    counted = {node: counts.get('dropped.malformed', 0) for node, counts in final.items()}
+    counted = counters.malformed()
     traces = [f'{name}: {line}' for name in processes.names
               for line in processes.log(name).splitlines()
               if line.startswith('Traceback') or 'terminate called' in line
