@@ -5,23 +5,28 @@ each feed, with the frames of some cycles. Keys of SigMF begin with ``core:``, a
 package with ``rhs_isac:``. The library sigmf is optional.
 """
 
+import bisect
 import contextlib
 import dataclasses
 import datetime
 import itertools
 import json
+import math
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.frontend.radio import Air, Modem, Sounding
 from rhs_isac_ros.frontend.waveform import Waveform
+from rhs_isac_ros.model.arrays import numbers
 from rhs_isac_ros.model.scenario import Scenario, ScenarioError
 from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.fields import finite
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 _EXTENSION = {'name': 'rhs_isac', 'version': '1.0.0', 'optional': True}
@@ -29,6 +34,9 @@ _EXTENSION = {'name': 'rhs_isac', 'version': '1.0.0', 'optional': True}
 # killed loses the frames since then.
 _N_FRAMES = 512
 _DATATYPES = {'<c8': 'cf32_le', '<c16': 'cf64_le'}
+# Integers would have lost the unit.
+_READABLE = (*_DATATYPES.values(), 'cf32_be', 'cf64_be')
+_FEED = 'rhs_isac:feed'
 
 
 @contextlib.contextmanager
@@ -149,7 +157,7 @@ class SampleRecorder:
             'core:recorder': f'rhs_isac_ros {__version__}',
             'core:collection': path.name.rpartition('-')[0],
             'core:extensions': [_EXTENSION],
-            'rhs_isac:feed': feed, 'rhs_isac:scenario': self._scenario.changes(),
+            _FEED: feed, 'rhs_isac:scenario': self._scenario.changes(),
             'rhs_isac:configurations': list(map(list, found.configurations))},
             'captures': found.captures, 'annotations': found.annotations}
         # Validation takes longer than all the rest; the tests validate.
@@ -191,8 +199,10 @@ class PlaybackRadio:
             import sigmf  # noqa: F401
         self._scenario, self._air, self._path = scenario, air, Path(path)
         self._waveform = Waveform(scenario)
-        # A recording that cannot be played is an error at once, not during the first cycle.
-        next(_cycles(self._path, scenario), None)
+        # A recording that cannot be played is an error at once, not during a cycle.
+        for one in _collections(self._path):
+            _streams(one, scenario, skip_checksum=True)
+        next(_cycles(self._path, scenario))
         self._cycles = _cycles(self._path, scenario)
         self._cycle: Mapping[int, _Recorded] = {}
         # The id of the cycle in the network, and the number of recorded cycles so far.
@@ -238,49 +248,158 @@ class PlaybackRadio:
         self._cycle, self._cycle_id, self._n_cycles = {}, None, 0
 
 
-def _cycles(path: Path, scenario: Scenario) -> Iterator[Mapping[int, _Recorded]]:
-    """Yield the bands of each cycle; raise ValueError if there are none."""
+class _Frame(NamedTuple):
+    """A frame in the stream of a feed: an annotation with keys of this package."""
+
+    sounding: int
+    frame: int
+    cycle_id: int
+    band: int
+    symbol: complex
+    time_s: float
+    n_samples: int
+    start: int  # index in the data
+
+
+def _collections(path: Path) -> list[Path]:
+    """Return the collections of a recording; raise ValueError if there are none."""
     paths = sorted(path.glob('*.sigmf-collection')) if path.is_dir() else [path]
     if not paths:
         raise ValueError(f'{path}: no collections, expected files *.sigmf-collection')
-    soundings = itertools.chain.from_iterable(_read(one, scenario) for one in paths)
-    for _, group in itertools.groupby(soundings, lambda sounding: sounding.cycle_id):
-        cycle: dict[int, _Recorded] = {}
-        for sounding in group:
-            cycle.setdefault(sounding.band, sounding)
-        yield cycle
+    return paths
+
+
+def _cycles(path: Path, scenario: Scenario) -> Iterator[Mapping[int, _Recorded]]:
+    """Yield the bands of each cycle; raise ValueError if a collection cannot be played."""
+    for one in _collections(path):
+        for _, group in itertools.groupby(_read(one, scenario), lambda band: band.cycle_id):
+            cycle: dict[int, _Recorded] = {}
+            for band in group:
+                cycle.setdefault(band.band, band)
+            yield cycle
 
 
 def _read(path: Path, scenario: Scenario) -> Iterator[_Recorded]:
-    """Yield the bands of a collection; raise ScenarioError if it is of another scenario."""
+    """Yield the bands of a collection."""
+    streams = _streams(path, scenario)
+    n_frames = scenario.n_frames
+    for first in range(0, len(streams[0][1]), n_frames):
+        spans = [[slice(frame.start, frame.start + frame.n_samples)
+                  for frame in frames[first:first + n_frames]] for _, frames in streams]
+        frames = streams[0][1][first:first + n_frames]
+        # Slices keep the type of the samples; read_samples() would return complex64.
+        yield _Recorded(
+            frames[0].cycle_id, frames[0].band, np.array([frame.symbol for frame in frames]),
+            np.swapaxes([[feed[span] for span in of_feed]
+                         for (feed, _), of_feed in zip(streams, spans, strict=True)], 0, 1),
+            np.array([frame.time_s for frame in frames]))
+
+
+def _streams(path: Path, scenario: Scenario, skip_checksum: bool = False
+             ) -> list[tuple[Any, list[_Frame]]]:
+    """Return the streams of a collection with their frames, in the order of the feeds.
+
+    What other tools add is ignored. Raises ScenarioError if the recording is of another scenario,
+    and ValueError if it contradicts the scenario or itself, or the data are incomplete.
+    """
     import sigmf
 
-    # For a damaged file, sigmf raises many kinds of exceptions.
-    with translated(Exception, ValueError, f'{path}: cannot be read'):
-        collection = sigmf.fromfile(path)
-        feeds = sorted((collection.get_SigMFFile(name) for name in collection.get_stream_names()),
-                       key=lambda feed: feed.get_global_field('rhs_isac:feed'))
-        about = dict(feeds[0].get_global_field('rhs_isac:scenario'))
-    _check_scenario(path, about, scenario)
-    if len(feeds) != scenario.n_feeds:
-        raise ValueError(f'{path}: {len(feeds)} streams, expected n_feeds = {scenario.n_feeds}')
-    with translated(Exception, ValueError, f'{path}: cannot be read'):
-        for _, group in itertools.groupby(
-                feeds[0].get_annotations(), lambda frame: frame['rhs_isac:sounding']):
-            frames = list(group)
-            spans = [slice(frame['core:sample_start'],
-                           frame['core:sample_start'] + frame['core:sample_count'])
-                     for frame in frames]
-            # Slices keep the type of the samples; read_samples() would return complex64.
-            yield _Recorded(
-                frames[0]['rhs_isac:cycle_id'], frames[0]['rhs_isac:band'],
-                np.array([complex(*frame['rhs_isac:symbol']) for frame in frames]),
-                np.array([[feed[span] for feed in feeds] for span in spans]),
-                np.array([frame['rhs_isac:time_s'] for frame in frames]))
+    # For a damaged file, sigmf raises many kinds of exceptions; of incomplete data, it warns.
+    with translated(Exception, ValueError, f'{path}: cannot be read'), warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        collection = sigmf.fromfile(path, skip_checksum=skip_checksum)
+        feeds = [feed for name in collection.get_stream_names()
+                 if (feed := collection.get_SigMFFile(name)).get_global_field(_FEED) is not None]
+    feeds.sort(key=lambda feed: feed.get_global_field(_FEED))
+    for feed in feeds:
+        _check_scenario(path, feed.get_global_field('rhs_isac:scenario'), scenario)
+    found = [feed.get_global_field(_FEED) for feed in feeds]
+    if found != [*range(scenario.n_feeds)]:
+        raise ValueError(f'{path}: {_FEED}: {found}, expected one stream for each of n_feeds = '
+                         f'{scenario.n_feeds} feeds, from 0')
+    streams = []
+    for number, feed in enumerate(feeds):
+        with translated(Exception, ValueError, f'{path}: feed {number}'):
+            streams.append((feed, _frames(feed, scenario)))
+        if [frame[:-1] for frame in streams[-1][1]] != [frame[:-1] for frame in streams[0][1]]:
+            raise ValueError(f'{path}: feed {number}: other annotations than those of feed 0')
+    return streams
 
 
-def _check_scenario(path: Path, recorded: Mapping[str, Any], scenario: Scenario) -> None:
+def _frames(feed: Any, scenario: Scenario) -> list[_Frame]:
+    """Return the frames of a stream in the order of the measurements, all of them complete."""
+    about, captures = feed.get_global_info(), feed.get_captures()
+    _expect('core:datatype', about.get('core:datatype'), *_READABLE)
+    _expect('core:num_channels', about.get('core:num_channels', 1), 1)
+    _expect('core:trailing_bytes', about.get('core:trailing_bytes', 0), 0)
+    rate_hz = Waveform(scenario).sample_rate_hz
+    _expect('core:sample_rate', about.get('core:sample_rate', rate_hz), rate_hz)
+    offset = _integer('core:offset', about.get('core:offset', 0))
+    captures = sorted(captures, key=lambda one: _integer(
+        'core:sample_start', one.get('core:sample_start')))
+    for capture in captures:
+        _expect('core:header_bytes', capture.get('core:header_bytes', 0), 0)
+    frames = sorted((_frame(one, offset) for one in feed.get_annotations()
+                     if any(key.startswith('rhs_isac:') for key in one)),
+                    key=lambda frame: (frame.sounding, frame.frame))
+    if not frames:
+        raise ValueError('no annotations with keys rhs_isac, expected one for each frame')
+    starts = [capture['core:sample_start'] - offset for capture in captures]
+    for _, group in itertools.groupby(frames, lambda frame: frame.sounding):
+        of_band = list(group)
+        first = of_band[0]
+        _expect(f'rhs_isac:frame of sounding {first.sounding}',
+                [frame.frame for frame in of_band], [*range(scenario.n_frames)])
+        _expect('rhs_isac:band', first.band, *range(scenario.n_bands))
+        for frame in of_band:
+            _expect('rhs_isac:cycle_id', frame.cycle_id, first.cycle_id)
+            _expect('rhs_isac:band', frame.band, first.band)
+            _expect('core:sample_count', frame.n_samples, first.n_samples)
+            end = frame.start + frame.n_samples
+            if not 0 <= frame.start < end <= len(feed):
+                raise ValueError(f'core:sample_start: {frame.start + offset} with '
+                                 f'{frame.n_samples} samples, expected within {offset} to '
+                                 f'{offset + len(feed)}')
+            expected_hz = scenario.center_frequencies_hz[frame.band]
+            for capture in captures[max(bisect.bisect(starts, frame.start) - 1, 0):
+                                    bisect.bisect_left(starts, end)]:
+                _expect('core:frequency', capture.get('core:frequency', expected_hz), expected_hz)
+    return frames
+
+
+def _frame(annotation: Mapping[str, Any], offset: int) -> _Frame:
+    """Return the frame of an annotation of a stream whose first sample has an index."""
+    sounding, frame, cycle_id, band, n_samples, start = (
+        _integer(name, annotation.get(name)) for name in (
+            'rhs_isac:sounding', 'rhs_isac:frame', 'rhs_isac:cycle_id', 'rhs_isac:band',
+            'core:sample_count', 'core:sample_start'))
+    parts = numbers('rhs_isac:symbol', annotation.get('rhs_isac:symbol', ()))
+    if parts.shape != (2,) or not parts.any():
+        raise ValueError(f'rhs_isac:symbol: {parts.tolist()}, expected a complex number but 0')
+    time_s = finite('rhs_isac:time_s', annotation.get('rhs_isac:time_s'))
+    return _Frame(sounding, frame, cycle_id, band, complex(*parts.tolist()), time_s, n_samples,
+                  start - offset)
+
+
+def _integer(name: str, value: Any) -> int:
+    # Some tools write all numbers with a point.
+    if type(value) is not int and not (isinstance(value, float) and value.is_integer()):
+        raise ValueError(f'{name}: {value!r}, expected an integer')
+    return int(value)
+
+
+def _expect(name: str, value: Any, *expected: Any) -> None:
+    """Raise ValueError unless a value equals one of those expected, up to rounding."""
+    if value not in expected and not any(
+            isinstance(value, int | float) and isinstance(one, int | float)
+            and math.isclose(value, one, rel_tol=1e-9) for one in expected):
+        raise ValueError(f'{name}: {value!r}, expected {" or ".join(map(repr, expected))}')
+
+
+def _check_scenario(path: Path, recorded: Any, scenario: Scenario) -> None:
     """Raise ScenarioError unless the fields that differ from their defaults are the same."""
+    if not isinstance(recorded, Mapping):
+        raise ScenarioError(f'{path}: rhs_isac:scenario: {recorded!r}, expected fields')
     defaults, expected = Scenario().fields(), scenario.fields()
     for name in {**expected, **recorded}:
         found = recorded.get(name, defaults.get(name))

@@ -20,6 +20,8 @@ N_SYMBOLS = 4
 _OVERSAMPLING = 2
 # Length of the prefix in RMS delay spreads; 2 % of an exponential profile are later.
 _PREFIX_SPREADS = 4.0
+# Probability that noise alone stands out.
+_FALSE_ALARM = 1e-6
 # Standard deviation of a phase that is practically uniform.
 _UNIFORM_RAD = 2 * math.pi
 
@@ -31,16 +33,18 @@ class Synchronisation:
     start: int  #: First sample of the symbols in a capture, within the prefix.
     delay_s: float  #: Delay of the symbols after `start`, at most half a symbol.
     carrier_hz: float  #: Offset of the carrier within a frame.
+    #: Whether the correlation of the frames exceeds that of noise alone.
+    stands_out: bool
 
 
 class Waveform:
     """The modem for samples: pilots as OFDM frames, and sub-bands by a Fourier transform.
 
-    Timing and carrier are estimated from the first band of a cycle, and used for all others: an
-    estimate for each band would destroy the difference of the delays between the bands, which
-    contains the range. With two clocks, the carrier's offset relative to its frequency is also the
-    drift of the clocks. From this drift and the times of the frames, phases and delays are turned
-    back to the middle of the first band.
+    Timing and carrier are estimated from the first band of a cycle in which the frames stand out
+    from the noise, and used for all later ones: an estimate for each band would destroy the
+    difference of the delays between the bands, which contains the range. With two clocks, the
+    carrier's offset relative to its frequency is also the drift of the clocks. From this drift and
+    the times of the frames, phases and delays are turned back to the middle of that band.
 
     Raises ScenarioError if the scenario cannot be measured with this waveform.
 
@@ -51,7 +55,7 @@ class Waveform:
     n_prefix, n_period, n_frame : int
         Numbers of samples of the prefix, of a symbol and of a frame.
     synchronisation : Synchronisation or None
-        The estimate of the present cycle.
+        The latest estimate of the present cycle.
     noise_power : float
         Mean power of the noise in a sub-band of the latest band, measured as the difference of
         its symbols.
@@ -96,12 +100,14 @@ class Waveform:
         Takes one capture of each frame, complex128 [F, K, n], the symbols of the pilots, [F], and
         the times of the frames, [F], which are all 0 with one clock.
         """
-        if cycle_id != self._cycle_id or self.synchronisation is None:
-            self._cycle_id, self.synchronisation = cycle_id, self.synchronise(captures)
-            self._drift = self.synchronisation.carrier_hz / self._centers_hz[band]
+        found = self.synchronisation
+        if found is None or not found.stands_out or cycle_id != self._cycle_id:
+            found = self.synchronise(captures)
+            self._cycle_id, self.synchronisation = cycle_id, found
+            self._drift = found.carrier_hz / self._centers_hz[band]
             self._mean_s = float(times_s.mean())
         values = self.subbands(captures, dataclasses.replace(
-            self.synchronisation, carrier_hz=self._drift * self._centers_hz[band]))
+            found, carrier_hz=self._drift * self._centers_hz[band]))
         mean = values.mean(axis=1)
         spread = np.sum(np.abs(values - mean[:, None])**2, axis=1) / (N_SYMBOLS - 1)
         self.noise_power = float(spread.mean() / N_SYMBOLS)
@@ -109,9 +115,9 @@ class Waveform:
         return mean / symbols[:, None, None] * np.exp(-2j * np.pi * cycles)[..., None]
 
     def status(self) -> Mapping[str, str]:
-        """Return timing, carrier and noise of the present cycle."""
+        """Return timing, carrier and noise of the present cycle; nothing without a frame."""
         found = self.synchronisation
-        if found is None:
+        if found is None or not found.stands_out:
             return {}
         delay_s = found.start / self.sample_rate_hz + found.delay_s
         return {'radio.delay_s': f'{delay_s:.9f}', 'radio.carrier_hz': f'{found.carrier_hz:.1f}',
@@ -130,7 +136,14 @@ class Waveform:
         # It is largest for all starts within the prefix; the middle is the safest.
         plateau = np.convolve(np.abs(correlation), np.ones(self.n_prefix + 1), 'valid')
         start = int(np.argmax(plateau)) + (self.n_prefix + 1) // 2
-        found = Synchronisation(start, 0.0, self._frequency(correlation[start]))
+        span = captures[..., start:start + N_SYMBOLS * n]
+        n_terms = span[..., n:].size
+        # The squared magnitude of the correlation of noise, relative to its energy, has the beta
+        # distribution with the parameters 1 and `n_terms` - 1.
+        limit = 1 - (_FALSE_ALARM / len(plateau)) ** (1 / (n_terms - 1))
+        energy = np.sum(np.abs(span[..., n:])**2) * np.sum(np.abs(span[..., :-n])**2)
+        found = Synchronisation(start, 0.0, self._frequency(correlation[start]),
+                                bool(abs(correlation[start])**2 > limit * energy))
         # The sub-bands contain less noise than the samples.
         values = self.subbands(captures, found)
         turn = np.sum(values[:, 1:] * np.conj(values[:, :-1]))

@@ -1,7 +1,9 @@
 """Recordings of samples: their files, and playback that yields the same signals bit for bit."""
 
 import dataclasses
+import hashlib
 import json
+import math
 import sys
 
 import numpy as np
@@ -179,6 +181,165 @@ def test_files_that_are_no_recording_are_refused(tmp_path):
     data.write_bytes(bytes([data.read_bytes()[0] ^ 1]) + data.read_bytes()[1:])
     with pytest.raises(ValueError, match='cannot be read: Calculated file hash does not match'):
         playback(tmp_path)
+
+
+class Edited:
+    """A recording of two cycles as another tool leaves it, with the hashes renewed."""
+
+    def __init__(self, folder):
+        self._folder = folder
+        _, self.feeds = record(folder, cycles(2))
+        self.names = [f'part-000001-feed{feed}' for feed in (0, 1)]
+        self.metas = [json.loads(self.file(name, 'meta').read_bytes()) for name in self.names]
+        self.data = [np.fromfile(self.file(name, 'data'), '<c16') for name in self.names]
+
+    def file(self, name, kind):
+        return self._folder / f'{name}.sigmf-{kind}'
+
+    def play(self):
+        """Return the signals, or raise the error of the radio."""
+        streams = []
+        for name, meta, data in zip(self.names, self.metas, self.data, strict=True):
+            data.tofile(self.file(name, 'data'))
+            digest = hashlib.sha512(self.file(name, 'data').read_bytes()).hexdigest()
+            meta['global']['core:sha512'] = digest
+            text = json.dumps(meta).encode()
+            self.file(name, 'meta').write_bytes(text)
+            streams.append({'name': name, 'hash': hashlib.sha512(text).hexdigest()})
+        path = self.file('part-000001', 'collection')
+        content = json.loads(path.read_bytes())
+        content['collection']['core:streams'] = streams
+        path.write_text(json.dumps(content), encoding='utf-8')
+        _, play = player(self._folder)
+        return [play(*one) for one in cycles(2)]
+
+
+def add_label(edited):
+    edited.metas[0]['annotations'].insert(3, {
+        'core:sample_start': 5, 'core:sample_count': 10**6, 'core:label': 'a bird'})
+
+
+def shuffle_frames(edited):
+    for meta in edited.metas:
+        meta['annotations'].reverse()
+
+
+def shuffle_streams(edited):
+    for each in (edited.names, edited.metas, edited.data):
+        each.reverse()
+
+
+def add_stream(edited):
+    edited.names.append('microphone')
+    edited.metas.append({'global': {'core:datatype': 'cf64_le', 'core:version': '1.0.0'},
+                         'captures': [{'core:sample_start': 0}], 'annotations': []})
+    edited.data.append(np.zeros(10, '<c16'))
+
+
+def split_captures(edited):
+    for meta in edited.metas:
+        meta['captures'] = [one | {'core:sample_start': one['core:sample_start'] + more}
+                            for one in meta['captures'] for more in (0, 7)]
+
+
+def merge_captures(edited):
+    for meta in edited.metas:
+        meta['captures'] = [one for n, one in enumerate(meta['captures']) if n % 4 == 0]
+
+
+def move_start(edited):
+    """As in the second of several files of one stream."""
+    for meta in edited.metas:
+        meta['global']['core:offset'] = 1000
+        for one in (*meta['captures'], *meta['annotations']):
+            one['core:sample_start'] += 1000
+
+
+def swap_bytes(edited):
+    for n, meta in enumerate(edited.metas):
+        meta['global']['core:datatype'] = 'cf64_be'
+        edited.data[n] = edited.data[n].astype('>c16')
+
+
+def write_floats(edited):
+    for meta in edited.metas:
+        for one in (*meta['captures'], *meta['annotations']):
+            one.update({name: float(value) for name, value in one.items() if type(value) is int})
+
+
+@pytest.mark.parametrize('edit', [
+    add_label, shuffle_frames, shuffle_streams, add_stream, split_captures, merge_captures,
+    move_start, swap_bytes, write_floats])
+def test_what_other_tools_may_change_changes_no_signals(tmp_path, edit):
+    edited = Edited(tmp_path)
+    edit(edited)
+    np.testing.assert_array_equal(edited.play(), edited.feeds)
+
+
+def test_samples_of_single_precision_are_played(tmp_path):
+    edited = Edited(tmp_path)
+    for n, meta in enumerate(edited.metas):
+        meta['global']['core:datatype'] = 'cf32_le'
+        edited.data[n] = edited.data[n].astype('<c8')
+    np.testing.assert_allclose(edited.play(), edited.feeds, rtol=1e-4)
+
+
+@pytest.mark.parametrize(('part', 'name', 'value', 'text'), [
+    ('global', 'core:sample_rate', 2e6, '2000000.0, expected 1000000.0'),
+    ('global', 'core:num_channels', 2, '2, expected 1'),
+    ('global', 'core:datatype', 'ci16_le', "'ci16_le', expected 'cf32_le' or"),
+    ('global', 'core:trailing_bytes', 16, '16, expected 0'),
+    ('global', 'rhs_isac:feed', 0, r'\[0, 0\], expected one stream for each of n_feeds = 2'),
+    ('global', 'rhs_isac:scenario', None, 'None, expected fields'),
+    ('captures', 'core:frequency', 1e9, '1000000000.0, expected 5000000000.0'),
+    ('captures', 'core:header_bytes', 16, '16, expected 0'),
+    ('annotations', 'rhs_isac:frame', 2, r'\[0, 1, 2, 2\], expected \[0, 1, 2, 3\]'),
+    ('annotations', 'rhs_isac:band', 5, '5, expected 0'),
+    ('annotations', 'rhs_isac:cycle_id', 7, '7, expected 1'),
+    ('annotations', 'rhs_isac:cycle_id', None, 'None, expected an integer'),
+    ('annotations', 'rhs_isac:time_s', math.nan, 'nan, expected'),
+    ('annotations', 'rhs_isac:symbol', [0, 0], r'\[0.0, 0.0\], expected a complex number'),
+    ('annotations', 'core:sample_count', 10, '10, expected 58'),
+    ('annotations', 'core:sample_start', -1, '-1 with 58 samples, expected within 0 to'),
+    ('annotations', 'core:sample_start', 10**6, '1000000 with 58 samples, expected within 0'),
+])
+def test_contradictions_are_refused_by_name(tmp_path, part, name, value, text):
+    edited = Edited(tmp_path)
+    about = edited.metas[1][part]
+    (about if part == 'global' else about[3]).update({name: value})
+    with pytest.raises(ValueError, match=rf'part-000001\.sigmf-collection: .*{name}.*: {text}'):
+        edited.play()
+
+
+def test_streams_that_contradict_each_other_are_refused(tmp_path):
+    edited = Edited(tmp_path)
+    edited.metas[1]['annotations'][3]['rhs_isac:symbol'] = [0.6, 0.8]
+    with pytest.raises(ValueError, match='feed 1: other annotations than those of feed 0'):
+        edited.play()
+
+
+def test_incomplete_data_are_refused_before_the_first_cycle(tmp_path):
+    edited = Edited(tmp_path)
+    edited.data[1] = edited.data[1][:-20]
+    with pytest.raises(ValueError, match='feed 1: core:sample_start: .* expected within 0 to'):
+        edited.play()
+
+
+def test_a_later_collection_is_checked_at_the_start(tmp_path):
+    record(tmp_path, cycles(1))
+    Edited(tmp_path)  # Another one.
+    data = tmp_path / 'part-000002-feed1.sigmf-data'
+    data.write_bytes(data.read_bytes()[:-16])
+    with pytest.raises(ValueError, match=r'part-000002\.sigmf-collection: feed 1: core:sample'):
+        playback(tmp_path)
+
+
+def test_the_cycles_of_two_recordings_differ(tmp_path):
+    """Also if the last one and the first one have the same number."""
+    feeds = [record(tmp_path, cycles(1))[1] for _ in range(2)]
+    _, play = player(tmp_path)
+    for cycle, expected in enumerate(feeds):
+        np.testing.assert_array_equal(play(cycle, 0), expected[0])
 
 
 def test_a_failed_recording_ends_and_measurement_continues(tmp_path):

@@ -115,6 +115,23 @@ def test_the_next_cycle_is_synchronised_again():
     assert radio.modem.synchronisation != first
 
 
+@pytest.mark.parametrize('scale', [0.0, 1e-3, 1e3])
+def test_a_band_without_frames_does_not_synchronise_its_cycle(scale):
+    """Those of the next band do, and it is used for all later ones."""
+    rng = np.random.default_rng(RNG_SEED)
+    signals = response(LAB, 0.2e-6, rng)
+    radio = radio_of(LAB_60_DB, rng)
+    captures = captured(radio, signals)
+    received(radio, scale * (rng.normal(size=(*captures.shape, 2)) @ [1, 1j]), 7)
+    assert not radio.modem.synchronisation.stands_out and radio.modem.status() == {}
+    found = received(radio, captures, 7)
+    np.testing.assert_allclose(without_phase_and_delay(found, signals), signals, atol=0.01)
+    synchronisation = radio.modem.synchronisation
+    received(radio, 0 * captures, 7)
+    received(radio, captures, 7)
+    assert radio.modem.synchronisation is synchronisation and synchronisation.stands_out
+
+
 @pytest.mark.parametrize('clock_ppm', [0.0, 0.1, -2.0])
 def test_the_drift_of_two_clocks_is_turned_back_in_all_bands(clock_ppm):
     scenario = dataclasses.replace(LAB, center_frequencies_hz=(5.25e9, 5.75e9))
