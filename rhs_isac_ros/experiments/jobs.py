@@ -15,6 +15,8 @@ from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from rhs_isac_ros import __version__
 from rhs_isac_ros.support.arguments import integer, output_folder
 from rhs_isac_ros.support.exits import print_error
@@ -28,9 +30,10 @@ class JobError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """A call of an experiment's function with arguments that JSON can represent.
+    """A call of an experiment's function with arguments that JSON or NumPy can represent.
 
-    `name` is the name of the result file without its suffix, unique in its folder.
+    `run_jobs` converts those of NumPy to numbers and lists. `name` is the name of the result file
+    without its suffix, unique in its folder.
     """
 
     name: str
@@ -49,7 +52,7 @@ class JobResult(NamedTuple):
 def attempt(function: Callable[..., Mapping[str, Any]], job: Job) -> JobResult:
     """Run a job in this process; return errors as text, because some errors cannot be pickled."""
     try:
-        return JobResult(job, text=json.dumps(function(**job.arguments)))
+        return JobResult(job, text=json.dumps(as_json(function(**job.arguments))))
     except MissingLibraryError as error:
         return JobResult(job, error=str(error))
     except Exception:
@@ -64,13 +67,35 @@ def _stored(folder: Path, job: Job) -> dict[str, Any] | None:
         return None
     if not isinstance(record, dict) or not isinstance(record.get('result'), dict):
         return None
-    # JSON has no tuples.
-    expected = json.loads(json.dumps(_record(job, {})))
-    return record['result'] if record | {'result': {}} == expected else None
+    # As text, because 1, 1.0 and True are equal. JSON has no tuples.
+    found, expected = (json.dumps(json.loads(json.dumps(one)), sort_keys=True)
+                       for one in (record | {'result': {}}, _record(job, {})))
+    return record['result'] if found == expected else None
 
 
 def _record(job: Job, result: Mapping[str, Any]) -> dict[str, Any]:
     return {'version': __version__, 'arguments': dict(job.arguments), 'result': result}
+
+
+def as_json(value: Any) -> Any:
+    """Return a value in which numbers and arrays of NumPy are numbers and lists."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {key: as_json(entry) for key, entry in value.items()}
+    return type(value)(map(as_json, value)) if type(value) in (list, tuple) else value
+
+
+def _checked(job: Job) -> Job:
+    """Return a job without values of NumPy; raise ValueError if JSON cannot represent one."""
+    arguments = as_json(job.arguments)
+    for name, value in arguments.items():
+        try:
+            json.dumps(value)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f'job {job.name}: {name}: {value!r}, expected numbers, texts, lists '
+                             f'and mappings: {error}') from None
+    return dataclasses.replace(job, arguments=arguments)
 
 
 def _file(folder: Path, job: Job) -> Path:
@@ -173,18 +198,19 @@ def run_jobs(
         worker_timeout_s: float = _WORKER_TIMEOUT_S) -> list[dict[str, Any]]:
     """Run the jobs that have no stored result; return all results in order, decoded from JSON.
 
-    `function` takes the arguments of a job and returns a dict that JSON can represent. Each result
-    is stored as soon as it is available, in a file in `folder`. After an interruption or an error,
-    the same call resumes the experiment. `n_jobs` jobs run in parallel on this machine, by default
-    one per core; `dask` is the address of the scheduler of a Dask cluster to use instead, whose
-    first worker may take `worker_timeout_s` to appear. If stderr is a terminal, a progress bar
-    with the label appears there.
+    `function` takes the arguments of a job and returns a dict that JSON or NumPy can represent.
+    Each result is stored as soon as it is available, in a file in `folder`. After an interruption
+    or an error, the same call resumes the experiment. `n_jobs` jobs run in parallel on this
+    machine, by default one per core; `dask` is the address of the scheduler of a Dask cluster to
+    use instead, whose first worker may take `worker_timeout_s` to appear. If stderr is a terminal,
+    a progress bar with the label appears there.
 
     Raises JobError if a job fails, its process dies or its worker has another version of this
     package, ConnectionError if the cluster does not respond, OSError if a result cannot be read or
     stored, MissingLibraryError if a library is not installed, and ValueError if two jobs have the
-    same name.
+    same name, or JSON cannot represent an argument.
     """
+    jobs = [*map(_checked, jobs)]
     if len({job.name for job in jobs}) < len(jobs):
         raise ValueError('jobs: two have the same name, expected unique names')
     with optional_import('showing progress', extra='experiments'):

@@ -25,7 +25,7 @@ from rhs_isac_ros.codebook import (
     random_codebook,
 )
 from rhs_isac_ros.codebook.optimize import INTERRUPTED
-from rhs_isac_ros.experiments.jobs import Job, run_jobs
+from rhs_isac_ros.experiments.jobs import Job, as_json, run_jobs
 from rhs_isac_ros.experiments.sweep_settings import (
     FIELDS,
     MEASURES,
@@ -330,6 +330,7 @@ def _stacked(blocks: Sequence[Mapping[str, Sequence[Job]]],
 
 
 def _job(kind: str, arguments: dict[str, Any]) -> Job:
+    arguments = as_json(arguments)
     digest = hashlib.sha256(json.dumps(arguments).encode()).hexdigest()
     return Job(f'{kind}-{digest[:24]}', arguments)
 

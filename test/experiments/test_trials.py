@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 from rhs_isac_ros.experiments import Job, JobError, run_jobs
@@ -111,6 +112,37 @@ def test_a_result_may_be_infinite_or_missing(tmp_path):
         (result,) = run_jobs(work, JOBS[:1], tmp_path, n_jobs=1)
         assert result['mean'] == float('inf') and result['low'] != result['low']
     assert calls == [0]
+
+
+def test_values_of_numpy_are_numbers_and_lists(tmp_path):
+    given = {'number': np.int64(3), 'of': (np.float32(0.5), np.arange(2), {'a': np.bool_(True)})}
+    seen = []
+
+    def work(number, of):
+        seen.append((number, of))
+        return {'square': np.float32(number**2), 'each': np.eye(2)}
+
+    for _ in range(2):
+        assert run_jobs(work, [Job('numpy', given)], tmp_path, n_jobs=1) == [
+            {'square': 9.0, 'each': [[1.0, 0.0], [0.0, 1.0]]}]
+    assert seen == [(3, (0.5, [0, 1], {'a': True}))]
+    assert type(seen[0][0]) is int
+
+
+def test_an_argument_without_json_is_refused_before_any_job_runs(tmp_path):
+    worker = Worker()
+    with pytest.raises(ValueError, match=r'^job b: of: \{1\}, expected numbers, texts, lists'):
+        run_jobs(worker, [JOBS[0], Job('b', {'number': 1, 'of': {1}})], tmp_path, n_jobs=1)
+    assert worker.seen == []
+
+
+def test_equal_arguments_of_other_types_are_other_jobs(tmp_path):
+    def work(value):
+        return {'type': type(value).__name__}
+
+    for value in (1, 1.0, True, float('nan'), 1):
+        (result,) = run_jobs(work, [Job('one', {'value': value})], tmp_path, n_jobs=1)
+        assert result == {'type': type(value).__name__}
 
 
 @pytest.mark.parametrize(('failure', 'text', 'n_jobs'), [
