@@ -39,6 +39,8 @@ _N_TRIALS = 12
 _N_POSITIONS = 32
 _STEPS = 60
 _FORMAT = 1
+# Errors of rounding in the cells of a file [m].
+_TOLERANCE_M = 1e-6
 _ARRAYS = ('centres_m', 'spreads_m', 'analog', 'digital')
 
 
@@ -96,9 +98,11 @@ class Library:
 
     @functools.cached_property
     def id(self) -> str:
-        """Hash of the codebooks' ids: ``lib`` and 16 hex digits; ``none`` if it is empty."""
-        digest = hashlib.sha256(' '.join(self.by_id).encode()).hexdigest()
-        return f'lib{digest[:16]}' if self.by_id else 'none'
+        """Hash of cells and codebooks: ``lib`` and 16 hex digits; ``none`` if it is empty."""
+        content = ([one.id for one in self.codebooks], self.centres_m.tolist(),
+                   self.spreads_m.tolist())
+        digest = hashlib.sha256(repr(content).encode()).hexdigest()
+        return f'lib{digest[:16]}' if self.codebooks else 'none'
 
     def codebook_at(self, position_m: np.ndarray, std_m: float) -> Codebook | None:
         """Return the codebook for a predicted position, float64 [3] [m], in the surface's frame.
@@ -115,13 +119,21 @@ class Library:
         return self.codebooks[rows[np.argmin(distances)]]
 
     def check(self, scenario: Scenario) -> None:
-        """Raise CodebookError if the library is incomplete, or for another scenario."""
+        """Raise CodebookError if the library is incomplete, or for another scenario or plan."""
         expected = scenario.unplaced.id
         if self.plan.scenario != expected:
             raise CodebookError(f'scenario: {self.plan.scenario}, expected {expected}')
-        n_cells = len(self.plan.cells(scenario))
-        if len(self.codebooks) != n_cells:
-            raise CodebookError(f'codebooks: {len(self.codebooks)}, expected {n_cells}')
+        cells = self.plan.cells(scenario)
+        if len(self.codebooks) != len(cells):
+            raise CodebookError(f'codebooks: {len(self.codebooks)}, expected {len(cells)}')
+        both: dict[str, list[Any]] = {'centres_m': [cell.centre_m for cell in cells],
+                                      'spreads_m': [cell.std_m for cell in cells]}
+        for name, planned in both.items():
+            found = getattr(self, name)
+            wrong = np.argwhere(np.abs(found - np.array(planned)) > _TOLERANCE_M)
+            if wrong.size:
+                raise CodebookError(f'{name}[{(row := wrong[0, 0])}]: {found[row].tolist()}, '
+                                    f'expected {planned[row]} of the plan')
         for one in self.codebooks:
             one.check(scenario)
 

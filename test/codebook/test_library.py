@@ -105,6 +105,22 @@ def test_a_library_for_another_scenario_or_an_incomplete_one_is_an_error(built):
         part.check(SCENARIO)
 
 
+@pytest.mark.parametrize(('name', 'factor'), [('centres_m', 1000), ('spreads_m', 2)])
+def test_cells_that_are_not_those_of_the_plan_are_an_error(built, name, factor):
+    moved = dataclasses.replace(built, **{name: factor * getattr(built, name)})
+    assert moved.id != built.id
+    with pytest.raises(CodebookError, match=rf'^{name}\[0\]: .*, expected .* of the plan'):
+        moved.check(SCENARIO)
+
+
+def test_the_order_of_the_cells_is_part_of_the_library(built):
+    order = np.array([1, 0, *range(2, 7)])
+    swapped = dataclasses.replace(built, centres_m=built.centres_m[order])
+    assert swapped.id != built.id
+    with pytest.raises(CodebookError, match=r'^centres_m\[0\]'):
+        swapped.check(SCENARIO)
+
+
 def test_the_pitch_is_the_largest_with_a_small_loss(start, monkeypatch):
     losses = dict(zip(
         (0.8, 0.625, 0.5, 0.4, 0.3, 0.2), (0.3, 0.1, 0.04, 0.01, 0.0, 0.0), strict=True))
