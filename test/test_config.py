@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.calibration import load_surface
-from rhs_isac_ros.codebook import Codebook, default_codebook_file
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.codebook.library import Library
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_intervals_m
@@ -72,5 +72,5 @@ def test_the_library_fits_the_band_plan_and_its_codebook():
 
 
 def test_the_default_codebook_is_found_in_a_clone():
-    default = Codebook.load(default_codebook_file())
+    default = Codebook.default()
     assert default.id == Codebook.load(CONFIG / 'codebook.yaml').id

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from rhs_isac_ros.calibration import survey
-from rhs_isac_ros.codebook import Codebook, default_codebook_file
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, PathChannel, Scenario, simulate_received
 
 # Corners of the hall [m], and the frequency of the amplitudes [Hz].
@@ -65,7 +65,7 @@ def raster(scenario: Scenario) -> np.ndarray:
 
 def main(paths_file: str, multipath_file: str) -> None:
     """Write the paths of the raster and the multipath of a survey to two files."""
-    scenario, codebook = Scenario(), Codebook.load(default_codebook_file())
+    scenario, codebook = Scenario(), Codebook.default()
     rng = np.random.default_rng(0)
     trace(raster(scenario)).save(paths_file)
     positions = scenario.sample_positions(N_SURVEY, rng)

@@ -10,7 +10,7 @@ site = Site.from_yaml(sys.argv[1] if len(sys.argv) > 1 else 'config/site.yaml')
 estimator = SiteEstimator(site)
 rng = np.random.default_rng(1)
 users = rng.uniform(*site.bounds_m, size=(5, 3))
-received = site.simulate(users, rng)
+received = site.sample(users, rng)
 
 for number, user in enumerate(users):
     errors_m = []

@@ -13,20 +13,20 @@ from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.positioning import Site, SiteEstimator
-from rhs_isac_ros.positioning.site import SiteSurface
+from rhs_isac_ros.system import System
 
 # Less probable candidates are not shown.
 MIN_PROBABILITY = 0.01
 COLOURS = {'front': 'C0', 'side': 'C1', 'both': 'C2'}
-codebook = Codebook.load(default_codebook_file())
+codebook = Codebook.default()
 example = Site.from_yaml(default_codebook_file().parent / 'site.yaml')
-site = Site({name: SiteSurface(dataclasses.replace(
+site = Site({name: System(dataclasses.replace(
     Scenario(), pose=one.pose, roi_center_m=one.scenario.roi_center_m,
     roi_size_m=one.scenario.roi_size_m), codebook)
     for name, one in example.surfaces.items()}, example.bounds_m)
 estimator, rng = SiteEstimator(site), np.random.default_rng(2)
 users = rng.uniform(*site.bounds_m, size=(16, 3))
-received = site.simulate(users, rng)
+received = site.sample(users, rng)
 
 
 def signals(user, names):

@@ -22,11 +22,10 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from rhs_isac_ros.bounds.fisher import fisher_information
-from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.geometry import jacobian, polar_bounds, to_polar
-from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Lattice steps of (r, u, v), in standard deviations of one coordinate with the others known, and
@@ -61,8 +60,7 @@ class GlobalBound(NamedTuple):
 
 @one_blas_thread
 def global_bound(
-        scenario: Scenario, codebook: Beamforming, rng: np.random.Generator,
-        n_phases: int = 2048) -> GlobalBound:
+        model: MeasurementModel, rng: np.random.Generator, n_phases: int = 2048) -> GlobalBound:
     """Compute the bound from the posteriors of `n_phases` random positioning phases.
 
     The bound holds for a synchronised user: nuisance parameters of the scenario are not included.
@@ -70,12 +68,11 @@ def global_bound(
     """
     if n_phases < 2:
         raise ValueError(f'n_phases: {n_phases}, expected at least 2')
-    model = MeasurementModel(scenario, codebook).prepare()
-    steps, coarseness = _steps(model, rng)
+    steps, coarseness = _steps(model.prepare(), rng)
     parts = []
     for first in range(0, n_phases, _PER_OFFSET):
         # A random position as the offset makes the positions of all phases uniform.
-        lattice = _Lattice(model, steps, scenario.sample_positions(1, rng)[0])
+        lattice = _Lattice(model, steps, model.scenario.sample_positions(1, rng)[0])
         parts.append(np.stack(list(lattice.phases(min(_PER_OFFSET, n_phases - first), rng))))
     moments = np.concatenate(parts)
     # The variance of the posterior has the same mean as the squared error, and a smaller spread.

@@ -270,9 +270,9 @@ def expected_error(
     the region as prior, plus the squared error from confusing ranges.
     """
     rng = streams.generator(seed, streams.PLANS, 1)
-    if not len(nuisance_of(scenario)):
-        return global_bound(scenario, codebook, rng, n_shots).value
     model = MeasurementModel(scenario, codebook)
+    if not len(nuisance_of(scenario)):
+        return global_bound(model, rng, n_shots).value
     positions = scenario.sample_positions(_POSITIONS, rng)
     return (float(crlb_of(model, positions, region_prior=True).mean())
             + range_confusion_error_of(model, positions, rng))

@@ -152,8 +152,16 @@ class Codebook:
         write_whole(path, text)
 
     @classmethod
-    def load(cls, path: str | Path) -> 'Codebook':
-        """Read a ROS 2 parameter file; raise CodebookError unless it contains a valid codebook."""
+    def default(cls) -> 'Codebook':
+        """Return the codebook of the package for Table I; see `default_codebook_file`."""
+        return cls.load(default_codebook_file())
+
+    @classmethod
+    def load(cls, path: str | Path, scenario: Scenario | None = None) -> 'Codebook':
+        """Read a ROS 2 parameter file, and check that the codebook fits a `scenario`, if given.
+
+        Raises CodebookError unless the file contains a valid codebook.
+        """
         with translated(ValueError, CodebookError):
             content = read_yaml(path)
         for node in content.values() if isinstance(content, dict) else ():
@@ -161,7 +169,11 @@ class Codebook:
             values = parameters.get('codebook') if isinstance(parameters, dict) else None
             if isinstance(values, dict):
                 with translated(CodebookError, CodebookError, path):
-                    return cls.from_parameters({f'codebook.{k}': v for k, v in values.items()})
+                    codebook = cls.from_parameters(
+                        {f'codebook.{k}': v for k, v in values.items()})
+                    if scenario:
+                        codebook.check(scenario)
+                    return codebook
         raise CodebookError(f'{path}: expected ros__parameters with a mapping named codebook')
 
 

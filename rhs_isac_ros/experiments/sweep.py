@@ -16,7 +16,7 @@ from scipy.special import chdtri
 from scipy.stats import qmc
 
 from rhs_isac_ros import __version__
-from rhs_isac_ros.bounds import crlb, global_bound
+from rhs_isac_ros.bounds import global_bound
 from rhs_isac_ros.codebook import (
     Codebook,
     CodebookError,
@@ -37,8 +37,9 @@ from rhs_isac_ros.experiments.sweep_settings import (
 from rhs_isac_ros.link import capacity as capacity_of
 from rhs_isac_ros.link import capacity_report, choose_beam
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning import Estimator, make_estimator, simulate_pairs
+from rhs_isac_ros.positioning import Estimator, make_estimator
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.system import System
 
 # Kinds of codebooks that are made for a scenario.
 OPTIMIZE, DIRECTIONAL, RANDOM = 'optimize', 'directional', 'random'
@@ -112,15 +113,16 @@ def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, An
     value per position.
     """
     world, book = Scenario(**scenario), Codebook.from_parameters(dict(codebook))
+    system = System(world, book)
     if family == BOUND:
         # The bound needs at least two phases.
         bound = global_bound(
-            world, book, streams.generator(seed, streams.HELD_OUT, first), max(n, 2))
+            system, streams.generator(seed, streams.HELD_OUT, first), max(n, 2))
         loose = bound.coarseness > max_coarseness
         return {'bound_m2': [np.nan] * n if loose else bound.squared_errors[:n].tolist()}
-    positions, received = simulate_pairs(world, book, n, seed, first)
+    positions, received = system.pairs(n, seed, first)
     if family == CRLB:
-        return {'crlb_m2': crlb(world, book, positions).tolist()}
+        return {'crlb_m2': system.crlb(positions).tolist()}
     located = _estimator(estimator, json.dumps(scenario), json.dumps(codebook)).estimate(received)
     fix = located.fix
     # Without a fix, only the region is known.

@@ -3,8 +3,8 @@
 `make_estimator` creates an estimator for a scenario and a codebook: an object with the interface
 of `Estimator`, whose method ``estimate`` takes received signals and returns an `Estimate`. The
 classes of estimators are listed in `ESTIMATORS` below, and other packages may provide more as
-entry points of `plugins.ESTIMATORS`. `simulate_pairs` draws signals for trials, and a `Tracker`
-combines successive positioning phases of a moving user. A shot is the signals of one positioning
+entry points of `plugins.ESTIMATORS`. A `Tracker` combines successive positioning phases of a
+moving user. A shot is the signals of one positioning
 phase in a batch of them.
 
 Positions are ranges and direction cosines, (r, u, v), in which the modes of the likelihood are
@@ -44,8 +44,7 @@ from rhs_isac_ros.positioning.estimators import (
 from rhs_isac_ros.positioning.fusion import Fused, Sighting, fuse
 from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.positioning.neural import ModelError, Network, NeuralEstimator, train
-from rhs_isac_ros.positioning.simulate import simulate_pairs
-from rhs_isac_ros.positioning.site import Site, SiteError, SiteEstimator, SiteSurface
+from rhs_isac_ros.positioning.site import Site, SiteError, SiteEstimator
 from rhs_isac_ros.positioning.tracking import Motion, Tracker, TrackEstimate
 from rhs_isac_ros.support import plugins
 
@@ -58,8 +57,8 @@ __all__ = [
     'ESTIMATORS', 'REGION_ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'Fused',
     'Mixture', 'MlEstimator', 'ModelError', 'Motion', 'Network', 'NeuralEstimator',
     'SearchEstimator', 'Sighting', 'SignalError', 'Site', 'SiteError', 'SiteEstimator',
-    'SiteSurface', 'TrackEstimate', 'Tracker', 'WeightedModes', 'estimate_each', 'file_options',
-    'fuse', 'make_estimator', 'simulate_pairs', 'train', 'weighted_modes',
+    'TrackEstimate', 'Tracker', 'WeightedModes', 'estimate_each', 'file_options',
+    'fuse', 'make_estimator', 'train', 'weighted_modes',
 ]
 
 

@@ -24,12 +24,12 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import check_arrays, numbers
 from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
-from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
 from rhs_isac_ros.support.optional import optional_import
 from rhs_isac_ros.support.threads import one_blas_thread
+from rhs_isac_ros.system import System
 
 DEFAULT_PAIRS = 100_000
 DEFAULT_HIDDEN = 256
@@ -200,7 +200,8 @@ def train(
     if inputs not in INPUTS:
         raise ValueError(f'inputs: {inputs!r}, expected one of {sorted(INPUTS)}')
     regressor = _regressor(n_hidden, seed)
-    positions, received = simulate_pairs(scenario, codebook, n_pairs, seed)
+    system = System(scenario, codebook)
+    positions, received = system.pairs(n_pairs, seed)
     first, second = (n_pairs * percent // 100 for percent in (_VALIDATION_PERCENT, _TEST_PERCENT))
     training, validation, test = slice(first), slice(first, second), slice(second, None)
     features, center = INPUTS[inputs](received), scenario.roi_bounds_m.mean(axis=0)
@@ -223,8 +224,7 @@ def train(
     best_epoch, best_mse = _fit(
         regressor, scaled[training], targets[training], max_epochs, after_epoch)
     errors = residuals(validation)
-    model = MeasurementModel(scenario, codebook)
-    energies = np.sum(np.abs(model.whiten(model.mean(positions)))**2, axis=(1, 2))
+    energies = np.sum(np.abs(system.whiten(system.mean(positions)))**2, axis=(1, 2))
     (w_in, w_out), (b_in, b_out) = (
         [array.astype(float) for array in arrays]
         for arrays in (regressor.coefs_, regressor.intercepts_))

@@ -4,20 +4,21 @@ import dataclasses
 import json
 import os
 import re
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
+from rhs_isac_ros.bounds import site_crlb
+from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.positioning.agreement import Pair, pair_agreements
 from rhs_isac_ros.positioning.estimators import BayesEstimator
 from rhs_isac_ros.positioning.fusion import Fused, Fuser, Sighting, fuse
 from rhs_isac_ros.support.errors import translated
-from rhs_isac_ros.support.files import read_yaml
+from rhs_isac_ros.support.files import mapping_of, read_yaml
+from rhs_isac_ros.system import System, SystemFiles
 
 # Number of decimals of regions [m], and tolerance of their comparisons [m].
 _DECIMALS, _TOLERANCE_M = 6, 2e-6
@@ -28,28 +29,15 @@ class SiteError(ValueError):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class SiteSurface:
-    """One surface of a site; its pose is that of the scenario."""
-
-    scenario: Scenario
-    codebook: Codebook
-
-    @property
-    def pose(self) -> Pose:
-        """Pose of the surface in the frame of the site."""
-        return self.scenario.pose
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
 class Site:
-    """Surfaces by their names, and the region of interest in the frame of the site.
+    """Systems by the names of their surfaces, and the region of interest in the frame of the site.
 
     Raises SiteError without surfaces, if a name is not valid in a ROS namespace, if two surfaces
-    have the same scenario and pose, if a codebook does not fit, or if the region of a scenario
-    does not contain that of the site.
+    have the same scenario and pose, or if the region of a scenario does not contain that of the
+    site.
     """
 
-    surfaces: Mapping[str, SiteSurface]
+    surfaces: Mapping[str, System]
     bounds_m: np.ndarray  #: Lower and upper corner of the region, float64 [2, 3] [m].
 
     def __post_init__(self) -> None:
@@ -66,8 +54,6 @@ class Site:
             if same != name:
                 raise SiteError(f'{same}, {name}: pose {one.pose.position_m} m, expected surfaces '
                                 'with different scenarios or poses')
-            with translated(ValueError, SiteError, name):
-                one.codebook.check(one.scenario)
             low, high = one.scenario.roi_bounds_m
             places = one.pose.to_surface(_corners(self.bounds_m))
             if (places < low - _TOLERANCE_M).any() or (places > high + _TOLERANCE_M).any():
@@ -87,7 +73,7 @@ class Site:
         with translated(ValueError, SiteError):
             content = read_yaml(path)
         with translated((ValueError, TypeError, KeyError), SiteError, path):
-            content = _mapping('the file', content, {'roi_center_m', 'roi_size_m', 'surfaces'})
+            content = mapping_of(content, {'roi_center_m', 'roi_size_m', 'surfaces'})
             region = Scenario(
                 roi_center_m=content['roi_center_m'], roi_size_m=content['roi_size_m'])
             if not isinstance(content['surfaces'], dict):
@@ -101,13 +87,17 @@ class Site:
         """Name of the surface whose base station leads: the first one."""
         return next(iter(self.surfaces))
 
-    def simulate(self, positions: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    def sample(self, positions: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """Draw signals for users at positions [N, 3] [m], complex128 [N, N_B, N_SB F] by name.
 
         Multipath, noise and impairments of different surfaces are independent.
         """
-        return {name: MeasurementModel(one.scenario, one.codebook).sample(
-            one.pose.to_surface(positions), rng) for name, one in self.surfaces.items()}
+        return {name: one.sample(one.pose.to_surface(positions), rng)
+                for name, one in self.surfaces.items()}
+
+    def crlb(self, positions: np.ndarray) -> np.ndarray:
+        """Compute the Cramer-Rao bound at positions [N, 3] [m]; see `site_crlb`."""
+        return site_crlb(self.surfaces.values(), positions)
 
 
 class SiteEstimator:
@@ -135,7 +125,7 @@ class SiteEstimator:
         Users without a position are left out.
         """
         low, high = self._site.bounds_m
-        received = self._site.simulate(rng.uniform(low, high, size=(n, 3)), rng)
+        received = self._site.sample(rng.uniform(low, high, size=(n, 3)), rng)
         agreements, places = [], []
         for cycle in range(n):
             sightings = self.sightings(
@@ -162,7 +152,7 @@ def site_text(path: str | Path, poses: Mapping[str, Pose], folder: Path) -> str:
     content = read_yaml(path)
     for name, surface in content['surfaces'].items():
         surface.update({key: os.path.relpath(Path(path).parent / surface[key], folder)
-                        for key in ('scenario', 'codebook')})
+                        for key in SystemFiles._fields if key in surface})
         if name in poses:
             # A copy through JSON shares no values, for which YAML would write anchors and aliases.
             surface['pose'] = json.loads(json.dumps(dataclasses.asdict(poses[name])))
@@ -174,26 +164,17 @@ def _corners(bounds_m: np.ndarray) -> np.ndarray:
     return np.stack(np.meshgrid(*bounds_m.T), axis=-1).reshape(-1, 3)
 
 
-def _surface(name: str, value: Any, folder: Path, bounds_m: np.ndarray) -> SiteSurface:
-    content = _mapping(name, value, {'scenario', 'codebook'}, {'pose'})
-    with translated(ValueError, SiteError, name):
-        scenario = Scenario.from_yaml(folder / content['scenario'])
-        if 'pose' in content:
-            scenario = dataclasses.replace(scenario, pose=content['pose'])
+def _surface(name: str, content: Any, folder: Path, bounds_m: np.ndarray) -> System:
+    def adapted(scenario: Scenario) -> Scenario:
+        if pose:
+            scenario = dataclasses.replace(scenario, pose=pose[0])
         # Rounded, so that errors of the rotation do not change the identifier of the scenario; the
         # sum turns -0.0 into 0.0.
         places = np.round(scenario.pose.to_surface(_corners(bounds_m)), _DECIMALS) + 0.0
         low, high = places.min(axis=0), places.max(axis=0)
-        scenario = dataclasses.replace(
-            scenario, roi_center_m=(low + high) / 2, roi_size_m=high - low)
-        return SiteSurface(scenario, Codebook.load(folder / content['codebook']))
+        return dataclasses.replace(scenario, roi_center_m=(low + high) / 2, roi_size_m=high - low)
 
-
-def _mapping(place: str, content: Any, required: Set[str], optional: Set[str] = frozenset()
-             ) -> dict[str, Any]:
-    """Return a mapping with the required keys and none beyond the optional ones."""
-    if not isinstance(content, dict) or not required <= content.keys() <= required | optional:
-        keys = sorted(map(str, content)) if isinstance(content, dict) else content
-        raise SiteError(f'{place}: {keys}, expected the keys {sorted(required)}'
-                        + (f' and, if needed, {sorted(optional)}' if optional else ''))
-    return content
+    with translated(ValueError, SiteError, name):
+        files = dict(mapping_of(content, {'scenario', 'codebook'}, {'pose'}))
+        pose = [files.pop('pose')] if 'pose' in files else []
+        return SystemFiles.of(files, folder).load(adapted)

@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection, Mapping
 import numpy as np
 
 from rhs_isac_ros.bounds import site_crlb
-from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.positioning.agreement import PoseTest, pair_agreements
 from rhs_isac_ros.positioning.fusion import Fused, Fuser, Sighting
 from rhs_isac_ros.positioning.mixture import Mixture
@@ -84,8 +83,8 @@ class Fusion(Role):
         super().__init__()
         self._bounds_m, self._stopwatch = site.bounds_m, stopwatch
         self._surfaces, self._scenario = site.surfaces, site.surfaces[site.leader].scenario
-        self._models = {name: MeasurementModel(one.scenario, one.codebook).prepare()
-                        for name, one in site.surfaces.items()}
+        for one in site.surfaces.values():
+            one.prepare()
         # Positions of the site are in front of the surface that leads.
         self._pose = dataclasses.replace(self._scenario.pose, uncertainty=(0.0, 0.0))
         self._names = {one.scenario.id: name for name, one in site.surfaces.items()}
@@ -238,8 +237,7 @@ class Fusion(Role):
             return math.nan
         # A thin region is widened, perhaps to positions behind a surface.
         place = np.clip(position, *self._bounds_m)[None]
-        return float(site_crlb(
-            [(self._models[name], one.pose) for name, one in surfaces.items()], place)[0])
+        return float(site_crlb(surfaces.values(), place)[0])
 
     def _track(self, source: m.Posterior, mixture: Mixture, missing: float) -> None:
         """Update the track of a user and publish it, unless the cycle is late."""

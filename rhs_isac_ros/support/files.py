@@ -8,7 +8,7 @@ import secrets
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Set
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -105,6 +105,19 @@ def check_writable(path: Path) -> None:
     # The name of the temporary file is longer and may exceed the limit of the file system.
     with contextlib.suppress(FileNotFoundError):
         os.lstat(path.parent / f'.{path.name}.{"x" * 8}')
+
+
+def mapping_of(content: Any, required: Set[str], optional: Set[str] = frozenset()
+               ) -> dict[str, Any]:
+    """Return a mapping with the required keys and none beyond the optional ones.
+
+    Raises ValueError for any other content.
+    """
+    if not isinstance(content, dict) or not required <= content.keys() <= required | optional:
+        keys = sorted(map(str, content)) if isinstance(content, dict) else content
+        raise ValueError(f'{keys}, expected the keys {sorted(required)}'
+                         + (f' and, if needed, {sorted(optional)}' if optional else ''))
+    return content
 
 
 def read_yaml(path: str | Path, max_bytes: int = _MAX_YAML_BYTES) -> Any:

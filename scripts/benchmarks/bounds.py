@@ -15,12 +15,13 @@ from collections.abc import Iterator
 import numpy as np
 from parts import frame
 
-from rhs_isac_ros.bounds import crlb, global_bound
+from rhs_isac_ros.bounds import global_bound
 from rhs_isac_ros.codebook import Codebook, directional_codebook, optimize, random_codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning import make_estimator, simulate_pairs
+from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.arguments import integer
+from rhs_isac_ros.system import System
 
 PLANS = {'equal': (2.5e9, 2.667e9, 2.833e9, 3.0e9), 'unequal': (2.5e9, 2.55e9, 2.7e9, 3.0e9)}
 # Update steps and positions of the optimisations: seconds for the bound, a minute for ambiguity.
@@ -73,14 +74,14 @@ def compare(
         scenario: Scenario, codebook: Codebook, options: argparse.Namespace
 ) -> dict[str, float | str]:
     """Measure the error and compute the bounds."""
-    positions, received = simulate_pairs(scenario, codebook, options.positions, options.seed)
+    system = System(scenario, codebook)
+    positions, received = system.pairs(options.positions, options.seed)
     means = make_estimator('bayes', scenario, codebook).estimate(received).mean
     means[~np.isfinite(means).all(axis=1)] = scenario.roi_center_m
     errors = np.sum((means - positions)**2, axis=1)
-    local = float(crlb(scenario, codebook, positions).mean())
+    local = float(system.crlb(positions).mean())
     begin = time.process_time()
-    bound = global_bound(
-        scenario, codebook, np.random.default_rng([options.seed, 1]), options.phases)
+    bound = global_bound(system, np.random.default_rng([options.seed, 1]), options.phases)
     seconds = time.process_time() - begin
     return {
         'id': codebook.id, 'mse_m2': float(errors.mean()),

@@ -21,7 +21,7 @@ import numpy as np
 from parts import frame
 
 from rhs_isac_ros.calibration import Calibration, Pilots, calibrate
-from rhs_isac_ros.codebook import Codebook, default_codebook_file
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.experiments.resampling import replicate, share_percent
 from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario, draw_surface
 from rhs_isac_ros.positioning import make_estimator
@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument('--surfaces', type=positive_int, default=6, help='number of surfaces')
     parser.add_argument('--silent', action='store_true', help='calibrate with the default prior')
     options = parser.parse_args()
-    scenario, codebook = Scenario(), Codebook.load(default_codebook_file())
+    scenario, codebook = Scenario(), Codebook.default()
     print(f'{options.surfaces} surfaces, {PILOTS} pilots each, {options.positions} fresh '
           f'positions, seed {options.seed}\n')
     table = frame.Table(['surface', 'knowledge'], {

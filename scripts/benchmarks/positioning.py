@@ -20,10 +20,11 @@ from parts import frame
 from parts.exhaustive_posterior import exhaustive_posterior
 
 from rhs_isac_ros.bounds import crlb
-from rhs_isac_ros.codebook import Codebook, default_codebook_file
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning import Estimate, make_estimator, simulate_pairs
+from rhs_isac_ros.positioning import Estimate, make_estimator
 from rhs_isac_ros.support.arguments import integer
+from rhs_isac_ros.system import System
 
 
 def main() -> None:
@@ -32,11 +33,11 @@ def main() -> None:
     parser.add_argument('--reference', type=integer(0, 24), default=0, metavar='N',
                         help='compare with the posterior mean over 2^N points; 0 to omit')
     options = parser.parse_args()
-    scenario, codebook = Scenario(), Codebook.load(default_codebook_file())
+    scenario, codebook = Scenario(), Codebook.default()
     begin = time.perf_counter()
     estimator = make_estimator('bayes', scenario, codebook)
     ready_s = time.perf_counter() - begin
-    positions, received = simulate_pairs(scenario, codebook, options.positions, options.seed)
+    positions, received = System(scenario, codebook).pairs(options.positions, options.seed)
     estimate, times_s = frame.estimate_singly(estimator, received)
     begin, busy = time.perf_counter(), time.process_time()
     together = estimator.estimate(received)

@@ -21,7 +21,8 @@ from parts import frame
 from rhs_isac_ros.codebook import Codebook, optimize
 from rhs_isac_ros.experiments.resampling import share_percent
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.positioning import make_estimator, simulate_pairs
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.system import System
 
 FOLDER = frame.CONFIG / 'scenarios'
 # Scenarios whose codebook is directional.
@@ -64,7 +65,7 @@ def scenario_of(name: str) -> Scenario:
 def measure(name: str, codebook: Codebook, n: int, seed: int) -> dict[str, Any]:
     """Measure one scenario with n positions."""
     scenario = scenario_of(name)
-    positions, received = simulate_pairs(scenario, codebook, n, seed)
+    positions, received = System(scenario, codebook).pairs(n, seed)
     begin_s = time.process_time()
     estimator = make_estimator('bayes', scenario, codebook, reject_outside=True)
     build_s = time.process_time() - begin_s

@@ -156,9 +156,10 @@ def compare(world: World, found: list[list[Posterior]], poses: list[Pose]) -> di
     fixes = frame.Fixes.of(Estimate(means, covariances), world.positions)
     mse = fixes.squared.mean()
     margin = 1.96 * fixes.squared.std() / np.sqrt(n)
-    models = [world.model] * len(poses)
+    surfaces = [MeasurementModel(dataclasses.replace(world.scenario, pose=pose), world.model.beams)
+                for pose in poses]
     return {**fixes.figures(), 'mse_m2': [mse, mse - margin, mse + margin],
-            'crlb_m2': site_crlb(zip(models, poses, strict=True), world.positions).mean(),
+            'crlb_m2': site_crlb(surfaces, world.positions).mean(),
             'time_ms': 1e3 * np.median(times_s)}
 
 

@@ -38,10 +38,11 @@ from rhs_isac_ros.codebook.optimize import INTERRUPTED
 from rhs_isac_ros.experiments import Job, run_command, run_jobs
 from rhs_isac_ros.link import capacity, steer
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning import make_estimator, simulate_pairs
+from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.positioning.neural import INPUTS, train
 from rhs_isac_ros.support.arguments import ArgumentParser, integer
 from rhs_isac_ros.support.optional import optional_import
+from rhs_isac_ros.system import System
 
 TRIALS, QUICK_TRIALS = 50, 3
 # Random codebooks are drawn at least this often.
@@ -91,7 +92,7 @@ def locate(estimator: str, inputs: str, scenario: Mapping[str, Any], codebook: M
     Signals that give no fix are located at the centre of the region.
     """
     world, book = Scenario(**scenario), Codebook.from_parameters(codebook)
-    _, received = simulate_pairs(world, book, n, TEST_SEED)
+    _, received = System(world, book).pairs(n, TEST_SEED)
     received, about = received[first::step], {}
     if estimator == NEURAL:
         network = train(world, book, pairs, seed, inputs=inputs)
@@ -110,7 +111,7 @@ def capacity_losses(scenario: Mapping[str, Any], first: int,
     world = Scenario(**scenario)
     n = len(next(iter(estimates.values())))
     # The positions do not depend on the codebook.
-    truth, _ = simulate_pairs(world, directional_codebook(world), n, TEST_SEED, first)
+    truth, _ = System(world, directional_codebook(world)).pairs(n, TEST_SEED, first)
 
     def capacities(means: np.ndarray) -> np.ndarray:
         return np.array([capacity(world, steer(world, mean, 0), position[None])[0]
@@ -170,8 +171,8 @@ class Experiment:
                         'seed': trial, 'n': options.positions, 'first': first, 'step': step}))
                     places.append((condition, row, first, step))
         done = self._run(locate, jobs)
-        truth, _ = simulate_pairs(
-            Scenario(), directional_codebook(Scenario()), options.positions, TEST_SEED)
+        world = Scenario()
+        truth, _ = System(world, directional_codebook(world)).pairs(options.positions, TEST_SEED)
         results = Results(truth)
         for job, (condition, row, first, step) in zip(jobs, places, strict=True):
             results.add(condition, row, done[job.name], first, step)

@@ -14,7 +14,7 @@ SMALL = {'elements_per_side': 4, 'n_subbands': 2, 'n_frames': 2, 'n_feeds': 2}
 def bound_and_codebook(n_phases=1024, **fields):
     scenario = Scenario(**{**SMALL, **fields})
     codebook = random_codebook(scenario, np.random.default_rng(1))
-    bound = global_bound(scenario, codebook, np.random.default_rng(2), n_phases)
+    bound = global_bound(MeasurementModel(scenario, codebook), np.random.default_rng(2), n_phases)
     return scenario, codebook, bound
 
 

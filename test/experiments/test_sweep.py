@@ -14,7 +14,7 @@ from rhs_isac_ros.experiments import sweep as sweep_module
 from rhs_isac_ros.experiments.sweep import Sweep, run_sweep, table
 from rhs_isac_ros.experiments.sweep_settings import FIELDS, parse_axis, settings_of
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning import simulate_pairs
+from rhs_isac_ros.system import System
 
 pytest.importorskip('joblib')
 pytest.importorskip('tqdm')
@@ -40,7 +40,7 @@ def test_points_have_the_order_of_settings_and_measures(tmp_path, file):
     assert [(point.setting.scenario.max_power_w, point.measure) for point in points] == [
         (1e-4, 'crlb'), (1e-4, 'crlb_median'), (1e-3, 'crlb'), (1e-3, 'crlb_median')]
     book = Codebook.load(file)
-    positions, _ = simulate_pairs(BASE, book, 300, 0)
+    positions, _ = System(BASE, book).pairs(300, 0)
     assert points[2].interval.value == pytest.approx(crlb(BASE, book, positions).mean(), rel=1e-6)
     assert points[2].codebook_ids == (book.id,)
     # A file has the power of each setting.

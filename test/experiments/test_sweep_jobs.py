@@ -12,7 +12,8 @@ from rhs_isac_ros.experiments import sweep as sweep_jobs
 from rhs_isac_ros.experiments.sweep import design, evaluate, families, with_power
 from rhs_isac_ros.link import capacity_report, choose_beam
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning import Estimate, make_estimator, simulate_pairs
+from rhs_isac_ros.positioning import Estimate, make_estimator
+from rhs_isac_ros.system import System
 
 SMALL = {'elements_per_side': 4, 'n_subbands': 2, 'n_feeds': 2, 'n_frames': 2}
 WORLD = Scenario(**SMALL)
@@ -38,7 +39,7 @@ def test_one_job_computes_all_quantities_of_the_estimates(quantities, expected):
 
 
 def test_results_are_those_of_the_library(case, codebook):
-    positions, received = simulate_pairs(WORLD, codebook, 6, 5, 10)
+    positions, received = System(WORLD, codebook).pairs(6, 5, 10)
     found = make_estimator('bayes', WORLD, codebook).estimate(received)
     result = evaluate('loss', **case, first=10, n=6, estimator='bayes')
     assert result['squared_error_m2'] == pytest.approx(
@@ -64,7 +65,7 @@ def test_a_position_without_fix_counts_with_the_region(case, monkeypatch):
             return Estimate(np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan), ('weak',) * n)
 
     monkeypatch.setattr(sweep_jobs, 'make_estimator', lambda *_: Nothing())
-    positions, _ = simulate_pairs(WORLD, Codebook.from_parameters(case['codebook']), 3, 5)
+    positions, _ = System(WORLD, Codebook.from_parameters(case['codebook'])).pairs(3, 5)
     result = evaluate('capacity', **case, first=0, n=3, estimator='nothing')
     assert result['fix'] == result['inside'] == [0.0] * 3
     assert result['squared_error_m2'] == pytest.approx(

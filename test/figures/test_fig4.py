@@ -164,14 +164,14 @@ def test_trials_of_bayes_locate_their_share_of_the_positions():
     world = Scenario(multipath_to_los_db=-30.0)
     book = fig4.as_json(fig4.directional_codebook(world))
     located = fig4.locate('bayes', '', world.changes(), book, 0, 0, 6, 1, 2)
-    truth, _ = fig4.simulate_pairs(world, fig4.directional_codebook(world), 6, fig4.TEST_SEED)
+    truth, _ = fig4.System(world, fig4.directional_codebook(world)).pairs(6, fig4.TEST_SEED)
     assert located['without_fix'] == 0
     np.testing.assert_allclose(located['means'], truth[1::2], atol=0.2)
 
 
 def test_capacity_losses_depend_on_the_estimates():
     world = Scenario()
-    truth, _ = fig4.simulate_pairs(world, fig4.directional_codebook(world), 2, fig4.TEST_SEED, 3)
+    truth, _ = fig4.System(world, fig4.directional_codebook(world)).pairs(2, fig4.TEST_SEED, 3)
     losses = fig4.capacity_losses({}, 3, {
         'right': truth.tolist(), 'wrong': (truth + [0, 2, 0]).tolist()})
     assert np.allclose(losses['right'], 0)

@@ -6,7 +6,7 @@ import types
 
 import pytest
 
-from rhs_isac_ros.codebook import Codebook, default_codebook_file
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import check
@@ -54,7 +54,7 @@ def is_complete(watch, cycle_id):
 
 
 def test_all_messages_of_a_cycle_carry_its_user_and_codebook(network, join):
-    codebook, watch = Codebook.load(default_codebook_file()), network.watch
+    codebook, watch = Codebook.default(), network.watch
     join(1)
 
     def complete():

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from policy_rules import RIGHTS, permissions, rules, used
 
-from rhs_isac_ros.codebook import Codebook, default_codebook_file
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.positioning import Site
@@ -116,7 +116,7 @@ def test_the_tools_use_no_more_than_the_permissions_of_the_operator(tmp_path):
         nodes = [session.node, view, CalibratorNode(PilotLog(scenario), scenario), WatchNode(),
                  SnapshotNode(scenario), RecorderNode(recorder),
                  RepublisherNode([], [*recorded_topics()], 1.0, 1.0),
-                 replay._optimizer(scenario, Codebook.load(default_codebook_file()))]
+                 replay._optimizer(scenario, Codebook.default())]
         # It creates the clients.
         replay._optimizer_present(nodes[-2])
         for node in nodes:

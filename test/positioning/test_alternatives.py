@@ -12,9 +12,10 @@ from rhs_isac_ros.model.geometry import to_positions
 from rhs_isac_ros.model.hall import CONDITIONS, MultipathEstimate
 from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.model.los import draw_blocked
-from rhs_isac_ros.positioning import Tracker, alternatives, make_estimator, simulate_pairs
+from rhs_isac_ros.positioning import Tracker, alternatives, make_estimator
 from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT, LIMIT, Outside, tabulate_outside
 from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.system import System
 
 
 @pytest.fixture(scope='module')
@@ -162,7 +163,7 @@ def test_users_around_the_region_get_no_fix_or_a_probability_outside(shipped, ta
     rejected = [
         reason for reason in reasons if reason.startswith('position outside of the region')]
     assert len(rejected) > 0.9 * len(reasons)
-    inside = simulate_pairs(scenario, shipped, 300, 5)[1]
+    inside = System(scenario, shipped).pairs(300, 5)[1]
     found = estimator.estimate(inside)
     assert found.fix.mean() > 0.97
     assert (found.outside_probability <= LIMIT)[found.fix].all()
@@ -181,7 +182,7 @@ def test_users_around_the_region_get_no_fix_or_a_probability_outside(shipped, ta
 
 @pytest.mark.slow
 def test_the_prior_shifts_the_odds_of_a_user_outside(shipped):
-    received = simulate_pairs(Scenario(), shipped, 40, 6)[1]
+    received = System(Scenario(), shipped).pairs(40, 6)[1]
     log_odds = {}
     for prior in (0.5, 0.02):
         scenario = dataclasses.replace(Scenario(), outside_probability=prior)

@@ -12,8 +12,8 @@ from rhs_isac_ros.positioning import (
     Network,
     SignalError,
     make_estimator,
-    simulate_pairs,
 )
+from rhs_isac_ros.system import System
 
 SCENARIO = Scenario(n_subbands=2, elements_per_side=4, roi_center_m=(4, 0, 0),
                     roi_size_m=(1, 1, 0.5))
@@ -28,7 +28,7 @@ def codebook(random_beams):
 
 @pytest.fixture(scope='module')
 def received(codebook):
-    return simulate_pairs(SCENARIO, codebook, 40, 1)[1]
+    return System(SCENARIO, codebook).pairs(40, 1)[1]
 
 
 @pytest.fixture(scope='module')

@@ -9,7 +9,7 @@ from scipy.stats import chi2, gamma
 
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.model.gaussian import FALSE_ALARM
-from rhs_isac_ros.positioning import Estimate, make_estimator, simulate_pairs
+from rhs_isac_ros.positioning import Estimate, make_estimator
 from rhs_isac_ros.positioning.alternatives import (
     LIMIT,
     Blocked,
@@ -27,6 +27,7 @@ from rhs_isac_ros.positioning.diagnosis import (
     InnovationTest,
     diagnose,
 )
+from rhs_isac_ros.system import System
 
 
 @pytest.fixture(scope='module', params=['bayes', 'ml'])
@@ -80,14 +81,14 @@ def test_the_largest_energy_is_that_of_the_strongest_position_with_noise():
 @pytest.mark.parametrize('factor', [0.0, 1e-30, 1e-3], ids=str)
 def test_signals_weaker_than_noise_give_no_fix(setting, factor):
     scenario, codebook, estimator = setting
-    received = factor * simulate_pairs(scenario, codebook, 1, 0)[1][0]
+    received = factor * System(scenario, codebook).pairs(1, 0)[1][0]
     assert_no_fix(estimator.estimate(received), 'energy')
 
 
 def test_a_user_with_a_low_gain_is_not_weaker_than_the_multipath(setting):
     scenario, codebook, estimator = setting
     declared = dataclasses.replace(scenario, user_gain_std_db=6.0)
-    received = simulate_pairs(scenario, codebook, 4, 0)[1] / 4
+    received = System(scenario, codebook).pairs(4, 0)[1] / 4
     estimate = make_estimator(estimator.name, declared, codebook).estimate(received)
     assert estimate.reason == ('',) * 4 and estimate.fix.all()
 
@@ -108,7 +109,7 @@ def test_a_user_far_outside_the_region_gives_no_fix(setting, position):
 ], ids=['amplified', 'conjugate', 'bands swapped', 'rotating phase'])
 def test_distorted_signals_give_no_fix(setting, change):
     scenario, codebook, estimator = setting
-    received = simulate_pairs(scenario, codebook, 20, 0)[1]
+    received = System(scenario, codebook).pairs(20, 0)[1]
     assert_no_fix(estimator.estimate(change(received)), 'residual')
 
 
@@ -126,7 +127,7 @@ def test_a_user_who_is_more_probably_outside_is_rejected():
 
 def test_valid_signals_are_located_beside_invalid_ones(setting):
     scenario, codebook, estimator = setting
-    positions, received = simulate_pairs(scenario, codebook, 6, 0)
+    positions, received = System(scenario, codebook).pairs(6, 0)
     expected = estimator.estimate(received)
     received[[1, 4]] = 0
     estimate = estimator.estimate(received)
@@ -263,7 +264,7 @@ def test_the_expectation_accounts_for_the_choice_of_the_best_mode(
     """With few measurements, there are many modes, of which the best leaves less energy."""
     codebook = random_beams(small.scenario, np.random.default_rng(0))
     estimator = make_estimator('bayes', small.scenario, codebook, reject_outside=reject_outside)
-    estimate = estimator.estimate(simulate_pairs(small.scenario, codebook, 400, 1)[1])
+    estimate = estimator.estimate(System(small.scenario, codebook).pairs(400, 1)[1])
     known = np.isfinite(estimate.expected_residual)
     residual, expected = estimate.residual[known], estimate.expected_residual[known]
     error = 4 * residual.std() / np.sqrt(len(residual))

@@ -11,7 +11,8 @@ from scipy.stats import qmc
 from rhs_isac_ros.bounds.fisher import fisher_information
 from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
 from rhs_isac_ros.model.multipath import multipath_covariance
-from rhs_isac_ros.positioning import Tracker, make_estimator, simulate_pairs, weighted_modes
+from rhs_isac_ros.positioning import Tracker, make_estimator, weighted_modes
+from rhs_isac_ros.system import System
 
 # Little scattering and three bands, which leave a single mode.
 SINGLE_MODE = Scenario(
@@ -180,7 +181,7 @@ def strong(random_beams):
     """Positions and signals with a single mode, of few sub-bands."""
     scenario = dataclasses.replace(SINGLE_MODE, n_subbands=2)
     codebook = random_beams(scenario, np.random.default_rng(1))
-    positions, received = simulate_pairs(scenario, codebook, 8, 0)
+    positions, received = System(scenario, codebook).pairs(8, 0)
     return scenario, codebook, positions, received
 
 
@@ -218,7 +219,7 @@ def test_the_covariance_is_the_inverse_information_at_the_estimate(strong):
 
 def test_a_single_mode_is_not_enough_for_table_1(table1_estimator, shipped):
     """The errors exceed those of the posterior mean, as the covariances state."""
-    positions, received = simulate_pairs(Scenario(), shipped, 60, 2)
+    positions, received = System(Scenario(), shipped).pairs(60, 2)
     ml = make_estimator('ml', Scenario(), shipped).estimate(received)
     mean = table1_estimator.estimate(received)
     errors = [np.sum((e.mean - positions)**2, axis=1) for e in (ml, mean)]

@@ -15,11 +15,11 @@ from rhs_isac_ros.positioning import (
     NeuralEstimator,
     make_estimator,
     neural,
-    simulate_pairs,
     train,
 )
 from rhs_isac_ros.positioning.__main__ import main
 from rhs_isac_ros.support.optional import MissingLibraryError
+from rhs_isac_ros.system import System
 
 pytest.importorskip('sklearn')
 PAIRS = 6000
@@ -46,7 +46,7 @@ def training(scenario, codebook):
 
 
 def mse(network, scenario, codebook, first, n):
-    positions, received = simulate_pairs(scenario, codebook, n, 1, first)
+    positions, received = System(scenario, codebook).pairs(n, 1, first)
     estimate = NeuralEstimator(scenario, codebook, network).estimate(received)
     return np.mean(np.sum((estimate.mean - positions)[estimate.fix]**2, axis=1))
 
@@ -64,7 +64,7 @@ def test_training_reduces_the_error(scenario, codebook, training):
 def test_the_pairs_are_split_7_to_1_5_to_1_5(scenario, codebook, training):
     network, epochs = training
     first, second = int(0.7 * PAIRS), int(0.85 * PAIRS)
-    received = simulate_pairs(scenario, codebook, PAIRS, 1)[1].reshape(PAIRS, -1)
+    received = System(scenario, codebook).pairs(PAIRS, 1)[1].reshape(PAIRS, -1)
     parts = np.hstack([received.real, received.imag])[:first]
     np.testing.assert_allclose(network.input_mean, parts.mean(axis=0), atol=1e-12)
     np.testing.assert_allclose(network.input_scale, parts.std(axis=0))
@@ -79,7 +79,7 @@ def test_the_pairs_are_split_7_to_1_5_to_1_5(scenario, codebook, training):
 
 def test_the_covariance_matches_the_validation_residuals(scenario, codebook, training):
     first, n = int(0.7 * PAIRS), int(0.85 * PAIRS) - int(0.7 * PAIRS)
-    positions, received = simulate_pairs(scenario, codebook, n, 1, first)
+    positions, received = System(scenario, codebook).pairs(n, 1, first)
     estimate = make_estimator(
         'neural', scenario, codebook, model_file=training[0]).estimate(received)
     residuals = estimate.mean - positions
@@ -91,7 +91,7 @@ def test_the_covariance_matches_the_validation_residuals(scenario, codebook, tra
 def test_a_network_of_magnitudes_locates_signals_of_any_phase(scenario, codebook):
     network = train(scenario, codebook, 600, 4, 8, 2, inputs='magnitudes')
     assert len(network.w_in) == scenario.n_bands * scenario.n_subbands * scenario.n_frames
-    received = simulate_pairs(scenario, codebook, 5, 9)[1]
+    received = System(scenario, codebook).pairs(5, 9)[1]
     estimator = NeuralEstimator(scenario, codebook, network)
     np.testing.assert_allclose(
         estimator.estimate(-received).mean, estimator.estimate(received).mean, rtol=1e-12)
@@ -127,7 +127,7 @@ def test_batches_grow_and_training_stops_when_the_validation_error_does_not_fall
 @pytest.mark.parametrize(('factor', 'message'), [
     (0.0, 'expected at least'), (1e-3, 'expected at least'), (100.0, 'expected at most')])
 def test_signals_too_weak_or_too_strong_give_no_fix(scenario, codebook, training, factor, message):
-    received = factor * simulate_pairs(scenario, codebook, 5, 9)[1]
+    received = factor * System(scenario, codebook).pairs(5, 9)[1]
     estimate = NeuralEstimator(scenario, codebook, training[0]).estimate(received)
     assert not estimate.fix.any()
     assert np.isnan(estimate.mean).all()

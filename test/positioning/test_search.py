@@ -9,12 +9,12 @@ from rhs_isac_ros.bounds.fisher import fisher_information
 from rhs_isac_ros.codebook import Codebook, random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.geometry import element_positions, jacobian, to_polar, to_positions
-from rhs_isac_ros.positioning import simulate_pairs
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.likelihood import Alignment, DispersedLikelihood, Likelihood
 from rhs_isac_ros.positioning.search import ascend, find_modes, marginal_at
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.templates import tabulate
+from rhs_isac_ros.system import System
 
 SCENARIO = Scenario(
     center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
@@ -27,7 +27,7 @@ def setting(shipped):
     scenario = Scenario()
     likelihood = Likelihood(scenario, shipped)
     grid = TemplateTable(scenario, tabulate(likelihood.model))
-    positions, received = simulate_pairs(scenario, shipped, 30, 3)
+    positions, received = System(scenario, shipped).pairs(30, 3)
     signals = likelihood.signals(received)
     return likelihood, grid, signals, positions, find_modes(
         likelihood, grid, signals, np.zeros((30, 0)))

@@ -10,9 +10,10 @@ import yaml
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Pose, Scenario
-from rhs_isac_ros.positioning import Site, SiteError, SiteEstimator, SiteSurface
+from rhs_isac_ros.positioning import Site, SiteError, SiteEstimator
 from rhs_isac_ros.positioning.agreement import PoseTest
 from rhs_isac_ros.positioning.site import site_text
+from rhs_isac_ros.system import System
 
 CONFIG = Path(__file__).parents[2] / 'config'
 BOUNDS = np.array([[5.0, -5.0, -1.0], [15.0, 5.0, 1.0]])
@@ -20,7 +21,7 @@ EXACT = (0.0, 0.0)
 SCENARIO = Scenario.from_yaml(CONFIG / 'bandplan.yaml')
 CODEBOOK = Codebook.load(CONFIG / 'codebook_bandplan.yaml')
 FRONT, SIDE = (
-    SiteSurface(dataclasses.replace(SCENARIO, pose=pose), CODEBOOK)
+    System(dataclasses.replace(SCENARIO, pose=pose), CODEBOOK)
     for pose in (Pose(uncertainty=EXACT), Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.0, 1.0), EXACT)))
 SITE = Site({'front': FRONT, 'side': SIDE}, BOUNDS)
 
@@ -35,7 +36,7 @@ def cycles():
     """Positions, and the signals of each cycle by the name of the surface."""
     rng = np.random.default_rng(2)
     positions = rng.uniform(*BOUNDS, size=(30, 3))
-    received = SITE.simulate(positions, rng)
+    received = SITE.sample(positions, rng)
     return positions, [{name: signals[number] for name, signals in received.items()}
                        for number in range(len(positions))]
 
@@ -91,8 +92,8 @@ def test_a_pose_is_by_default_that_of_the_scenario(tmp_path):
 @pytest.mark.parametrize(('change', 'message'), [
     (lambda site: site['surfaces'].update(side=copy.deepcopy(site['surfaces']['front'])),
      r'front, side: pose \(0.0, 0.0, 0.0\) m, expected surfaces with different scenarios'),
-    (lambda site: site.pop('roi_size_m'), r"the file: \[.*\], expected the keys \['roi_center_m'"),
-    (lambda site: site.update(extra=1), r"the file: \['extra', .*\], expected the keys"),
+    (lambda site: site.pop('roi_size_m'), r"site.yaml: .*, expected the keys \['roi_center_m'"),
+    (lambda site: site.update(extra=1), r"site.yaml: \['extra', .*\], expected the keys"),
     (lambda site: site.update(surfaces={}), 'surfaces: none, expected at least one'),
     (lambda site: site.update(surfaces=[1]), 'surfaces: expected a mapping of names to surfaces'),
     (lambda site: site['surfaces'].update({'Top/1': site['surfaces'].pop('side')}),
@@ -103,7 +104,7 @@ def test_a_pose_is_by_default_that_of_the_scenario(tmp_path):
     (lambda site: site['surfaces']['side'].update(scenario=3), 'unsupported operand'),
     (lambda site: site['surfaces']['side'].update(scenario='none.yaml'), 'none.yaml: cannot be'),
     (lambda site: site['surfaces']['side'].update(codebook=str(CONFIG / 'codebook.yaml')),
-     'side: analog'),
+     'codebook.yaml: analog'),
     (lambda site: site['surfaces']['side']['pose'].update(position_m=[10.0, 0.0, 0.0]),
      'side: roi_center_m'),
 ])
@@ -138,9 +139,9 @@ def test_the_region_of_a_turned_surface_may_be_larger():
     turned = dataclasses.replace(
         SCENARIO, pose=Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.1, 1.0), EXACT))
     with pytest.raises(SiteError, match='side: roi_center_m'):
-        Site({'side': SiteSurface(turned, CODEBOOK)}, BOUNDS)
+        Site({'side': System(turned, CODEBOOK)}, BOUNDS)
     large = dataclasses.replace(turned, roi_size_m=(14.0, 14.0, 2.0))
-    assert Site({'side': SiteSurface(large, CODEBOOK)}, BOUNDS).surfaces
+    assert Site({'side': System(large, CODEBOOK)}, BOUNDS).surfaces
 
 
 def test_drawn_agreements_are_references_for_their_places(estimator):

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import site_crlb
-from rhs_isac_ros.model import MeasurementModel, Pose
+from rhs_isac_ros.model import Pose
 from rhs_isac_ros.positioning import Mixture, Sighting, Site, fuse
 from rhs_isac_ros.positioning.agreement import WINDOW
-from rhs_isac_ros.positioning.site import SiteSurface
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
     AgreementsDrawn,
@@ -21,6 +20,7 @@ from rhs_isac_ros.protocol.events import (
 )
 from rhs_isac_ros.protocol.fusion import Fusion, posterior_of, sighting_of
 from rhs_isac_ros.protocol.settings import FusionSettings
+from rhs_isac_ros.system import System
 
 POSES = {'front': Pose(), 'side': Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.0, 1.0))}
 PLACE = np.array([9.0, 1.0, 0.3])
@@ -29,7 +29,7 @@ WAIT_S = 0.2
 
 @pytest.fixture(scope='module')
 def site(scenario, codebooks):
-    return Site({name: SiteSurface(dataclasses.replace(scenario, pose=pose), codebooks[0])
+    return Site({name: System(dataclasses.replace(scenario, pose=pose), codebooks[0])
                  for name, pose in POSES.items()}, scenario.roi_bounds_m)
 
 
@@ -102,12 +102,10 @@ def test_a_cycle_with_all_surfaces_is_fused_at_once(fusion, site, answer):
 
 
 def test_the_bound_is_that_of_the_surfaces_with_a_position(fusion, site, answer, no_fix):
-    models = {name: (MeasurementModel(one.scenario, one.codebook), one.pose)
-              for name, one in site.surfaces.items()}
     *_, (both, _), _, (alone, _) = at_once(fusion, [
         answer('side'), answer('front'), no_fix('front', 2), answer('side', 2)])
     for estimate, names in ((both, ('front', 'side')), (alone, ('side',))):
-        expected = site_crlb([models[name] for name in names], estimate.position[None])
+        expected = site_crlb([site.surfaces[name] for name in names], estimate.position[None])
         assert estimate.crlb_m2 == pytest.approx(expected[0])
     assert both.crlb_m2 < 0.7 * alone.crlb_m2
     # The site has no other codebooks.

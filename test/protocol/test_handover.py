@@ -10,7 +10,6 @@ from in_memory_network import SUBSCRIPTIONS, Fault, Network, faults, plain_choic
 from rhs_isac_ros.link import CapacityReport
 from rhs_isac_ros.model import Pose
 from rhs_isac_ros.positioning import Mixture, Sighting, Site
-from rhs_isac_ros.positioning.site import SiteSurface
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.channel import Channel
@@ -22,6 +21,7 @@ from rhs_isac_ros.protocol.settings import Impairments
 from rhs_isac_ros.protocol.transmission import Carriers, Steering, Transmission
 from rhs_isac_ros.ros.place import Place
 from rhs_isac_ros.ros.roster import FOLLOWING, MEMBERS
+from rhs_isac_ros.system import System
 
 POSES = {'front': Pose(), 'side': Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.0, 1.0)),
          'rear': Pose((20.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))}
@@ -129,7 +129,7 @@ def make_site(scenario, codebooks):
     """Function that returns a site with the given surfaces, each with a codebook of its own."""
     def make(*names):
         bounds_m = np.array([[5.0, -5.0, -1.0], [15.0, 5.0, 1.0]])
-        return Site({name: SiteSurface(dataclasses.replace(
+        return Site({name: System(dataclasses.replace(
             scenario, pose=POSES[name], roi_center_m=(10.0, 0.0, 0.0),
             roi_size_m=(10.0, 10.0, 2.0)), codebook)
             for name, codebook in zip(names, codebooks, strict=False)}, bounds_m)

@@ -11,7 +11,7 @@ from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from ros_messages import position_estimate
 
-from rhs_isac_ros.codebook import Codebook, default_codebook_file
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.nodes import bs
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import endpoints, topics
@@ -93,7 +93,7 @@ def test_a_role_runs_without_what_was_refused(bench, refused, capfd, role):
     member = ROSTER[role]
     node = bench.add_role(role, **({'name': 'user_1'} if role == 'user' else {}))
     if member.has_codebook:
-        node._on_codebook(Codebook.load(default_codebook_file()))
+        node._on_codebook(Codebook.default())
     if role == 'positioner':
         bench.until(lambda: topics.NAMES[m.ReceivedSignals] in refused, 'the estimator')
         assert node.publish(position_estimate())

@@ -22,7 +22,7 @@ from rclpy.serialization import deserialize_message
 from ros_messages import to_ros
 
 import rhs_isac_msgs.msg as ros
-from rhs_isac_ros.codebook import Codebook, default_codebook_file
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.ros import convert, topics
@@ -353,7 +353,7 @@ def test_the_tool_ends_with_one_line_if_the_disk_is_full(tmp_path):
 
 def test_nodes_receive_a_recording_that_is_played_with_its_recorded_qos(bench, tmp_path):
     """As ``ros2 bag play`` does, which reads the quality of service from the file."""
-    codebook = Codebook.load(default_codebook_file())
+    codebook = Codebook.default()
     message = to_ros(
         convert.CodebookMessage.of(codebook, 1, Scenario().id), Time())
     player = bench.add(Node, 'player')

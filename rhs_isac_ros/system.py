@@ -1,0 +1,131 @@
+"""The system: one surface with its base station, and the file that names its parts.
+
+A `System` answers all questions about a positioning phase: it is the `MeasurementModel` of the
+signals, simulates them and bounds the error. Estimators, sites and beams take a system. The file
+of a system names a scenario, a codebook and, optionally, a calibration, as does each entry of the
+file of a site.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.bounds import crlb_of
+from rhs_isac_ros.calibration import load_surface
+from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
+from rhs_isac_ros.model.measurement import KnownSurface
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.files import mapping_of, read_yaml
+from rhs_isac_ros.support.threads import map_blocks
+
+# Number of pairs that share a random generator and all matrix products. Another number would
+# change the pairs of every seed.
+_CHUNK = 512
+
+
+class System(MeasurementModel):
+    """A scenario, a codebook, and the knowledge of the surface: the model of all signals.
+
+    Without a `surface`, the errors of its elements have the distribution that the scenario
+    declares. Otherwise the errors are known (`ElementErrors`), or the coefficients are estimated
+    (the attribute `surface` of a `Calibration`). The pose is that of the scenario.
+
+    Raises CodebookError if the codebook does not fit the scenario, and ValueError if the surface
+    does not.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> system = System(Scenario(), Codebook.default())
+    >>> rng = np.random.default_rng(1)
+    >>> positions = system.scenario.sample_positions(2, rng)
+    >>> system.sample(positions, rng).shape
+    (2, 2, 20)
+    >>> np.sqrt(system.crlb(positions)).round(2)  # [m]
+    """
+
+    def __init__(self, scenario: Scenario, codebook: Codebook,
+                 surface: KnownSurface | None = None) -> None:
+        with translated(CodebookError, CodebookError, f'codebook {codebook.id}'):
+            codebook.check(scenario)
+        super().__init__(scenario, codebook, surface)
+        self.codebook = codebook
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> 'System':
+        """Read the file of a system, and the files that it names; paths are relative to it.
+
+        Raises ValueError if one of them is invalid, or they do not fit together.
+        """
+        return SystemFiles.named_in(path).load()
+
+    @property
+    def pose(self) -> Pose:
+        """Pose of the surface in the frame of its site."""
+        return self.scenario.pose
+
+    def crlb(self, positions: np.ndarray, *, region_prior: bool = False) -> np.ndarray:
+        """Compute the Cramer-Rao bound at positions [N, 3] [m], float64 [N] [m^2]; see `crlb`."""
+        return crlb_of(self, positions, region_prior=region_prior)
+
+    def pairs(self, n: int, seed: int, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Simulate positioning phases at random positions of the region of interest.
+
+        A seed defines an infinite sequence of pairs, of which this method returns n, beginning
+        with `first`. The pairs do not depend on how calls divide the sequence. Returns positions,
+        float64 [n, 3] [m], uniform in the region, and received signals,
+        complex128 [n, N_B, N_SB F], sub-band-major. Raises ValueError if an argument is negative.
+        """
+        for name, value in (('n', n), ('seed', seed), ('first', first)):
+            if value < 0:
+                raise ValueError(f'{name}: {value}, expected 0 or more')
+        positions = np.empty((n, 3))
+        received = np.empty((n, *self.shape), complex)
+
+        def fill(chunk: int) -> None:
+            begin = chunk * _CHUNK
+            part = slice(max(first - begin, 0), min(first + n - begin, _CHUNK))
+            target = slice(begin + part.start - first, begin + part.stop - first)
+            # Draw the whole chunk, because the rounding of matrix products depends on their sizes.
+            rng = streams.generator(seed, streams.PHASES, chunk)
+            drawn = self.scenario.sample_positions(_CHUNK, rng)
+            positions[target] = drawn[part]
+            received[target] = self.sample(drawn, rng)[part]
+
+        map_blocks(fill, range(first // _CHUNK, -(-(first + n) // _CHUNK)))
+        return positions, received
+
+
+class SystemFiles(NamedTuple):
+    """Paths of the files of a system."""
+
+    scenario: Path
+    codebook: Path
+    calibration: Path | None = None
+
+    @classmethod
+    def named_in(cls, path: str | Path) -> 'SystemFiles':
+        """Read the file of a system; raise ValueError if it is invalid."""
+        content = read_yaml(path)
+        with translated((ValueError, TypeError), ValueError, path):
+            return cls.of(content, Path(path).parent)
+
+    @classmethod
+    def of(cls, content: Any, folder: Path) -> 'SystemFiles':
+        """Take the paths in a mapping, which are relative to a folder."""
+        names = mapping_of(content, {'scenario', 'codebook'}, {'calibration'})
+        return cls(**{name: folder / path for name, path in names.items()})
+
+    def load(self, adapted: Callable[[Scenario], Scenario] = lambda scenario: scenario) -> System:
+        """Load the system, whose scenario may be adapted to a site.
+
+        Raises ValueError if a file is invalid or does not belong to the scenario.
+        """
+        scenario = Scenario.from_yaml(self.scenario)
+        surface = load_surface(str(self.calibration or ''), scenario)
+        scenario = adapted(scenario)
+        return System(scenario, Codebook.load(self.codebook, scenario), surface)
