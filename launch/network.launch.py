@@ -1,10 +1,11 @@
-"""Starts a network with one process for each node: ``ros2 launch rhs_isac_ros network.launch.py``.
+"""Starts a network or a site: ``ros2 launch rhs_isac_ros network.launch.py``.
 
-``--show-args`` lists the arguments. ``network.launch.xml`` starts the network in one process.
+``--show-args`` lists the arguments. Other launch files can include this one.
 """
 
 import functools
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +14,26 @@ from ament_index_python.packages import (
     get_package_prefix,
     get_package_share_directory,
 )
-from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
+from launch.actions import (
+    DeclareLaunchArgument,
+    IncludeLaunchDescription,
+    LogInfo,
+    OpaqueFunction,
+)
+from launch.conditions import InvalidConditionExpressionError, evaluate_condition_expression
 from launch.events.process import ProcessExited
+from launch.substitutions import TextSubstitution
+from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from rhs_isac_ros.positioning import Site
-from rhs_isac_ros.ros.parameters import NODES
+from rhs_isac_ros.ros.parameters import NODES, hint
 from rhs_isac_ros.ros.processes import MAX_USER_NODES
 from rhs_isac_ros.ros.roster import MEMBERS, networks
 
-PACKAGE = 'rhs_isac_ros'
+PACKAGE, FOLDER = 'rhs_isac_ros', Path(__file__).resolve().parent
 # A launch that receives SIGTERM does not end its processes, so the kernel does.
 END_WITH_LAUNCH = 'setpriv --pdeathsig TERM'
 ARGUMENTS = {
@@ -45,11 +54,12 @@ ARGUMENTS = {
     'log_level': ('info', 'Minimum severity of logged messages.'),
     'respawn': ('false', 'Whether to restart a process that ends; otherwise a failure ends the '
                          'launch.'),
-    'composed': ('false', 'Whether to run all nodes but the visualizer in one process.'),
+    'composed': ('true', 'Whether to run all nodes but the visualizer in one process.'),
 }
-CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']} | {
-    name: ['true', 'false']
-    for name in ('use_sim_time', 'visualizer', 'rviz', 'respawn', 'composed')}
+LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
+# Names with a meaning for launch itself.
+OF_LAUNCH = ('launch-prefix', 'launch-prefix-filter', 'emulate_tty', 'sigterm_timeout',
+             'sigkill_timeout')
 RESPAWN_DELAY_S = 1.0
 # Exit code for invalid parameters, arguments or files: a restart would fail again.
 INVALID = 2
@@ -58,8 +68,7 @@ INVALID = 2
 def generate_launch_description() -> LaunchDescription:
     """Return the arguments of the launch and the function that starts the nodes."""
     return LaunchDescription([
-        *(DeclareLaunchArgument(name, default_value=default, description=text,
-                                choices=CHOICES.get(name))
+        *(DeclareLaunchArgument(name, default_value=default, description=text)
           for name, (default, text) in ARGUMENTS.items()),
         OpaqueFunction(function=start_nodes),
     ])
@@ -71,32 +80,58 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     Raises
     ------
     ValueError
-        If the number of users or the seed is not an integer in its range, if the parameter file
-        does not exist, or if the site file is invalid or used with another file.
+        If an argument is unknown or has an invalid value, if the parameter file does not exist, or
+        if the site file is invalid or used with another file.
     """
+    _refuse_unknown(context)
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
     users = _integer('users', given, 1)
     values = {'seed': _integer('seed', given, 0), 'codebook_file': given['codebook'],
               'estimator': given['estimator']}
-    others = [name for name in ('config', 'codebook', 'composed')
-              if given[name] not in ('', 'false')]
+    others = [name for name in ('config', 'codebook') if given[name]]
     if given['site'] and others:
         raise ValueError(f'site: {given["site"]!r}, expected none with {others[0]}')
     parts = networks(Site.from_yaml(given['site']).surfaces if given['site'] else ())
     file = given['params_file']
     if file and not Path(file).is_file():
         raise ValueError(f'params_file: {file!r}, expected an existing file')
-    if given['composed'] == 'true':
+    if given['log_level'].lower() not in LOG_LEVELS:
+        raise ValueError(f'log_level: {given["log_level"]!r}, expected {", ".join(LOG_LEVELS)}')
+    if _boolean('composed', given):
         # Without a name, the parameters apply to every node of the process.
         nodes = [_node(given, 'network', None, users=users, **values)]
     else:
         nodes = [node for name, roles in parts for role in roles
                  for node in _nodes(_below(given, name), role, users, values)]
-    if 'true' in (given['visualizer'], given['rviz']):
+    if _boolean('visualizer', given) or _boolean('rviz', given):
         nodes += [_node(_below(given, name), 'visualizer', 'visualizer')
                   for name, roles in parts if 'positioner' in roles]
     # The recorder comes first, because it misses earlier messages that are not latched.
     return [*_recorder(given), *nodes, *_rviz(given)]
+
+
+def _refuse_unknown(context: LaunchContext) -> None:
+    """Raise ValueError if an include of a launch file in this folder has an unknown argument.
+
+    launch sets an argument that nobody declares without a word. In `context`, it looks like an
+    argument of a parent, so the actions that include these files are examined.
+    """
+    event = getattr(context.locals, 'event', None)
+    for include in _includes(event.launch_description) if hasattr(
+            event, 'launch_description') else ():
+        if Path(include.launch_description_source.location).resolve().parent == FOLDER:
+            for name, _ in include.launch_arguments:
+                text = perform_substitutions(context, normalize_to_list_of_substitutions(name))
+                if text not in (*ARGUMENTS, *OF_LAUNCH):
+                    raise ValueError(f'{text}: unknown argument{hint(text, ARGUMENTS)}')
+
+
+def _includes(entity: LaunchDescriptionEntity) -> Iterator[IncludeLaunchDescription]:
+    for one in [*entity.describe_sub_entities(), *(
+            one for _, several in entity.describe_conditional_sub_entities() for one in several)]:
+        if isinstance(one, IncludeLaunchDescription):
+            yield one
+        yield from _includes(one)
 
 
 def _below(given: dict[str, str], name: str) -> dict[str, str]:
@@ -126,16 +161,25 @@ def _integer(name: str, given: dict[str, str], low: int) -> int:
     return int(text)
 
 
+def _boolean(name: str, given: dict[str, str]) -> bool:
+    """Return the value of an argument, which is read like a condition of launch."""
+    try:
+        return evaluate_condition_expression(LaunchContext(), [TextSubstitution(text=given[name])])
+    except InvalidConditionExpressionError:
+        raise ValueError(f'{name}: {given[name]!r}, expected true or false') from None
+
+
 def _node(given: dict[str, str], executable: str, name: str | None, **values: int | str) -> Node:
     # rcl gives precedence to the parameters that it reads last, which are those in the file.
     file = [ParameterFile(given['params_file'])] if given['params_file'] else []
     # JSON quotes a string so that YAML does not read it as another type.
     pairs = [f'{key}:={json.dumps(value, ensure_ascii=False)}'
-             for key, value in {**values, 'scenario_file': given['config'],
-                                'site_file': given['site'],
-                                'use_sim_time': given['use_sim_time'] == 'true'}.items()]
+             for key, value in {
+                 **values, 'scenario_file': given['config'], 'site_file': given['site'],
+                 # By default not set, because a parent may have set it for all nodes.
+                 **({'use_sim_time': True} if _boolean('use_sim_time', given) else {})}.items()]
     return _process(
-        given, name or executable, given['respawn'] == 'true',
+        given, name or executable, _boolean('respawn', given),
         [word for pair in pairs for word in ('-p', pair)],
         executable=executable, name=name, parameters=file)
 
@@ -165,7 +209,7 @@ def _process(
 
 
 def _rviz(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
-    if given['rviz'] != 'true':
+    if not _boolean('rviz', given):
         return []
     try:
         get_package_prefix('rviz2')

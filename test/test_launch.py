@@ -1,6 +1,7 @@
 """The launch files: their arguments, the service of all users, and a clean end."""
 
 import ast
+import contextlib
 import functools
 import importlib.util
 import itertools
@@ -30,7 +31,7 @@ from launch.actions import IncludeLaunchDescription
 from launch.launch_description_sources import AnyLaunchDescriptionSource
 
 arguments = [tuple(argument.split(':=')) for argument in sys.argv[2:]]
-service = LaunchService(noninteractive=True)
+service = LaunchService(argv=sys.argv[2:], noninteractive=True)
 service.include_launch_description(LaunchDescription([
     IncludeLaunchDescription(AnyLaunchDescriptionSource(sys.argv[1]),
                              launch_arguments=arguments)]))
@@ -77,14 +78,12 @@ def test_the_python_file_uses_all_arguments():
     (arguments,) = [node.value for node in ast.parse(text).body if isinstance(node, ast.Assign)
                     and node.targets[0].id == 'ARGUMENTS']
     unused = [name for name in ast.literal_eval(arguments)
-              if f"given['{name}']" not in text and f"_integer('{name}'" not in text]
+              if f"given['{name}']" not in text and f"('{name}', given" not in text]
     assert not unused
 
 
-def test_the_xml_file_includes_the_python_file_composed():
-    root = ElementTree.parse(ROOT / 'launch' / 'network.launch.xml').getroot()
-    argument, include = root
-    assert (argument.get('name'), argument.get('default')) == ('composed', 'true')
+def test_the_xml_file_includes_the_python_file():
+    (include,) = ElementTree.parse(ROOT / 'launch' / 'network.launch.xml').getroot()
     assert include.attrib == {
         'file': '$(find-pkg-share rhs_isac_ros)/launch/network.launch.py'}
 
@@ -104,22 +103,26 @@ def test_both_files_list_the_same_arguments():
 ONE_EACH = [name for name in UNIQUE if name != 'bs']
 
 
+SITE = str(ROOT / 'config' / 'site.yaml')
+
+
 @needs_launch
 @pytest.mark.parametrize(('values', 'expected'), [
-    ({}, [*ONE_EACH, 'user', 'user', 'bs']),
-    ({'users': '1', 'record': 'run.mcap'}, ['record', *ONE_EACH, 'user', 'bs']),
-    ({'users': '16'}, [*ONE_EACH, *['user'] * 16, 'bs']),
-    ({'users': '1000'}, [*ONE_EACH, 'LogInfo', 'user', 'bs']),
-    ({'composed': 'true'}, ['network']),
-    ({'composed': 'true', 'visualizer': 'true'}, ['network', 'visualizer'])])
+    ({'composed': 'False'}, [*ONE_EACH, 'user', 'user', 'bs']),
+    ({'composed': '0', 'users': '1', 'record': 'run.mcap'}, ['record', *ONE_EACH, 'user', 'bs']),
+    ({'composed': 'false', 'users': '16'}, [*ONE_EACH, *['user'] * 16, 'bs']),
+    ({'composed': ' FALSE ', 'users': '1000'}, [*ONE_EACH, 'LogInfo', 'user', 'bs']),
+    ({}, ['network']), ({'users': '1000'}, ['network']), ({'site': SITE}, ['network']),
+    ({'visualizer': 'True'}, ['network', 'visualizer']),
+    ({'site': SITE, 'visualizer': '1'}, ['network', 'visualizer', 'visualizer'])])
 def test_the_started_executables(values, expected):
     assert [name for name, _ in started(**values)] == expected
 
 
 @needs_launch
 def test_a_site_has_a_network_for_each_surface_and_their_fusion():
-    site = str(ROOT / 'config' / 'site.yaml')
-    nodes = started(site=site, namespace='lab', users='1', visualizer='true', record='a.mcap')
+    nodes = started(site=SITE, composed='false', namespace='lab', users='1', visualizer='true',
+                    record='a.mcap')
     assert [(node._Node__node_namespace, name) for name, node in nodes] == [
         ('lab', 'record'), *(('lab/front', name) for name in [*ONE_EACH, 'user', 'bs']),
         *(('lab/side', name) for name in FOLLOWING), ('lab', 'fusion'),
@@ -128,7 +131,7 @@ def test_a_site_has_a_network_for_each_surface_and_their_fusion():
 
 @needs_launch
 @pytest.mark.parametrize(('values', 'file'), [
-    ({}, 'network.rviz'), ({'site': str(ROOT / 'config' / 'site.yaml')}, 'site.rviz')])
+    ({}, 'network.rviz'), ({'site': SITE}, 'site.rviz')])
 def test_rviz_opens_the_layout_of_the_network_in_its_namespace(values, file, monkeypatch):
     module = load_python_file()
     # RViz need not be installed.
@@ -142,7 +145,7 @@ def test_rviz_opens_the_layout_of_the_network_in_its_namespace(values, file, mon
 
 
 @needs_launch
-@pytest.mark.parametrize('other', ['config', 'codebook', 'composed'])
+@pytest.mark.parametrize('other', ['config', 'codebook'])
 def test_a_site_excludes_arguments_of_a_single_surface(other):
     with pytest.raises(ValueError, match=f"^site: 'site.yaml', expected none with {other}"):
         started(site='site.yaml', **{other: 'true'})
@@ -161,13 +164,26 @@ def test_parameters_are_declared(composed):
         words = [''.join(part.text for part in word if hasattr(part, 'text')) for word in node.cmd]
         names = {word.partition(':=')[0] for flag, word in itertools.pairwise(words)
                  if flag == '-p'}
-        assert {'scenario_file', 'use_sim_time'} <= names <= declared | {'use_sim_time'}
+        assert {'scenario_file', 'site_file'} <= names <= declared
+
+
+@needs_launch
+@pytest.mark.parametrize(('value', 'given'), [
+    ('True', True), ('1', True), (' true', True), ('False', False), ('0', False)])
+def test_simulated_time_is_set_only_if_it_is_true_because_a_parent_may_set_it(value, given):
+    from launch import LaunchContext
+    ((_, node),) = started(use_sim_time=value)
+    node._perform_substitutions(LaunchContext())
+    words = [''.join(part.text for part in word if hasattr(part, 'text')) for word in node.cmd]
+    assert ('use_sim_time:=true' in words) == given
+    assert not given or words[words.index('use_sim_time:=true') - 1] == '-p'
 
 
 @needs_launch
 @pytest.mark.parametrize(('name', 'value'), [
     ('users', '0'), ('users', 'x'), ('users', '-1'), ('seed', 'abc'), ('seed', '1.5'),
-    ('params_file', '/no/such.yaml')])
+    ('params_file', '/no/such.yaml'), ('composed', 'yes'), ('use_sim_time', ''),
+    ('visualizer', 'on'), ('rviz', '2'), ('respawn', 'None'), ('log_level', 'loud')])
 def test_an_invalid_argument_is_named(name, value):
     with pytest.raises(ValueError, match=f"^{name}: '{value}', expected "):
         started(**{name: value})
@@ -196,8 +212,11 @@ def test_a_failure_ends_the_launch_unless_the_process_is_restarted_or_optional(
 @needs_launch
 @pytest.mark.parametrize(('file', 'arguments', 'expected'), [
     ('network.launch.py', ['users:=none'], ["users: 'none', expected an integer"]),
-    ('network.launch.xml', ['log_level:=loud'], ['"log_level"', 'loud', 'debug', 'warn']),
-    ('network.launch.py', [f'config:={ROOT}/config/quick.yaml'],
+    ('network.launch.xml', ['log_level:=loud'], ["log_level: 'loud', expected debug"]),
+    ('network.launch.py', ['user:=3'], ['user: unknown argument (the closest is users)']),
+    ('network.launch.xml', ['user:=3'], ['user: unknown argument (the closest is users)']),
+    ('site.launch.py', [f'site:={SITE}', 'mode:=x'], ['mode: unknown argument']),
+    ('network.launch.py', [f'config:={ROOT}/config/quick.yaml', 'composed:=false'],
      ['config/codebook.yaml', 'config/quick.yaml', 'codebook:=', 'optimizer-4 ended']),
     ('network.launch.xml', [f'config:={ROOT}/config/quick.yaml'],
      ['config/codebook.yaml', 'config/quick.yaml', 'codebook:=', 'network-1 ended'])])
@@ -245,7 +264,7 @@ def observer(monkeypatch):
 
 
 ALL = ('users:=3', 'seed:=4', f'config:={ROOT}/config/quick.yaml',
-       f'codebook:={ROOT}/config/codebook_quick.yaml', 'visualizer:=true',
+       f'codebook:={ROOT}/config/codebook_quick.yaml', 'visualizer:=True', 'composed:=False',
        *(['record:={}/run.mcap'] if RECORDS else []))
 # All arguments except the file have their default values.
 DEFAULT = ('params_file:={}/parameters.yaml',)
@@ -274,7 +293,7 @@ def test_all_users_are_served_and_no_process_remains(
         try:
             end_s = time.monotonic() + TIMEOUT_S
             while ({record.user for record in node.log.complete} != {1, 2, 3}
-                   or 'visualizer:=true' in arguments
+                   or 'visualizer:=True' in arguments
                    and not node.count_publishers('/launched/markers')):
                 executor.spin_once(timeout_sec=0.1)
                 assert process.poll() is None and time.monotonic() < end_s, (
@@ -313,3 +332,37 @@ def test_without_rviz_the_launch_logs_that_and_starts_the_nodes(monkeypatch):
     names = [name for name, _ in started(rviz='true')]
     assert names[-2:] == ['visualizer', 'LogInfo']
     assert 'LogInfo' not in [name for name, _ in started()]
+
+
+EXAMPLE = ROOT / 'docs' / 'examples' / 'robot.launch.py'
+
+
+def test_the_example_of_an_include_uses_arguments_of_the_network_in_a_scope():
+    text = EXAMPLE.read_text(encoding='utf-8')
+    (group,) = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)
+                and getattr(node.func, 'id', '') == 'GroupAction']
+    options = {option.arg: option.value for option in group.keywords}
+    assert options['forwarding'].value is False
+    names = {key.value for key in options['launch_configurations'].keys}
+    declared = (ROOT / 'launch' / 'network.launch.py').read_text(encoding='utf-8')
+    assert names and all(f"\n    '{name}': (" in declared for name in names)
+
+
+
+@needs_launch
+def test_a_parent_with_arguments_of_its_own_includes_the_network(monkeypatch, tmp_path):
+    from rhs_isac_ros.ros.environment import claim_domain
+    monkeypatch.setenv('ROS_DOMAIN_ID', claim_domain())
+    arguments = ('use_sim_time:=False', 'params_file:=of_robot.yaml', 'slam:=True')
+    with subprocess.Popen(
+            [sys.executable, '-c', LAUNCH, EXAMPLE, *arguments], text=True,
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            env={**os.environ, 'ROS_LOG_DIR': str(tmp_path)}) as process:
+        # The output ends if the launch fails.
+        with contextlib.closing(process.stdout) as output:
+            lines = list(itertools.takewhile(lambda line: 'serving: codebook' not in line or (
+                '[positioning.bs]' not in line), output))
+        assert process.poll() is None, ''.join(lines)
+        process.send_signal(signal.SIGINT)
+        process.wait(TIMEOUT_S)
+    assert not [line for line in lines if '[WARN]' in line or 'ERROR' in line]

@@ -84,7 +84,7 @@ def permissions(
     -------
     dict
         Permissions by node. ``users`` is a node with all users, ``network`` the process of all
-        nodes of a network with one surface. ``operator`` stands for all tools, which may read
+        nodes of the network or site. ``operator`` stands for all tools, which may read
         every topic, set parameters and pause cycles, except for ``replay``, which may publish
         every topic and take the place of the optimizer.
     """
@@ -98,8 +98,8 @@ def permissions(
         for user, source in (robots or {}).items():
             nodes[f'user_{user}'] = _with_robot(nodes[f'user_{user}'], source)
         nodes['users'] = _of_member('user', numbers, place)
-    if not place.site:
-        nodes['network'] = _together({**nodes, 'network': Permissions(publish=_RCLPY_TOPICS)})
+    head = {} if place.name else {'network': Permissions(publish=_RCLPY_TOPICS)}
+    nodes['network'] = _together({**nodes, **head})
     optimizer = topics.OPTIMIZER_NODE
     tools = {}
     if optimizer in roles:
@@ -179,20 +179,21 @@ def _of_site(
         is_simulated: bool) -> dict[tuple[str, str], Permissions]:
     """Return the permissions of a site, or of a single network, by namespace and node.
 
-    The operator of the whole site has the permissions of those of the surfaces, too.
+    The operator of the whole site has the permissions of those of the surfaces, too, and the
+    process of all nodes has those of all nodes.
     """
-    found, operators = {}, {}
+    found, parts = {}, {}
     for name, roles in networks(site.surfaces if site else ()):
         place = Place(site.surfaces[name or site.leader].scenario, site, base, name
                       ) if site else _ALONE
-        nodes = permissions(users, robots, is_simulated, place, roles)
+        parts[name] = permissions(users, robots, is_simulated, place, roles)
         found |= {(f'{base}/{name}'.rstrip('/'), node): allowed
-                  for node, allowed in nodes.items()}
-        operators[name] = nodes['operator']
-    found[base, 'operator'] = Permissions(*(
-        tuple(dict.fromkeys(posixpath.join(name, one) for name, allowed in operators.items()
-                            for one in getattr(allowed, right)))
-        for right in Permissions._fields))
+                  for node, allowed in parts[name].items() if node != 'network'}
+    for node in ('network', 'operator'):
+        found[base, node] = Permissions(*(
+            tuple(dict.fromkeys(posixpath.join(name, one) for name, nodes in parts.items()
+                                for one in getattr(nodes[node], right)))
+            for right in Permissions._fields))
     return found
 
 

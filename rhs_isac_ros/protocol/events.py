@@ -40,9 +40,10 @@ class SettingsOffered:
 
 @dataclasses.dataclass(frozen=True)
 class PeersChanged:
-    """The set of required roles that are missing has changed."""
+    """The required roles that are missing, or another missing requirement, have changed."""
 
     missing: tuple[str, ...]
+    lacking: str = ''  # description of a missing requirement that is not a role
 
 
 @dataclasses.dataclass(frozen=True)

@@ -68,6 +68,7 @@ class User(StateMachine):
         self._mobilities, self._world_s, self._pose = mobilities, world_s, pose or Pose()
         self._crowd = Crowd([mobilities[user] for user in self.users])
         self._cycle_id = 0
+        self._was_connected = False
         # Cycle, first band and last band of the pilot request that was answered last.
         self._sounded = (0, 0, 0)
         # The highest attempt received, by cycle, and the true position, by cycle and user.
@@ -108,7 +109,7 @@ class User(StateMachine):
     # Guards
 
     def _peers_missing(self, event: PeersChanged) -> bool:
-        return bool(event.missing)
+        return bool(event.missing or event.lacking)
 
     def _stale_beacon(self, event: m.Beacon) -> bool:
         granted = self.state is State.GRANTED and event.cycle_id == self._cycle_id
@@ -158,13 +159,18 @@ class User(StateMachine):
     # Steps
 
     def _log_connected(self, event: PeersChanged) -> None:
+        self._was_connected = True
         self.log_state('peers', 'listening for beacons', False)
 
     def _log_missing_peers(self, event: PeersChanged) -> None:
-        self.log_state('peers', f'waiting for {", ".join(event.missing)}', True)
+        lacking = (event.lacking,) if event.lacking else ()
+        # At the start, the other nodes may be about to start, too.
+        self.log_state('peers', f'waiting for {", ".join((*event.missing, *lacking))}', True,
+                       bool(lacking) or self._was_connected)
 
     def _log_no_beacon(self, event: Timeout) -> None:
-        self.log_state('beacons', f'no beacon for {self._beacon_s:g} s', True)
+        self.log_state('beacons', f'no beacon for {self._beacon_s:g} s', True,
+                       warning=bool(self._attempts))
 
     def _log_other_instance(self, event: m.Grant) -> None:
         text = m.describe_conflict(event.user, event.user_instance)

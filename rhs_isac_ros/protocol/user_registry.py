@@ -323,15 +323,17 @@ class ServiceLog:
         self._outages: NewestDict[tuple[str, tuple[int, str]], None] = NewestDict(MAX_USERS)
         # Missing roles and codebook as logged last; empty once a cycle has begun.
         self._lacking: tuple[str, ...] = ()
-        # Whether a cycle has been served since the last time that something was missing.
-        self._serving = False
+        # Whether a cycle has been served since the last time that something was missing, and ever.
+        self._serving = self._has_served = False
 
     def waits(self, lacking: tuple[str, ...]) -> Iterator[LogMessage]:
         """Log missing roles and codebook if they have changed."""
         self._serving = False
         if lacking != self._lacking:
             self._lacking = lacking
-            yield LogMessage(f'waiting for {", ".join(lacking)}', True, 'service', True)
+            # At the start, the other nodes may be about to start, too.
+            yield LogMessage(
+                f'waiting for {", ".join(lacking)}', self._has_served, 'service', True)
 
     def begins(self) -> None:
         """Note that a cycle has begun; a role that is missing later is then logged again."""
@@ -350,7 +352,7 @@ class ServiceLog:
     def serves(self, cycle_id: int, user: int, use: str) -> Iterator[LogMessage]:
         """Log the start of service, with what it uses, and the outages that ended."""
         if not self._serving:
-            self._serving = True
+            self._serving = self._has_served = True
             yield LogMessage(f'serving: {use}', False, 'service', False)
         ended = [outage for outage in self._outages if outage[1][0] in (0, user)]
         for outage in ended:

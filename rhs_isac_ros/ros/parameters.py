@@ -35,7 +35,7 @@ from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import create_or_refuse, refusals
-from rhs_isac_ros.ros.roster import MEMBERS, ROSTER
+from rhs_isac_ros.ros.roster import MEMBERS
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import ArgumentParser
 from rhs_isac_ros.support.errors import translated
@@ -206,7 +206,7 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
         _parameter('forget_s', 10.0, 'Time without a message after which a user is removed.',
                    unit='s', low=0.1, high=3600.0),
     ),
-    'network': (_parameter('users', 2, 'Number of users.', low=1, high=MAX_USERS),),
+    'network': (_parameter('users', 2, 'Number of users.', low=1, high=MAX_USERS), _SITE),
 }
 
 # Options for nodes that need no services; access control then need not permit any.
@@ -289,7 +289,7 @@ def check_nodes(nodes: Sequence[Node]) -> None:
     known = known_names()
     for node in nodes:
         # rclpy gives no public access to all overrides. An endpoint declares its qos_overrides.*.
-        foreign = [f'{name}{hint(name)}' for name in sorted(node._parameter_overrides)
+        foreign = [f'{name}{hint(name, known)}' for name in sorted(node._parameter_overrides)
                    if not (name in known or node.has_parameter(name)
                            or name.startswith('qos_overrides.'))]
         if foreign:
@@ -302,9 +302,9 @@ def known_names() -> set[str]:
     return known.union(CODEBOOK)
 
 
-def hint(name: str) -> str:
-    """Return a text that suggests the closest known parameter; empty if none is close."""
-    close = difflib.get_close_matches(name, known_names(), 1)
+def hint(name: str, known: Iterable[str]) -> str:
+    """Return a text that suggests the closest of the known names; empty if none is close."""
+    close = difflib.get_close_matches(name, known, 1)
     return f' (the closest is {close[0]})' if close else ''
 
 
@@ -315,9 +315,10 @@ def check_arguments(
     A parameter file may set parameters of several executables; see `check_nodes`.
     """
     accepted = set(_names(executable)).union(*map(_names, _composed(executable)))
+    known = known_names()
     for name in _assigned(arguments):
-        if name not in known_names() and not name.startswith(_OF_RCLPY):
-            parser.error(f'argument -p: {name}: unknown parameter{hint(name)}')
+        if name not in known and not name.startswith(_OF_RCLPY):
+            parser.error(f'argument -p: {name}: unknown parameter{hint(name, known)}')
         owners = [owner for owner in NODES if name in _names(owner)]
         if owners and name not in accepted:
             parser.error(f'argument -p: {name} is a parameter of {", ".join(owners)}, '
@@ -344,7 +345,7 @@ def _assigned(arguments: Sequence[str]) -> Iterator[str]:
 
 
 def _composed(executable: str) -> list[str]:
-    return [name for name in NODES if name in ROSTER] if executable == 'network' else []
+    return [name for name in NODES if name in MEMBERS] if executable == 'network' else []
 
 
 def make_parser(executable: str, text: str) -> ArgumentParser:

@@ -244,10 +244,11 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._report_missing(missing)
         has_optimizer = topics.OPTIMIZER_NODE not in missing
         if has_optimizer != had_optimizer:
+            codebook_id = self._codebook_client.codebook_id
             endpoints.journal(self).state(
-                'optimizer', 'optimizer is present again' if has_optimizer else
-                'optimizer is not present; the codebook in use is '
-                f'{self._codebook_client.codebook_id or "none"}', not has_optimizer)
+                'optimizer', 'optimizer is present' if has_optimizer else
+                f'optimizer is not present; the codebook in use is {codebook_id or "none"}',
+                not has_optimizer, warning=bool(codebook_id) and not has_optimizer)
 
     def set_lacking(self, text: str) -> None:
         """Set the description of a missing requirement that is not a role; '' if there is none."""
@@ -258,11 +259,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 self._report_missing(self._missing)
 
     def _report_missing(self, missing: tuple[str, ...]) -> None:
-        lacking = (self._lacking,) if self._lacking else ()
-        self._statistics.missing = (*missing, *lacking)
+        self._statistics.missing = tuple(filter(None, (*missing, self._lacking)))
         if MEMBERS[self._executable].requires:
-            self.dispatch(events.PeersChanged((*(
-                role for role in missing if role != topics.OPTIMIZER_NODE), *lacking)))
+            self.dispatch(events.PeersChanged(tuple(
+                role for role in missing if role != topics.OPTIMIZER_NODE), self._lacking))
 
     def _on_rival(self, stands_by: bool) -> None:
         if stands_by == self.stands_by:

@@ -1,13 +1,16 @@
 """Limits on log lines about states that begin and end, and about events that repeat."""
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
 # Time in which repeated changes of a state, or repetitions of an event, are only counted [s].
 PERIOD_S = 60.0
-# Maximum number of states and events, which bounds the memory.
-_MAX_RECORDS = 1024
+# Maximum number of states and events, which bounds the memory, and maximum number of texts of a
+# state that are logged in a period.
+_MAX_RECORDS, _MAX_TEXTS = 1024, 8
+_NUMBER = re.compile(r'[\d.]+')
 
 
 class Line(NamedTuple):
@@ -24,7 +27,8 @@ class _Record:
 
     until_s: float  # end of the period [s]
     holds: bool | None = None  # whether the state holds; None for an event
-    logged: set[bool | None] = dataclasses.field(default_factory=set)  # kinds of logged lines
+    # Texts of logged lines, without numbers; '' for the end of a state, and for an event.
+    logged: set[str] = dataclasses.field(default_factory=set)
     suppressed: Line | None = None  # latest line, if it was not logged
     n: int = 0  # number of changes or repetitions that were not logged
 
@@ -33,7 +37,8 @@ class StateLog:
     """Decides which lines about states and events a log contains.
 
     The log contains the first begin and the first end of a state, and the first occurrence of an
-    event. Within a minute after that, further changes and occurrences are only counted. At the end
+    event. Within a minute after that, it also contains a text of the state that differs from those
+    before by more than numbers. Other changes and occurrences are only counted. At the end
     of the minute, if there were any, one line contains the latest text and their number, and the
     next minute begins. After a minute without any, the state or event counts as new.
 
@@ -98,8 +103,9 @@ class StateLog:
             record = self._records[key] = _Record(now_s + PERIOD_S)
         is_change = holds is None or holds != record.holds
         record.holds = holds
-        if holds not in record.logged:
-            record.logged.add(holds)
+        text = _NUMBER.sub('', line.text) if holds else ''
+        if text not in record.logged and len(record.logged) < _MAX_TEXTS:
+            record.logged.add(text)
             # The line also shows the current state, so nothing else remains to be logged.
             if not record.n:
                 record.suppressed = None

@@ -60,6 +60,13 @@ def test_no_node_of_a_site_may_publish_in_the_namespace_of_a_surface_but_its_own
                     if name.startswith('/lab/') and not name.startswith(f'{space}/')} == set()
 
 
+def test_the_process_of_a_site_has_the_permissions_of_all_nodes(of_site):
+    process = of_site.pop('/lab/network')
+    for path, rights in of_site.items():
+        if path.rpartition('/')[2] not in ('operator', 'replay', 'visualizer'):
+            assert all(rights[right] <= process[right] for right in RIGHTS), path
+
+
 def test_the_operator_of_a_site_has_the_permissions_of_those_of_its_surfaces(of_site):
     for name in ('front', 'side'):
         for right in RIGHTS:

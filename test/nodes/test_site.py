@@ -82,6 +82,16 @@ def test_the_demonstration_compares_all_surfaces_with_the_fusion_and_counts_thei
     assert re.fullmatch(r'\d handovers?', handovers)
 
 
+def test_a_process_with_all_nodes_of_a_site_locates_its_users(
+        make_site_file, processes, make_watch):
+    watch, file = make_watch('/lab'), make_site_file('front')
+    network = processes.start('network', namespace='/lab', site_file=file, users=1)
+    watch.until(lambda: FRONT in [one.estimator for one in watch.received[m.PositionEstimate]],
+                'a position of the site', [network])
+    spaces = {space for _, space in watch.node.get_node_names_and_namespaces()}
+    assert spaces == {'/lab', '/lab/front'}
+
+
 def known(watch, kind, estimate):
     """Return the messages that an observer has received about the user and cycle of a position."""
     return [one for one in watch.of_cycle(kind, estimate.cycle_id) if one.user == estimate.user]

@@ -111,6 +111,8 @@ def test_a_disconnected_user_logs_it_and_sends_nothing(user, state):
     assert user.handle(PeersChanged(('channel', 'bs')), 1.0) == [
         LogMessage('waiting for channel, bs', warning=True, key='peers', holds=True)]
     assert user.state is State.DISCONNECTED
+    assert user.handle(PeersChanged((), 'odometry'), 1.0) == [
+        LogMessage('waiting for odometry', warning=True, key='peers', holds=True)]
     assert user.handle(beacon(), 1.0) == []
     assert user.counters == {}
     assert user.handle(PeersChanged(()), 2.0) == [

@@ -156,7 +156,7 @@ def test_a_node_without_an_optimizer_reports_it(bench, capfd):
     codebook_id = node._codebook_client.codebook_id
     assert log.count('optimizer is not present; the codebook in use is none') == 1
     assert log.count(f'optimizer is not present; the codebook in use is {codebook_id}') == 1
-    assert log.count('optimizer is present again') == 1
+    assert log.count('optimizer is present') == 1
 
 
 # Simulated time

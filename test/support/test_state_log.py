@@ -55,13 +55,20 @@ def test_after_a_minute_the_log_contains_the_present_state(log):
     assert log.due(2 * PERIOD_S) == []
 
 
-def test_another_text_of_a_state_is_logged_after_a_minute_unless_the_state_has_ended(log):
-    other = Line('no position of the second source', True)
-    for key in ('lasts', 'ends'):
-        assert log.state(key, BEGIN, 0.0) == [BEGIN]
-        assert log.state(key, other, 1.0) == []
-    assert log.state('ends', END, 2.0, holds=False) == [END]
-    assert log.due(PERIOD_S) == [other]
+def test_another_text_of_a_state_is_logged_at_once_and_its_repetitions_are_not(log):
+    other, older = Line('stamps differ by 7.5 s', True), Line('stamps differ by 12 s', True)
+    assert log.state('robot', BEGIN, 0.0) == [BEGIN]
+    assert log.state('robot', other, 1.0) == [other]
+    assert log.state('robot', BEGIN, 2.0) == log.state('robot', older, 3.0) == []
+    # At the end of the minute, the log contains the present text, unless the state has ended.
+    assert log.due(PERIOD_S) == [older]
+
+
+def test_a_state_has_a_limited_number_of_texts_in_a_minute(log):
+    lines = [Line('x' * n, True) for n in range(1, 100)]
+    logged = [line for line in lines if log.state('robot', line, 0.0)]
+    assert logged == lines[:len(logged)] and 4 <= len(logged) <= 10
+    assert log.due(PERIOD_S) == lines[-1:]
 
 
 def test_an_event_is_logged_once_and_then_once_a_minute_with_its_number(log):
