@@ -64,8 +64,9 @@ def scenario_table(kind):
         declared, source = field.metadata['declared'], field.metadata['source']
         default = defaults[field.name]
         source = f' Source: {source}.' if source else ''
+        limits = f'{declared.low:g} to {declared.high:g}' + declared.has_unknown * ' or unknown'
         rows.append((code(field.name), declared.unit, 'null' if default is None else default,
-                     f'{declared.low:g} to {declared.high:g}', declared.text + source))
+                     limits, declared.text + source))
     return table(('field', 'unit', 'default', 'range', 'meaning'), rows, '22 7 11 14 46')
 
 

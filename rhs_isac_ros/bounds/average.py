@@ -184,7 +184,7 @@ class AverageCrlb(Average):
 
     def _bounds(self, _: slice, joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the bounds [n] and their negative derivatives with respect to the forms."""
-        marginal = without_nuisance(joint)
+        marginal = without_nuisance(joint, self.scenario)
         inverse = inverse_information(marginal.information + self._prior)
         values = np.trace(inverse, axis1=1, axis2=2)
         # If the signals do not determine the position, the value is infinite and the slope zero.

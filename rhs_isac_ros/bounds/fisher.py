@@ -24,7 +24,8 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
     Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2], infinite where the
     information is singular. Declared nuisance parameters are unknown, with their distributions as
     priors; the result is then the hybrid bound. Errors of the elements add their covariance,
-    averaged over the region. `region_prior` adds a Gaussian prior that has the variances of the
+    averaged over the region. The prior of a phase is that of the wrapped density, and an unknown
+    parameter has none. `region_prior` adds a Gaussian prior that has the variances of the
     region, size^2 / 12. Raises ValueError if `positions` is not a finite [N, 3] array.
     """
     return crlb_of(MeasurementModel(scenario, codebook), positions, region_prior=region_prior)
@@ -34,15 +35,16 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
 def crlb_of(model: MeasurementModel, positions: np.ndarray, *,
             region_prior: bool = False) -> np.ndarray:
     """Compute `crlb` for a measurement model, which keeps its whitener for further calls."""
-    information = without_nuisance(joint_information_of(model, positions)).information
+    information = without_nuisance(
+        joint_information_of(model, positions), model.scenario).information
     if region_prior:
         information = information + region_information(model.scenario)
     return np.trace(inverse_information(information), axis1=1, axis2=2)
 
 
-def without_nuisance(joint: np.ndarray) -> Marginal:
-    """Integrate `joint_information_of` over nuisance parameters with priors of unit variance."""
-    prior = np.diag(np.repeat([0.0, 1.0], [3, joint.shape[1] - 3]))
+def without_nuisance(joint: np.ndarray, scenario: Scenario) -> Marginal:
+    """Integrate `joint_information_of` over nuisance parameters with their priors."""
+    prior = np.diag(np.concatenate([np.zeros(3), nuisance_of(scenario).precision]))
     return marginalise(joint + prior, np.zeros(joint.shape[:2]))
 
 

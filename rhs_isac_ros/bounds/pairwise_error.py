@@ -1,9 +1,9 @@
 """Error from confusing distant positions, which the local Cramer-Rao bound does not include.
 
-The phases of the bands may be unknown: theta = A z, with standard normal z. The distance between
-whitened signals is then the minimum over z of ``sum_i 2 |a_i exp(i theta_i) - b_i|^2 + |z|^2``.
-For close positions, it agrees with the marginal Fisher information. If the signals differ only in
-the phases of their bands, at most the cost ``|z|^2`` remains, which vanishes as A grows.
+The phases of the bands may be unknown: theta = A z, where z has the information P of its prior.
+The distance between whitened signals is then the minimum over z of ``sum_i 2 |a_i exp(i theta_i) -
+b_i|^2 + z^T P z``. For close positions, it agrees with the marginal Fisher information. If the
+signals differ only in the phases of their bands, at most the cost ``z^T P z`` remains.
 """
 
 import copy
@@ -55,7 +55,7 @@ class PairwiseErrorCost(Average):
             raise ValueError(
                 f'weights: shape {weights.shape}, expected {(n,)}, none negative or NaN')
         self._costs = weights * np.sum((first_positions - second_positions)**2, axis=1)
-        self._scales = nuisance_of(scenario).scaled_phases
+        self._scales, self._precision = nuisance_of(scenario).scaled_phases
 
         def gains(block: slice, band: int) -> list[np.ndarray]:
             return [_repeated_gain(scenario, first_positions[block], band),
@@ -120,7 +120,8 @@ class PairwiseErrorCost(Average):
         first = np.arange(0, forms.shape[1], 3)
         turned, second = first + 1, first + 2
         phases, penalties = best_phases(
-            forms[:, first, second] + 1j * forms[:, turned, second], self._scales)
+            forms[:, first, second] + 1j * forms[:, turned, second], self._scales,
+            self._precision)
         # The phases minimise the value, so their changes do not contribute to its derivative.
         slopes = np.zeros(forms.shape)
         slopes[:, first, first] = slopes[:, second, second] = 1.0
@@ -130,24 +131,25 @@ class PairwiseErrorCost(Average):
         return np.maximum(squares, 0.0), slopes
 
 
-def best_phases(products: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def best_phases(products: np.ndarray, scales: np.ndarray, precision: np.ndarray
+                ) -> tuple[np.ndarray, np.ndarray]:
     """Find phases theta that bring signals a close to signals b: the better of two local minima.
 
-    `products` are 2 a_i^H b_i of the whitened signals, complex128 [n, N_B], and `scales` is the
-    matrix A, float64 [N_B, Q] [rad]. Returns theta, float64 [n, N_B] [rad], and the cost ``|z|^2``
-    of these phases, float64 [n].
+    `products` are 2 a_i^H b_i of the whitened signals, complex128 [n, N_B], `scales` is the matrix
+    A, float64 [N_B, Q] [rad], and `precision` the diagonal of P, float64 [Q]. Returns theta,
+    float64 [n, N_B] [rad], and the cost ``z^T P z`` of these phases, float64 [n].
     """
     magnitude, angle = np.abs(products), np.angle(products)
     # The magnitudes bound the curvatures of the cosines, so these steps do not overshoot.
-    curvature = np.einsum('bq,nb,bp->nqp', scales, magnitude, scales) + np.eye(scales.shape[1])
+    curvature = np.einsum('bq,nb,bp->nqp', scales, magnitude, scales) + np.diag(precision)
     inverse = np.linalg.inv(curvature)
     candidates = []
     # If A is small, the best z is near 0; if A is large, the phases are near the products' angles.
     for z in (np.zeros((len(products), scales.shape[1])), angle @ np.linalg.pinv(scales).T):
         for _ in range(_STEPS):
-            slope = (magnitude * np.sin(z @ scales.T - angle)) @ scales + z
+            slope = (magnitude * np.sin(z @ scales.T - angle)) @ scales + precision * z
             z = z - np.einsum('nqp,np->nq', inverse, slope)
-        penalty = np.sum(z**2, axis=1)
+        penalty = z**2 @ precision
         phases = z @ scales.T
         cost = penalty - 2 * np.sum(magnitude * np.cos(phases - angle), axis=1)
         candidates.append((cost, phases, penalty))

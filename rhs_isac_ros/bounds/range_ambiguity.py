@@ -102,11 +102,12 @@ def _differences(
     """Return the smallest whitened differences, real [n, 2 N_B R], and costs of the phases [n]."""
     means, jacobians = model.mean_and_jacobian(confused)
     means, jacobians, target = model.whiten(means), model.whiten(jacobians), model.whiten(mean)
-    scales, penalties = nuisance_of(model.scenario).scaled_phases, np.zeros(len(confused))
+    (scales, precision), penalties = (
+        nuisance_of(model.scenario).scaled_phases, np.zeros(len(confused)))
     slopes = jacobians
     if scales.size:
         products = 2 * np.sum(np.conj(means) * target, axis=2)
-        phases, penalties = best_phases(products, scales)
+        phases, penalties = best_phases(products, scales, precision)
         turns = np.exp(1j * phases)[..., None]
         means, jacobians = turns * means, turns[:, None] * jacobians
         # Displacements and phases can compensate for each other.
@@ -115,8 +116,8 @@ def _differences(
     difference, directions = _real(means - target), _real(slopes)
     by_position = np.einsum('nur,nr->nu', directions, difference)
     information = np.einsum('nur,nvr->nuv', directions, directions)
-    # `information` is half the curvature, to which the prior of the phases adds 1.
-    information[:, 3:, 3:] += np.eye(scales.shape[1]) / 2
+    # `information` is half the curvature, to which the prior of the phases adds its own.
+    information[:, 3:, 3:] += np.diag(precision) / 2
     displacement = step_to_maximum(information, by_position)
     return difference - np.einsum('nu,nur->nr', displacement, directions), penalties
 

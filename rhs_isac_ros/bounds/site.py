@@ -22,7 +22,8 @@ def site_information(surfaces: Iterable[MeasurementModel], positions: np.ndarray
     for model in surfaces:
         pose = model.scenario.pose
         joint = joint_information_of(model, pose.to_surface(positions))
-        information = pose.covariances_to_site(without_nuisance(joint).information)
+        information = pose.covariances_to_site(
+            without_nuisance(joint, model.scenario).information)
         # The errors of the pose add their covariance to the inverse of the information.
         widened = np.eye(3) + np.matmul(information, pose.spread(positions))
         total += np.linalg.solve(widened, information)

@@ -167,7 +167,8 @@ def initial_values(nuisance: Nuisance, white: np.ndarray, white_mean: np.ndarray
         turns = nuisance.phases[:, q]
         output = outputs[:, turns != 0].sum(axis=1)
         turn, magnitude = turns[turns != 0].mean(), 2 * np.abs(output)
-        values[:, q] = turn * magnitude * np.angle(output) / (turn**2 * magnitude + 1)
+        values[:, q] = turn * magnitude * np.angle(output) / (
+            turn**2 * magnitude + nuisance.precision[q])
         outputs = outputs * np.exp(-1j * values[:, q, None] * turns)
     return values
 
@@ -178,13 +179,15 @@ def refined_values(nuisance: Nuisance, values: np.ndarray, signals: np.ndarray, 
     aligned = nuisance.divide(signals, values)
     slopes = whiten(nuisance.derivatives(aligned, mean))
     residual = whiten(aligned) - whiten(mean)
-    gradient = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), residual).real - values
-    return values + step_to_maximum(_curvature(slopes), gradient)
+    gradient = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), residual).real
+    gradient -= nuisance.precision * values
+    return values + step_to_maximum(_curvature(nuisance, slopes), gradient)
 
 
-def _curvature(slopes: np.ndarray) -> np.ndarray:
+def _curvature(nuisance: Nuisance, slopes: np.ndarray) -> np.ndarray:
     """Return the curvature [N, Q, Q] that results from whitened slopes and the prior."""
-    return quadratic_form(slopes.reshape(*slopes.shape[:2], -1)) + np.eye(slopes.shape[1])
+    curvature = quadratic_form(slopes.reshape(*slopes.shape[:2], -1))
+    return curvature + np.diag(nuisance.precision)
 
 
 def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
@@ -297,7 +300,7 @@ class PilotStatistics:
                        for band, columns in enumerate(part.columns))
         coupling = 2 * np.concatenate([coupling.real, -coupling.imag], axis=2)
         of_signals = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), part.whiten(signals)).real
-        regression = np.linalg.solve(_curvature(slopes), coupling)
+        regression = np.linalg.solve(_curvature(self._nuisance, slopes), coupling)
         flat = regression.reshape(-1, regression.shape[2])
         return coupling.reshape(flat.shape).T @ flat, of_signals.reshape(-1) @ flat
 

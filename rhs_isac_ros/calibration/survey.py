@@ -283,9 +283,9 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     of the errors, [N] each.
     """
     mean, by_position = model.mean_and_jacobian(positions)
-    slopes = np.concatenate(
-        [by_position, nuisance_of(model.scenario).scaled_patterns * mean[:, None]], axis=1)
-    prior = np.eye(slopes.shape[1])
+    nuisance = nuisance_of(model.scenario)
+    slopes = np.concatenate([by_position, nuisance.scaled_patterns * mean[:, None]], axis=1)
+    prior = np.diag(np.concatenate([np.zeros(3), nuisance.precision]))
     prior[:3, :3] = region_information(model.scenario)
     energies, without, distances = np.empty((3, len(positions)))
     for rows in places:

@@ -48,9 +48,8 @@ def nuisance(
     cannot dominate the average. The scenario may declare further nuisance parameters. `rng` and
     `prior` are unused.
     """
-    uniform = dataclasses.replace(
-        scenario, band_phase_std_rad=max(scenario.band_phase_std_rad, 2 * np.pi))
-    return AverageCrlb(uniform, positions, ROW_TOLERANCE, region_prior=True, tick=tick)
+    unknown = dataclasses.replace(scenario, band_phase_std_rad=np.inf)
+    return AverageCrlb(unknown, positions, ROW_TOLERANCE, region_prior=True, tick=tick)
 
 
 def ambiguity(

@@ -5,6 +5,8 @@ signals of a cycle are Gaussian. Each of the numbers is a nuisance parameter x w
 the signals are multiplied by ``exp(x P)``. A real exponent is a gain in nepers, an imaginary one a
 phase. The factor applies to the direct path and to the multipath, but not to the thermal noise.
 The exponential wraps phases: with a standard deviation of a whole turn, a phase is nearly uniform.
+An unknown phase is uniform, and so is an unknown offset over the period of its phases. An unknown
+gain has no distribution: simulated signals have a gain of 1, which estimators do not know.
 
 Simulation, estimators, bounds and calibration depend only on the interface `Impairment`. A new
 impairment is a plug-in of the group ``rhs_isac_ros.impairments``, or a `Factor` in `BUILT_IN` with
@@ -14,6 +16,7 @@ a field of the scenario that declares it.
 import dataclasses
 import enum
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -28,6 +31,11 @@ from rhs_isac_ros.support import plugins
 
 # Standard deviation above which a wrapped phase is treated as uniform [rad].
 UNIFORM_STD_RAD = 2.0
+# Standard deviation below which the tails of a wrapped phase do not overlap, points of its density
+# around the circle, and smallest information relative to a Gaussian's. It keeps matrices regular.
+_SEPARATE_STD_RAD, _CIRCLE, NO_INFORMATION = 0.25, 256, 1e-12
+# Relative deviation of phases from whole multiples of the smallest one.
+_ROUNDING = 1e-9
 
 
 class Scope(enum.Enum):
@@ -45,6 +53,8 @@ class Linear(NamedTuple):
     #: Whether the likelihood of a value has several maxima within its prior. Estimators then
     #: compare values on a grid before they refine one.
     needs_search: bool = False
+    #: Whether the values have no prior. L then only sets their units.
+    is_unknown: bool = False
 
 
 class Impairment:
@@ -100,28 +110,86 @@ class Nuisance(Exponents):
     dimensionless. `patterns` and `scaled_patterns`, complex128 [Q, N_B, N_SB F], are the exponents
     per unit of x and of z. `needs_search`, bool [Q], is the flag of `Linear` for each parameter.
     `phases`, float64 [N_B, Q], is the phase of each band per unit of z; it is 0 for every
-    parameter that does more than rotate the phases of whole bands.
+    parameter that does more than rotate the phases of whole bands. `precision`, float64 [Q], is
+    the information of the prior about z, from `NO_INFORMATION` to 1; see `wrapped_precision`.
+    `period`, float64 [Q], is the change of z that does not change the factors; infinite if there
+    is none. Parameters without information, whose effect others have as well, are left out of
+    everything but `patterns`.
     """
 
     def __init__(self, scenario: Scenario, parts: Sequence[Linear]) -> None:
         none = np.zeros((0, *_shape(scenario)), complex)
         self.patterns = read_only(np.concatenate([none, *(part.patterns for part in parts)]))
-        self.scaled_patterns = read_only(np.concatenate([none, *(
-            np.tensordot(part.root.T, part.patterns, axes=1) for part in parts)]))
-        self.needs_search = np.repeat(
-            [part.needs_search for part in parts], [len(part.root) for part in parts]).astype(bool)
+        scaled = np.concatenate([none, *(
+            np.tensordot(part.root.T, part.patterns, axes=1) for part in parts)])
+        needs_search, is_unknown = (
+            np.repeat(flags, [len(part.root) for part in parts]).astype(bool) for flags in (
+                [part.needs_search for part in parts], [part.is_unknown for part in parts]))
+        steps = np.array([_phase_step(pattern) for pattern in scaled])
+        precision = np.where(is_unknown, 0.0, [
+            wrapped_precision(step) for step in steps])
+        precision = np.maximum(precision, NO_INFORMATION)
+        kept = _independent(scaled, precision)
+        self.scaled_patterns, self.precision = read_only(scaled[kept]), read_only(precision[kept])
+        self.needs_search = needs_search[kept]
+        with np.errstate(divide='ignore'):
+            self.period = read_only(2 * np.pi / steps[kept])
         self.moves_multipath = np.ptp(self.scaled_patterns, axis=2).any(axis=1)
         turns = ~self.moves_multipath & ~self.scaled_patterns.real.any(axis=(1, 2))
         self.phases = read_only(np.where(turns, self.scaled_patterns[:, :, 0].imag.T, 0.0))
 
     @property
-    def scaled_phases(self) -> np.ndarray:
-        """The columns of `phases` that are not zero, float64 [N_B, q]."""
-        return self.phases[:, self.phases.any(axis=0)]
+    def scaled_phases(self) -> tuple[np.ndarray, np.ndarray]:
+        """The columns of `phases` that are not zero, float64 [N_B, q], and their `precision`."""
+        turns = self.phases.any(axis=0)
+        return self.phases[:, turns], self.precision[turns]
 
     def factors(self, values: np.ndarray) -> np.ndarray:
         """Compute the factors exp(x P) for values x [..., Q], complex128 [..., N_B, N_SB F]."""
         return np.exp(np.tensordot(values, self.patterns, axes=1))
+
+
+def wrapped_precision(std_rad: float) -> float:
+    """Return the information of a wrapped normal prior of a phase in standard deviations, 0 to 1.
+
+    The Fisher information about the location of the density is this divided by std^2: about
+    1 / std^2 for small standard deviations, and 2 exp(-std^2) for large ones.
+    """
+    if std_rad < _SEPARATE_STD_RAD:
+        return 1.0
+    # On a circle, equal weights integrate smooth functions up to rounding errors.
+    angle = np.arange(_CIRCLE) * (2 * np.pi / _CIRCLE)
+    order = np.arange(1, math.ceil(9 / std_rad) + 1)
+    harmonic = 2 * np.exp(-(std_rad * order)**2 / 2)
+    density = 1 + np.cos(np.outer(angle, order)) @ harmonic
+    slope = np.sin(np.outer(angle, order)) @ (order * harmonic)
+    return std_rad**2 * float(np.mean(slope**2 / np.maximum(density, np.finfo(float).eps)))
+
+
+def _phase_step(pattern: np.ndarray) -> float:
+    """Return the phase [rad] of which all imaginary exponents are whole multiples, or 0."""
+    turns = np.abs(pattern.imag[pattern != 0])
+    if not turns.size or pattern.real.any():
+        return 0.0
+    multiples = turns / turns.min()
+    is_whole = np.abs(multiples - np.round(multiples)) <= _ROUNDING * multiples
+    return float(turns.min()) if is_whole.all() else 0.0
+
+
+def _independent(scaled: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    """Mark parameters with a prior, and a largest set of independent ones without, bool [Q]."""
+    kept = precision > NO_INFORMATION
+    basis: list[np.ndarray] = []
+    width = math.prod(scaled.shape[1:])
+    columns = np.ascontiguousarray(scaled).reshape(len(scaled), width).view(float)
+    # The phases of the bands come last; the others only follow from them.
+    for row in np.flatnonzero(~kept)[::-1]:
+        rest = columns[row] - sum((column @ columns[row]) * column for column in basis)
+        length = np.linalg.norm(rest)
+        if length > _ROUNDING * np.linalg.norm(columns[row]):
+            kept[row] = True
+            basis.append(rest / length)
+    return kept
 
 
 def _carrier_offset(scenario: Scenario) -> np.ndarray:
@@ -153,13 +221,26 @@ class Factor(Impairment):
     scope: Scope = Scope.CYCLE
 
     def std(self, scenario: Scenario) -> float:
-        """Return the standard deviation that the scenario declares, in the unit of the values."""
+        """Return the declared standard deviation in the unit of the values, or infinity."""
         return float(getattr(scenario, self.field)) * self.unit
 
     def linear(self, scenario: Scenario) -> Linear:
-        """Return the exponents and the prior."""
-        patterns = self.patterns(scenario)
-        return Linear(patterns, self.std(scenario) * np.eye(len(patterns)), self.needs_search)
+        """Return the exponents and the prior.
+
+        The unit of an unknown value is the period of its phases, so that normal numbers are
+        uniform in it, or 1.
+        """
+        patterns, std = self.patterns(scenario), self.std(scenario)
+        is_unknown = std == math.inf
+        if is_unknown:
+            std = 2 * np.pi / (_phase_step(patterns[0]) or 2 * np.pi)
+        return Linear(patterns, std * np.eye(len(patterns)), self.needs_search, is_unknown)
+
+    def values(self, scenario: Scenario, white: np.ndarray) -> np.ndarray:
+        """Map standard normal numbers [n, q] to values; an unknown gain is 0 dB."""
+        linear = self.linear(scenario)
+        has_distribution = not linear.is_unknown or linear.patterns.imag.any()
+        return has_distribution * (white @ linear.root.T)
 
 
 BUILT_IN: tuple[Factor, ...] = (

@@ -18,7 +18,7 @@ from rhs_isac_ros.model.hall import MultipathEstimate, PathChannel
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.errors import translated
-from rhs_isac_ros.support.fields import Field, to_number
+from rhs_isac_ros.support.fields import UNKNOWN, Field, to_number
 from rhs_isac_ros.support.files import read_yaml
 from rhs_isac_ros.support.plugins import PluginError
 
@@ -32,7 +32,7 @@ class ScenarioError(ValueError):
 
 def declare(
         default: Any, low: float, high: float, text: str, unit: str = '', source: str = '', *,
-        label: str) -> Any:
+        label: str, has_unknown: bool = False) -> Any:
     """Declare a scenario field.
 
     `low` and `high` are inclusive. `source` cites the publication that defines this part of the
@@ -41,7 +41,8 @@ def declare(
     """
     kind = int if isinstance(default, int) else float
     return dataclasses.field(default=default, metadata={
-        'declared': Field(kind, text, unit, low, high), 'source': source, 'label': label})
+        'declared': Field(kind, text, unit, low, high, has_unknown=has_unknown),
+        'source': source, 'label': label})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +109,9 @@ class Extensions:
 
     Standard deviations describe Gaussians with zero mean. Phases are wrapped to the circle: with a
     standard deviation of 2 pi or more, a phase is practically uniform, because its mean resultant
-    length, exp(-std^2 / 2), is below 3e-9.
+    length, exp(-std^2 / 2), is below 3e-9. A gain, phase or offset may also be ``unknown``, or
+    infinity, and then has no prior: an unknown phase or offset is uniform, and an unknown gain has
+    no distribution.
 
     Gain, carrier offset and blockage of a user are drawn once per user, phases and the timing
     offset once per cycle, and element errors and failures once per surface.
@@ -129,33 +132,33 @@ class Extensions:
         "Standard deviation of the gain of a user, log-normal, in addition to user_gain: "
         'transmit power, antenna and shadowing. It acts on the direct path and on the multipath.',
         'dB', 'log-normal shadow fading, 3GPP TR 38.901, section 7.4',
-        label='user gain, standard deviation')
+        label='user gain, standard deviation', has_unknown=True)
     phase_std_rad: float = declare(
         0.0, 0.0, 1e3,
         'Standard deviation of a phase that all bands of a cycle share; 6.2832 for a uniform '
         'phase.', 'rad',
         'wrapped normal distribution, Mardia and Jupp, Directional Statistics, 2000, '
-        'section 3.5', label='common phase, standard deviation')
+        'section 3.5', label='common phase, standard deviation', has_unknown=True)
     band_phase_std_rad: float = declare(
         0.0, 0.0, 1e3,
         'Standard deviation of a phase that each band of a cycle draws independently, as after '
         'retuning an oscillator; 6.2832 for a uniform phase.', 'rad',
         'wrapped normal distribution, Mardia and Jupp, Directional Statistics, 2000, '
-        'section 3.5', label='phase of a band, standard deviation')
+        'section 3.5', label='phase of a band, standard deviation', has_unknown=True)
     timing_std_s: float = declare(
         0.0, 0.0, 1.0,
         'Standard deviation of the sampling-time offset of a cycle, which adds a phase that is '
         'linear over the sub-bands.', 's',
         'Speth, Fechtel, Fock and Meyr, Optimum receiver design for wireless broad-band systems '
         'using OFDM, part I, IEEE Trans. Commun. 47 (11), 1999',
-        label='timing offset, standard deviation')
+        label='timing offset, standard deviation', has_unknown=True)
     carrier_offset_std_hz: float = declare(
         0.0, 0.0, 1e9,
         "Standard deviation of the carrier frequency offset of a user's oscillator. The offset is "
         'the same in all bands and adds a phase that is linear over the frames of a band.', 'Hz',
         'Moose, A technique for orthogonal frequency division multiplexing frequency offset '
         'correction, IEEE Trans. Commun. 42 (10), 1994',
-        label='carrier offset, standard deviation')
+        label='carrier offset, standard deviation', has_unknown=True)
     element_error_rms: float = declare(
         0.0, 0.0, 1.0,
         'RMS of the complex error of an element coefficient relative to its value; the error is '
@@ -394,6 +397,8 @@ def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) 
 def _plain(value: Any) -> Any:
     if isinstance(value, External | str):
         return str(value)
+    if isinstance(value, float) and value == np.inf:
+        return UNKNOWN
     if isinstance(value, Pose):
         return {name: _plain(entry) for name, entry in dataclasses.asdict(value).items()}
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value

@@ -29,6 +29,8 @@ LIMIT = 0.5
 BLOCKED_LIMIT = 0.05
 # Largest plausible level of the multipath of a blocked user, in standard deviations.
 _LEVEL_REACH = 3.0
+# Standard deviation that represents an unknown gain in the level of a blocked user [dB].
+_UNKNOWN_GAIN_DB = 40.0
 _MIN_PROBABILITY = 1e-12
 # Smallest probability of an alternative that is reported.
 _MIN_DOUBT = 0.01
@@ -91,10 +93,14 @@ class Blocked:
         """Compute the log evidence from the energies of the signals; see `Outside`."""
         energy = np.array([residual, np.sum(np.abs(whitened)**2)])
         # The gain of the user is part of the level.
-        std_db = math.hypot(BLOCKED_STD_DB, self._std_db, prior.gain_std / NEPERS_PER_DB)
+        gain_db = min(prior.gain_std / NEPERS_PER_DB, _UNKNOWN_GAIN_DB)
+        std_db = math.hypot(BLOCKED_STD_DB, self._std_db, gain_db)
         in_sight, blocked = (
             float(log_evidence_of_level(energy[[index]], whitened.size, std, self._median_db)[0])
             for index, std in enumerate((self._std_db, std_db)))
+        if prior.gain_std:
+            # Relative to the density of an unknown gain that positions assume.
+            blocked += math.log(gain_db * NEPERS_PER_DB / prior.gain_unit)
         return blocked - (in_sight + residual) + prior.log_evidence_of_aligned(aligned)
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
@@ -176,14 +182,26 @@ class Outside:
         for the others. `whitened`, complex128 [N_B, N_SB F], are the signals of one shot without
         the factors of `aligned`. `residual` is the residual energy at the best position inside.
         """
-        gain = np.zeros(1)
-        if prior.gain_std:
-            n_points = 2 * int(np.ceil(GRID.gain_reach * prior.gain_std / GRID.gain_step)) + 3
-            gain = prior.gain_std * np.linspace(-GRID.gain_reach, GRID.gain_reach, n_points)
+        known = prior.log_evidence_of_aligned(aligned)
+        if not prior.gain_std:
+            return float(self.log_evidence(whitened)[0]) + known
+        low, high = self._gain_limits(whitened, prior.gain_std)
+        gain, step = np.linspace(
+            low, high, 3 + int(np.ceil((high - low) / GRID.gain_step)), retstep=True)
         evidence = self.log_evidence(whitened, np.exp(-gain)) - 2 * whitened.size * gain
-        weights = -gain**2 / (2 * (prior.gain_std or 1.0)**2)
-        return (log_sum(evidence + weights) - log_sum(weights)
-                + prior.log_evidence_of_aligned(aligned))
+        log_density = -(gain / prior.gain_std)**2 / 2 - np.log(2 * np.pi) / 2
+        return (log_sum(evidence + log_density) + math.log(step / prior.gain_unit) + known)
+
+    def _gain_limits(self, whitened: np.ndarray, std: float) -> tuple[float, float]:
+        """Return limits of the gain [nepers] beyond which its posterior is negligible."""
+        # Without a prior, the most likely gain makes the energy of all signals, or of what no
+        # position explains in them, equal to that of noise.
+        energy, n = float(np.sum(np.abs(whitened)**2)), whitened.size
+        filtered = np.sum(self._filter(whitened), axis=0)**2 / self._node_energy
+        rest = max(energy - float(filtered.max()), n * _MIN_PROBABILITY)
+        reach, margin = GRID.gain_reach * std, GRID.gain_reach / math.sqrt(n)
+        low, high = (math.log(part / n) / 2 for part in (rest, energy))
+        return max(min(low - margin, 0.0), -reach), min(max(high + margin, 0.0), reach)
 
     def log_evidence(self, whitened: np.ndarray, scales: Iterable[float] = (1.0,)) -> np.ndarray:
         """Return the log of the mean of ``exp(-|s y - t|^2)`` over the prior for each scale s.

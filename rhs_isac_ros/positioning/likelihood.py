@@ -19,7 +19,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import adjoint, mixture_weights
+from rhs_isac_ros.model.arrays import adjoint, blocks, mixture_weights
 from rhs_isac_ros.model.gaussian import (
     covariance_root,
     marginalise,
@@ -33,6 +33,7 @@ from rhs_isac_ros.model.impairments import (
     nuisance_of,
 )
 from rhs_isac_ros.model.measurement import KnownSurface
+from rhs_isac_ros.model.scenario import ScenarioError
 from rhs_isac_ros.positioning.lattice import Resolution
 
 # Standard deviation of a Gaussian whose density at its centre equals that of a uniform phase.
@@ -51,6 +52,8 @@ class _Search(NamedTuple):
     # Grid on which parameters with several maxima are compared.
     reach: float = 4.0  # In standard deviations.
     points: tuple[int, ...] = (513, 49, 13, 5)  # Per parameter, for 1, 2, 3 and more parameters.
+    points_per_turn: int = 6  # Of the phase between two measurements, if these are more.
+    block: int = 1 << 20  # Number of complex numbers at a time.
     refinements: int = 4  # Of the best point.
     # Errors of the estimates, in standard deviations, whose effect the margin covers, and largest
     # margin. Nearby users have stronger signals than the average, on which the effect depends.
@@ -138,7 +141,10 @@ class NuisancePrior(Exponents):
     is_coarse: bool  #: Whether every band is given a uniform phase, by the last parameters.
     needs_search: np.ndarray  #: As in `Nuisance`, bool [Q].
     phases: np.ndarray  #: Phase of each band per unit [rad], float64 [N_B, Q].
-    precision: np.ndarray  #: Inverse variance of the prior, 0 for a uniform phase, float64 [Q].
+    #: Information of the prior, as in `Nuisance`, but 0 for a uniform phase, float64 [Q].
+    precision: np.ndarray
+    #: Half of the change of a parameter that does not change the signals, float64 [Q].
+    half_period: np.ndarray
     information: np.ndarray  #: Contribution of the model's covariance, float64 [Q, Q].
 
     def __init__(self, model: MeasurementModel) -> None:
@@ -159,7 +165,14 @@ class NuisancePrior(Exponents):
         uniform = largest > UNIFORM_STD_RAD
         scale = np.where(uniform, _UNIFORM_EQUIVALENT / np.where(uniform, largest, 1.0), 1.0)
         self.scaled_patterns, self.phases = patterns * scale[:, None, None], phases * scale
-        self.precision = np.where(uniform, 0.0, 1.0)
+        precision, period = (np.append(values[kept], np.zeros(len(turns)))
+                             for values in (declared.precision, declared.period))
+        if (self.scenario.timing_std_s == np.inf and self.scenario.n_subbands % 2 == 0
+                and not np.isinf(self.phase_std_rad).all()):
+            raise ScenarioError(
+                'timing_std_s: unknown, expected an unknown phase_std_rad or band_phase_std_rad '
+                'as well: half a period of the timing turns all phases by half a turn')
+        self.precision, self.half_period = np.where(uniform, 0.0, precision), period / 2
         self._operators = self._multiplying(model.root, model.whitener)
         self.information = self.information_of(model.root, model.whitener)
 
@@ -169,10 +182,23 @@ class NuisancePrior(Exponents):
         return self.scaled_patterns.real.mean(axis=(1, 2))
 
     @functools.cached_property
+    def gain_unit(self) -> float:
+        """Gain [nepers] per unit of its density; the standard deviation unless it is unknown."""
+        return float(np.linalg.norm(self.gain))
+
+    @functools.cached_property
     def gain_std(self) -> float:
-        """Standard deviation of the gain of all signals [nepers]; 0 if it is negligible."""
-        gain_std = float(np.linalg.norm(self.gain))
+        """Standard deviation of the gain of all signals [nepers]; 0 if it is negligible.
+
+        It is far above `gain_unit` if the gain has no prior.
+        """
+        gain_std = float(np.sqrt(self.gain @ self._gain_variance))
         return gain_std if gain_std > _MIN_GAIN_STD else 0.0
+
+    @functools.cached_property
+    def _gain_variance(self) -> np.ndarray:
+        """Covariance of the parameters with the gain of all signals [nepers], float64 [Q]."""
+        return self.gain / np.where(self.gain == 0, 1.0, self.precision)
 
     @functools.cached_property
     def volume(self) -> np.ndarray:
@@ -276,7 +302,7 @@ class NuisancePrior(Exponents):
         variance = np.where(self.precision > 0, 1.0, 1e6)
         spread = self.phases * variance
         values: np.ndarray = (spread.T @ np.linalg.pinv(spread @ self.phases.T) @ angles).T
-        values += np.outer(gain, self.gain) / max(self.gain_std, _MIN_GAIN_STD)**2
+        values += np.outer(gain, self._gain_variance) / max(self.gain_std, _MIN_GAIN_STD)**2
         return values
 
 
@@ -547,12 +573,19 @@ class Alignment:
         prior = self._prior
         (searched,) = np.nonzero(prior.needs_search)
         n_grid = _SEARCH.points[min(len(searched), len(_SEARCH.points)) - 1]
-        line = np.linspace(-_SEARCH.reach, _SEARCH.reach, n_grid)
-        grid = np.stack(np.meshgrid(*[line] * len(searched), indexing='ij'), axis=-1)
-        candidates = np.zeros((n_grid**len(searched), len(prior)))
+        # Beyond half a period, the signals repeat.
+        reach = np.minimum(_SEARCH.reach, prior.half_period[searched])
+        turns = reach * np.ptp(prior.scaled_patterns[searched].imag, axis=(1, 2))
+        counts = np.maximum(n_grid, np.ceil(_SEARCH.points_per_turn * turns / np.pi)).astype(int)
+        lines = [np.linspace(-most, most, n)
+                 for most, n in zip(reach, counts.tolist(), strict=True)]
+        grid = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1)
+        candidates = np.zeros((grid[..., 0].size, len(prior)))
         candidates[:, searched] = grid.reshape(len(candidates), -1)
-        signals = self._whitened(prior.divide(received, candidates))
-        cost = np.sum(np.abs(signals)**2, axis=(1, 2))
+        parts = blocks(len(candidates), max(_SEARCH.block // received.size, 1))
+        cost = np.concatenate([np.sum(np.abs(
+            self._whitened(prior.divide(received, candidates[part])))**2, axis=(1, 2))
+            for part in parts])
         if prior.gain_std:
             cost = received.size * np.log(cost)
         cost += candidates**2 @ prior.precision / 2

@@ -190,8 +190,8 @@ def train(
     The seed determines the pairs, their order and the initial weights. `n_pairs` is at least 20,
     `n_hidden` is the number of hidden units, and `inputs` is a key of `INPUTS`. `progress` is
     called with the number of each epoch and its validation error [m^2]. Raises CodebookError if
-    the codebook does not fit the scenario, ValueError if a number is too small or the inputs are
-    unknown, and MissingLibraryError if scikit-learn is not installed.
+    the codebook does not fit the scenario, ValueError if a number is too small, or the inputs or
+    the gain are unknown, and MissingLibraryError if scikit-learn is not installed.
     """
     for name, value, minimum in (('n_pairs', n_pairs, 20), ('n_hidden', n_hidden, 1),
                                  ('max_epochs', max_epochs, 1)):
@@ -199,6 +199,10 @@ def train(
             raise ValueError(f'{name}: {value}, expected at least {minimum}')
     if inputs not in INPUTS:
         raise ValueError(f'inputs: {inputs!r}, expected one of {sorted(INPUTS)}')
+    if scenario.user_gain_std_db == np.inf:
+        raise ValueError(
+            'user_gain_std_db: unknown, expected a standard deviation: an unknown gain has no '
+            'distribution from which to draw examples')
     regressor = _regressor(n_hidden, seed)
     system = System(scenario, codebook)
     positions, received = system.pairs(n_pairs, seed)

@@ -17,6 +17,9 @@ from rhs_isac_ros.support import plugins
 DECIMAL = re.compile(
     r'[-+]?(?:0|[1-9][0-9]*)(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?|[-+]?\.[0-9]+(?:[eE][-+]?[0-9]+)?')
 
+# Text for a number without a known or assumed value.
+UNKNOWN = 'unknown'
+
 
 def to_number(value: Any, kind: type) -> Any:
     """Convert a real number to int or float, and return any other value unchanged.
@@ -52,6 +55,7 @@ class Field:
     high: float = math.inf
     is_open: bool = False  #: Whether `low` itself is invalid.
     choices: tuple[str, ...] = ()  #: Valid strings; if empty, all are valid.
+    has_unknown: bool = False  #: Whether infinity, also written 'unknown', is valid for a number.
     plugins: str = ''  #: Entry point group whose names are also valid; empty for none.
 
     WORDS: ClassVar[Mapping[type, str]] = {
@@ -72,7 +76,7 @@ class Field:
             words = f'above {low}' if self.is_open else f'at least {low}'
         else:
             return ''
-        return f'{words} {self.unit}'.rstrip()
+        return f'{words} {self.unit}'.rstrip() + self.has_unknown * f' or {UNKNOWN}'
 
     @property
     def expected(self) -> str:
@@ -84,7 +88,8 @@ class Field:
 
     def checked(self, name: str, value: Any) -> Any:
         """Return a number as the declared type; raise ValueError with `name` if it is invalid."""
-        value = to_number(value, self.kind)
+        is_unknown = self.has_unknown and isinstance(value, str) and value == UNKNOWN
+        value = math.inf if is_unknown else to_number(value, self.kind)
         if problem := self.problem(value):
             raise ValueError(f'{name}: {problem}')
         return value
@@ -97,7 +102,8 @@ class Field:
             return self._choice_problem(value)
         numbers = value if self.kind is list else [value] if self.kind in (int, float) else []
         if all(self.low <= number <= self.high and abs(number) < math.inf
-               and not (self.is_open and number == self.low) for number in numbers):
+               and not (self.is_open and number == self.low)
+               or self.has_unknown and number == math.inf for number in numbers):
             return ''
         return f'{value!r}, expected {self.range or "finite numbers"}'
 

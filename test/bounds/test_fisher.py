@@ -99,7 +99,7 @@ def test_nothing_declared_gives_the_plain_bound(case):
     model = MeasurementModel(case.scenario, case.codebook)
     joint = fisher.joint_information_of(model, positions)
     np.testing.assert_allclose(
-        fisher.without_nuisance(joint).information, case.vectors['fim'], rtol=1e-8,
+        fisher.without_nuisance(joint, case.scenario).information, case.vectors['fim'], rtol=1e-8,
         atol=1e-9 * np.abs(case.vectors['fim']).max())
     # An impairment too small to matter, through the code of nuisance parameters.
     tiny = dataclasses.replace(case.scenario, band_phase_std_rad=1e-9, user_gain_std_db=1e-9)
@@ -122,12 +122,36 @@ def test_the_bound_is_that_of_the_joint_information(uncertain, uncertain_codeboo
     steps = 1e-5 * np.eye(n_parameters)
     slopes = np.stack([(mean(step) - mean(-step)) / 2e-5 for step in steps])
     information = 2 * (slopes @ slopes.conj().T).real
-    information[3:, 3:] += np.eye(len(nuisance))
+    information[3:, 3:] += np.diag(nuisance.precision)
     expected = np.trace(np.linalg.inv(information)[:3, :3])
     assert crlb_of(model, position)[0] == pytest.approx(expected, rel=1e-5)
     information[:3, :3] += np.diag(12 / np.array(uncertain.roi_size_m)**2)
     expected = np.trace(np.linalg.inv(information)[:3, :3])
     assert crlb_of(model, position, region_prior=True)[0] == pytest.approx(expected, rel=1e-5)
+
+
+def test_an_unknown_phase_is_a_wrapped_one(table1):
+    """From half a turn on, a phase is uniform, whatever its standard deviation."""
+    bounds = [crlb(dataclasses.replace(table1.scenario, band_phase_std_rad=std), table1.codebook,
+                   table1.vectors['positions'], region_prior=True)
+              for std in (0.5, 2 * np.pi, 1e3, 'unknown')]
+    assert (bounds[0] < bounds[1]).all()
+    np.testing.assert_allclose(bounds[1:3], [bounds[3]] * 2, rtol=1e-6)
+    # The phases of the bands contain a common one.
+    both = dataclasses.replace(
+        table1.scenario, band_phase_std_rad='unknown', phase_std_rad='unknown')
+    np.testing.assert_allclose(crlb(both, table1.codebook, table1.vectors['positions'],
+                                    region_prior=True), bounds[3], rtol=1e-9)
+
+
+@pytest.mark.parametrize('name', DECLARED)
+def test_the_bound_of_an_unknown_value_is_the_limit_of_wide_priors(table1, name):
+    wide = {'user_gain_std_db': 60.0, 'carrier_offset_std_hz': 1e6, 'timing_std_s': 1e-4}
+    unknown, prior = (
+        crlb(dataclasses.replace(table1.scenario, **{name: value}), table1.codebook,
+             table1.vectors['positions'], region_prior=True)
+        for value in ('unknown', wide.get(name, 100.0)))
+    np.testing.assert_allclose(prior, unknown, rtol=1e-3)
 
 
 @pytest.mark.parametrize('declared', CASES, ids=lambda declared: '+'.join(declared)[:24])

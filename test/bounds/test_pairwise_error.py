@@ -204,15 +204,16 @@ def test_exact_differences_are_not_sampled(scenario, codebook, pairs):
     {'band_phase_std_rad': 6.3}, {'phase_std_rad': 0.5, 'band_phase_std_rad': 0.5}])
 def test_hardly_any_phases_are_better(phases):
     """Compared with a search over all phases."""
-    rng, scales = np.random.default_rng(0), nuisance_of(Scenario(**phases)).scaled_phases
+    rng, (scales, precision) = (
+        np.random.default_rng(0), nuisance_of(Scenario(**phases)).scaled_phases)
     products = rng.exponential(3.0, (50, 2)) * np.exp(2j * np.pi * rng.uniform(size=(50, 2)))
-    found, penalties = best_phases(products, scales)
+    found, penalties = best_phases(products, scales, precision)
     grid = np.linspace(-np.pi, np.pi, 181)
     if scales.shape[1] == 1:
         every = np.stack([grid, grid], axis=1)
     else:
         every = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-    inverse = np.linalg.pinv(scales @ scales.T)
+    inverse = np.linalg.pinv(scales / precision @ scales.T, rcond=1e-14)
 
     def cost(theta, penalty):
         return penalty - 2 * np.sum((products * np.exp(-1j * theta)).real, axis=-1)
@@ -233,10 +234,10 @@ def test_unknown_phases_minimise_the_distance(
     """Compared with the definition, evaluated on a grid of phases."""
     unknown, p = dataclasses.replace(scenario, **phases), plain(
         scenario, codebook.analog, codebook.digital)
-    scales = nuisance_of(unknown).scaled_phases
+    scales, precision = nuisance_of(unknown).scaled_phases
     z = np.stack(np.meshgrid(*[np.linspace(-2.5, 2.5, 41)] * scales.shape[1]), -1).reshape(
         -1, scales.shape[1])
-    turns, distances = np.exp(1j * z @ scales.T), np.tile(np.sum(z**2, axis=1), (N_PAIRS, 1))
+    turns, distances = np.exp(1j * z @ scales.T), np.tile(z**2 @ precision, (N_PAIRS, 1))
     for i, spatial in enumerate(multipath_covariance(scenario)):
         inverse = np.linalg.inv(p.covariance(i, spatial))
         for n, (first, second) in enumerate(zip(p.mean(pairs[0], i), p.mean(pairs[1], i),
@@ -257,5 +258,5 @@ def test_unknown_phases_minimise_the_distance(
 def test_small_phases_equal_the_linear_model():
     """Minimise |a (1 + i theta) - b|^2 with a prior: theta = 2 Im a^H b / (2 |a|^2 + 1 / s^2)."""
     products, scale = np.array([[4.0 * np.exp(1e-3j)]]), np.array([[0.7]])
-    (found,), _ = best_phases(products, scale)
+    (found,), _ = best_phases(products, scale, np.ones(1))
     assert found[0] == pytest.approx(4e-3 / (4 + 1 / 0.7**2), rel=1e-3)

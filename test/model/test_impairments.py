@@ -9,11 +9,13 @@ from impairment_checks import CHECKS
 from rhs_isac_ros.model import Linear, MeasurementModel, Scenario, Scope, simulate_received
 from rhs_isac_ros.model.impairments import (
     BUILT_IN,
+    NO_INFORMATION,
     Nuisance,
     draw_factors,
     draw_impairments,
     impairments_of,
     nuisance_of,
+    wrapped_precision,
 )
 from rhs_isac_ros.support.plugins import IMPAIRMENTS, PluginError
 
@@ -73,6 +75,54 @@ def test_a_phase_with_the_deviation_of_a_turn_is_uniform():
     factors = draw_factors(Scenario(phase_std_rad=2 * np.pi), 20_000, rng, rng)[:, 0, 0]
     assert abs(factors.mean()) < 4 / np.sqrt(20_000)
     assert abs((factors**2).mean()) < 4 / np.sqrt(20_000)
+
+
+@pytest.mark.parametrize('std', [0.1, 0.24, 0.26, 1.0, 2.0, 4.0])
+def test_the_prior_of_a_phase_has_the_information_of_the_wrapped_density(std):
+    """By finite differences of the density, as a sum over turns."""
+    angle = np.linspace(-np.pi, np.pi, 4001)[:-1]
+    turns = 2 * np.pi * np.arange(-9, 10)[:, None]
+    density = np.exp(-(angle + turns)**2 / (2 * std**2)).sum(axis=0)
+    density /= density.sum()
+    slope = (np.roll(density, -1) - np.roll(density, 1)) / (2 * np.pi / 2000)
+    information = np.sum(slope**2 / np.maximum(density, 1e-300))
+    assert wrapped_precision(std) == pytest.approx(std**2 * information, rel=1e-3)
+
+
+def test_the_information_of_a_wrapped_phase_has_the_known_limits():
+    assert wrapped_precision(1e-300) == 1
+    assert wrapped_precision(5.0) / 25 == pytest.approx(2 * np.exp(-25), rel=1e-6)
+    nuisance = nuisance_of(Scenario(band_phase_std_rad=3.0, user_gain_std_db=60.0))
+    np.testing.assert_allclose(nuisance.precision, [1, *[wrapped_precision(3.0)] * 2])
+
+
+def test_offsets_are_wrapped_like_phases():
+    scenario = Scenario(timing_std_s=3e-6, carrier_offset_std_hz=4e4)
+    steps = 2 * np.pi * np.array([4e4 * scenario.frame_duration_s,
+                                  3e-6 * scenario.subband_width_hz / 2])
+    nuisance = nuisance_of(scenario)
+    np.testing.assert_allclose(nuisance.period, 2 * np.pi / steps)
+    np.testing.assert_allclose(nuisance.precision, [wrapped_precision(step) for step in steps])
+
+
+def test_unknown_values_have_no_prior_and_are_uniform_over_a_period():
+    scenario = Scenario(**{one.field: 'unknown' for one in BUILT_IN})
+    nuisance = nuisance_of(scenario)
+    # The common phase follows from those of the bands.
+    assert len(nuisance) == 5
+    assert (nuisance.precision == NO_INFORMATION).all()
+    rng = np.random.default_rng(3)
+    factors = draw_factors(scenario, 10_000, rng, rng)
+    np.testing.assert_allclose(np.abs(factors), 1)
+    first = factors[:, 0].reshape(-1, 8, 4)
+    origin = first[:, 0, 0]
+    for uniform in (origin, first[:, 1, 0] / origin, first[:, 0, 1] / origin):
+        assert abs(uniform.mean()) < 4 / np.sqrt(10_000)
+        assert abs((uniform**2).mean()) < 4 / np.sqrt(10_000)
+    # A single measurement does not depend on offsets.
+    single = Scenario(
+        n_subbands=1, n_frames=1, timing_std_s='unknown', carrier_offset_std_hz='unknown')
+    assert len(nuisance_of(single)) == 0
 
 
 def test_a_seed_draws_the_same_values_whatever_is_declared():
@@ -174,7 +224,7 @@ def test_table_1_has_no_nuisance_parameters(table1):
     nuisance = nuisance_of(table1.scenario)
     assert len(nuisance) == 0
     assert nuisance.patterns.shape == nuisance.scaled_patterns.shape == (0, 2, 32)
-    assert nuisance.phases.shape == nuisance.scaled_phases.shape == (2, 0)
+    assert nuisance.phases.shape == nuisance.scaled_phases[0].shape == (2, 0)
     np.testing.assert_array_equal(nuisance.factors(np.zeros((3, 0))), np.ones((3, 2, 32)))
     rng = np.random.default_rng(0)
     assert draw_factors(table1.scenario, 5, rng, rng) is None
@@ -204,7 +254,7 @@ def test_only_parameters_that_turn_whole_bands_have_phases(every):
     np.testing.assert_array_equal(
         nuisance_of(every).phases, [[0, 0, 0.4, 0, 0.4, 0], [0, 0, 0.4, 0, 0, 0.4]])
     np.testing.assert_array_equal(
-        nuisance_of(every).scaled_phases, [[0.4, 0.4, 0], [0.4, 0, 0.4]])
+        nuisance_of(every).scaled_phases[0], [[0.4, 0.4, 0], [0.4, 0, 0.4]])
 
 
 def test_moves_and_phases_refer_to_standard_normal_numbers(install):

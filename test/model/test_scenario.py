@@ -92,6 +92,20 @@ def test_a_surface_has_one_or_two_numbers_of_elements():
     assert len({uneven.id, Scenario().id, Scenario(element_interval_wavelengths=0.4).id}) == 3
 
 
+def test_values_of_users_may_be_unknown(tmp_path):
+    (tmp_path / 'scenario.yaml').write_text('user_gain_std_db: unknown\nphase_std_rad: .inf\n')
+    scenario = Scenario.from_yaml(tmp_path / 'scenario.yaml')
+    assert scenario.user_gain_std_db == scenario.phase_std_rad == np.inf
+    assert scenario.changes() == {'user_gain_std_db': 'unknown', 'phase_std_rad': 'unknown'}
+    assert scenario == Scenario(**scenario.changes())
+    assert scenario.id != Scenario(user_gain_std_db='unknown').id
+    for name, value in (('element_error_rms', 'unknown'), ('delay_spread_s', np.inf)):
+        with pytest.raises(ScenarioError, match=f'^{name}: '):
+            Scenario(**{name: value})
+    with pytest.raises(ScenarioError, match='^user_gain_std_db: .*expected 0 to 60 dB or unknown'):
+        Scenario(user_gain_std_db=61)
+
+
 def test_bands_may_touch_but_not_overlap():
     Scenario(center_frequencies_hz=(28e9, 28.4e9), n_subbands=64, subband_width_hz=6.25e6)
     with pytest.raises(ScenarioError, match='^center_frequencies_hz: .* expected at least 4e'):

@@ -9,7 +9,7 @@ from scipy.special import chdtri
 from scipy.stats import qmc
 
 from rhs_isac_ros.bounds.fisher import fisher_information
-from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
+from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError, simulate_received
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.positioning import Tracker, make_estimator, weighted_modes
 from rhs_isac_ros.system import System
@@ -149,6 +149,7 @@ def share_covered(estimate, positions) -> float:
     {'phase_std_rad': 7.0}, {'band_phase_std_rad': 0.2},
     {'user_gain_std_db': 1.0, 'phase_std_rad': 0.5, 'carrier_offset_std_hz': 1e3},
     {'element_error_rms': 0.02},
+    {'carrier_offset_std_hz': 'unknown', 'phase_std_rad': 'unknown', 'timing_std_s': 'unknown'},
 ], ids=lambda changes: ' '.join(changes))
 def test_declared_impairments_leave_consistent_estimates(codebook, changes):
     """Undeclared, many of these signals have no fix or a wrong one."""
@@ -161,6 +162,27 @@ def test_declared_impairments_leave_consistent_estimates(codebook, changes):
     assert share_covered(estimate, positions) >= 0.88
     assert estimate.fix.all()
     assert 75 < np.median(estimate.residual) < 110
+
+
+def test_an_unknown_gain_needs_no_prior(codebook):
+    """Not even one that contains the gain, with or without other explanations of the signals."""
+    sent = dataclasses.replace(SINGLE_MODE, user_gain=30.0)
+    unknown = dataclasses.replace(
+        SINGLE_MODE, user_gain_std_db='unknown', blocked_probability=0.1)
+    positions = unknown.sample_positions(25, np.random.default_rng(2))
+    received = MeasurementModel(sent, codebook).sample(positions, np.random.default_rng(3))
+    for reject_outside in (False, True):
+        estimate = make_estimator(
+            'bayes', unknown, codebook, reject_outside=reject_outside).estimate(received)
+        assert estimate.fix.all()
+        assert share_covered(estimate, positions) >= 0.88
+        assert np.nanmax(estimate.blocked_probability) < 0.05
+
+
+def test_an_unknown_timing_requires_an_unknown_phase(codebook):
+    with pytest.raises(ScenarioError, match='^timing_std_s: unknown, expected an unknown phase'):
+        make_estimator(
+            'bayes', dataclasses.replace(SINGLE_MODE, timing_std_s='unknown'), codebook)
 
 
 @pytest.mark.parametrize('std', [1e-300, 1e-12])
