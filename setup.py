@@ -49,7 +49,7 @@ setup(
         'experiments': ['joblib', 'dask', 'distributed', 'tqdm'],
         'neural': ['scikit-learn'],
         'genetic': ['pymoo'],
-        'recording': ['mcap'],
+        'recording': ['mcap>=1.6'],
         'samples': ['sigmf'],
         'watch': ['rich'],
         # See requirements-view.txt.

@@ -3,6 +3,7 @@
 import contextlib
 import gc
 import importlib.util
+import resource
 import signal
 import subprocess
 import sys
@@ -322,3 +323,21 @@ def install(tmp_path, monkeypatch):
         monkeypatch.delitem(sys.modules, package, raising=False)
         return folder
     return install
+
+
+@contextlib.contextmanager
+def file_sizes(n_bytes):
+    """Limit the files that this process and its children write, as a full disk does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
+    try:
+        yield
+    finally:
+        # Otherwise, pytest cannot print its report to a file.
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.fixture
+def full_disk():
+    """Context manager in which files can have only a number of bytes."""
+    return file_sizes

@@ -75,6 +75,7 @@ CALLS = [
     pytest.param('tools.replay', ['garbage'], 'garbage: not a complete recording',
                  marks=NEEDS_MCAP),
     ('tools.replay', ['garbage', '--estimator', 'magic'], "invalid choice: 'magic'"),
+    ('tools.replay', ['garbage', '--config', 'good.yaml', '--site', 'good.yaml'], 'with --site'),
     ('tools.replay', ['garbage', '--publish', '--estimator', 'ml'], 'not allowed with'),
     ('tools.replay', ['garbage', '--estimator', 'neural', '--calibration', 'garbage'],
      'not allowed with --estimator neural'),

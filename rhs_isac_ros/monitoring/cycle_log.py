@@ -1,10 +1,12 @@
-"""Records of the cycles of a network, assembled from messages."""
+"""Records of the cycles of a network, and of its signals, assembled from messages."""
 
 import dataclasses
 import math
+from typing import TypeAlias
 
 import numpy as np
 
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome
 from rhs_isac_ros.support.fields import finite
@@ -16,6 +18,8 @@ RECEIVES = (m.Beacon, m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Ca
             m.ProtocolState)
 # Types of the messages that answer received signals.
 ANSWERS = (m.PositionEstimate, m.NoFix)
+# Cycle and user.
+Key: TypeAlias = tuple[int, int]
 
 
 @dataclasses.dataclass
@@ -150,6 +154,11 @@ class CycleLog:
         if cycle or record.outcome not in ('', 'served'):
             del self._open[record.cycle_id]
 
+    def cut(self, end_s: float) -> None:
+        """Remove the cycles that ended after `end_s` [s] from both lists."""
+        self.complete[:] = [cycle for cycle in self.complete if cycle.ended_s <= end_s]
+        self.ended[:] = [record for record in self.ended if record.ended_s <= end_s]
+
     def clear(self) -> None:
         """Empty the lists `complete` and `ended`."""
         self.complete.clear()
@@ -163,3 +172,45 @@ class CycleLog:
             record.began_s = now_s
         while len(self._open) > _MAX_OPEN_CYCLES:
             del self._open[next(iter(self._open))]
+
+
+class SignalLog:
+    """Collects the signals of one network, with true positions, answers and codebooks.
+
+    Unlike `CycleLog`, it keeps cycles without a fix, and cycles whose other messages are missing.
+    The arrival of a message or a codebook is a time as in `CycleLog.add`.
+    """
+
+    #: Types of the messages that the log uses.
+    RECEIVES = (m.GroundTruth, m.ReceivedSignals, *ANSWERS, m.ProtocolState)
+
+    def __init__(self) -> None:
+        self.signals: dict[Key, m.ReceivedSignals] = {}
+        self.arrived_s: dict[Key, float] = {}  # Arrival of the signals.
+        self.estimates: dict[Key, m.PositionEstimate] = {}
+        self.codebooks: dict[str, Codebook] = {}
+        #: Cycles that were answered, or that ended.
+        self.ended: set[Key] = set()
+        self._truths: dict[Key, list[m.GroundTruth]] = {}
+
+    def add(self, found: m.Message | Codebook, arrived_s: float = math.nan) -> None:
+        """Add a codebook, or a message whose type is in `RECEIVES`."""
+        if isinstance(found, Codebook):
+            self.codebooks[found.id] = found
+            return
+        key = found.cycle_id, getattr(found, 'user', 0)
+        match found:
+            case m.GroundTruth() if found.cycle_id:
+                self._truths.setdefault(key, []).append(found)
+            case m.ReceivedSignals():
+                self.signals[key], self.arrived_s[key] = found, arrived_s
+            case m.PositionEstimate():
+                self.estimates[key] = found
+        if isinstance(found, ANSWERS) or isinstance(found, m.ProtocolState) and found.outcome:
+            self.ended.add(key)
+
+    def truth_of(self, signals: m.ReceivedSignals) -> m.GroundTruth | None:
+        """Return the true position in a cycle, as sent by the node of its user, or None."""
+        return next((truth for truth in reversed(
+            self._truths.get((signals.cycle_id, signals.user), []))
+            if m.same_instance(truth.sender, signals.user_instance)), None)

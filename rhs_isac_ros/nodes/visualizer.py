@@ -193,8 +193,8 @@ class VisualizerNode(Node):
                 ' and transforms' if self._transforms.available
                 else '; no transforms, because tf2_msgs is not installed'))
 
-    def _on_message(self, message: m.Message) -> None:
-        self._scene.add(message, time.monotonic())
+    def _on_message(self, message: m.Message, arrived_s: float) -> None:
+        self._scene.add(message, arrived_s)
         # The number of frames is limited like the number of topics, because tf2 keeps every frame.
         if isinstance(message, m.PositionEstimate) and self._paths.publishers(message.user):
             self._transforms.publish(transform(

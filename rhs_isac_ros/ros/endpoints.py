@@ -11,6 +11,7 @@ node then runs without it, logs the refusal, and reports it in its diagnostics.
 import collections
 import copy
 import functools
+import inspect
 import itertools
 import threading
 import time
@@ -156,26 +157,34 @@ def publish_if_subscribed(publishers: Iterable[Publisher], make: Callable[[], An
 
 
 def subscribe(
-        node: Node, kind: type, name: str, callback: Callable[[Any], None], profile: QoSProfile,
+        node: Node, kind: type, name: str, callback: Callable[..., None], profile: QoSProfile,
         raw: bool = False, overridable: bool = False) -> None:
-    """Subscribe to a topic of a ROS type; a `raw` callback receives serialized bytes (CDR).
+    """Subscribe to a topic of a ROS type; a `raw` callback receives bytes (CDR) and their times.
 
-    The node logs that it drops a message without a valid serialization. Parameters
-    ``qos_overrides.*`` change the quality of service of an `overridable` topic.
+    The times are those of rclpy's `MessageInfo`. The node logs that it drops a message without a
+    valid serialization. Parameters ``qos_overrides.*`` change the quality of service of an
+    `overridable` topic.
     """
-    def deserialize(content: bytes) -> None:
+    def receive(*taken: Any) -> None:
+        # The EventsExecutor of rclpy 7.1 passes both as one argument.
+        content, info = taken if len(taken) == 2 else taken[0]
+        if raw:
+            callback(content, info)
+            return
         try:
             message = convert.deserialize(content, kind)
         except m.MessageError as error:
             log_dropped(node, error)
             return
         callback(message)
+    # The callbacks to which rclpy passes the times are those with two parameters.
+    receive.__signature__ = inspect.signature(lambda content, info: None)  # type: ignore[attr-defined]
     # A copy, as in `create_publisher`.
     own = copy.copy(profile)
     # A subscription of rclpy that is not raw drops an invalid message without a word, and leaves
     # the error to the next call that fails.
     create_or_refuse(node, f'subscription to {name}', lambda: node.create_subscription(
-        kind, name, callback if raw else deserialize, own, raw=True,
+        kind, name, receive, own, raw=True,
         qos_overriding_options=_overriding(overridable),
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False)))
 
@@ -228,6 +237,14 @@ def journal(node: Node) -> Journal:
     return _journals[node]
 
 
+def arrived_s(info: Mapping[str, int]) -> float:
+    """Return when the middleware received a message [s], on the clock of `time.monotonic`.
+
+    The callback of a busy process may run seconds later.
+    """
+    return time.monotonic() - 1e-9 * max(time.time_ns() - info['received_timestamp'], 0)
+
+
 def log_dropped(node: Node, error: m.MessageError) -> None:
     """Log the reason why a node drops a message; the text starts with the name of the field."""
     journal(node).event(
@@ -236,7 +253,7 @@ def log_dropped(node: Node, error: m.MessageError) -> None:
 
 def subscribe_messages(
         node: Node, kinds: Iterable[type[m.Message]], scenario: Scenario | None,
-        on_message: Callable[[m.Message], None],
+        on_message: Callable[[m.Message, float], None],
         on_error: Callable[[m.MessageError], None] | None = None, *,
         on_foreign: Callable[[m.Message], None] | None = None,
         on_arrival: Callable[[type[m.Message]], None] = lambda kind: None,
@@ -247,6 +264,8 @@ def subscribe_messages(
     ----------
     scenario
         Scenario of the messages, whose id and sizes are checked; None: no check.
+    on_message
+        Called with each message, and the time of its arrival as in `arrived_s` [s].
     on_error
         Called with the reason why a message was dropped; by default, the node logs it.
     on_foreign
@@ -258,7 +277,7 @@ def subscribe_messages(
     prefix
         Namespace of the topics with a final slash; empty: that of the node.
     """
-    def receive(kind: type[m.Message], serialized: bytes) -> None:
+    def receive(kind: type[m.Message], serialized: bytes, info: Mapping[str, int]) -> None:
         on_arrival(kind)
         try:
             message = convert.from_bytes(kind, serialized)
@@ -273,7 +292,7 @@ def subscribe_messages(
         except m.MessageError as error:
             (on_error or functools.partial(log_dropped, node))(error)
             return
-        on_message(message)
+        on_message(message, arrived_s(info))
     for kind in kinds:
         subscribe(node, convert.ros_type(kind), prefix + topics.NAMES[kind],
                   functools.partial(receive, kind), profile_for(kind, exchange), raw=True)

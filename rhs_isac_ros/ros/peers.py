@@ -186,7 +186,7 @@ class Peers:
                 self._changed.wait(PERIOD_S)
                 self._changed.clear()
 
-    def _receive(self, content: bytes, roles: tuple[str, ...] = ()) -> None:
+    def _receive(self, content: bytes, _: object, roles: tuple[str, ...] = ()) -> None:
         """Process an announcement; with `roles`, only of a node that has had one of them."""
         try:
             presence = convert.from_bytes(Presence, content)

@@ -7,10 +7,13 @@ can read. The library mcap is optional.
 """
 
 import contextlib
+import copy
 import dataclasses
+import errno
+import functools
+import os
 import posixpath
 import re
-import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,10 +47,13 @@ _SCENARIO, _NETWORK, _WHOLE, _REGION = 'scenario', 'network', '', 'region'
 _MAX_BYTES = 2**26
 # Period of completing a chunk, so that a killed process loses at most this time [s].
 _FLUSH_S = 0.5
-_COMPLETE_CHUNK = '_Writer__finalize_chunk'
 # Maximum number of characters of a scenario.
 _MAX_SCENARIO = 2**20
-_BUILT_IN = re.compile(r'(bool|byte|char|float\d+|u?int\d+|w?string)\b')
+_BUILT_IN = re.compile(r'bool|float\d+|u?int\d+|w?string')
+# Names of the same type in different languages.
+_BYTES = {'byte', 'char', 'octet'}
+# Type, bounds and name of a field; the name of a constant begins with a capital letter.
+_FIELD = re.compile(r'\s*([A-Za-z][\w/]*)(\S*)\s+([a-z]\w*)')
 
 
 class RecordingError(Exception):
@@ -81,7 +87,8 @@ def schema(kind: type) -> str:
             package, short = name.split('/')
             file = Path(get_package_share_directory(package)) / 'msg' / f'{short}.msg'
             texts[name] = file.read_text(encoding='utf-8')
-            wanted += _parts(texts[name], package)
+            wanted += (part.partition('[')[0] for part, _ in _fields(name, texts[name])
+                       if '/' in part)
     own = texts.pop(first)
     parts = (f'{_SEPARATOR}\nMSG: {name}\n{text}' for name, text in texts.items())
     return '\n'.join([own, *parts])
@@ -97,20 +104,25 @@ def _offered_qos(profile: QoSProfile) -> str:
         'liveliness_lease_duration': dict(unlimited), 'avoid_ros_namespace_conventions': False}])
 
 
-def _parts(text: str, package: str) -> Iterator[str]:
-    for line in text.splitlines():
-        field = re.match(r'\s*([A-Za-z][\w/]*)', line)
-        if field and not _BUILT_IN.match(field[1]):
-            name = field[1].replace('/msg/', '/')
-            yield name if '/' in name else f'{package}/{name}'
+def _fields(owner: str, text: str) -> list[tuple[str, str]]:
+    """Return type and name of each field in the definition of a message, such as ``pkg/Name``.
+
+    Other writers omit constants, defaults and comments, or qualify the types.
+    """
+    package = owner.partition('/')[0]
+    return [(('uint8' if kind in _BYTES else kind if '/' in kind or _BUILT_IN.fullmatch(kind) else
+              f'{package}/{kind}') + bounds, name)
+            for kind, bounds, name in (
+                (found[1].replace('/msg/', '/'), *found.groups()[1:])
+                for found in map(_FIELD.match, text.splitlines()) if found)]
 
 
 class Recorder:
-    """Writes the messages and the scenario of a network, or of those of a site, to a file.
+    """Writes the messages and the scenario of a network, or of those of a site, to a new file.
 
     Until `close` completes the file, its name is ``<name>.part``; an incomplete file keeps it.
     The messages up to `_FLUSH_S` before the end of a process that is killed are readable. Raises
-    RecordingError if mcap is not installed or the file cannot be created.
+    RecordingError if mcap is not installed, or one of the two files exists or cannot be created.
     """
 
     def __init__(self, path: str | Path, scenario: Scenario, site: Site | None = None) -> None:
@@ -120,10 +132,20 @@ class Recorder:
         self._path = Path(path)
         self._partial = self._path.with_name(f'{self._path.name}.part')
         try:
-            self._stream = self._partial.open('wb')
+            self._check_absence()
+            self._stream = self._partial.open('xb')
         except OSError as error:
-            raise RecordingError(f'{path}: cannot be written: {error.strerror}') from None
+            hint = '; a recorder that runs, or was killed, has the file FILE.part' if isinstance(
+                error, FileExistsError) else ''
+            raise RecordingError(
+                f'{error.filename}: cannot be written: {error.strerror}{hint}') from None
         self._writer = Writer(self._stream)
+        self._networks = [_WHOLE, *(site.surfaces if site else ())]
+        # Number of messages written, and the reason why writing failed, such as a full disk.
+        self.count, self.failure = 0, ''
+        self._attempt(lambda: self._begin(scenario, site))
+
+    def _begin(self, scenario: Scenario, site: Site | None) -> None:
         self._writer.start(profile='ros2', library='rhs_isac_ros')
         surfaces = {name: one.scenario for name, one in site.surfaces.items()} if site else {}
         for name, one in {_WHOLE: scenario, **surfaces}.items():
@@ -131,20 +153,16 @@ class Recorder:
                 _SCENARIO, {_NETWORK: name, 'yaml': yaml.safe_dump(one.changes())})
         if site:
             self._writer.add_metadata(_REGION, {'yaml': yaml.safe_dump(site.bounds_m.tolist())})
-        self._networks = [_WHOLE, *surfaces]
-        # The library completes a chunk at a certain size, but has no public method for it.
-        self._complete_chunk: Callable[[], None] = getattr(self._writer, _COMPLETE_CHUNK)
-        # Number of messages written, and the reason why writing failed, such as a full disk.
-        self.count, self.failure = 0, ''
-        self._attempt(self._stream.flush)
+        self._writer.flush()
 
     def record_topics(
-            self, node: Node, on_message: Callable[[str, bytes], None] | None = None) -> None:
+            self, node: Node,
+            on_message: Callable[[str, bytes, float], object] = lambda *_: None) -> None:
         """Record the topics of `recorded_topics` in the namespace of a node and of the surfaces.
 
         `on_message` is called with the name of the topic, as in `recorded_topics` after the name
-        of the surface, and the serialized message, once the message is written or writing has
-        failed.
+        of the surface, the serialized message, and its arrival as in `endpoints.arrived_s`, once
+        the message is written or writing has failed.
         """
         # Absolute names are the same in all namespaces.
         for name, (kind, profile) in {
@@ -155,31 +173,29 @@ class Recorder:
                 schema_id=self._writer.register_schema(
                     type_name(kind), 'ros2msg', schema(kind).encode()),
                 metadata={'offered_qos_profiles': _offered_qos(profile)})
-            endpoints.subscribe(
-                node, kind, name, self._writer_of(channel, name, on_message), profile, raw=True)
+            # The process may be suspended for several seconds.
+            queue = copy.copy(profile)
+            queue.depth = endpoints.OBSERVATION.depth
+            endpoints.subscribe(node, kind, name, functools.partial(
+                self._write, channel, name, on_message), queue, raw=True)
         endpoints.steady_timer(node, _FLUSH_S, self._flush)
 
     def _flush(self) -> None:
-        if not self._stream.closed:
-            self._attempt(self._complete_chunk)
-            self._attempt(self._stream.flush)
+        self._attempt(self._writer.flush)
 
-    def _writer_of(
-            self, channel: int, name: str, on_message: Callable[[str, bytes], None] | None
-    ) -> Callable[[bytes], None]:
-        def write(message: bytes) -> None:
-            now_ns = time.time_ns()
-            if self._attempt(lambda: self._writer.add_message(
-                    channel_id=channel, log_time=now_ns, publish_time=now_ns, data=message)):
-                self.count += 1
-            if on_message:
-                on_message(name, message)
-        return write
+    def _write(
+            self, channel: int, name: str, on_message: Callable[[str, bytes, float], object],
+            message: bytes, info: Mapping[str, int]) -> None:
+        if self._attempt(lambda: self._writer.add_message(
+                channel_id=channel, log_time=info['received_timestamp'],
+                publish_time=info['source_timestamp'], data=message)):
+            self.count += 1
+        on_message(name, message, endpoints.arrived_s(info))
 
     def _attempt(self, write: Callable[[], object]) -> bool:
-        """Write unless an earlier attempt has failed; return whether all attempts succeeded."""
+        """Write unless the file is closed or an attempt has failed; return whether none has."""
         try:
-            if not self.failure:
+            if not (self.failure or self._stream.closed):
                 write()
         except OSError as error:
             self.failure = (f'{self._partial}: cannot be written: {error.strerror}; the recording '
@@ -188,13 +204,20 @@ class Recorder:
 
     def close(self) -> None:
         """Complete the file and rename it; after a failure, the incomplete file remains."""
-        if self._stream.closed:
-            return
-        if self._attempt(self._writer.finish) and self._attempt(self._stream.flush):
-            self._partial.replace(self._path)
-        # Closing writes the rest of the buffer, which may fail.
+        self._attempt(self._complete)
         with contextlib.suppress(OSError):
             self._stream.close()
+
+    def _complete(self) -> None:
+        self._writer.finish()
+        # Closing writes the rest of the buffer, which may fail.
+        self._stream.close()
+        self._check_absence()
+        self._partial.replace(self._path)
+
+    def _check_absence(self) -> None:
+        if self._path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(self._path))
 
 
 def read(
@@ -202,13 +225,15 @@ def read(
 ) -> Iterator[tuple[str, bytes, float]]:
     """Yield the topic, the bytes (CDR) and the recorded time [s] of each message of a known type.
 
-    The known types are those of `recorded_topics`. `names`, if given, selects topics by full name.
+    The messages are sorted by time; copies of a recording may have them in another order. The
+    known types are those of `recorded_topics`. `names`, if given, selects topics by full name.
     Raises RecordingError if the file cannot be read, or a type differs from the installed one.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
     schemas: dict[int, Any] = {}
     channels: dict[int, Any] = {}
     checked: set[int] = set()
+    messages: list[tuple[str, bytes, int]] = []
     for record in _records(path):
         match type(record).__name__:
             case 'Schema':
@@ -226,21 +251,28 @@ def read(
                 if found.id not in checked:
                     _check_schema(path, found, kinds[found.name])
                     checked.add(found.id)
-                yield channel.topic, record.data, 1e-9 * record.log_time
+                messages.append((channel.topic, record.data, record.log_time))
+    messages.sort(key=lambda message: message[2])
+    yield from ((topic, content, 1e-9 * time_ns) for topic, content, time_ns in messages)
 
 
 def _check_schema(path: str | Path, found: Any, kind: type) -> None:
-    if found.encoding == 'ros2msg' and _fields(found.data.decode(errors='replace')) != _fields(
-            schema(kind)):
-        raise RecordingError(
-            f'{path}: {found.name}: recorded with other fields than the installed message has; '
-            'expected a recording of this version')
+    if found.encoding != 'ros2msg':
+        return
+    recorded = _definitions(found.name, found.data.decode(errors='replace'))
+    for name, fields in _definitions(found.name, schema(kind)).items():
+        if recorded.get(name, fields) != fields:
+            raise RecordingError(
+                f'{path}: {name}: recorded with other fields than the installed message has; '
+                'expected a recording of this version')
 
 
-def _fields(text: str) -> list[str]:
-    """Return the fields and constants of the first message in a schema."""
-    lines = (line.split('#')[0] for line in text.split(_SEPARATOR)[0].splitlines())
-    return [' '.join(line.split()) for line in lines if line.strip()]
+def _definitions(name: str, text: str) -> dict[str, list[tuple[str, str]]]:
+    """Return the fields of the message `name` and of its nested messages, by their names."""
+    first, *others = re.split(r'^=+\s*MSG: (\S+)', text, flags=re.MULTILINE)
+    texts = {name: first, **dict(zip(others[::2], others[1::2], strict=True))}
+    return {(short := name.replace('/msg/', '/')): _fields(short, part)
+            for name, part in texts.items()}
 
 
 class Recorded(NamedTuple):
@@ -266,12 +298,15 @@ def _last(namespace: str) -> str:
     return namespace.rstrip('/').rpartition('/')[2]
 
 
-def read_networks(path: str | Path) -> Recorded:
-    """Return the scenarios of a recording.
+def read_networks(path: str | Path, site: Site | None = None) -> Recorded:
+    """Return the scenarios of a recording, or of a site that the recording does not describe.
 
     Raises RecordingError if the file, a scenario or the region is unreadable, ScenarioError if a
     value is wrong.
     """
+    if site:
+        return Recorded(None, {name: one.scenario for name, one in site.surfaces.items()},
+                        site.bounds_m)
     scenarios: dict[str, Scenario] = {}
     bounds_m = np.full((2, 3), np.nan)
     for record in _records(path):
@@ -378,10 +413,10 @@ class CycleObserver(Node):
             # The log and the recording share subscriptions, so that a replay yields the same
             # cycles in the same order.
             kinds = {topics.NAMES[kind]: kind for kind in cycle_log.RECEIVES}
-            recorder.record_topics(self, lambda name, message: self._on_recorded(
-                kinds.get(name), message))
+            recorder.record_topics(self, lambda name, message, arrived_s: self._on_recorded(
+                kinds.get(name), message, arrived_s))
             return
-        endpoints.subscribe_messages(self, receives, scenario, self._on_message, on_malformed,
+        endpoints.subscribe_messages(self, receives, scenario, self.observe, on_malformed,
                                      exchange=endpoints.OBSERVATION)
 
     @property
@@ -394,13 +429,10 @@ class CycleObserver(Node):
         if isinstance(message, cycle_log.RECEIVES):
             self.log.add(message, now_s)
 
-    def _on_recorded(self, kind: type[m.Message] | None, message: bytes) -> None:
-        if kind is None:
-            return
+    def _on_recorded(
+            self, kind: type[m.Message] | None, message: bytes, arrived_s: float) -> None:
         try:
-            self._on_message(convert.from_bytes(kind, message))
+            if kind:
+                self.observe(convert.from_bytes(kind, message), arrived_s)
         except m.MessageError as error:
             endpoints.log_dropped(self, error)
-
-    def _on_message(self, message: m.Message) -> None:
-        self.observe(message, time.monotonic())

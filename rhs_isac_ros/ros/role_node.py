@@ -338,7 +338,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         """Raise TypeError; subclasses override this method to execute actions of their roles."""
         raise TypeError(f'{type(action).__name__} is not an action of {self.get_name()}')
 
-    def _on_message(self, message: m.Message) -> None:
+    def _on_message(self, message: m.Message, _: float) -> None:
         if not self.stands_by:
             self.dispatch(message)
 

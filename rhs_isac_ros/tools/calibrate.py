@@ -35,6 +35,7 @@ from rhs_isac_ros.calibration.survey import PLACE_WAVELENGTHS
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import MultipathEstimate, Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
+from rhs_isac_ros.monitoring.cycle_log import SignalLog
 from rhs_isac_ros.positioning import Sighting, Site, make_estimator
 from rhs_isac_ros.positioning.alignment import PoseError, estimate_pose
 from rhs_isac_ros.positioning.site import SiteError, site_text
@@ -53,8 +54,8 @@ from rhs_isac_ros.support.arguments import (
 from rhs_isac_ros.support.files import ArchiveError, read_arrays, write_whole
 from rhs_isac_ros.tools import command
 
-# Types of the messages that the log uses.
-RECEIVES = (m.GroundTruth, m.ReceivedSignals)
+# The messages that pilots consist of.
+_RECEIVES = (m.GroundTruth, m.ReceivedSignals)
 _CYCLES = 200
 _OUTPUT, _SITE_OUTPUT = Path('calibration.npz'), Path('site_calibrated.yaml')
 _TIMEOUT_S = 600.0
@@ -65,27 +66,12 @@ _N_COMPARED, _N_FOLDS = 200, 5
 Assumption: TypeAlias = Callable[[list[Pilots]], tuple[Scenario, SurfaceEstimate | None]]
 
 
-class PilotLog:
-    """Collects codebooks, signals and true positions.
-
-    Unlike `CycleLog`, it keeps cycles without a fix, because a fix may require the calibration.
-    """
+class PilotLog(SignalLog):
+    """Collects pilots, also of cycles without a fix, which may require the calibration."""
 
     def __init__(self, scenario: Scenario) -> None:
+        super().__init__()
         self._pose = scenario.pose
-        self._truths: dict[tuple[int, int], list[m.GroundTruth]] = {}
-        self._signals: dict[int, m.ReceivedSignals] = {}
-        self.codebooks: dict[str, Codebook] = {}
-
-    def add(self, found: m.Message | Codebook) -> None:
-        """Add a codebook, or a message whose type is in `RECEIVES`."""
-        match found:
-            case Codebook():
-                self.codebooks[found.id] = found
-            case m.GroundTruth() if found.cycle_id:
-                self._truths.setdefault((found.cycle_id, found.user), []).append(found)
-            case m.ReceivedSignals():
-                self._signals.setdefault(found.cycle_id, found)
 
     @property
     def n_pilots(self) -> int:
@@ -95,7 +81,7 @@ class PilotLog:
     @property
     def missing_codebooks(self) -> list[str]:
         """Ids of unknown codebooks with which signals were received."""
-        return sorted({signals.codebook_id for signals in self._signals.values()}
+        return sorted({signals.codebook_id for signals in self.signals.values()}
                       - self.codebooks.keys())
 
     def pilots(self) -> list[Pilots]:
@@ -109,13 +95,8 @@ class PilotLog:
                 for codebook_id, group in groups.items()]
 
     def _known(self) -> list[tuple[m.ReceivedSignals, m.GroundTruth]]:
-        return [(signals, truth) for signals in self._signals.values()
-                if (truth := self._truth_of(signals)) and signals.codebook_id in self.codebooks]
-
-    def _truth_of(self, signals: m.ReceivedSignals) -> m.GroundTruth | None:
-        known = self._truths.get((signals.cycle_id, signals.user), [])
-        return next((truth for truth in reversed(known)
-                     if m.same_instance(truth.sender, signals.user_instance)), None)
+        return [(signals, truth) for signals in self.signals.values()
+                if (truth := self.truth_of(signals)) and signals.codebook_id in self.codebooks]
 
 
 class CalibratorNode(Node):
@@ -123,7 +104,7 @@ class CalibratorNode(Node):
 
     def __init__(self, log: PilotLog, scenario: Scenario) -> None:
         super().__init__('calibrator', **WITHOUT_SERVICES)
-        subscribe_messages(self, RECEIVES, scenario, log.add, on_foreign=lambda message: None)
+        subscribe_messages(self, _RECEIVES, scenario, log.add, on_foreign=lambda message: None)
         command.subscribe_codebooks(self, scenario, log.add)
 
 
@@ -134,7 +115,7 @@ class PosteriorLog:
         self._names = [*site.surfaces]
         self._found: dict[tuple[int, int], dict[str, Sighting]] = {}
 
-    def add(self, name: str, message: m.Message) -> None:
+    def add(self, name: str, message: m.Message, *_: object) -> None:
         """Add a posterior of a surface."""
         assert isinstance(message, m.Posterior)
         self._found.setdefault((message.cycle_id, message.user), {})[name] = sighting_of(message)
@@ -248,7 +229,7 @@ def _collected(
     log = PilotLog(scenario)
     if options.file:
         for found, _ in command.recorded(
-                options.file, options.namespace, scenario, [*RECEIVES, Codebook]):
+                options.file, options.namespace, scenario, [*_RECEIVES, Codebook]):
             log.add(found)
     else:
         _collect(lambda: CalibratorNode(log, scenario), lambda: log.n_pilots, 'pilots',

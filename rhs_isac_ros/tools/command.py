@@ -24,7 +24,7 @@ from rhs_isac_ros.calibration import CalibrationError
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.role_statistics import Report
-from rhs_isac_ros.positioning import ModelError, SiteError
+from rhs_isac_ros.positioning import ModelError, Site, SiteError
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, diagnostics, endpoints, topics
 from rhs_isac_ros.ros.endpoints import subscribe
@@ -145,7 +145,7 @@ def observe(
 def subscribe_codebooks(
         node: Node, scenario: Scenario, on_codebook: Callable[[Codebook], None]) -> None:
     """Subscribe to the codebooks of a network, and drop codebooks that do not fit the scenario."""
-    def receive(content: bytes) -> None:
+    def receive(content: bytes, _: object) -> None:
         try:
             codebook = convert.from_bytes(convert.CodebookMessage, content).codebook()
             codebook.check(scenario)
@@ -157,14 +157,14 @@ def subscribe_codebooks(
 
 
 def choose_scenario(config: Path | None, recording: Path | None = None,
-                    namespace: str | None = None) -> Scenario:
+                    namespace: str | None = None, site: Site | None = None) -> Scenario:
     """Return the scenario in a file, or else in a recording, or else the paper's Table I.
 
     In a recording of a site, each surface has its own scenario in its own namespace.
     """
     if config:
         return Scenario.from_yaml(config)
-    found = read_networks(recording).of(namespace or '') if recording else None
+    found = read_networks(recording, site).of(namespace or '') if recording else None
     return found or Scenario()
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rclpy
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.utilities import try_shutdown
 
 from rhs_isac_ros.calibration import load_surface
@@ -134,19 +134,22 @@ def watch(
     `cycles`. Returns the error that ended the wait, or ''.
     """
     seen, changed_s = -1, time.monotonic()
-    while seen < cycles and not stopped():
-        rclpy.spin_once(observer, timeout_sec=_PERIOD_S)
-        complete = len(observer.complete)
-        if complete != seen:
-            seen, changed_s = complete, time.monotonic()
-            on_progress(complete, cycles)
-        for name, code in processes.ended().items():
-            return f'{name} ended with exit code {code}:\n{processes.log(name)}'
-        if time.monotonic() - changed_s > _CYCLE_TIMEOUT_S:
-            # In a site, the name of the leading surface precedes that of the role.
-            (name,) = (name for name in processes.names if name.endswith('bs'))
-            return (f'no cycle within {_CYCLE_TIMEOUT_S:.0f} s; log of the base station:\n'
-                    f'{processes.log(name)}')
+    # This executor takes messages in the order of their arrival, also when it is late.
+    with EventsExecutor() as executor:
+        executor.add_node(observer)
+        while seen < cycles and not stopped():
+            executor.spin_once(timeout_sec=_PERIOD_S)
+            complete = len(observer.complete)
+            if complete != seen:
+                seen, changed_s = complete, time.monotonic()
+                on_progress(complete, cycles)
+            for name, code in processes.ended().items():
+                return f'{name} ended with exit code {code}:\n{processes.log(name)}'
+            if time.monotonic() - changed_s > _CYCLE_TIMEOUT_S:
+                # In a site, the name of the leading surface precedes that of the role.
+                (name,) = (name for name in processes.names if name.endswith('bs'))
+                return (f'no cycle within {_CYCLE_TIMEOUT_S:.0f} s; log of the base station:\n'
+                        f'{processes.log(name)}')
     return ''
 
 
@@ -201,9 +204,8 @@ class SiteObserver(CycleObserver):
         if recorder:
             recorder.record_topics(self)
         endpoints.subscribe_messages(
-            self, RECEIVES, None,
-            lambda message: self.observe(message, time.monotonic()),
-            exchange=endpoints.OBSERVATION, prefix=f'/{site.leader}/')
+            self, RECEIVES, None, self.observe, exchange=endpoints.OBSERVATION,
+            prefix=f'/{site.leader}/')
         # By cycle, for each surface and for the fusion.
         self.estimates: dict[str, dict[int, m.PositionEstimate]] = {}
         # By cycle, the surface that delivered the uplink data.
@@ -216,7 +218,7 @@ class SiteObserver(CycleObserver):
                 self, [m.PositionEstimate, m.Data], scenario, functools.partial(self._keep, name),
                 on_foreign=lambda message: None, exchange=endpoints.OBSERVATION, prefix=prefix)
 
-    def _keep(self, name: str, message: m.Message) -> None:
+    def _keep(self, name: str, message: m.Message, *_: object) -> None:
         match message:
             case m.PositionEstimate():
                 self.estimates[name][message.cycle_id] = message
@@ -329,7 +331,8 @@ def _check_front_end(options: argparse.Namespace, scenario: Scenario) -> None:
 class _Demonstration:
     """A network with one surface: its parameters, observer, recording and report."""
 
-    surfaces: Collection[str] = ()
+    site: Site | None = None
+    recorder: Recorder | None = None
 
     def __init__(self, options: argparse.Namespace) -> None:
         if options.follow:
@@ -340,14 +343,16 @@ class _Demonstration:
         _check_front_end(options, self.scenario)
         self.files = {'scenario_file': options.config, 'codebook_file': codebook_file}
         self.options = options
-        self.recorder = Recorder(options.record, self.scenario) if options.record else None
         self.board = EmulatedBoard() if options.port == 'emulated' else None
 
     def start(self, processes: Processes, together: bool) -> None:
-        """Start all processes."""
+        """Begin the recording, if any, and start all processes."""
+        if self.options.record:
+            self.recorder = Recorder(self.options.record, self.scenario, self.site)
         options, port = self.options, self.board.port if self.board else self.options.port
         start_network(
-            processes, options.users, self.scenario, together=together, surfaces=self.surfaces,
+            processes, options.users, self.scenario, together=together,
+            surfaces=self.site.surfaces if self.site else (),
             first_cycle=1, seed=options.seed, **self.files,
             prior=options.prior, library_file=options.follow, calibration_file=options.calibration,
             states_file=options.calibration, surface=options.surface,
@@ -363,6 +368,11 @@ class _Demonstration:
     def observer(self, log: CycleLog) -> CycleObserver:
         """Create the observer of the cycles."""
         return CycleObserver(self.recorder, log=log, **WITHOUT_SERVICES)
+
+    @property
+    def failure(self) -> str:
+        """The reason why the recording failed, or ''."""
+        return self.recorder.failure if self.recorder else ''
 
     def report(self, log: CycleLog) -> None:
         """Print and draw at least one complete cycle."""
@@ -383,15 +393,13 @@ class _SiteDemonstration(_Demonstration):
                 if str(getattr(options, name)) != str(parser.get_default(name))]:
             option = other[0].replace('_', '-')
             parser.error(f'argument --{option}: not allowed with --site')
-        self._site = Site.from_yaml(options.site)
-        self.surfaces = self._site.surfaces
-        self.scenario = self._site.surfaces[self._site.leader].scenario
+        self.site = site = Site.from_yaml(options.site)
+        self.scenario = site.surfaces[site.leader].scenario
         self.files, self.options, self.board = {'site_file': options.site.resolve()}, options, None
-        self.recorder = (
-            Recorder(options.record, self.scenario, self._site) if options.record else None)
 
     def observer(self, log: CycleLog) -> CycleObserver:
-        self._observer = SiteObserver(self._site, self.recorder, log=log, **WITHOUT_SERVICES)
+        assert self.site
+        self._observer = SiteObserver(self.site, self.recorder, log=log, **WITHOUT_SERVICES)
         return self._observer
 
     def report(self, log: CycleLog) -> None:
@@ -417,9 +425,10 @@ def _run(demonstration: _Demonstration, options: argparse.Namespace) -> int:
                 if demonstration.board:
                     stack.enter_context(demonstration.board)
                 problem = '' if signals else _observe(
-                    log, processes, demonstration, options.cycles, lambda: bool(signals))
+                    log, processes, demonstration, options.cycles,
+                    lambda: bool(signals or demonstration.failure))
             finally:
-                if demonstration.recorder is not None:
+                if demonstration.recorder:
                     demonstration.recorder.close()
             processes.interrupt()
             on_end_signals(signal.default_int_handler)
@@ -438,7 +447,11 @@ def _observe(
     # Use the time that the network takes to start.
     prepare_drawing()
     try:
-        return watch(observer, processes, cycles, _show_progress, stopped)
+        problem = watch(observer, processes, cycles, _show_progress, stopped)
+        # The executor may have processed further messages at once.
+        if len(complete := observer.complete[:cycles]) == cycles:
+            log.cut(complete[-1].ended_s)
+        return problem
     finally:
         observer.destroy_node()  # type: ignore[no-untyped-call]
         try_shutdown()
@@ -449,10 +462,10 @@ def _show_progress(complete: int, goal: int) -> None:
         print(f'network started with ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}, '
               'waiting for the first cycle', file=sys.stderr)
     elif sys.stderr.isatty():
-        print(f'\rcycle {complete} of {goal}', end='\n' if complete >= goal else '',
+        print(f'\rcycle {min(complete, goal)} of {goal}', end='\n' if complete >= goal else '',
               file=sys.stderr, flush=True)
     elif complete % 10 == 0 or complete >= goal:
-        print(f'cycle {complete} of {goal}', file=sys.stderr)
+        print(f'cycle {min(complete, goal)} of {goal}', file=sys.stderr)
 
 
 def _report(
@@ -460,9 +473,9 @@ def _report(
         problem: str) -> int:
     if log.complete:
         demonstration.report(log)
-    if options.record:
+    if options.record and not demonstration.failure:
         print(f'recording: {options.record}')
-    if problem:
+    if problem := problem or demonstration.failure:
         print_error(problem, 'demo')
     return 1 if problem or log.failed else 0
 

@@ -4,9 +4,9 @@ With ``--publish``, it publishes the signals, or other topics, to running nodes 
 """
 
 import argparse
-import dataclasses
 import functools
 import math
+import posixpath
 import sys
 import tempfile
 import time
@@ -23,7 +23,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.monitoring.cycle_log import ANSWERS, RECEIVES, CompleteCycle, CycleLog
+from rhs_isac_ros.monitoring.cycle_log import ANSWERS, Key, SignalLog
 from rhs_isac_ros.nodes.optimizer import OptimizerNode, ros_parameters
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
@@ -32,6 +32,7 @@ from rhs_isac_ros.positioning import (
     Estimator,
     Motion,
     Sighting,
+    Site,
     file_options,
     fuse,
     make_estimator,
@@ -61,9 +62,8 @@ from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_
 from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.command import ToolError
 
-# Cycle and user, and positions by these, float64 [3] [m].
-_Key: TypeAlias = tuple[int, int]
-_Positions: TypeAlias = dict[_Key, np.ndarray]
+# Positions, float64 [3] [m], by cycle and user.
+_Positions: TypeAlias = dict[Key, np.ndarray]
 _SIGNALS = topics.NAMES[m.ReceivedSignals]
 _ESTIMATES = topics.NAMES[m.PositionEstimate]
 # Period of looking for subscribers; maximum time to discover an optimizer, without and with DDS
@@ -127,7 +127,7 @@ class RepublisherNode(Node):
         if _SIGNALS in names:
             subscribe_messages(self, ANSWERS, None, self._on_answer)
 
-    def _on_answer(self, message: m.Message) -> None:
+    def _on_answer(self, message: m.Message, _: float) -> None:
         if isinstance(message, m.PositionEstimate | m.NoFix) and self._pending == (
                 message.cycle_id, message.user):
             self._pending = None
@@ -249,7 +249,8 @@ def _without_gaps(
 
 def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     names = options.topic or [_SIGNALS]
-    scenario = command.choose_scenario(options.config, options.file, options.namespace)
+    scenario = command.choose_scenario(
+        options.config, options.file, options.namespace, options.site)
     first_codebook = _first_codebook(options) if _SIGNALS in names else None
     if first_codebook:
         first_codebook.check(scenario)
@@ -329,111 +330,89 @@ def _optimizer_present(node: Node) -> bool:
         _SECURE_DISCOVERY_TIMEOUT_S if is_secure() else _DISCOVERY_TIMEOUT_S)
 
 
-@dataclasses.dataclass(frozen=True)
 class Recording:
-    """Complete cycles of one network, with its scenario and its codebooks by id."""
+    """The signals of one or more surfaces in the same cycles, and their true positions.
 
-    scenario: Scenario
-    cycles: list[CompleteCycle]
-    codebooks: dict[str, Codebook]
-
-
-def load(path: Path, namespace: str = '/', config: Path | None = None) -> Recording:
-    """Load the complete cycles of a network from a recording.
-
-    The scenario file `config` replaces the recorded scenario. Raises ScenarioError if the scenario
-    is invalid, RecordingError if the recording is, or has no complete cycle in the namespace.
+    `logs` contains those of each surface by name, and '' for what answers the base station: the
+    network itself or, in a site, the fusion. `truths` contains the positions of all cycles with
+    signals and a true position, also of those without a fix, but without a last one that has not
+    ended. Raises RecordingError if there are none.
     """
-    scenario = command.choose_scenario(config, path, namespace)
-    log = CycleLog()
-    codebooks: dict[str, Codebook] = {}
-    for found, time_s in command.recorded(path, namespace, scenario, [*RECEIVES, Codebook]):
-        if isinstance(found, Codebook):
-            codebooks[found.id] = found
-        else:
-            log.add(found, time_s)
-    if not log.complete:
-        raise RecordingError(
-            f'{path}: no complete cycle in the namespace {namespace}; see --namespace')
-    return Recording(scenario, log.complete, codebooks)
+
+    def __init__(self, path: Path, namespace: str, scenarios: Mapping[str, Scenario]) -> None:
+        self.logs = {name: SignalLog() for name in scenarios}
+        for name, log in self.logs.items():
+            for found in command.recorded(
+                    path, posixpath.join(namespace, name), scenarios[name],
+                    [*SignalLog.RECEIVES, Codebook]):
+                log.add(*found)
+        self.scenarios, leader = scenarios, next(iter(self.logs.values()))
+        self.truths: _Positions = {
+            key: truth.position for log in self.logs.values()
+            for key, signals in log.signals.items() if (truth := leader.truth_of(signals))}
+        if self.truths and (last := max(self.truths)) not in self.logs[''].ended:
+            del self.truths[last]
+        if not self.truths:
+            raise RecordingError(f'{path}: no received signals with a true position in the '
+                                 f'namespace {namespace}; see --namespace')
+
+    def live(self, name: str = '') -> _Positions:
+        """Return the recorded positions."""
+        return {key: found.position for key, found in self.logs[name].estimates.items()}
+
+    def errors_m(self, positions: _Positions) -> np.ndarray:
+        """Return the errors of positions, float64 [N] [m]; NaN without a position."""
+        return np.array([np.linalg.norm(positions.get(key, np.full(3, np.nan)) - truth)
+                         for key, truth in self.truths.items()])
 
 
-def errors_m(
+def load(path: Path, namespace: str = '/', config: Path | None = None,
+         site: Site | None = None) -> Recording:
+    """Load a recording of a network; `config`, a file, or `site` replaces the recorded scenario.
+
+    Raises ScenarioError if the scenario is invalid, RecordingError if the recording is.
+    """
+    return Recording(path, namespace, {
+        '': command.choose_scenario(config, path, namespace, site)})
+
+
+def locate(
         recording: Recording, estimators: Mapping[str, Estimator],
-        track_speed_mps: float | None = None) -> np.ndarray:
-    """Repeat the position estimate of each cycle, and return the errors, float64 [N] [m].
+        track_speed_mps: float | None = None) -> _Positions:
+    """Locate the users of a network again; those without a fix have no position.
 
-    Without a fix, the error is NaN. The keys of `estimators` are ids of codebooks. If the typical
-    speed `track_speed_mps` [m/s] is given, users are tracked over the cycles.
+    The keys of `estimators` are ids of codebooks. If the typical speed `track_speed_mps` [m/s] is
+    given, users are tracked over the cycles.
     """
-    tracks, errors = Tracks(), []
-    for cycle in recording.cycles:
-        signals, estimator = cycle.signals.signals, estimators[cycle.signals.codebook_id]
-        if track_speed_mps is None:
-            estimate = estimator.estimate(signals.reshape(len(signals), -1))
-        else:
-            estimate = tracks.locate(
-                cycle.signals, estimator, track_speed_mps, cycle.signals.time_s(cycle.ended_s))
-        position = estimate.to_site(recording.scenario.pose).mean
-        errors.append(np.linalg.norm(position - cycle.truth.position)
-                      if estimate.fix else np.nan)
-    return np.array(errors)
+    tracks, log, found = Tracks(), recording.logs[''], {}
+    for key in recording.truths:
+        signals = log.signals[key]
+        estimator, received = estimators[signals.codebook_id], signals.signals
+        estimate = estimator.estimate(
+            received.reshape(len(received), -1)) if track_speed_mps is None else tracks.locate(
+            signals, estimator, track_speed_mps, signals.time_s(log.arrived_s[key]))
+        if estimate.fix:
+            found[key] = estimate.to_site(recording.scenarios[''].pose).mean
+    return found
 
 
-class _Answers:
-    """What a surface of a site, or their fusion, has sent, by cycle and user."""
-
-    def __init__(self, path: Path, namespace: str, scenario: Scenario) -> None:
-        self.signals: dict[_Key, m.ReceivedSignals] = {}
-        self.positions: _Positions = {}
-        self.truths: list[m.GroundTruth] = []
-        self.codebooks: dict[str, Codebook] = {}
-        for found, _ in command.recorded(path, namespace, scenario, [
-                m.ReceivedSignals, m.PositionEstimate, m.GroundTruth, Codebook]):
-            match found:
-                case m.ReceivedSignals():
-                    self.signals[found.cycle_id, found.user] = found
-                case m.PositionEstimate():
-                    self.positions[found.cycle_id, found.user] = found.position
-                case m.GroundTruth():
-                    self.truths.append(found)
-                case Codebook():
-                    self.codebooks[found.id] = found
-
-
-class SiteRecording:
-    """The signals and positions of all surfaces of a recorded site, and of their fusion.
-
-    `live` contains the recorded positions by name, '' for the fusion, and `truths` those of users
-    whom the fusion has located. Raises RecordingError if there are none.
-    """
+class SiteRecording(Recording):
+    """The recording of a site."""
 
     def __init__(self, path: Path, namespace: str, networks: Recorded) -> None:
         self._path, self._networks = path, networks
-        leader = next(iter(networks.surfaces))
-        self._answers = {
-            name: _Answers(path, f'{namespace.rstrip("/")}/{name}',
-                           networks.surfaces[name or leader])
-            for name in (*networks.surfaces, '')}
-        self.live = {name: one.positions for name, one in self._answers.items()}
-        self.truths = {
-            key: truth.position for truth in self._answers[leader].truths
-            if (key := (truth.cycle_id, truth.user)) in self.live['']
-            and any(m.same_instance(truth.sender, one.signals[key].user_instance)
-                    for one in self._answers.values() if key in one.signals)}
-        if not self.truths:
-            raise RecordingError(f'{path}: no position of the fusion in the namespace '
-                                 f'{namespace}; see --namespace')
+        leader = next(iter(networks.surfaces.values()))
+        super().__init__(path, namespace, {**networks.surfaces, '': leader})
 
     def located(self, table_folder: Path | None = None) -> dict[str, _Positions]:
-        """Locate the users again from the recorded signals; the result is like `live`."""
+        """Locate the users again from the recorded signals; return the positions by name."""
         find = functools.cache(functools.partial(self._estimator, table_folder))
-        again: dict[str, _Positions] = {name: {} for name in self.live}
+        again: dict[str, _Positions] = {name: {} for name in self.logs}
         for key in self.truths:
             sightings = []
             # In the order of the node `fusion`.
             for name, scenario in sorted(self._networks.surfaces.items()):
-                signals = self._answers[name].signals.get(key)
+                signals = self.logs[name].signals.get(key)
                 if signals is None:
                     continue
                 posterior = find(name, signals.codebook_id).posterior(
@@ -446,16 +425,11 @@ class SiteRecording:
         return again
 
     def _estimator(self, folder: Path | None, name: str, codebook_id: str) -> BayesEstimator:
-        if codebook_id not in self._answers[name].codebooks:
+        if codebook_id not in self.logs[name].codebooks:
             raise RecordingError(f'{self._path}: codebook {codebook_id} of {name}: not recorded')
         return BayesEstimator(
-            self._networks.surfaces[name], self._answers[name].codebooks[codebook_id], folder,
+            self._networks.surfaces[name], self.logs[name].codebooks[codebook_id], folder,
             reject_outside=True)
-
-    def errors_m(self, positions: _Positions) -> np.ndarray:
-        """Return the errors of positions, float64 [N] [m]; NaN without a position."""
-        return np.array([np.linalg.norm(positions.get(key, np.full(3, np.nan)) - truth)
-                         for key, truth in self.truths.items()])
 
 
 def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
@@ -473,8 +447,9 @@ def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
     recording = SiteRecording(options.file, options.namespace, networks)
     command.print_now(f'{len(recording.truths)} cycles')
     again = recording.located(default_folder())
-    rows = [_row(f'{label}{name or "fusion"}', recording.errors_m(positions[name]))
-            for name in again for label, positions in (('live ', recording.live), ('', again))]
+    rows = [_row(f'{label}{name or "fusion"}', recording.errors_m(positions))
+            for name, found in again.items()
+            for label, positions in (('live ', recording.live(name)), ('', found))]
     _print_table(rows)
     return 0
 
@@ -491,6 +466,8 @@ def _conflict(options: argparse.Namespace) -> str:
     if not options.publish and (options.topic, options.rate, options.timeout) != (
             None, _RATE, _TIMEOUT_S):
         return 'arguments --topic, --rate and --timeout: expected together with --publish'
+    if options.config and options.site:
+        return 'argument --config: not allowed with --site'
     if options.track and BayesEstimator.name not in estimators:
         return 'argument --track: expected together with --estimator bayes'
     if options.track_speed is not None and not options.track:
@@ -502,30 +479,32 @@ def _conflict(options: argparse.Namespace) -> str:
 
 def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     """Publish a recording, or compare the errors of estimators with the recorded errors."""
-    networks = read_networks(options.file)
+    if options.site:
+        options.site = Site.from_yaml(options.site)
+    networks = read_networks(options.file, options.site)
     if networks.is_site(options.namespace):
         return _replay_site(options, networks)
     if options.publish:
         return _republish(options, arguments)
-    recording = load(options.file, options.namespace, options.config)
+    recording = load(options.file, options.namespace, options.config, options.site)
+    (scenario,), (log,) = recording.scenarios.values(), recording.logs.values()
     codebooks = _codebooks(recording, options.codebook)
-    names = sorted({cycle.estimate.estimator for cycle in recording.cycles})
-    live = np.array([cycle.error_m for cycle in recording.cycles])
-    command.print_now(f'{len(live)} cycles')
-    rows = [_row(f'live {", ".join(names)}', live)]
+    names = sorted({estimate.estimator for estimate in log.estimates.values()})
+    command.print_now(f'{len(recording.truths)} cycles')
+    rows = [_row(f'live {", ".join(names)}', recording.errors_m(recording.live()))]
     known = {}
     if options.calibration:
-        known['surface'] = load_surface(str(options.calibration), recording.scenario)
+        known['surface'] = load_surface(str(options.calibration), scenario)
     for name in options.estimator or [BayesEstimator.name]:
         region = {'reject_outside': True} if name in REGION_ESTIMATORS else {}
         estimators = {codebook_id: make_estimator(
-            name, recording.scenario, codebook, **region, **known,
+            name, scenario, codebook, **region, **known,
             **file_options(name, default_folder(), options.model or ''))
             for codebook_id, codebook in codebooks.items()}
-        rows.append(_row(name, errors_m(recording, estimators)))
+        rows.append(_row(name, recording.errors_m(locate(recording, estimators))))
         if options.track and name == BayesEstimator.name:
-            rows.append(_row('track', errors_m(
-                recording, estimators, options.track_speed or Motion.speed_mps)))
+            rows.append(_row('track', recording.errors_m(locate(
+                recording, estimators, options.track_speed or Motion.speed_mps))))
     _print_table(rows)
     return 0
 
@@ -543,20 +522,21 @@ def _row(name: str, errors: np.ndarray) -> list[str]:
 
 def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
     """Return the codebooks to assume, by the id of the recorded codebook."""
-    used = sorted({cycle.signals.codebook_id for cycle in recording.cycles})
+    log = recording.logs['']
+    used = sorted({log.signals[key].codebook_id for key in recording.truths})
     if file:
         codebook = Codebook.load(file)
-        codebook.check(recording.scenario)
+        codebook.check(recording.scenarios[''])
         for codebook_id in used:
             if codebook_id != codebook.id:
                 print(f'signals received with codebook {codebook_id} are evaluated with '
                       f'{codebook.id}', file=sys.stderr)
         return dict.fromkeys(used, codebook)
     for codebook_id in used:
-        if codebook_id not in recording.codebooks:
+        if codebook_id not in log.codebooks:
             raise RecordingError(f'codebook {codebook_id}: not in the recording; give its file '
                                  'with --codebook FILE')
-    return {codebook_id: recording.codebooks[codebook_id] for codebook_id in used}
+    return {codebook_id: log.codebooks[codebook_id] for codebook_id in used}
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -573,6 +553,8 @@ def _parser() -> argparse.ArgumentParser:
         help=f'typical speed of the users (default: {Motion.speed_mps:g} m/s)')
     command.add_files(parser, 'codebook', 'config', 'calibration')
     add('--model', type=input_file, metavar='FILE', help='model of the estimator neural')
+    add('--site', type=input_file, metavar='FILE',
+        help='site file; by default the recorded scenarios of the surfaces')
     add('--namespace', default='/', help='namespace of the recorded network (default: /)')
     add = parser.add_argument_group(
         'running nodes', 'Publish the recorded signals again, with their timing, in the namespace '

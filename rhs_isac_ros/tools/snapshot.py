@@ -41,12 +41,11 @@ class SnapshotNode(Node):
         subscribe_messages(
             self, SCENE_RECEIVES, scenario, self._on_message, self._on_mismatch)
 
-    def _on_message(self, message: m.Message) -> None:
-        now_s = time.monotonic()
-        self._began_s = min(self._began_s, now_s)
-        self.scene.add(message, now_s)
+    def _on_message(self, message: m.Message, arrived_s: float) -> None:
+        self._began_s = min(self._began_s, arrived_s)
+        self.scene.add(message, arrived_s)
         if self.scene.drawable:
-            self._drawable_s = min(self._drawable_s, now_s)
+            self._drawable_s = min(self._drawable_s, arrived_s)
 
     def _on_mismatch(self, error: m.MessageError) -> None:
         self._began_s = min(self._began_s, time.monotonic())

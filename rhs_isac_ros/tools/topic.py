@@ -6,7 +6,6 @@ import collections
 import importlib
 import operator
 import sys
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,7 +16,7 @@ from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
 from rhs_isac_ros.protocol.messages import MessageError
 from rhs_isac_ros.ros.convert import deserialize
-from rhs_isac_ros.ros.endpoints import log_dropped, steady_timer
+from rhs_isac_ros.ros.endpoints import log_dropped, steady_timer, subscribe
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run_verb
 
@@ -131,13 +130,13 @@ def show_rate(session: Session, options: argparse.Namespace) -> None:
     times_ns: collections.deque[int] = collections.deque(maxlen=_MAX_TIMES)
     reported_ns = 0
     # Raw messages, because deserialization of long messages takes time.
-    session.node.create_subscription(
-        kind, name, lambda _: times_ns.append(time.monotonic_ns()), qos_profile_sensor_data,
-        raw=True)
+    subscribe(session.node, kind, name,
+              lambda _, info: times_ns.append(info['received_timestamp']),
+              qos_profile_sensor_data, raw=True)
 
     def report() -> None:
         nonlocal reported_ns
-        if len(times_ns) > 1 and times_ns[-1] > reported_ns:
+        if len(times_ns) > 1 and times_ns[-1] != reported_ns:
             reported_ns = times_ns[-1]
             print_now(rate_text(times_ns))
     steady_timer(session.node, 1.0, report)

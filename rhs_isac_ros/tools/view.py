@@ -86,13 +86,13 @@ class ViewNode(Node):
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text)  # type: ignore[no-untyped-call]
 
-    def _on_message(self, message: m.Message) -> None:
-        now_s = time.monotonic()
+    def _on_message(self, message: m.Message, arrived_s: float) -> None:
         if isinstance(message, m.Beam):
+            now_s = time.monotonic()
             if now_s < self._beam_s + _BEAM_PERIOD_S:
                 return
             self._beam_s = now_s
-        self._write(self.view.add(message, now_s))
+        self._write(self.view.add(message, arrived_s))
         if isinstance(message, m.PositionEstimate):
             self._follow_track(message.user)
 

@@ -132,9 +132,7 @@ class WatchNode(Node):
         super().__init__('watch', **WITHOUT_SERVICES)
         self.overview = Overview()
         # Log messages would disturb the view, and the nodes already count malformed messages.
-        subscribe_messages(
-            self, RECEIVES, None,
-            lambda message: self.overview.add(message, time.monotonic()), lambda error: None)
+        subscribe_messages(self, RECEIVES, None, self.overview.add, lambda error: None)
         subscribe_reports(self, lambda name, report: self.overview.add_report(
             name, report, time.monotonic()))
 

@@ -16,7 +16,7 @@ import multiprocessing
 import os
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,7 +32,7 @@ from rhs_isac_msgs.msg import FeedSignals
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import EXCHANGE, OBSERVATION, subscribe
+from rhs_isac_ros.ros.endpoints import EXCHANGE, OBSERVATION, arrived_s, subscribe
 from rhs_isac_ros.ros.environment import check_environment, private_domain, use_discovery_profile
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.support.arguments import positive_int
@@ -179,11 +179,11 @@ class ChainObserver(Node):
             subscribe(self, convert.ros_type(kind), topics.NAMES[kind], self._store(kind),
                       OBSERVATION, raw=True)
 
-    def _store(self, kind: type[m.Message]) -> Callable[[bytes], None]:
+    def _store(self, kind: type[m.Message]) -> Callable[..., None]:
         stored, ends = self._stored[kind], kind is m.ProtocolState
 
-        def store(content: bytes) -> None:
-            stored.append((content, time.monotonic()))
+        def store(content: bytes, info: Mapping[str, int]) -> None:
+            stored.append((content, arrived_s(info)))
             # The outcome is text on the wire.
             self.served += ends and b'served' in content
         return store
@@ -192,9 +192,9 @@ class ChainObserver(Node):
         """Return the cycles that were served and are complete, in order."""
         cycles: dict[int, Cycle] = {}
         for kind, stored in self._stored.items():
-            for content, arrived_s in stored:
+            for content, time_s in stored:
                 message = convert.from_bytes(kind, content)
-                cycles.setdefault(message.cycle_id, Cycle([])).sent.append((arrived_s, message))
+                cycles.setdefault(message.cycle_id, Cycle([])).sent.append((time_s, message))
         return [cycle for _, cycle in sorted(cycles.items()) if cycle.is_served]
 
 

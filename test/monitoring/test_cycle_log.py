@@ -91,6 +91,16 @@ def test_a_cycle_without_a_position_is_given_up_but_has_not_failed(example):
     assert log.failed == log.complete == []
 
 
+def test_cycles_that_ended_after_a_time_are_removed(network):
+    net = network()
+    net.run_cycles(3)
+    log = log_of(net)
+    first, second, _ = log.complete
+    log.cut(second.ended_s)
+    assert log.complete == [first, second]
+    assert [record.cycle_id for record in log.ended] == [1, 2]
+
+
 def test_the_order_of_topics_does_not_matter(network):
     net = network(2)
     net.run_cycles(3)

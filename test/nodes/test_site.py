@@ -63,7 +63,7 @@ def site_file(make_site_file):
 
 # First, while no other site runs.
 def test_the_demonstration_compares_all_surfaces_with_the_fusion_and_counts_their_data(
-        make_site_file, monkeypatch, capsys):
+        make_site_file, monkeypatch, capfd):
     def fork(processes, name):
         processes._running[name] = Forked(
             processes._commands[name], processes._logs / f'{name}.log', processes._environment)
@@ -73,7 +73,7 @@ def test_the_demonstration_compares_all_surfaces_with_the_fusion_and_counts_thei
     names = ('side', 'front')
     code = demo.main(
         ['--site', str(make_site_file(*names)), '--cycles', '4', '--prior', 'track'])
-    out, err = capsys.readouterr()
+    out, err = capfd.readouterr()
     assert code == 0, err
     for text in (*(f'{name}: ' for name in names), 'fused: 4 positions, root mean square error'):
         assert text in out
@@ -277,15 +277,16 @@ def test_a_replay_locates_the_users_of_each_surface_and_of_the_fusion_again(reco
     path, estimates = recorded
     recording = SiteRecording(path, '/', read_networks(path))
     again = recording.located()
-    assert again.keys() == recording.live.keys() == {'front', 'side', ''}
+    assert again.keys() == recording.logs.keys() == {'front', 'side', ''}
     # With all signals, the positions are the same. The recorder discovers topics one by one.
     first = min(again['front'].keys() & again['side'].keys())
     keys = {(one.cycle_id, one.user) for one in estimates
             if (one.cycle_id, one.user) >= first} & recording.truths.keys()
     assert len(keys) > N_USERS
     for name, found in again.items():
-        for key in keys & recording.live[name].keys():
-            np.testing.assert_allclose(found[key], recording.live[name][key], atol=1e-6)
+        live = recording.live(name)
+        for key in keys & live.keys():
+            np.testing.assert_allclose(found[key], live[key], atol=1e-6)
     assert main([str(path)]) == 0
     number, _, *rows = capsys.readouterr().out.splitlines()
     assert number == f'{len(recording.truths)} cycles'
@@ -297,8 +298,8 @@ def test_a_replay_locates_the_users_of_each_surface_and_of_the_fusion_again(reco
     (['--publish'], 1, '--publish: not available for a whole site; select a surface with '
      '--namespace: /front, /side\n'),
     (['--estimator', 'ml'], 1, 'select a surface with --namespace: /front\n'),
-    (['--namespace', '/side'], 2, 'no complete cycle in the namespace /side'),
-    (['--namespace', '/lab'], 2, 'no position of the fusion in the namespace /lab')])
+    (['--namespace', '/side'], 2, 'with a true position in the namespace /side'),
+    (['--namespace', '/lab'], 2, 'with a true position in the namespace /lab')])
 def test_a_replay_of_a_site_names_what_is_not_available(
         recorded, capsys, arguments, code, expected):
     from rhs_isac_ros.tools.replay import main

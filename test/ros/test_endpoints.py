@@ -123,7 +123,7 @@ def test_a_simulation_whose_time_was_refused_is_not_used(bench, refused):
 
 def test_the_visualizer_runs_without_what_was_refused(bench, refused):
     node = bench.add_role('visualizer')
-    node._on_message(position_estimate())
+    node._on_message(position_estimate(), 0.0)
     node._show()
     assert {topics.MARKERS, topics.PATH.format(user=1), topics.TRUE_PATH.format(user=1)} <= {
         *refused}

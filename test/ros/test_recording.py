@@ -2,8 +2,11 @@
 
 import array
 import importlib
+import os
+import re
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -35,7 +38,6 @@ from rhs_isac_ros.ros.recording import (
     read,
     read_networks,
     recorded_topics,
-    schema,
     type_name,
 )
 
@@ -80,9 +82,62 @@ def test_messages_are_read_back(recording):
         found, sent, strict=True)] == sent
     assert [topic for topic, _, _ in found] == [
         '/received_signals', '/position_estimate', '/received_signals']
-    times = [time_s for _, _, time_s in found]
-    assert times == sorted(times)
     assert read_networks(path).scenario == Scenario(n_frames=2)
+
+
+def test_the_times_are_those_of_the_middleware_however_late_the_callback_is(
+        bench, probe, tmp_path, monkeypatch):
+    """Those of the messages in the file, and those with which an observer logs cycles."""
+    from mcap.reader import make_reader
+    times_s = []
+    monkeypatch.setattr(CycleObserver, 'observe', lambda *arguments: times_s.append(arguments[-1]))
+    recorder = Recorder(tmp_path / 'run.mcap', Scenario())
+    for recorded in (recorder, None):
+        bench.add(CycleObserver, recorded)
+    publisher = probe.create_publisher(ros.Beacon, 'beacon', EXCHANGE)
+    bench.until(lambda: publisher.get_subscription_count() == 2, 'the recorder')
+    begin_ns, begin_s = time.time_ns(), time.monotonic()
+    publisher.publish(ros.Beacon(cycle_id=7))
+    # Nobody spins meanwhile.
+    time.sleep(0.5)
+    late_ns, late_s = time.time_ns() - 10**8, time.monotonic() - 0.1
+    bench.until(lambda: len(times_s) == 2, 'the message')
+    recorder.close()
+    with (tmp_path / 'run.mcap').open('rb') as stream:
+        ((_, _, message),) = make_reader(stream).iter_messages()
+    assert begin_ns < message.publish_time < message.log_time < late_ns
+    for time_s in times_s:
+        assert begin_s - 1e-3 < time_s < late_s
+
+
+def test_messages_are_read_in_the_order_of_their_arrival(tmp_path):
+    """Callbacks may be called in another order, and copies are often sorted."""
+    from mcap.writer import Writer
+    path = tmp_path / 'a.mcap'
+    writer = Writer(str(path))
+    writer.start()
+    channel = writer.register_channel('/ack', 'cdr', writer.register_schema(
+        'rhs_isac_msgs/msg/Ack', '', b''))
+    for time_ns in (3, 1, 2, 1):
+        writer.add_message(channel, time_ns * 10**9, bytes([time_ns]), 0)
+    writer.finish()
+    assert [(content, time_s) for _, content, time_s in read(path)] == [
+        (b'\1', 1.0), (b'\1', 1.0), (b'\2', 2.0), (b'\3', 3.0)]
+
+
+def test_a_recorder_replaces_no_file(tmp_path):
+    path = tmp_path / 'run.mcap'
+    recorder = Recorder(path, Scenario())
+    with pytest.raises(RecordingError, match='run.mcap.part: cannot be written: File exists; a '
+                                             'recorder that runs, or was killed, has the file'):
+        Recorder(path, Scenario())
+    path.write_text('other')
+    recorder.close()
+    assert 'File exists' in recorder.failure
+    assert path.read_text() == 'other'
+    assert read_networks(tmp_path / 'run.mcap.part').scenario == Scenario()
+    with pytest.raises(RecordingError, match='run.mcap: cannot be written: File exists'):
+        Recorder(path, Scenario())
 
 
 def test_an_observer_logs_the_cycles_that_it_records(bench, probe, tmp_path):
@@ -218,20 +273,56 @@ def test_a_site_without_a_valid_region_is_an_error(tmp_path, region, reason):
         read_networks(path)
 
 
-def test_a_recording_with_other_fields_is_an_error(recording, monkeypatch):
+def rewritten(path, change, **options):
+    """Copy a recording with another writer and with changed definitions; return the copy."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+    copy, channels = path.with_name('copy.mcap'), {}
+    with path.open('rb') as source, copy.open('wb') as target:
+        writer = Writer(target, **options)
+        writer.start('other', 'another writer')
+        for about, channel, message in make_reader(source).iter_messages():
+            if channel.id not in channels:
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, writer.register_schema(
+                        about.name, about.encoding, change(about.data.decode()).encode()))
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return copy
+
+
+@pytest.mark.parametrize(('old', 'new', 'owner'), [
+    ('uint64 sender\n', '', 'ReceivedSignals'),
+    ('uint64 sender', 'int64 sender', 'ReceivedSignals'),
+    ('float64[] im', 'float32[] im', 'ComplexArray')])
+def test_a_recording_with_other_fields_is_an_error(recording, old, new, owner):
     """Such as one from before the messages had headers: its bytes would be misread."""
-    path, _ = recording
-    assert list(read(path))
-    text, kind = schema(ros.ReceivedSignals), ros.ReceivedSignals
-    monkeypatch.setattr('rhs_isac_ros.ros.recording.schema', lambda found: (
-        text.replace('uint64 sender\n', '') if found is kind else schema(found)))
-    with pytest.raises(RecordingError, match='mcap: rhs_isac_msgs/msg/ReceivedSignals: recorded '
-                                             'with other fields'):
-        list(read(path))
+    copy = rewritten(recording[0], lambda text: text.replace(old, new))
+    with pytest.raises(RecordingError, match=f'mcap: rhs_isac_msgs/{owner}: recorded with other'):
+        list(read(copy))
+
+
+@pytest.mark.parametrize('options', [
+    {}, {'compression': 'LZ4'}, {'compression': 'NONE', 'use_chunking': False},
+    {'index_types': 'NONE', 'use_statistics': False, 'use_summary_offsets': False,
+     'repeat_channels': False, 'repeat_schemas': False, 'enable_crcs': False}], ids=str)
+def test_a_copy_by_another_writer_contains_the_same_messages(recording, options):
+    """Such as one that qualifies types, and drops comments, constants, defaults and spaces."""
+    from mcap import writer
+
+    def change(text):
+        text = re.sub(r' *#.*|.*=[^=\n].*|(?<=_user) \d+$', '', text, flags=re.MULTILINE)
+        text = re.sub(r'\b(\w+_msgs)/(?=[A-Z])', r'\1/msg/', text).replace('byte ', 'octet ')
+        return re.sub(r'^(?=(Real|Complex)Array)', 'rhs_isac_msgs/msg/', text, flags=re.MULTILINE)
+    enums = {'compression': writer.CompressionType, 'index_types': writer.IndexType}
+    copy = rewritten(recording[0], change, **{
+        key: enums[key][value] if key in enums else value for key, value in options.items()})
+    assert list(read(copy)) == list(read(recording[0]))
 
 
 def test_the_error_names_a_missing_folder(tmp_path):
-    with pytest.raises(RecordingError, match='none/run.mcap: cannot be written: No such file'):
+    with pytest.raises(RecordingError, match='none/run.mcap.part: cannot be written: No such'):
         Recorder(tmp_path / 'none' / 'run.mcap', Scenario())
 
 
@@ -317,21 +408,21 @@ def test_rosbags_reads_all_topics(bench, probe, tmp_path):
     assert not any(sent.values())
 
 
-def test_a_full_disk_ends_the_recording_with_one_error(bench, probe, tmp_path):
-    (tmp_path / 'run.mcap.part').symlink_to('/dev/full')
+def test_a_full_disk_ends_the_recording_with_one_error(bench, probe, tmp_path, full_disk):
     recorder, seen = Recorder(tmp_path / 'run.mcap', Scenario()), []
-    recorder.record_topics(probe, lambda name, message: seen.append(name))
+    recorder.record_topics(probe, lambda name, *_: seen.append(name))
     publisher = probe.create_publisher(ros.Ack, 'ack', ACKS)
     bench.until(publisher.get_subscription_count, 'the recorder')
 
     def failed():
         for _ in range(5):
-            publisher.publish(ros.Ack(cycle_id=1, user=1, scenario_id=200_000 * 'x'))
+            publisher.publish(ros.Ack(cycle_id=1, user=1, scenario_id=os.urandom(100_000).hex()))
         return recorder.failure
-    assert 'run.mcap.part: cannot be written: No space left on device; the recording ends after ' \
-        in bench.until(failed, 'the failure')
+    with full_disk(100_000):
+        failure = bench.until(failed, 'the failure')
+    assert 'mcap.part: cannot be written: File too large; the recording ends after ' in failure
     # Observers of the recorded messages receive the others nevertheless.
-    n_seen, count, failure = len(seen), recorder.count, recorder.failure
+    n_seen, count = len(seen), recorder.count
     publisher.publish(ros.Ack(cycle_id=1, user=1))
     bench.until(lambda: len(seen) > n_seen, 'another message')
     for _ in range(2):
@@ -340,15 +431,15 @@ def test_a_full_disk_ends_the_recording_with_one_error(bench, probe, tmp_path):
     assert not (tmp_path / 'run.mcap').exists()
 
 
-def test_the_tool_ends_with_one_line_if_the_disk_is_full(tmp_path):
-    (tmp_path / 'run.mcap.part').symlink_to('/dev/full')
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'rhs_isac_ros.tools', 'record', str(tmp_path / 'run.mcap')],
-        stderr=subprocess.PIPE, text=True)
-    error = process.communicate(timeout=60)[1]
+def test_the_tool_ends_with_one_line_if_the_disk_is_full(tmp_path, full_disk):
+    with full_disk(10):
+        process = subprocess.run(
+            [sys.executable, '-m', 'rhs_isac_ros.tools', 'record', 'run.mcap'], cwd=tmp_path,
+            capture_output=True, text=True, timeout=60, check=False)
     assert process.returncode == 1
-    assert 'Traceback' not in error
-    assert error.count('error: ') == error.count('No space left on device') == 1
+    assert 'Traceback' not in process.stderr
+    assert process.stderr.count('error: ') == process.stderr.count(
+        'run.mcap.part: cannot be written: File too large') == 1
 
 
 def test_nodes_receive_a_recording_that_is_played_with_its_recorded_qos(bench, tmp_path):

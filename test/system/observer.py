@@ -84,7 +84,7 @@ class NetworkObserver(CycleObserver):
     def _subscribe(
             self, kind: type, name: str, profile: QoSProfile,
             callback: Callable[[Any], None]) -> None:
-        def receive(serialized: bytes) -> None:
+        def receive(serialized: bytes, _: object) -> None:
             with contextlib.suppress(CodebookError, ValueError):
                 callback(deserialize(serialized, kind))
         subscribe(self, kind, name, receive, profile, raw=True)

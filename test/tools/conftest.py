@@ -2,11 +2,13 @@
 
 import contextlib
 import subprocess
+import time
 import types
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rclpy.experimental.events_executor import EventsExecutor
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
@@ -84,13 +86,20 @@ def spin_until(shared_session):
 
 
 @pytest.fixture(scope='package')
-def run(spin_until, tmp_path_factory):
+def run(shared_session, tmp_path_factory):
     """A recording of some cycles of two users, and the cycles as they were observed live."""
     pytest.importorskip('mcap', reason='mcap is not installed')
     path = tmp_path_factory.mktemp('recording') / 'run.mcap'
     recorder = Recorder(path, Scenario.from_yaml(CONFIG / 'quick.yaml'))
     observer = CycleObserver(recorder)
-    spin_until(observer, lambda: len(observer.complete) >= CYCLES)
+    # In the order of arrival; the executor of the session takes the topics in turn.
+    executor, end_s = EventsExecutor(), time.monotonic() + TIMEOUT_S
+    executor.add_node(observer)
+    while len(observer.complete) < CYCLES:
+        executor.spin_once(timeout_sec=0.1)
+        assert time.monotonic() < end_s
+    executor.shutdown()
+    observer.destroy_node()
     recorder.close()
     return types.SimpleNamespace(path=path, cycles=observer.complete)
 

@@ -53,6 +53,21 @@ def test_a_signal_during_the_start_completes_the_recording(
     assert [*read_networks('run.mcap').surfaces] == surfaces
 
 
+def test_a_recording_that_fails_has_an_exit_code(tmp_path, monkeypatch, capsys, full_disk):
+    pytest.importorskip('mcap', reason='mcap is not installed')
+    monkeypatch.setattr(demo, 'start_network', lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(demo, 'private_domain', dict)
+    monkeypatch.chdir(tmp_path)
+    with full_disk(10):
+        assert main(['--record', 'run.mcap']) == 1
+    out, err = capsys.readouterr()
+    assert (out, err) == ('', 'demo: error: run.mcap.part: cannot be written: File too large; the '
+                              'recording ends after 0 messages\n')
+    # The same command again would replace the file.
+    assert main(['--record', 'run.mcap']) == 2
+    assert 'run.mcap.part: cannot be written: File exists' in capsys.readouterr().err
+
+
 class Started(dict):
     """The parameters of processes, by namespace and name."""
 

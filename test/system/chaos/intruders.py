@@ -72,7 +72,7 @@ def _incompatible_observer() -> Iterator[None]:
     """Run a node that requests every topic as latched, which most publishers do not offer."""
     node = Node('incompatible')
     for kind, name in topics.NAMES.items():
-        subscribe(node, convert.ros_type(kind), name, lambda content: None, LATCHED, raw=True)
+        subscribe(node, convert.ros_type(kind), name, lambda *_: None, LATCHED, raw=True)
     try:
         yield
     finally:
