@@ -21,7 +21,8 @@ from rhs_isac_ros.positioning.segments import Segments, select
 from rhs_isac_ros.positioning.templates import standard_normal
 from rhs_isac_ros.support.threads import one_blas_thread
 
-# Smallest number of common users. A pose has six unknowns, and a user yields up to three numbers.
+# Smallest number of places of common users. A pose has six unknowns, and a place yields up to
+# three numbers.
 MIN_USERS = 10
 
 
@@ -55,11 +56,18 @@ class _Limits(NamedTuple):
     # the pose.
     std_m: float = 2.0
     std_rad: float = 0.2
+    # Smallest share of the apparent information about an error that is not due to the errors of
+    # the places.
+    certain: float = 0.5
+    # Squared Mahalanobis distance of users who are at one place.
+    same_place: float = 2.0
 
 
 _LIMITS = _Limits()
 # Information of a prior that keeps undetermined errors finite: 10 m and 1 rad.
 _PRIOR = np.diag(1 / np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])**2)
+# Cross products of the unit vectors, [3, 3, 3].
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3))
 
 
 class PoseError(ValueError):
@@ -87,23 +95,39 @@ def estimate_pose(
     Raises
     ------
     PoseError
-        If the numbers of sightings differ or are below `MIN_USERS`, or if the users do not
-        determine the pose, for example because all are at one place.
+        If the numbers of sightings differ or are below `MIN_USERS`, if the users are at fewer
+        places, or if they do not determine the pose, for example because all are on one line.
+
+    Notes
+    -----
+    Users whose positions differ by less than their errors are at one place, such as a user at rest
+    in several cycles. Their errors may be the same, so they count as one user. Users determine the
+    pose if they spread by more than their own errors in at least two directions.
     """
     if len(reference) != len(other) or len(other) < MIN_USERS:
         raise PoseError(f'sightings: {len(reference)} and {len(other)}, expected equal numbers, '
                         f'at least {MIN_USERS}')
     pairs = _Pairs.of(reference, other, bounds_m)
     pose = pairs.climb(other[0].pose, _LIMITS.widths_m)[1]
+    pairs, n_places = pairs.by_place(pose)
+    if n_places < MIN_USERS:
+        raise PoseError(f'users: {n_places} places that differ by more than the errors of the '
+                        f'positions, expected users at more different places, {MIN_USERS}')
     near = [pairs.climb(pose.displaced(error), _LIMITS.widths_m[-_LIMITS.near_widths:])
             for error in standard_normal(_LIMITS.near, 6) * np.repeat(_LIMITS.near_std, 3)]
     score, pose = max(near, key=lambda found: found[0].value)
-    std = np.sqrt(np.diagonal(score.covariance()))
+    if score.certain_share() < _LIMITS.certain:
+        raise PoseError('users: they spread by less than the errors of their positions, except '
+                        'along a line, expected users at more different places')
+    mean, covariance = _moments(pairs, pose, near)
+    # The likelihood takes the errors of a place for a part of its lever arm.
+    covariance = symmetric(covariance + covariance @ score.noise @ covariance)
+    # Without any pair, the samples do not represent the likelihood.
+    std = np.sqrt(np.diagonal(np.maximum(covariance, score.covariance())))
     if not (std[:3].max() <= _LIMITS.std_m and std[3:].max() <= _LIMITS.std_rad):
         raise PoseError(
             f'users: standard deviations of the pose up to {std[:3].max():.2g} m and '
             f'{np.rad2deg(std[3:].max()):.2g} deg, expected users at more different places')
-    mean, covariance = _moments(pairs, pose, near)
     pose = pose.displaced(mean)
     return Pose(pose.position_m, pose.quaternion, tuple(map(tuple, covariance.tolist())))
 
@@ -170,23 +194,27 @@ class _Score(NamedTuple):
     """Log-likelihood of a pose for N users, and its derivatives with respect to an error."""
 
     value: float
-    gradients: np.ndarray  # Float64 [N, 6].
+    gradient: np.ndarray  # Float64 [6].
     paired: np.ndarray  # Information for known pairs of candidates, float64 [6, 6].
     lost: np.ndarray  # Part of this information that is lost, as pairs are uncertain, [6, 6].
+    noise: np.ndarray  # Part that is due to errors of the places, float64 [6, 6].
 
     def covariance(self) -> np.ndarray:
-        """Return the covariance of the maximum, float64 [6, 6], from the scatter of the users."""
-        # As in a jackknife, the factor makes up for the six unknowns that the users determine.
-        n = len(self.gradients)
-        inverse = np.linalg.inv(self.paired - self.lost + _PRIOR)
-        scatter = self.gradients.T @ self.gradients * (n / (n - 6))**2 + _PRIOR
-        return symmetric(inverse @ scatter @ inverse)
+        """Return the covariance of the maximum, float64 [6, 6]."""
+        inverse = np.linalg.inv(self.paired - self.lost - self.noise + _PRIOR)
+        return symmetric(inverse @ (self.paired + _PRIOR) @ inverse)
+
+    def certain_share(self) -> float:
+        """Return the smallest share of the information that is not due to errors of places."""
+        shares = np.linalg.eigvals(np.linalg.solve(self.paired + _PRIOR, self.noise))
+        return 1 - float(shares.real.max())
 
 
 class _Pairs(NamedTuple):
     """All P pairs of a candidate of the reference and one of the other surface, for N users."""
 
     of_user: Segments
+    weights: np.ndarray  # Weights of the users, float64 [N].
     log_weights: np.ndarray  # Float64 [P].
     log_outlier: np.ndarray  # Logarithm of the density of a user without a right pair, [N].
     means_m: np.ndarray  # Candidates of the reference in the frame of the site, [P, 3].
@@ -214,13 +242,31 @@ class _Pairs(NamedTuple):
                             for one, two in zip(reference, other, strict=True)])
         log_outlier = np.log(missing) - np.log(np.ptp(bounds_m, axis=0)).sum()
         counts = np.array([len(column[0]) for column in columns])
-        return cls(Segments.of_counts(counts), log_weights, log_outlier, *others)
+        return cls(Segments.of_counts(counts), np.ones(len(counts)), log_weights, log_outlier,
+                   *others)
+
+    def by_place(self, pose: Pose) -> tuple['_Pairs', int]:
+        """Give each place a weight of 1, which its users share; return also the number of places.
+
+        The position of a user is that of the most probable pair.
+        """
+        _, offsets, precisions, logs = self._compared(pose, 0.0)
+        best = np.array([rows.start + np.argmax(logs[rows]) for rows in self.of_user.slices])
+        places_m, covariances = self._places(best, offsets, precisions)
+        left, weights, n_places = np.arange(len(best)), np.ones(len(best)), 0
+        while len(left):
+            both, _ = _inverses(covariances[left] + covariances[left[0]])
+            loss = likelihood_loss(places_m[left] - places_m[left[0]], both)
+            is_near = 2 * loss <= _LIMITS.same_place
+            weights[left[is_near]] = 1 / np.count_nonzero(is_near)
+            left, n_places = left[~is_near], n_places + 1
+        return self._replace(weights=weights), n_places
 
     def climb(self, pose: Pose, widths_m: Sequence[float]) -> tuple[_Score, Pose]:
         """Return the nearest maximum of the likelihood, and the derivatives there."""
         for width_m in (*widths_m, *(0.0,) * _LIMITS.steps):
             score = self.score(pose, width_m)
-            step = step_to_maximum(score.paired + _PRIOR, score.gradients.sum(axis=0))
+            step = step_to_maximum(score.paired + _PRIOR, score.gradient)
             pose = pose.displaced(step)
             if not width_m and np.abs(step).max() < _LIMITS.change:
                 break
@@ -228,12 +274,7 @@ class _Pairs(NamedTuple):
 
     def score(self, pose: Pose, width_m: float) -> _Score:
         """Return derivatives at a pose, with mixtures widened by a standard deviation [m]."""
-        turned = pose.vectors_to_site(self.local_m)
-        offsets = self.means_m - turned - pose.origin
-        covariances = self.covariances + pose.covariances_to_site(self.local_covariances)
-        precisions, log_dets = _inverses(covariances + width_m**2 * np.eye(3))
-        logs = (self.log_weights - likelihood_loss(offsets, precisions) - log_dets / 2
-                - 1.5 * np.log(2 * np.pi))
+        turned, offsets, precisions, logs = self._compared(pose, width_m)
         highest = np.maximum(self.of_user.max(logs), self.log_outlier)
         densities = np.exp(logs - self.of_user.repeat(highest))
         totals = self.of_user.sum(densities) + np.exp(self.log_outlier - highest)
@@ -241,12 +282,41 @@ class _Pairs(NamedTuple):
         pulls = np.matmul(precisions, offsets[..., None])[..., 0]
         # An error of the pose moves candidates by its shift and by the turn times their offset.
         slopes = np.concatenate([pulls, np.cross(turned, pulls)], axis=1)
-        likely = shares > _LIMITS.share
-        crosses = np.cross(np.eye(3), turned[likely, None])
-        moves = np.concatenate([np.broadcast_to(np.eye(3), crosses.shape), crosses], axis=1)
-        information = moves @ precisions[likely] @ np.swapaxes(moves, 1, 2)
         gradients = self.of_user.sum(shares[:, None] * slopes)
-        squares = slopes.T @ (shares[:, None] * slopes)
-        value = float((highest + np.log(totals)).sum())
-        return _Score(value, gradients, np.tensordot(shares[likely], information, axes=1),
-                      squares - gradients.T @ gradients)
+        weights = shares * self.of_user.repeat(self.weights)
+        lost = slopes.T @ (weights[:, None] * slopes) - (
+            gradients.T @ (self.weights[:, None] * gradients))
+        (likely,) = np.nonzero(shares > _LIMITS.share)
+        places_m, covariances = self._places(likely, offsets, precisions)
+        weights, precisions = weights[likely], precisions[likely]
+        crosses = np.cross(np.eye(3), (places_m - pose.origin)[:, None])
+        moves = np.concatenate([np.broadcast_to(np.eye(3), crosses.shape), crosses], axis=1)
+        paired = np.tensordot(weights, moves @ precisions @ np.swapaxes(moves, 1, 2), axes=1)
+        # The mean of `paired` over the errors of the places, less that without them.
+        both = np.tensordot(weights[:, None, None] * covariances, precisions, axes=(0, 0))
+        noise = np.zeros((6, 6))
+        noise[3:, 3:] = np.einsum('aki,blj,klij->ab', _CROSS, _CROSS, both)
+        value = float(self.weights @ (highest + np.log(totals)))
+        return _Score(value, self.weights @ gradients, paired, lost, noise)
+
+    def _compared(self, pose: Pose, width_m: float) -> tuple[np.ndarray, ...]:
+        """Compare the candidates of all pairs for a pose.
+
+        Returns candidates of the other surface relative to it and the offsets from them, in the
+        frame of the site, [P, 3], the precisions of the offsets, [P, 3, 3], and log-weights [P].
+        """
+        turned = pose.vectors_to_site(self.local_m)
+        offsets = self.means_m - turned - pose.origin
+        covariances = self.covariances + pose.covariances_to_site(self.local_covariances)
+        precisions, log_dets = _inverses(covariances + width_m**2 * np.eye(3))
+        logs = (self.log_weights - likelihood_loss(offsets, precisions) - log_dets / 2
+                - 1.5 * np.log(2 * np.pi))
+        return turned, offsets, precisions, logs
+
+    def _places(self, rows: np.ndarray, offsets: np.ndarray, precisions: np.ndarray
+                ) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean [T, 3] and covariance [T, 3, 3] of the positions that pairs agree on."""
+        covariances = self.covariances[rows]
+        gains = covariances @ precisions[rows]
+        means_m = self.means_m[rows] - np.matmul(gains, offsets[rows, :, None])[..., 0]
+        return means_m, covariances - gains @ covariances

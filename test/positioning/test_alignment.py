@@ -42,10 +42,11 @@ def normalised_error(found):
     return error @ np.linalg.solve(found.covariance, error)
 
 
-def test_a_pose_is_found_with_a_covariance_that_fits_its_error():
-    squares = [normalised_error(estimate_pose(*sightings(np.random.default_rng(seed)), BOUNDS))
-               for seed in range(8)]
-    # The mean of 8 chi-square variables with 6 degrees of freedom has a deviation of 1.2.
+@pytest.mark.parametrize(('n', 'seeds'), [(40, range(6)), (MIN_USERS, range(2))])
+def test_a_pose_is_found_with_a_covariance_that_fits_its_error(n, seeds):
+    squares = [normalised_error(estimate_pose(
+        *sightings(np.random.default_rng(seed), n), BOUNDS)) for seed in seeds]
+    # The mean of 6 chi-square variables with 6 degrees of freedom has a deviation of 1.4.
     assert 2.0 < np.mean(squares) < 11.0
 
 
@@ -78,8 +79,17 @@ def test_the_number_of_sightings_is_checked():
         estimate_pose(reference[1:], other[1:], BOUNDS)
 
 
-def test_users_at_one_place_do_not_determine_a_pose():
-    rng, place = np.random.default_rng(4), np.array([10.0, 0.0, 0.0])
+def test_users_at_rest_count_once():
+    once = sightings(np.random.default_rng(6), n=20)
+    found, again = (estimate_pose(*(n * one for one in once), BOUNDS) for n in (1, 4))
+    np.testing.assert_allclose(found.error_of(again), np.zeros(6), atol=1e-5)
+    np.testing.assert_allclose(again.covariance, found.covariance, rtol=1e-3, atol=1e-8)
+
+
+@pytest.mark.parametrize('half_m', [0.0, 0.03, 4.0])
+def test_users_at_one_place_or_on_a_line_do_not_determine_a_pose(half_m):
+    rng = np.random.default_rng(4)
+    places = [10.0, 0.0, 0.0] + np.linspace(-half_m, half_m, 40)[:, None] * [1.0, 0.5, 0.0]
     with pytest.raises(PoseError, match='expected users at more different places'):
-        estimate_pose([sighting(place, FRONT, rng) for _ in range(20)],
-                      [sighting(place, SIDE, rng) for _ in range(20)], BOUNDS)
+        estimate_pose([sighting(place, FRONT, rng) for place in places],
+                      [sighting(place, SIDE, rng) for place in places], BOUNDS)
