@@ -19,7 +19,7 @@ from rhs_isac_msgs.action import Locate
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BaseStation
-from rhs_isac_ros.protocol.receiver import combiner
+from rhs_isac_ros.protocol.cycle import combiner
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import SERVICES, create_or_refuse, steady_timer
 from rhs_isac_ros.ros.role_node import RoleNode

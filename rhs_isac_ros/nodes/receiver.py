@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from rhs_isac_ros.protocol.receiver import Receiver, combiner
+from rhs_isac_ros.protocol.cycle import combiner
+from rhs_isac_ros.protocol.receiver import Receiver
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 

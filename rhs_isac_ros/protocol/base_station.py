@@ -14,18 +14,15 @@ from rhs_isac_ros.codebook.library import EMPTY, Library
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.admission import Admission
+from rhs_isac_ros.protocol.cycle import Combine, Reception, SignalCollector
 from rhs_isac_ros.protocol.events import Event, LogMessage, Outcome, Timeout
-from rhs_isac_ros.protocol.receiver import Combine, Reception, SignalCollector
+from rhs_isac_ros.protocol.following import Proposals
+from rhs_isac_ros.protocol.handover import Carriers, Steering
 from rhs_isac_ros.protocol.role import ANY, AnyRow, Drops, Row, on
+from rhs_isac_ros.protocol.service_log import ServiceLog, join_users
 from rhs_isac_ros.protocol.settings import BaseStationSettings, PendingSettings
-from rhs_isac_ros.protocol.transmission import Carriers, Steering
-from rhs_isac_ros.protocol.user_registry import (
-    Admission,
-    Proposals,
-    ServiceLog,
-    UserRegistry,
-    join_users,
-)
+from rhs_isac_ros.protocol.user_registry import UserRegistry
 
 
 class State(enum.Enum):

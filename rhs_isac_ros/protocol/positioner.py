@@ -32,10 +32,12 @@ from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import EstimatorBuilt, Event, Outcome
+from rhs_isac_ros.protocol.following import proposal
 from rhs_isac_ros.protocol.fusion import posterior_of
 from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, Role
+from rhs_isac_ros.protocol.service_log import MAX_NAMED
 from rhs_isac_ros.protocol.settings import TRACK, PendingSettings, PositionerSettings
-from rhs_isac_ros.protocol.user_registry import MAX_NAMED, MAX_USERS
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
 
 
 @dataclasses.dataclass
@@ -124,8 +126,6 @@ def _stacked(received: m.ReceivedSignals) -> np.ndarray:
     return received.signals.reshape(len(received.signals), -1)
 
 
-# Time for which a proposed codebook holds, in intervals between the signals of the user.
-_PATIENCE = 2.0
 # Number of residuals that are kept for each user.
 _USER_WINDOW = 100
 
@@ -411,11 +411,7 @@ class Positioner(Role):
         """Return the fields of an estimate that propose a codebook for the user's next cycle."""
         if not (self._library.by_id and isinstance(estimate, TrackEstimate)):
             return {}
-        predicted = self._tracks.predict(user)
-        codebook = predicted and self._library.codebook_at(*predicted[:2])
-        if not (predicted and codebook):
-            return {}
-        return {'next_codebook_id': codebook.id, 'next_codebook_s': _PATIENCE * predicted[2]}
+        return proposal(self._library, self._tracks.predict(user))
 
     def _publish_posterior(self, received: m.ReceivedSignals, posterior: Posterior | None,
                            probabilities: Mapping[str, float]) -> None:

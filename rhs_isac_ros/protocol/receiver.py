@@ -1,109 +1,14 @@
 """The receiver of a surface that follows the cycles of another surface's base station."""
 
-import dataclasses
 import enum
-from collections.abc import Callable
-from typing import Any
-
-import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.cycle import Combine, Reception, SignalCollector
 from rhs_isac_ros.protocol.events import CodebookOffered, Outcome, SettingsOffered
-from rhs_isac_ros.protocol.role import ANY, Drops, Row, StateMachine, on
+from rhs_isac_ros.protocol.role import ANY, Row, on
 from rhs_isac_ros.protocol.settings import PendingSettings, ReceiverSettings
-from rhs_isac_ros.support import streams
-
-# Combines the signals at the feeds: (codebook, feeds [N_B, F, N_SB, K], user, cycle_id, whether to
-# add noise) to complex128 [N_B, N_SB, F].
-Combine = Callable[[Codebook, np.ndarray, int, int, bool], np.ndarray]
-
-
-def combiner(scenario: Scenario, seed: int) -> Combine:
-    """Return the combination of a receiver whose noise depends on the seed, user and cycle."""
-    def combine(codebook: Codebook, feeds: np.ndarray, user: int, cycle_id: int, noise: bool
-                ) -> np.ndarray:
-        rng = streams.generator(seed, streams.RECEIVER, user, cycle_id) if noise else None
-        return receive_feeds(scenario, codebook, feeds, rng)
-    return combine
-
-
-@dataclasses.dataclass
-class Reception:
-    """The signals of one cycle, as they arrive from a channel."""
-
-    cycle_id: int
-    codebook: Codebook | None = None  # latest codebook at the begin of the cycle
-    user: int = 0  # user of the cycle; 0 if there is none yet
-    # Instance of the user, from its acks or else from the first feed signals; 0 if unknown.
-    user_instance: int = 0
-    # Instance of the channel that sent the first signals; 0 if unknown.
-    channel: int = 0
-    # Feed signals by band, complex128 [F, N_SB, K].
-    signals: dict[int, np.ndarray] = dataclasses.field(default_factory=dict)
-    stamp_ns: int = 0  # time of the first feed signals [ns]; 0 if unknown
-
-    @property
-    def codebook_id(self) -> str:
-        """Id of the codebook; empty if there is none."""
-        return self.codebook.id if self.codebook else ''
-
-    def store(self, event: m.FeedSignals) -> None:
-        """Store the signals of a band, and the instances of user and channel if still unknown."""
-        self.user_instance = self.user_instance or event.user_instance
-        self.channel = self.channel or event.sender
-        self.stamp_ns = self.stamp_ns or event.stamp_ns
-        self.signals[event.band] = event.signals
-
-    def combined(self, combine: Combine, noise: bool) -> m.ReceivedSignals:
-        """Combine the signals of all bands, which must be complete; `noise` adds noise."""
-        assert self.codebook
-        feeds = np.stack([signals for _, signals in sorted(self.signals.items())])
-        return m.derive(
-            m.ReceivedSignals, self, stamp_ns=self.stamp_ns, signals=combine(
-                self.codebook, feeds, self.user, self.cycle_id, noise))
-
-
-class SignalCollector(StateMachine):
-    """A role that collects the feed signals of one cycle at a time; `cycle` is the first one."""
-
-    def __init__(self, initial: enum.Enum, scenario: Scenario, combine: Combine,
-                 cycle: Reception) -> None:
-        super().__init__(initial)
-        self._combine, self._cycle = combine, cycle
-        self._bands = frozenset(range(scenario.n_bands))
-
-    def _silent_bands(self) -> list[int]:
-        """Return the bands whose signals are missing, in ascending order."""
-        return sorted(self._bands - self._cycle.signals.keys())
-
-    def _wrong_cycle(self, event: m.Message) -> bool:
-        return event.cycle_id != self._cycle.cycle_id
-
-    def _wrong_user(self, event: Any) -> bool:
-        return bool(event.user != self._cycle.user)
-
-    def _wrong_instance(self, event: m.FeedSignals) -> bool:
-        return not (m.same_instance(event.user_instance, self._cycle.user_instance)
-                    and m.same_instance(event.sender, self._cycle.channel))
-
-    def _duplicate_signals(self, event: m.FeedSignals) -> bool:
-        return event.band in self._cycle.signals
-
-    def _last_signals(self, event: m.FeedSignals) -> bool:
-        return self._silent_bands() == [event.band]
-
-    def _store_signals(self, event: m.FeedSignals) -> None:
-        self._cycle.store(event)
-
-    # Conditions under which a message of a cycle is dropped.
-    _OF_CYCLE: Drops = {_wrong_cycle: Outcome.WRONG_CYCLE}
-    _SAME_USER: Drops = {_wrong_user: Outcome.WRONG_USER}
-    _OF_USER: Drops = _OF_CYCLE | _SAME_USER
-    _OF_SIGNALS: Drops = _OF_USER | {
-        _wrong_instance: Outcome.WRONG_INSTANCE, _duplicate_signals: Outcome.DUPLICATE}
 
 
 class State(enum.Enum):

@@ -12,7 +12,8 @@ import numpy as np
 
 from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.positioning import ESTIMATORS, BayesEstimator
-from rhs_isac_ros.protocol.user_registry import MAX_USERS, POLICIES, parse_users
+from rhs_isac_ros.protocol.admission import parse_users
+from rhs_isac_ros.protocol.user_registry import MAX_USERS, POLICIES
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field

@@ -1,18 +1,12 @@
-"""The users of a base station: admission, turns, owners of numbers, codebooks, log of service."""
+"""The users of a base station: which of them are invited and served, and who owns a number."""
 
-import collections
 import dataclasses
 import math
-import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.codebook.library import Library
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import LogMessage, Outcome
-from rhs_isac_ros.protocol.role import NewestDict
 
 POLICIES = ('round_robin', 'first', 'random')
 # Highest user number that is ever accepted. It bounds the memory, whatever acks arrive.
@@ -220,144 +214,3 @@ class UserRegistry:
         elif not completed:
             self._until_s = now_s + (now_s - begin_s)
         self._seniors_first = now_s < self._until_s
-
-
-_RANGE = re.compile(r'\s*(\d+)\s*(?:-\s*(\d+)\s*)?')
-
-
-def parse_users(text: str) -> tuple[range, ...]:
-    """Parse a possibly empty list of user numbers and ranges, such as ``1, 4, 10-20``.
-
-    Raises ValueError if a part is not a number from 1 to `LAST_USER` or an ascending range.
-    """
-    return tuple(_parse_range(part) for part in text.split(',')) if text.strip() else ()
-
-
-def _parse_range(part: str) -> range:
-    match = _RANGE.fullmatch(part)
-    first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, 0)
-    if not 1 <= first <= last <= m.LAST_USER:
-        raise ValueError(f'{part.strip()!r}, expected numbers from 1 to {m.LAST_USER} and ranges '
-                         'such as 10-20')
-    return range(first, last + 1)
-
-
-# Maximum number of users that a message lists.
-MAX_NAMED = 8
-
-
-def join_users(users: Iterable[int]) -> str:
-    """Return user numbers as text, such as ``1, 2``; after `MAX_NAMED`, only count the others."""
-    names = [str(user) for user in users]
-    n_others = len(names) - MAX_NAMED
-    others = f' and {n_others} other{"s" * (n_others > 1)}' if n_others > 0 else ''
-    return f'{", ".join(names[:MAX_NAMED])}{others}'
-
-
-class Admission:
-    """The limits on the numbers of users, as in `parse_users`, and on the rate of their acks."""
-
-    def __init__(self, allowed_users: str, max_users: int, rate_hz: float) -> None:
-        self._max_users, self._rate_hz = max_users, rate_hz
-        self._allowed = parse_users(allowed_users) or (range(m.LAST_USER + 1),)
-        # Number of acks by user in the current second; cleared each second, to bound the memory.
-        self._acks: collections.Counter[int] = collections.Counter()
-        self._second = 0
-
-    def allows(self, user: int) -> bool:
-        """Return whether the number of a user is within the limits."""
-        return user <= self._max_users and any(user in users for users in self._allowed)
-
-    def exceeds_rate(self, user: int, now_s: float) -> bool:
-        """Return whether another ack of a user is one too many in the current second."""
-        counted = self._acks[user] if math.floor(now_s) == self._second else 0
-        return counted + 1 > self._rate_hz
-
-    def count(self, user: int, now_s: float) -> None:
-        """Count an ack."""
-        second = math.floor(now_s)
-        if second != self._second:
-            self._second = second
-            self._acks.clear()
-        self._acks[user] += 1
-
-
-# Reasons for a lost cycle that concern one user. All others concern the whole network.
-_USER_REASONS = (Outcome.USER_GONE, Outcome.NO_FIX)
-
-
-class Proposals:
-    """The codebooks of a library that estimates propose for the next cycle of their users.
-
-    A proposal serves once: after a cycle without an estimate, there is none.
-    """
-
-    def __init__(self, library: Library) -> None:
-        self._library = library
-        # The latest estimate of each user, and its time of arrival [s].
-        self._estimates: NewestDict[int, tuple[m.PositionEstimate, float]] = NewestDict(MAX_USERS)
-
-    def add(self, estimate: m.PositionEstimate, now_s: float) -> None:
-        """Store the proposal of an estimate that arrives at a time [s]."""
-        self._estimates.put(estimate.user, (estimate, now_s))
-
-    def drop(self, user: int) -> None:
-        """Remove the proposal for a user."""
-        self._estimates.pop(user, None)
-
-    def take(self, user: int, instance: int, now_s: float) -> Codebook | None:
-        """Remove the proposal for a user; return its codebook if it holds at a time [s]."""
-        estimate, time_s = self._estimates.pop(user, (None, 0.0))
-        if (estimate and now_s <= time_s + estimate.next_codebook_s
-                and m.same_instance(estimate.user_instance, instance)):
-            return self._library.by_id.get(estimate.next_codebook_id)
-        return None
-
-
-class ServiceLog:
-    """Derives the messages of the log from what happens to cycles."""
-
-    def __init__(self) -> None:
-        # Outages that have been logged and have not ended, by reason, and number of the user, or 0
-        # for all users, with the name of the state, which contains the instance of the user.
-        self._outages: NewestDict[tuple[str, tuple[int, str]], None] = NewestDict(MAX_USERS)
-        # Missing roles and codebook as logged last; empty once a cycle has begun.
-        self._lacking: tuple[str, ...] = ()
-        # Whether a cycle has been served since the last time that something was missing, and ever.
-        self._serving = self._has_served = False
-
-    def waits(self, lacking: tuple[str, ...]) -> Iterator[LogMessage]:
-        """Log missing roles and codebook if they have changed."""
-        self._serving = False
-        if lacking != self._lacking:
-            self._lacking = lacking
-            # At the start, the other nodes may be about to start, too.
-            yield LogMessage(
-                f'waiting for {", ".join(lacking)}', self._has_served, 'service', True)
-
-    def begins(self) -> None:
-        """Note that a cycle has begun; a role that is missing later is then logged again."""
-        self._lacking = ()
-
-    def gives_up(self, cycle_id: int, user: int, instance: int, outcome: Outcome
-                 ) -> Iterator[LogMessage]:
-        """Log a lost cycle unless its outage has been logged."""
-        affected = ((user, f'outage of user {user} {instance}') if outcome in _USER_REASONS
-                    else (0, 'outage'))
-        if (outcome.value, affected) not in self._outages:
-            self._outages.put((outcome.value, affected), None)
-            yield LogMessage(f'cycle {cycle_id} of user {user} given up: {outcome.value}', True,
-                             affected[1], True)
-
-    def serves(self, cycle_id: int, user: int, use: str) -> Iterator[LogMessage]:
-        """Log the start of service, with what it uses, and the outages that ended."""
-        if not self._serving:
-            self._serving = self._has_served = True
-            yield LogMessage(f'serving: {use}', False, 'service', False)
-        ended = [outage for outage in self._outages if outage[1][0] in (0, user)]
-        for outage in ended:
-            del self._outages[outage]
-        for affected in dict.fromkeys(affected for _, affected in ended):
-            reasons = ', '.join(sorted(reason for reason, other in ended if other == affected))
-            yield LogMessage(f'cycle {cycle_id}: user {user} served again after: {reasons}', False,
-                             affected[1], False)

@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.user_registry import join_users
+from rhs_isac_ros.protocol.service_log import join_users
 from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float, picture_file

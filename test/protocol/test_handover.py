@@ -13,12 +13,14 @@ from rhs_isac_ros.positioning import Mixture, Sighting, Site
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.channel import Channel
+from rhs_isac_ros.protocol.cycle import combiner
 from rhs_isac_ros.protocol.events import Outcome
 from rhs_isac_ros.protocol.fusion import Fusion, posterior_of
-from rhs_isac_ros.protocol.receiver import Receiver, combiner
+from rhs_isac_ros.protocol.handover import Carriers, Steering
+from rhs_isac_ros.protocol.receiver import Receiver
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.protocol.settings import Impairments
-from rhs_isac_ros.protocol.transmission import Carriers, Steering, Transmission
+from rhs_isac_ros.protocol.transmission import Transmission
 from rhs_isac_ros.ros.place import Place
 from rhs_isac_ros.ros.roster import FOLLOWING, MEMBERS
 from rhs_isac_ros.system import System

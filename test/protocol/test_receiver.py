@@ -6,8 +6,9 @@ from in_memory_network import feed
 
 from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.cycle import combiner
 from rhs_isac_ros.protocol.events import CodebookOffered, LogMessage, SettingsOffered
-from rhs_isac_ros.protocol.receiver import Receiver, State, combiner
+from rhs_isac_ros.protocol.receiver import Receiver, State
 from rhs_isac_ros.protocol.settings import ReceiverSettings
 
 

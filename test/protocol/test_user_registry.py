@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.protocol.messages import LAST_USER
-from rhs_isac_ros.protocol.user_registry import POLICIES, SILENT_S, UserRegistry, parse_users
+from rhs_isac_ros.protocol.user_registry import POLICIES, SILENT_S, UserRegistry
 
 # Number of users that a beacon invites, and of seniors.
 INVITED = 8
@@ -291,20 +291,3 @@ def test_a_conflict_is_logged_once_until_it_has_ended(instances):
     assert instances.conflicts(20.0) == {}
     instances.reject(2)
     assert instances.register(2, FIRST, 21.0) == first
-
-
-# Lists of users in texts
-
-
-@pytest.mark.parametrize(('text', 'users'), [
-    ('  ', []), ('1, 4,10 - 12', [1, 4, 10, 11, 12]), ('7-7,4294967295', [7, 4294967295])])
-def test_lists_of_users_are_parsed(text, users):
-    assert [user for numbers in parse_users(text) for user in numbers] == users
-
-
-@pytest.mark.parametrize(('text', 'part'), [
-    ('0', "'0'"), ('1,', "''"), ('1,x', "'x'"), ('5-3', "'5-3'"), ('4294967296', "'4294967296'")])
-def test_a_malformed_part_is_an_error_that_names_it(text, part):
-    with pytest.raises(ValueError, match=r'expected numbers from 1 to 4294967295') as raised:
-        parse_users(text)
-    assert str(raised.value).startswith(part)

@@ -3,7 +3,7 @@
 import pytest
 
 from rhs_isac_ros.protocol.events import LogMessage, Outcome
-from rhs_isac_ros.protocol.user_registry import ServiceLog, join_users
+from rhs_isac_ros.protocol.service_log import ServiceLog, join_users
 
 
 class Service(ServiceLog):

@@ -2,8 +2,10 @@
 
 import math
 
+import pytest
+
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.user_registry import Admission
+from rhs_isac_ros.protocol.admission import Admission, parse_users
 
 
 def test_all_users_are_allowed_up_to_a_number_unless_some_are_listed():
@@ -47,3 +49,20 @@ def test_an_ack_that_is_rejected_does_not_end_beaconing(network):
     net.publish(m.Ack(cycle_id=1, user=4097))
     net.run(limit_s=0.01)
     assert net['bs'].counters['not_allowed'] == 1
+
+
+# Lists of users in texts
+
+
+@pytest.mark.parametrize(('text', 'users'), [
+    ('  ', []), ('1, 4,10 - 12', [1, 4, 10, 11, 12]), ('7-7,4294967295', [7, 4294967295])])
+def test_lists_of_users_are_parsed(text, users):
+    assert [user for numbers in parse_users(text) for user in numbers] == users
+
+
+@pytest.mark.parametrize(('text', 'part'), [
+    ('0', "'0'"), ('1,', "''"), ('1,x', "'x'"), ('5-3', "'5-3'"), ('4294967296', "'4294967296'")])
+def test_a_malformed_part_is_an_error_that_names_it(text, part):
+    with pytest.raises(ValueError, match=r'expected numbers from 1 to 4294967295') as raised:
+        parse_users(text)
+    assert str(raised.value).startswith(part)
