@@ -16,7 +16,7 @@ from system.invariants import RECEIVES, InvariantChecker
 from rhs_isac_ros.codebook import Codebook, random_codebook
 from rhs_isac_ros.codebook.library import EMPTY
 from rhs_isac_ros.frontend import Air, EmulatedRadio, EmulatedSurface, FrontEnd, Surface
-from rhs_isac_ros.link import Beam, CapacityReport
+from rhs_isac_ros.link import Beamformer, CapacityReport
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.measurement import receive_feeds, received_signal
@@ -74,7 +74,7 @@ def plain_choice(scenario: Scenario, position: np.ndarray, covariance_m2: np.nda
     angles = np.arange(scenario.n_elements) * np.abs(position).sum()
     digital = np.full((scenario.n_subbands, scenario.n_feeds), 0.1 + 0j)
     return types.SimpleNamespace(
-        beam=Beam(0.5 + 0.5 * np.cos(angles), digital, bands[0]), expected_bps=1e6)
+        beam=Beamformer(0.5 + 0.5 * np.cos(angles), digital, bands[0]), expected_bps=1e6)
 
 
 PLAIN_BEAMS = {'choose': plain_choice, 'evaluate': lambda *_: CapacityReport(1e6, 1.1e6)}

@@ -15,8 +15,8 @@ from rhs_isac_ros.monitoring.cycle_log import ANSWERS
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES
 from rhs_isac_ros.positioning import Site, SiteError
 from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.node_surface import NodeSurface
 from rhs_isac_ros.ros.parameters import TF
-from rhs_isac_ros.ros.place import Place
 from rhs_isac_ros.ros.recording import recorded_topics
 from rhs_isac_ros.ros.roster import MEMBERS, ROSTER, networks
 from rhs_isac_ros.support.arguments import ArgumentParser, integer
@@ -60,12 +60,12 @@ class Permissions(NamedTuple):
 
 
 # A network with one surface, whose scenario permissions do not depend on.
-_ALONE = Place(Scenario())
+_ALONE = NodeSurface(Scenario())
 
 
 def permissions(
         users: int, robots: Mapping[int, str] | None = None, is_simulated: bool = False,
-        place: Place = _ALONE, roles: Iterable[str] = ROSTER) -> dict[str, Permissions]:
+        surface: NodeSurface = _ALONE, roles: Iterable[str] = ROSTER) -> dict[str, Permissions]:
     """Return the permissions that the nodes of a network may need, and no others.
 
     Parameters
@@ -76,7 +76,7 @@ def permissions(
         Topic of the odometry, or ``tf``, of each user that is a robot.
     is_simulated
         Whether the nodes follow the clock of a simulation.
-    place, roles
+    surface, roles
         Surface of the nodes in their site, and their roles; by default, those of a network with
         one surface.
 
@@ -86,19 +86,19 @@ def permissions(
         Permissions by node. ``users`` is a node with all users, ``network`` the process of all
         nodes of the network or site. ``operator`` stands for all tools, which may read
         every topic, set parameters and pause cycles, except for ``replay``, which may publish
-        every topic and take the place of the optimizer.
+        every topic and replace the optimizer.
     """
     numbers = range(1, users + 1)
     nodes = {
         name if MEMBERS[name].is_unique else f'{name}_{number}': _of_member(
-            name, numbers if MEMBERS[name].is_unique else [number], place)
+            name, numbers if MEMBERS[name].is_unique else [number], surface)
         for name in sorted(roles)
         for number in ((1,) if MEMBERS[name].is_unique else numbers)}
     if 'user' in roles:
         for user, source in (robots or {}).items():
             nodes[f'user_{user}'] = _with_robot(nodes[f'user_{user}'], source)
-        nodes['users'] = _of_member('user', numbers, place)
-    head = {} if place.name else {'network': Permissions(publish=_RCLPY_TOPICS)}
+        nodes['users'] = _of_member('user', numbers, surface)
+    head = {} if surface.name else {'network': Permissions(publish=_RCLPY_TOPICS)}
     nodes['network'] = _together({**nodes, **head})
     optimizer = topics.OPTIMIZER_NODE
     tools = {}
@@ -128,13 +128,13 @@ def _together(nodes: Mapping[str, Permissions]) -> Permissions:
                       for name in getattr(allowed, right)})) for right in Permissions._fields))
 
 
-def _of_member(name: str, users: Iterable[int], place: Place) -> Permissions:
+def _of_member(name: str, users: Iterable[int], surface: NodeSurface) -> Permissions:
     """Return the permissions of a node of a role that serves some users."""
     member = MEMBERS[name]
-    received = [f'{source.prefix}{topics.NAMES[source.kind]}' for source in place.sources(
+    received = [f'{source.prefix}{topics.NAMES[source.kind]}' for source in surface.sources(
         member.role.RECEIVES if member.role else (), member.from_all)]
-    if member.requires_of_site and place.site:
-        received.append(f'{place.site_prefix}{topics.PRESENCE}')
+    if member.requires_of_site and surface.site:
+        received.append(f'{surface.site_prefix}{topics.PRESENCE}')
     sent = {name for topic in member.sent for name in (
         _of_users(users, topic) if '{user}' in topic else (topic,))}
     return Permissions(
@@ -184,9 +184,9 @@ def _of_site(
     """
     found, parts = {}, {}
     for name, roles in networks(site.surfaces if site else ()):
-        place = Place(site.surfaces[name or site.leader].scenario, site, base, name
+        surface = NodeSurface(site.surfaces[name or site.leader].scenario, site, base, name
                       ) if site else _ALONE
-        parts[name] = permissions(users, robots, is_simulated, place, roles)
+        parts[name] = permissions(users, robots, is_simulated, surface, roles)
         found |= {(f'{base}/{name}'.rstrip('/'), node): allowed
                   for node, allowed in parts[name].items() if node != 'network'}
     for node in ('network', 'operator'):

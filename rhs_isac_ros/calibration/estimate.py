@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from rhs_isac_ros.calibration.mixture import (
-    Posterior,
+    SurfacePosterior,
     SurfacePrior,
     surface_posterior,
     without_data,
@@ -205,7 +205,7 @@ def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
     return rms
 
 
-def _change(before: Posterior, after: Posterior, n_bands: int) -> float:
+def _change(before: SurfacePosterior, after: SurfacePosterior, n_bands: int) -> float:
     """Return the largest change, in standard deviations; band parameters are already changes."""
     moved = np.abs(after.mean - before.mean)
     moved[-n_bands:] = np.abs(after.mean[-n_bands:])
@@ -213,7 +213,7 @@ def _change(before: Posterior, after: Posterior, n_bands: int) -> float:
     return float(np.max(moved / np.maximum(std, 1e-9)))
 
 
-def _result(posterior: Posterior, band_gains: np.ndarray) -> SurfaceEstimate:
+def _result(posterior: SurfacePosterior, band_gains: np.ndarray) -> SurfaceEstimate:
     mean, n = posterior.mean, len(posterior.failed)
     values, vectors = np.linalg.eigh(posterior.covariance)
     kept = values > _MIN_VARIANCE * max(values[-1], 0.0)

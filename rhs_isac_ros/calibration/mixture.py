@@ -40,7 +40,7 @@ class SurfacePrior:
                 raise ValueError(f'{name}: {value:g}, expected 0 to {high:g}')
 
 
-class Posterior(NamedTuple):
+class SurfacePosterior(NamedTuple):
     """Gaussian approximation of the posterior of P = 2 N_E + N_B complex parameters."""
 
     # Mean of gains, offsets and errors of band gains, complex128 [P], and covariance E[z z^H] of
@@ -52,7 +52,7 @@ class Posterior(NamedTuple):
     failed_probability: np.ndarray
 
 
-def without_data(prior: SurfacePrior, band_rms: np.ndarray, n_elements: int) -> Posterior:
+def without_data(prior: SurfacePrior, band_rms: np.ndarray, n_elements: int) -> SurfacePosterior:
     """Return the prior: the result of `surface_posterior` without information."""
     n, n_bands = n_elements, band_rms.shape[1]
     size = 2 + n_bands
@@ -62,12 +62,12 @@ def without_data(prior: SurfacePrior, band_rms: np.ndarray, n_elements: int) -> 
     like = np.repeat(np.arange(size), [n, n, *[1] * n_bands])
     owner = np.array([*range(n), *range(n), *[n] * n_bands])
     covariance = one.covariance[np.ix_(like, like)] * (owner[:, None] == owner)
-    return Posterior(one.mean[like], covariance, np.repeat(one.failed, n),
+    return SurfacePosterior(one.mean[like], covariance, np.repeat(one.failed, n),
                      np.repeat(one.failed_probability, n))
 
 
 def surface_posterior(information: np.ndarray, shift: np.ndarray, prior: SurfacePrior,
-                      band_rms: np.ndarray, failed: np.ndarray) -> Posterior:
+                      band_rms: np.ndarray, failed: np.ndarray) -> SurfacePosterior:
     """Compute the posterior of a surface; the search starts from the states `failed` [N_E].
 
     The P parameters are gains and offsets of the elements, then errors of the bands' gains. The
@@ -89,7 +89,7 @@ def surface_posterior(information: np.ndarray, shift: np.ndarray, prior: Surface
         total_covariance += weight * (
             other_covariance - covariance
             + (1 - weight) * np.outer(difference, np.conj(difference)))
-    return Posterior(total_mean, total_covariance, state, np.where(state, 1 - other, other))
+    return SurfacePosterior(total_mean, total_covariance, state, np.where(state, 1 - other, other))
 
 
 class _Search:

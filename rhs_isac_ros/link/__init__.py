@@ -1,7 +1,7 @@
 """The transmission phase: capacity, beam steering and the choice of the band."""
 
 from rhs_isac_ros.link.capacity import (
-    Beam,
+    Beamformer,
     BeamPattern,
     actual_capacity,
     beam_pattern,
@@ -18,7 +18,10 @@ from rhs_isac_ros.link.steering import (
     steer,
 )
 
+# The former name, with which programs call `capacity`; a message has it, too.
+Beam = Beamformer
+
 __all__ = [
-    'Beam', 'BeamPattern', 'CapacityReport', 'Choice', 'actual_capacity', 'applied_beam',
+    'BeamPattern', 'Beamformer', 'CapacityReport', 'Choice', 'actual_capacity', 'applied_beam',
     'beam_pattern', 'capacity', 'capacity_report', 'choose_beam', 'expected_capacities',
     'prepare_steering', 'steer']

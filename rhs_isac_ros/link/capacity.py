@@ -24,7 +24,7 @@ _MAX_SPREAD_M = 1e6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Beam:
+class Beamformer:
     """Beamforming of one band in the transmission phase."""
 
     analog: np.ndarray  #: Configuration c-hat, float64 [N_E], each entry in [0, 1].
@@ -33,7 +33,7 @@ class Beam:
 
 
 @one_blas_thread
-def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
+def capacity(scenario: Scenario, beam: Beamformer, positions: np.ndarray) -> np.ndarray:
     """Implements Eq. (10). Capacity R_i of a beam at `positions`, float64 [N, 3] [m].
 
     The result is float64 [N] [bit/s]. Raises ValueError if `positions` is not a finite [N, 3]
@@ -42,7 +42,7 @@ def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarra
     return capacities(scenario, [beam], positions)[0]
 
 
-def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray,
+def capacities(scenario: Scenario, beams: Sequence[Beamformer], positions: np.ndarray,
                blocked: np.ndarray | None = None) -> np.ndarray:
     """Compute `capacity` for several beams, float64 [n, N] [bit/s].
 
@@ -59,7 +59,7 @@ def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray,
 
 
 @one_blas_thread
-def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray,
+def actual_capacity(scenario: Scenario, beam: Beamformer, positions: np.ndarray,
                     blocked: np.ndarray | None = None) -> np.ndarray:
     """Compute the capacity over the paths of the channel file, or else by Eq. (10).
 
@@ -74,7 +74,7 @@ def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray,
 
 @one_blas_thread
 def expected_capacities(
-        scenario: Scenario, beams: Sequence[Beam], mean: np.ndarray, covariance: np.ndarray
+        scenario: Scenario, beams: Sequence[Beamformer], mean: np.ndarray, covariance: np.ndarray
 ) -> np.ndarray:
     """Average Eq. (10) of n beams over a Gaussian posterior of the position, float64 [n] [bit/s].
 
@@ -129,7 +129,7 @@ def _standard_rule(varies: tuple[bool, ...]) -> tuple[np.ndarray, np.ndarray]:
     return product[..., 0], product[..., 1].prod(axis=1)
 
 
-def _radiation(scenario: Scenario, beam: Beam) -> np.ndarray:
+def _radiation(scenario: Scenario, beam: Beamformer) -> np.ndarray:
     """Return the radiation t_j = c . (s_j B_j) of the elements, complex128 [N_SB, N_E]."""
     check_shape('analog', beam.analog, 'N_E', scenario)
     check_shape('digital', beam.digital, 'N_SB K', scenario)
@@ -177,7 +177,8 @@ class BeamPattern:
 
 @one_blas_thread
 def beam_pattern(
-        scenario: Scenario, beam: Beam, distance_m: float, step_deg: float = 5.0) -> BeamPattern:
+        scenario: Scenario, beam: Beamformer, distance_m: float, step_deg: float = 5.0
+) -> BeamPattern:
     """Compute the near-field pattern of a beam at a distance from the centre of the surface.
 
     Neighbouring directions differ by at most `step_deg` in azimuth or in elevation. Raises

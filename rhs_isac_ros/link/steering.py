@@ -14,7 +14,7 @@ from rhs_isac_ros.link.band_link import (
     water_filling,
 )
 from rhs_isac_ros.link.candidates import candidate_configurations, tables
-from rhs_isac_ros.link.capacity import Beam, actual_capacity, expected_capacities
+from rhs_isac_ros.link.capacity import Beamformer, actual_capacity, expected_capacities
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -125,7 +125,7 @@ _MAX_SUBBANDS = 64
 class Choice:
     """A beam, and its capacity averaged over the posterior of the position [bit/s]."""
 
-    beam: Beam
+    beam: Beamformer
     expected_bps: float
 
 
@@ -149,7 +149,7 @@ class CapacityReport:
 
 @one_blas_thread
 def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
-          surface: SurfaceEstimate | None = None) -> Beam:
+          surface: SurfaceEstimate | None = None) -> Beamformer:
     """Find a beam that nearly maximises Eq. (10) for a user at a position, float64 [3] [m].
 
     A search from many starts, including the matched filter, proposes configurations. The best few
@@ -163,7 +163,7 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
 
 def steer_bands(
         scenario: Scenario, position: np.ndarray, bands: Sequence[int],
-        surface: SurfaceEstimate | None = None) -> list[Beam]:
+        surface: SurfaceEstimate | None = None) -> list[Beamformer]:
     """Find the beams of `steer` for several bands, in little more time than for one band."""
     if not len(bands):
         raise ValueError('bands: none, expected at least one')
@@ -177,7 +177,7 @@ def steer_bands(
     ends, rates = ascend(link.at_subbands(subbands), starts)
     best = ends[np.arange(len(ends)), rates.argmax(axis=1)]
     digital = link.best_digital(best[:, None])[:, 0]
-    return [Beam(*parts) for parts in zip(best, digital, bands, strict=True)]
+    return [Beamformer(*parts) for parts in zip(best, digital, bands, strict=True)]
 
 
 @one_blas_thread
@@ -186,11 +186,11 @@ def prepare_steering(scenario: Scenario, surface: SurfaceEstimate | None = None)
     choose_beam(scenario, np.array(scenario.roi_center_m), surface=surface)
 
 
-def applied_beam(beam: Beam, surface: SurfaceEstimate | None) -> Beam:
+def applied_beam(beam: Beamformer, surface: SurfaceEstimate | None) -> Beamformer:
     """Return a beam with the coefficients and band gain of a calibrated surface, if any."""
     if surface is None:
         return beam
-    return Beam(surface.applied(beam.analog), surface.band_gains[beam.band] * beam.digital,
+    return Beamformer(surface.applied(beam.analog), surface.band_gains[beam.band] * beam.digital,
                 beam.band)
 
 
@@ -218,7 +218,7 @@ def choose_beam(
 
 @one_blas_thread
 def capacity_report(
-        scenario: Scenario, beam: Beam, position: np.ndarray,
+        scenario: Scenario, beam: Beamformer, position: np.ndarray,
         bands: Sequence[int] | None = None,
         surface: SurfaceEstimate | None = None) -> CapacityReport:
     """Compare a beam with the beam that `choose_beam` finds for the true position.
@@ -229,7 +229,7 @@ def capacity_report(
     passed to `choose_beam`. Raises ValueError if the position is not a finite [3] array, or the
     beam does not fit the scenario.
     """
-    def actual_bps(beam: Beam) -> float:
+    def actual_bps(beam: Beamformer) -> float:
         place = np.asarray(position, dtype=float)[None]
         return float(actual_capacity(scenario, applied_beam(beam, surface), place)[0])
 

@@ -9,6 +9,7 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome
+from rhs_isac_ros.protocol.ground_truth import TruePositions
 from rhs_isac_ros.support.fields import finite
 
 # Maximum number of incomplete cycles; the missing messages of older ones will not arrive.
@@ -77,8 +78,7 @@ class CycleRecord(CycleTimes):
     """A cycle that may be running, given up or incomplete; missing messages are None."""
 
     outcome: str = ''  # served, or the reason why it was given up; empty while it runs
-    # True positions by the instance of the user that sent them.
-    truths: dict[int, m.GroundTruth] = dataclasses.field(default_factory=dict)
+    truths: TruePositions = dataclasses.field(default_factory=TruePositions)
     signals: m.ReceivedSignals | None = None
     estimate: m.PositionEstimate | None = None
     capacity: m.Capacity | None = None
@@ -86,9 +86,7 @@ class CycleRecord(CycleTimes):
     @property
     def truth(self) -> m.GroundTruth | None:
         """True position, as sent by the node of the located user; None if unknown."""
-        instance = self.estimate.user_instance if self.estimate else 0
-        return next((truth for sender, truth in reversed(self.truths.items())
-                     if m.same_instance(sender, instance)), None)
+        return self.truths.of(self.estimate or self.signals)
 
     def completed(self) -> CompleteCycle | None:
         """Return the complete cycle, or None if it was not served or a message is missing."""
@@ -136,7 +134,7 @@ class CycleLog:
             return
         match message:
             case m.GroundTruth():
-                record.truths[message.sender] = message
+                record.truths.add(message)
             case m.ReceivedSignals():
                 record.signals = message
             case m.PositionEstimate():
@@ -191,7 +189,7 @@ class SignalLog:
         self.codebooks: dict[str, Codebook] = {}
         #: Cycles that were answered, or that ended.
         self.ended: set[Key] = set()
-        self._truths: dict[Key, list[m.GroundTruth]] = {}
+        self.truths = TruePositions()
 
     def add(self, found: m.Message | Codebook, arrived_s: float = math.nan) -> None:
         """Add a codebook, or a message whose type is in `RECEIVES`."""
@@ -200,17 +198,11 @@ class SignalLog:
             return
         key = found.cycle_id, getattr(found, 'user', 0)
         match found:
-            case m.GroundTruth() if found.cycle_id:
-                self._truths.setdefault(key, []).append(found)
+            case m.GroundTruth():
+                self.truths.add(found)
             case m.ReceivedSignals():
                 self.signals[key], self.arrived_s[key] = found, arrived_s
             case m.PositionEstimate():
                 self.estimates[key] = found
         if isinstance(found, ANSWERS) or isinstance(found, m.ProtocolState) and found.outcome:
             self.ended.add(key)
-
-    def truth_of(self, signals: m.ReceivedSignals) -> m.GroundTruth | None:
-        """Return the true position in a cycle, as sent by the node of its user, or None."""
-        return next((truth for truth in reversed(
-            self._truths.get((signals.cycle_id, signals.user), []))
-            if m.same_instance(truth.sender, signals.user_instance)), None)

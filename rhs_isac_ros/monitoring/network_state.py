@@ -10,7 +10,8 @@ import numpy as np
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station import BsState
+from rhs_isac_ros.protocol.ground_truth import TruePositions
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.support.fields import finite
 
@@ -99,7 +100,7 @@ class Overview:
     @property
     def paused(self) -> bool:
         """Whether a base station has reported a pause since the current phase began."""
-        return any(status.report.values.get('phase') == State.PAUSED.value
+        return any(status.report.values.get('phase') == BsState.PAUSED.value
                    and not status.received_s < self.phase_began_s
                    for status in self.nodes.values())
 
@@ -131,7 +132,7 @@ def new_path() -> collections.deque[np.ndarray]:
 
 
 @dataclasses.dataclass
-class UserState:
+class SceneUser:
     """True position, estimate and paths of one user; a path lists positions from old to new."""
 
     user: int
@@ -140,14 +141,14 @@ class UserState:
     estimate: m.PositionEstimate | None = None
     true_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=new_path)
     estimated_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=new_path)
-    # The true position in the latest cycle.
-    _cycle_truth: m.GroundTruth | None = None
+    # Those of the latest cycle.
+    _truths: TruePositions = dataclasses.field(default_factory=lambda: TruePositions(1))
 
     @property
     def error_m(self) -> float:
         """Distance of the estimate from the true position of the cycle [m]; NaN if unknown."""
-        truth, estimate = self._cycle_truth, self.estimate
-        if truth is None or estimate is None or truth.cycle_id != estimate.cycle_id:
+        truth, estimate = self._truths.of(self.estimate), self.estimate
+        if truth is None or estimate is None:
             return math.nan
         return float(np.linalg.norm(estimate.position - truth.position))
 
@@ -159,8 +160,7 @@ class UserState:
             self.estimated_path.append(message.position)
             return
         self.truth = message
-        if message.cycle_id:
-            self._cycle_truth = message
+        self._truths.add(message)
         if not self.true_path or math.dist(self.true_path[-1], message.position) > _MIN_STEP_M:
             self.true_path.append(message.position)
 
@@ -175,7 +175,7 @@ class SceneState:
     def __init__(self) -> None:
         self.configuration: m.RhsConfiguration | None = None
         self.beam: m.Beam | None = None
-        self.users: dict[int, UserState] = {}
+        self.users: dict[int, SceneUser] = {}
         self._beam_s = math.nan
 
     def add(self, message: m.Message, now_s: float) -> None:
@@ -191,7 +191,7 @@ class SceneState:
                     self.add(truth, now_s)
             case m.GroundTruth() | m.PositionEstimate():
                 if message.user in self.users or len(self.users) < MAX_USERS:
-                    self.users.setdefault(message.user, UserState(message.user, now_s)).add(
+                    self.users.setdefault(message.user, SceneUser(message.user, now_s)).add(
                         message, now_s)
 
     def discard_stale(self, before_s: float) -> list[int]:
@@ -222,7 +222,7 @@ class SceneState:
         return sorted(user for user, state in self.users.items() if not state.estimate)
 
     @property
-    def shown_user(self) -> UserState | None:
+    def shown_user(self) -> SceneUser | None:
         """User of the latest beam if its cycle has an estimate, else of the latest estimate."""
         state = self.users.get(self.beam.user) if self.beam else None
         if state and state.estimate and self.beam and (

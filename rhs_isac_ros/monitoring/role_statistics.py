@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station import BsState
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Outcome, Send, kind_of
 
 # Number of latest durations from which percentiles are computed.
@@ -109,7 +109,7 @@ class RoleStatistics:
         elif new_faults:
             summary = _summary(new_faults)
         else:
-            return Report(False, 'paused' if phase == State.PAUSED.value else 'no fault', values)
+            return Report(False, 'paused' if phase == BsState.PAUSED.value else 'no fault', values)
         return Report(True, summary, values)
 
     def _codebook_ids(self, in_use: str) -> dict[str, str]:

@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from rhs_isac_ros.link import Beam, BeamPattern, beam_pattern
+from rhs_isac_ros.link import Beamformer, BeamPattern, beam_pattern
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.geometry import element_intervals_m, element_positions
@@ -282,7 +282,7 @@ def track(
 
 def pattern(scenario: Scenario, message: m.Beam, step_deg: float = 5.0) -> BeamPattern:
     """Return the pattern of a beam at the distance of the region's centre."""
-    return beam_pattern(scenario, Beam(message.analog, message.digital, message.band),
+    return beam_pattern(scenario, Beamformer(message.analog, message.digital, message.band),
                         math.hypot(*scenario.roi_center_m), step_deg)
 
 

@@ -25,7 +25,7 @@ class FusionNode(LocatingNode[Fusion]):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('fusion', **node_options)
-        site = self.place.site
+        site = self.surface.site
         assert site
         worker = BackgroundWorker(self)
         self.endings.callback(worker.close)

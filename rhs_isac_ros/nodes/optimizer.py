@@ -109,8 +109,8 @@ class OptimizerNode(RoleNode[Holder]):
         super().__init__(
             topics.OPTIMIZER_NODE, start_parameter_services=False, **node_options)
         file = self.values.codebook_file or default_codebook_file()
-        defaults = (Codebook.load(file) if self.values.codebook_file or not self.place.codebook
-                    else self.place.codebook).to_parameters()
+        defaults = (Codebook.load(file) if self.values.codebook_file or not self.surface.codebook
+                    else self.surface.codebook).to_parameters()
         for name, text in CODEBOOK.items():
             self.declare_parameter(name, defaults[name], ParameterDescriptor(description=text))
         # In a file of an earlier version, the provenance differs and the id may be missing.

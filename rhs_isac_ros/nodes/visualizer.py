@@ -26,11 +26,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from rhs_isac_ros import model
 from rhs_isac_ros.monitoring import shapes
-from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState, UserState
+from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState, SceneUser
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, endpoints, parameters, topics
 from rhs_isac_ros.ros.frames import Frame, to_ros
-from rhs_isac_ros.ros.place import Place
+from rhs_isac_ros.ros.node_surface import NodeSurface
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.ros.topics import RHS_FRAME, TF, TF_STATIC
 
@@ -86,8 +86,8 @@ def marker(
 _OF_SURFACE = ('region', 'board', 'traced', 'beam')
 
 
-def place(marker: Marker, frame: Frame, pose: model.Pose) -> Marker:
-    """Place a marker in the frame of the site, given the pose of the surface."""
+def in_site(marker: Marker, frame: Frame, pose: model.Pose) -> Marker:
+    """Move a marker to the frame of the site, given the pose of the surface, and return it."""
     marker.header.frame_id = frame.name
     if marker.ns in _OF_SURFACE:
         # The points of a marker are relative to its pose.
@@ -172,7 +172,7 @@ class VisualizerNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('visualizer', **node_options)
         values = parameters.declare(self, 'visualizer')
-        self._scenario = Place.of(values, self.get_namespace()).scenario
+        self._scenario = NodeSurface.of(values, self.get_namespace()).scenario
         self._frame = Frame.of(self, values)
         self._forget_s = values.forget_s
         self._scene = SceneState()
@@ -210,7 +210,7 @@ class VisualizerNode(Node):
             self._show_paths(state, stamp)
         endpoints.publish_if_subscribed((self._publisher,), lambda: self._markers(stamp))
 
-    def _show_paths(self, user: UserState, stamp: Time) -> None:
+    def _show_paths(self, user: SceneUser, stamp: Time) -> None:
         paths = user.estimated_path, user.true_path
         # Without publishers, the zip is empty.
         for publisher, places in zip(self._paths.publishers(user.user), paths, strict=False):
@@ -236,7 +236,7 @@ class VisualizerNode(Node):
         if state.beam:
             array.append(self._beam_marker(state.beam, stamp))
         for found in array:
-            place(found, self._frame, self._scenario.pose)
+            in_site(found, self._frame, self._scenario.pose)
             found.lifetime = self._lifetime
         return MarkerArray(markers=array)
 

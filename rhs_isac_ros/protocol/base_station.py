@@ -25,7 +25,7 @@ from rhs_isac_ros.protocol.settings import BaseStationSettings, PendingSettings
 from rhs_isac_ros.protocol.user_registry import UserRegistry
 
 
-class State(enum.Enum):
+class BsState(enum.Enum):
     """States of the base station."""
 
     WAITING = 'waiting'            # waits for a codebook and the other roles
@@ -40,8 +40,9 @@ class State(enum.Enum):
 
 
 # Steps of a granted cycle. Each waits for a reply, and may repeat its request.
-STEPS = (State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING, State.TRANSMITTING)
-NOT_BEACONING = tuple(state for state in State if state is not State.BEACONING)
+STEPS = (BsState.CONFIGURING, BsState.SOUNDING, BsState.ESTIMATING, BsState.STEERING,
+         BsState.TRANSMITTING)
+NOT_BEACONING = tuple(state for state in BsState if state is not BsState.BEACONING)
 
 
 @dataclasses.dataclass
@@ -99,9 +100,9 @@ class BaseStation(SignalCollector):
     SENDS = (m.Beacon, m.Grant, m.RhsCommand, m.PilotRequest, m.ReceivedSignals, m.Data,
              m.ProtocolState)
 
-    STATES = State
-    BLOCKED_STATES = frozenset({State.WAITING})
-    WORLD_STATES = frozenset({State.RESTING})
+    STATES = BsState
+    BLOCKED_STATES = frozenset({BsState.WAITING})
+    WORLD_STATES = frozenset({BsState.RESTING})
 
     _cycle: Cycle
 
@@ -109,7 +110,7 @@ class BaseStation(SignalCollector):
             self, scenario: Scenario, settings: BaseStationSettings, rng: np.random.Generator,
             receiver: Combine, first_cycle_id: int = 1, library: Library = EMPTY,
             world_s: Callable[[], float] | None = None) -> None:
-        super().__init__(State.WAITING, scenario, receiver, Cycle(first_cycle_id - 1))
+        super().__init__(BsState.WAITING, scenario, receiver, Cycle(first_cycle_id - 1))
         self._scenario = scenario
         self._users = UserRegistry(settings.policy, rng)
         self._settings = PendingSettings(settings)
@@ -133,20 +134,20 @@ class BaseStation(SignalCollector):
     def _observed(self, before: enum.Enum) -> Iterable[LogMessage]:
         """Return what to log about the transition from a state to the present one."""
         cycle = self._cycle
-        if self.state is State.WAITING and self._missing is not None:
+        if self.state is BsState.WAITING and self._missing is not None:
             return self._service.waits(self._lacking())
-        if self.state is State.BEACONING:
+        if self.state is BsState.BEACONING:
             self._service.begins()
-        elif self.state is State.RESTING and before in STEPS:
+        elif self.state is BsState.RESTING and before in STEPS:
             if self.outcome:
                 return self._service.gives_up(
                     cycle.cycle_id, cycle.user, cycle.user_instance, self.outcome)
             users = f'{len(self._users)} user{"s"[:len(self._users) != 1]}'
             return self._service.serves(
                 cycle.cycle_id, cycle.user, f'codebook {cycle.codebook_id}, {users}')
-        elif self.state is State.PAUSED and before is not State.PAUSED:
-            reason = '' if before is State.WAITING else f' after cycle {cycle.cycle_id}'
-            if before is State.BEACONING:
+        elif self.state is BsState.PAUSED and before is not BsState.PAUSED:
+            reason = '' if before is BsState.WAITING else f' after cycle {cycle.cycle_id}'
+            if before is BsState.BEACONING:
                 reason = f': no user answered the beacon of cycle {cycle.cycle_id}'
             return [LogMessage(f'paused{reason}')]
         return ()
@@ -154,9 +155,9 @@ class BaseStation(SignalCollector):
     def timeout_s(self, state: enum.Enum) -> float | None:
         """Return the timeout of a state [s], or None; the attempts at a step share it equally."""
         settings = self._settings.in_use
-        if state is State.BEACONING:
+        if state is BsState.BEACONING:
             return settings.ack_timeout_s
-        if state is State.RESTING:
+        if state is BsState.RESTING:
             return 0.0 if self._pause_requested else settings.rest_s
         return settings.step_timeout_s / (settings.retries + 1) if state in STEPS else None
 
@@ -443,46 +444,47 @@ class BaseStation(SignalCollector):
     _SOUNDED_HERE: Drops = {_sounds_elsewhere: None}
     # The row that repeats the request of a step, and the row that ends its cycle.
     _retry_row = functools.partial(AnyRow, guard=_may_retry, restart_timeout=True)
-    _last_row = functools.partial(AnyRow, target=State.RESTING)
+    _last_row = functools.partial(AnyRow, target=BsState.RESTING)
     # A beam and its configuration come from two roles of each surface, in either order.
     _ANSWER = (
-        AnyRow((State.ESTIMATING,), (_store_answer,), State.STEERING),
-        AnyRow((State.STEERING,), (_store_answer, _begin_transmission), State.TRANSMITTING,
+        AnyRow((BsState.ESTIMATING,), (_store_answer,), BsState.STEERING),
+        AnyRow((BsState.STEERING,), (_store_answer, _begin_transmission), BsState.TRANSMITTING,
                guard=_last_answer),
-        AnyRow((State.STEERING,), (_store_answer,)))
+        AnyRow((BsState.STEERING,), (_store_answer,)))
 
     # In each table, the first matching row for an event applies. The operator and the other roles
     # decide when cycles begin.
     _OPERATION = (
         *on(events.Immediately, 'immediately')(
-            Row((State.WAITING,), target=State.PAUSED, guard=_pausing),
-            Row((State.WAITING,), (_begin_cycle,), State.BEACONING, guard=_ready)),
+            Row((BsState.WAITING,), target=BsState.PAUSED, guard=_pausing),
+            Row((BsState.WAITING,), (_begin_cycle,), BsState.BEACONING, guard=_ready)),
         # A new codebook takes effect with the next beacon.
         *on(events.CodebookOffered, 'codebook')(Row(ANY, (_store_codebook,))),
         *on(events.PeersChanged, 'peers')(Row(ANY, (_store_peers,))),
         *on(events.SettingsOffered, 'settings')(
-            Row((State.WAITING, State.PAUSED), (_store_settings, _apply_settings)),
-            Row((State.RESTING,), (_store_settings, _apply_settings), restart_timeout=True),
+            Row((BsState.WAITING, BsState.PAUSED), (_store_settings, _apply_settings)),
+            Row((BsState.RESTING,), (_store_settings, _apply_settings), restart_timeout=True),
             Row(ANY, (_store_settings,))),
         # A pause persists while another base station serves.
         *on(events.StoodBy, 'stood_by')(
-            Row(ANY, (_forget_peers, _apply_settings), State.WAITING)),
+            Row(ANY, (_forget_peers, _apply_settings), BsState.WAITING)),
         *on(events.Resumed, 'resumed')(
-            Row((State.WAITING, State.PAUSED), (_skip_cycles,))),
+            Row((BsState.WAITING, BsState.PAUSED), (_skip_cycles,))),
         *on(events.PauseRequested, 'pause')(
             # A pause begins between cycles or after an unanswered beacon.
-            Row((State.PAUSED,), (reply(True, 'already paused'),)),
-            Row((State.WAITING, State.RESTING), (_pause, reply(True, 'paused')), State.PAUSED),
+            Row((BsState.PAUSED,), (reply(True, 'already paused'),)),
+            Row((BsState.WAITING, BsState.RESTING), (_pause, reply(True, 'paused')),
+                BsState.PAUSED),
             Row(ANY, (_pause, reply(True, 'the pause begins after cycle {cycle}')))),
         *on(events.ResumeRequested, 'resume')(
-            Row((State.PAUSED,), (_resume, reply_resumed), State.WAITING),
+            Row((BsState.PAUSED,), (_resume, reply_resumed), BsState.WAITING),
             Row(ANY, (_resume, reply_resumed), guard=_pausing),
             Row(ANY, (reply(True, 'not paused'),))),
         *on(events.StepRequested, 'step')(
             # The pause remains requested, so the base station pauses again after the cycle.
-            Row((State.PAUSED,), (reply(False, 'waiting for {lacking}'),), guard=_not_ready),
-            Row((State.PAUSED,), (_begin_cycle, reply(True, 'cycle {cycle} begins')),
-                State.BEACONING),
+            Row((BsState.PAUSED,), (reply(False, 'waiting for {lacking}'),), guard=_not_ready),
+            Row((BsState.PAUSED,), (_begin_cycle, reply(True, 'cycle {cycle} begins')),
+                BsState.BEACONING),
             Row(ANY, (reply(False, 'cycle {cycle} has not ended'),), guard=_pausing),
             Row(ANY, (reply(False, 'not paused; a step requires a pause'),))),
         *on(events.LocateRequested, 'locate')(
@@ -501,79 +503,81 @@ class BaseStation(SignalCollector):
             Row(ANY, (_count_ack,), guard=_duplicate_ack, outcome=Outcome.DUPLICATE),
             # This cycle no longer collects acks; the user is registered for later ones.
             Row(NOT_BEACONING, (_count_ack, _register_user), outcome=Outcome.LATE_ACK),
-            Row((State.BEACONING,), (_count_ack, _accept_ack, _grant), State.CONFIGURING,
+            Row((BsState.BEACONING,), (_count_ack, _accept_ack, _grant), BsState.CONFIGURING,
                 guard=_last_ack),
-            Row((State.BEACONING,), (_count_ack, _accept_ack))),
+            Row((BsState.BEACONING,), (_count_ack, _accept_ack))),
     )
 
     # The steps of a cycle, in order, and their timeouts.
     _CYCLE = (
         *on(Timeout, 'timeout')(
-            Row((State.RESTING,), target=State.WAITING, guard=_pausing_or_not_ready),
-            Row((State.RESTING,), (_begin_cycle,), State.BEACONING),
-            Row((State.BEACONING,), (_grant,), State.CONFIGURING, guard=_some_acks),
-            Row((State.BEACONING,), (_apply_settings,), State.WAITING,
+            Row((BsState.RESTING,), target=BsState.WAITING, guard=_pausing_or_not_ready),
+            Row((BsState.RESTING,), (_begin_cycle,), BsState.BEACONING),
+            Row((BsState.BEACONING,), (_grant,), BsState.CONFIGURING, guard=_some_acks),
+            Row((BsState.BEACONING,), (_apply_settings,), BsState.WAITING,
                 guard=_pausing_or_not_ready),
-            Row((State.BEACONING,), (_apply_settings, _beacon_again), outcome=Outcome.UNANSWERED,
+            Row((BsState.BEACONING,), (_apply_settings, _beacon_again), outcome=Outcome.UNANSWERED,
                 restart_timeout=True),
-            _retry_row((State.CONFIGURING,), (_command_bands,), outcome=Outcome.RETRY_RHS),
-            _last_row((State.CONFIGURING,), (_abandon,), outcome=Outcome.RHS_SILENT),
+            _retry_row((BsState.CONFIGURING,), (_command_bands,), outcome=Outcome.RETRY_RHS),
+            _last_row((BsState.CONFIGURING,), (_abandon,), outcome=Outcome.RHS_SILENT),
             # Repeat the command too, because the channel may have missed the report of the RHS.
-            _retry_row((State.SOUNDING,), (_command_silent_bands, _request_pilots),
+            _retry_row((BsState.SOUNDING,), (_command_silent_bands, _request_pilots),
                    outcome=Outcome.RETRY_BAND),
-            _last_row((State.SOUNDING,), (_abandon,), guard=_signals_due,
+            _last_row((BsState.SOUNDING,), (_abandon,), guard=_signals_due,
                      outcome=Outcome.CHANNEL_SILENT),
-            _last_row((State.SOUNDING,), (_remove_user, _abandon), outcome=Outcome.USER_GONE),
-            _retry_row((State.ESTIMATING,), (_resend_signals,), outcome=Outcome.RETRY_POSITION),
-            _last_row((State.ESTIMATING,), (_abandon,), outcome=Outcome.POSITIONER_SILENT),
+            _last_row((BsState.SOUNDING,), (_remove_user, _abandon), outcome=Outcome.USER_GONE),
+            _retry_row((BsState.ESTIMATING,), (_resend_signals,), outcome=Outcome.RETRY_POSITION),
+            _last_row((BsState.ESTIMATING,), (_abandon,), outcome=Outcome.POSITIONER_SILENT),
             # The cycle goes on without surfaces that did not answer; the next one does not await
             # them either.
-            Row((State.STEERING,), (_begin_transmission,), State.TRANSMITTING, guard=_some_ready),
+            Row((BsState.STEERING,), (_begin_transmission,), BsState.TRANSMITTING,
+                guard=_some_ready),
             # Roles answer a repeated message again, so repeated signals lead to the beam again.
-            _retry_row((State.STEERING,), (_resend_signals,), outcome=Outcome.RETRY_BEAM),
-            _last_row((State.STEERING,), (_abandon,), outcome=Outcome.TRANSMISSION_SILENT),
+            _retry_row((BsState.STEERING,), (_resend_signals,), outcome=Outcome.RETRY_BEAM),
+            _last_row((BsState.STEERING,), (_abandon,), outcome=Outcome.TRANSMISSION_SILENT),
             # The channel may have missed the beam or its configuration, or another surface can
             # carry the data.
-            _retry_row((State.TRANSMITTING,), (_note_loss, _resend_signals, _send_downlink),
+            _retry_row((BsState.TRANSMITTING,), (_note_loss, _resend_signals, _send_downlink),
                    outcome=Outcome.RETRY_DATA),
-            _last_row((State.TRANSMITTING,), (_note_loss, _abandon), outcome=Outcome.DATA_LOST)),
+            _last_row((BsState.TRANSMITTING,), (_note_loss, _abandon), outcome=Outcome.DATA_LOST)),
         *on(m.RhsConfiguration, 'configured')(
             Row(ANY, (_await_surface,), guard=_shown_late, outcome=Outcome.WRONG_CYCLE)),
         *on(m.RhsConfiguration, 'configured',
               _SOUNDED_HERE | SignalCollector._OF_CYCLE | _OF_CODEBOOK)(
             # A report concerns the configurations for positioning in a band, or that of the beam.
-            Row((State.CONFIGURING,), (_store_configured, _request_pilots), State.SOUNDING,
+            Row((BsState.CONFIGURING,), (_store_configured, _request_pilots), BsState.SOUNDING,
                 guard=_last_configuration),
-            Row((State.CONFIGURING, State.SOUNDING), (_store_configured,), guard=_for_positioning),
-            Row((State.ESTIMATING, State.STEERING, State.TRANSMITTING), guard=_for_positioning,
-                outcome=Outcome.DUPLICATE),
+            Row((BsState.CONFIGURING, BsState.SOUNDING), (_store_configured,),
+                guard=_for_positioning),
+            Row((BsState.ESTIMATING, BsState.STEERING, BsState.TRANSMITTING),
+                guard=_for_positioning, outcome=Outcome.DUPLICATE),
             *_ANSWER,
-            Row((State.TRANSMITTING, State.RESTING), (_store_answer,), guard=_late_surface),
+            Row((BsState.TRANSMITTING, BsState.RESTING), (_store_answer,), guard=_late_surface),
             # A repeated request may be answered twice.
-            Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
+            Row((BsState.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
         # Pilots only distinguish a silent user from a silent channel.
         *on(m.Pilot, 'pilot', _OF_USER)(Row(ANY, (_store_piloted,))),
         *on(m.FeedSignals, 'signals', SignalCollector._OF_SIGNALS)(
-            Row((State.SOUNDING,), (SignalCollector._store_signals, _send_signals),
-                State.ESTIMATING, guard=SignalCollector._last_signals),
+            Row((BsState.SOUNDING,), (SignalCollector._store_signals, _send_signals),
+                BsState.ESTIMATING, guard=SignalCollector._last_signals),
             # Each band restarts the timeout and the retries.
-            Row((State.SOUNDING,), (SignalCollector._store_signals,), State.SOUNDING)),
+            Row((BsState.SOUNDING,), (SignalCollector._store_signals,), BsState.SOUNDING)),
         *on(m.PositionEstimate, 'estimate', _OF_USER | _OF_CODEBOOK)(
-            Row((State.ESTIMATING,), (_store_estimate,), State.STEERING),
-            Row((State.STEERING,), (_store_estimate,)),
-            Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
+            Row((BsState.ESTIMATING,), (_store_estimate,), BsState.STEERING),
+            Row((BsState.STEERING,), (_store_estimate,)),
+            Row((BsState.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
         *on(m.NoFix, 'no_fix', _OF_USER | _OF_CODEBOOK)(
-            _last_row((State.ESTIMATING,), (_abandon,), outcome=Outcome.NO_FIX)),
+            _last_row((BsState.ESTIMATING,), (_abandon,), outcome=Outcome.NO_FIX)),
         *on(m.Beam, 'beam')(
             Row(ANY, (_await_surface,), guard=SignalCollector._wrong_cycle,
                 outcome=Outcome.WRONG_CYCLE)),
         *on(m.Beam, 'beam', SignalCollector._SAME_USER | _OF_CODEBOOK)(
             *_ANSWER,
-            Row((State.TRANSMITTING,), (_store_answer,), guard=_late_surface),
-            Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
+            Row((BsState.TRANSMITTING,), (_store_answer,), guard=_late_surface),
+            Row((BsState.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
         *on(m.Data, 'delivered', _DELIVERED | _OF_USER)(
-            Row((State.TRANSMITTING,), (_finish,), State.RESTING),
-            Row((State.PAUSED, State.RESTING), outcome=Outcome.DUPLICATE)),
+            Row((BsState.TRANSMITTING,), (_finish,), BsState.RESTING),
+            Row((BsState.PAUSED, BsState.RESTING), outcome=Outcome.DUPLICATE)),
     )
 
     TABLE = (*_OPERATION, *_CYCLE, *_ADMISSION)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.frontend import FrontEnd, RadioFault, Sounding, SurfaceFault
-from rhs_isac_ros.link import Beam, actual_capacity
+from rhs_isac_ros.link import Beamformer, actual_capacity
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import DeclaredElements, SurfaceEstimate, draw_surface
 from rhs_isac_ros.model.impairments import draw_factors
@@ -83,8 +83,8 @@ class Fading:
         return gains
 
 
-class Air:
-    """The emulated transmission of messages, with random losses, duplicates and delays."""
+class Delivery:
+    """The emulated delivery of messages, with random losses, duplicates and delays."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng, self._serial = rng, itertools.count()
@@ -189,7 +189,7 @@ class Channel(Role):
         self._use(self._settings.in_use)
         self._cycle: _Cycle | None = None
         self._fading = Fading(scenario, seed)
-        self._air = Air(streams.generator(seed, streams.AIR))
+        self._delivery = Delivery(streams.generator(seed, streams.AIR))
         # Id, user, instance and position of each cycle that has begun.
         self._begun: NewestDict[tuple[float, ...], None] = NewestDict(REMEMBERED_CYCLES)
         # Configurations and beams of the current cycle and of future ones.
@@ -213,7 +213,7 @@ class Channel(Role):
 
     def next_deadline(self) -> float | None:
         """Return the time at which the next message arrives [s], or None if none is in flight."""
-        return self._air.in_flight[0][0] if self._air.in_flight else None
+        return self._delivery.in_flight[0][0] if self._delivery.in_flight else None
 
     def status(self) -> Mapping[str, str]:
         """Return the impairments in use, the pending ones and the fault of the front end."""
@@ -244,7 +244,7 @@ class Channel(Role):
                 # Compute the capacity, which is the same in both directions, before data arrive.
                 self._cycle.rate_bps = self._rate_bps(self._cycle)
             self._answer_pending(self._cycle)
-        for message in self._air.arrived(self.now_s):
+        for message in self._delivery.arrived(self.now_s):
             self.send(message)
 
     def _keep_beam(self, beam: m.Beam) -> None:
@@ -340,7 +340,7 @@ class Channel(Role):
         exchange = self._applying.pop(applied.key)
         if exchange.cycle is not self._cycle:
             self.count(Outcome.STALE)
-        elif impaired := self._air.send(
+        elif impaired := self._delivery.send(
                 self._answer(exchange, applied.feeds), self._settings.in_use, self.now_s):
             self.counters[impaired] += 1
 
@@ -391,7 +391,7 @@ class Channel(Role):
             # The phases of the factors do not change the capacity.
             digital = digital * np.abs(cycle.factors[beam.band, 0, 0])
         return float(actual_capacity(
-            self._scenario, Beam(applied, digital, beam.band), cycle.position,
+            self._scenario, Beamformer(applied, digital, beam.band), cycle.position,
             cycle.blocked)[0])
 
 

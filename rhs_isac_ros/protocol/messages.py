@@ -216,8 +216,8 @@ def _equal(one: object, other: object) -> bool:
     return np.array_equal(one, other, equal_nan=can_be_nan)  # type: ignore[arg-type]
 
 
-# Fields that the messages of a cycle share.
-_SHARED = ('cycle_id', 'user', 'user_instance', 'band', 'codebook_id')
+# Fields that the messages of a cycle have in common.
+_COMMON = ('cycle_id', 'user', 'user_instance', 'band', 'codebook_id')
 MessageT = TypeVar('MessageT', bound=Message)
 
 
@@ -226,9 +226,9 @@ def derive(kind: type[MessageT], source: object, **fields: Any) -> MessageT:
 
     Attributes that the source or `kind` lacks are left out. `fields` adds or replaces fields.
     """
-    shared = {name: getattr(source, name) for name in _SHARED
+    common = {name: getattr(source, name) for name in _COMMON
               if name in kind.__dataclass_fields__ and hasattr(source, name)}
-    return kind(**shared | fields)
+    return kind(**common | fields)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -318,6 +318,11 @@ class ReceivedSignals(Message):
     user_instance: int = 0
     codebook_id: str
     signals: np.ndarray = array('N_B N_SB F', complex)
+
+    @property
+    def stacked(self) -> np.ndarray:
+        """The signals in the shape that estimators take, complex128 [N_B, N_SB F]."""
+        return self.signals.reshape(len(self.signals), -1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -494,7 +499,7 @@ class ProtocolState(Message):
 
 
 #: Messages of the base station and the users that concern every surface of a site.
-SHARED = (Grant, Pilot, GroundTruth)
+OF_USERS = (Grant, Pilot, GroundTruth)
 #: Messages with which a surface, or in a site their fusion, answers the signals of a user.
 LOCATED = (PositionEstimate, NoFix)
 #: Messages that contain positions.

@@ -88,7 +88,7 @@ class Tracks:
         is that of these signals alone. A new track assumes the typical speed `speed_mps`. Raises
         SignalError if the signals are unusable.
         """
-        signals, self.posterior = _stacked(received), None
+        signals, self.posterior = received.stacked, None
         # The oldest track comes first.
         while self._tracks and now_s > next(iter(self._tracks.values())).time_s + MAX_GAP_S:
             del self._tracks[next(iter(self._tracks))]
@@ -119,11 +119,6 @@ class Tracks:
         predicted = track.tracker.predict(track.time_s + track.interval_s)
         return predicted and (
             predicted[0], float(np.trace(predicted[1]) / 3)**0.5, track.interval_s)
-
-
-def _stacked(received: m.ReceivedSignals) -> np.ndarray:
-    """Return the signals in the shape that estimators expect, complex128 [N_B, N_SB F]."""
-    return received.signals.reshape(len(received.signals), -1)
 
 
 # Number of residuals that are kept for each user.
@@ -401,7 +396,7 @@ class Positioner(Role):
                 received, estimator, settings.track_speed_mps, received.time_s(now_s)
             ), self._tracks.posterior
         self._tracks.clear()
-        signals = _stacked(received)
+        signals = received.stacked
         if not (self._is_observed() and isinstance(estimator, SearchEstimator)):
             return estimator.estimate(signals), None
         posterior = estimator.posterior(signals)

@@ -11,7 +11,7 @@ from rhs_isac_ros.protocol.role import ANY, Row, on
 from rhs_isac_ros.protocol.settings import PendingSettings, ReceiverSettings
 
 
-class State(enum.Enum):
+class ReceiverState(enum.Enum):
     """States of the receiver."""
 
     LISTENING = 'listening'  # waits for a grant
@@ -28,11 +28,11 @@ class Receiver(SignalCollector):
 
     SENDS = (m.RhsCommand, m.ReceivedSignals)
 
-    STATES = State
+    STATES = ReceiverState
 
     def __init__(self, scenario: Scenario, combine: Combine,
                  settings: ReceiverSettings | None = None) -> None:
-        super().__init__(State.LISTENING, scenario, combine, Reception(0))
+        super().__init__(ReceiverState.LISTENING, scenario, combine, Reception(0))
         self._settings = PendingSettings(settings or ReceiverSettings())
         self._codebook: Codebook | None = None
 
@@ -80,11 +80,11 @@ class Receiver(SignalCollector):
         *on(SettingsOffered, 'settings')(Row(ANY, (_apply_settings,))),
         *on(m.Grant, 'grant', {_without_codebook: Outcome.WRONG_CODEBOOK,
                                _same_cycle: Outcome.DUPLICATE})(
-            Row((State.SOUNDING,), (_give_up, _begin), State.SOUNDING,
+            Row((ReceiverState.SOUNDING,), (_give_up, _begin), ReceiverState.SOUNDING,
                 outcome=Outcome.INCOMPLETE),
-            Row((State.LISTENING,), (_begin,), State.SOUNDING)),
+            Row((ReceiverState.LISTENING,), (_begin,), ReceiverState.SOUNDING)),
         *on(m.FeedSignals, 'signals', SignalCollector._OF_SIGNALS)(
-            Row((State.SOUNDING,), (SignalCollector._store_signals, _send_signals),
-                State.LISTENING, guard=SignalCollector._last_signals),
-            Row((State.SOUNDING,), (SignalCollector._store_signals,))),
+            Row((ReceiverState.SOUNDING,), (SignalCollector._store_signals, _send_signals),
+                ReceiverState.LISTENING, guard=SignalCollector._last_signals),
+            Row((ReceiverState.SOUNDING,), (SignalCollector._store_signals,))),
     )

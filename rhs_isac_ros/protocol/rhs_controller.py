@@ -18,7 +18,7 @@ from rhs_isac_ros.protocol.role import (
 )
 
 
-class State(enum.Enum):
+class RhsControllerState(enum.Enum):
     """States of the RHS controller."""
 
     IDLE = 'idle'                  # applies no configuration
@@ -35,10 +35,10 @@ class RhsController(StateMachine):
 
     SENDS = (m.RhsConfiguration,)
 
-    STATES = State
+    STATES = RhsControllerState
 
     def __init__(self, library: Library = EMPTY) -> None:
-        super().__init__(State.IDLE)
+        super().__init__(RhsControllerState.IDLE)
         self._codebooks: CodebookCache[Codebook] = CodebookCache(library.by_id)
         self._codebooks.update(library.by_id)
         self._library_id = library.id
@@ -62,7 +62,7 @@ class RhsController(StateMachine):
         return event.codebook_id not in self._codebooks
 
     def _repeats_command(self, event: m.RhsCommand) -> bool:
-        return (self.state is State.POSITIONING and event.cycle_id == self._cycle_id
+        return (self.state is RhsControllerState.POSITIONING and event.cycle_id == self._cycle_id
                 and self._was_executed(event))
 
     def _was_executed(self, event: m.RhsCommand) -> bool:
@@ -75,7 +75,7 @@ class RhsController(StateMachine):
         return self._granted.get(event.cycle_id, event.user) != event.user
 
     def _wrong_instance(self, event: m.Beam) -> bool:
-        return (self.state is State.TRANSMITTING
+        return (self.state is RhsControllerState.TRANSMITTING
                 and not m.same_instance(self._beam_sender, event.sender))
 
     def _wrong_codebook(self, event: m.Beam) -> bool:
@@ -124,12 +124,13 @@ class RhsController(StateMachine):
             # The base station repeats a command if the answer may have been lost.
             Row(ANY, (_apply_band,), guard=_repeats_command, outcome=Outcome.DUPLICATE),
             Row(ANY, guard=_was_executed, outcome=Outcome.STALE_COMMAND),
-            Row(ANY, (_apply_band,), State.POSITIONING)),
+            Row(ANY, (_apply_band,), RhsControllerState.POSITIONING)),
         *on(m.Beam, 'beam', {_wrong_cycle: Outcome.WRONG_CYCLE,
                      _wrong_user: Outcome.WRONG_USER,
                      _wrong_instance: Outcome.WRONG_INSTANCE})(
             Row(ANY, (_log_unknown_codebook,), guard=_wrong_codebook,
                 outcome=Outcome.WRONG_CODEBOOK),
-            Row((State.POSITIONING,), (_apply_beam,), State.TRANSMITTING),
-            Row((State.TRANSMITTING,), (_apply_beam,), outcome=Outcome.DUPLICATE)),
+            Row((RhsControllerState.POSITIONING,), (_apply_beam,),
+                RhsControllerState.TRANSMITTING),
+            Row((RhsControllerState.TRANSMITTING,), (_apply_beam,), outcome=Outcome.DUPLICATE)),
     )

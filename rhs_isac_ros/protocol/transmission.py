@@ -9,7 +9,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook.library import EMPTY, Library
 from rhs_isac_ros.link import (
-    Beam,
+    Beamformer,
     CapacityReport,
     Choice,
     applied_beam,
@@ -22,6 +22,7 @@ from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Event, Outcome
+from rhs_isac_ros.protocol.ground_truth import TruePositions
 from rhs_isac_ros.protocol.role import REMEMBERED_CYCLES, CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.settings import PendingSettings, TransmissionSettings
 
@@ -80,10 +81,9 @@ class Transmission(Role):
         self._settings = PendingSettings(settings or TransmissionSettings())
         self._codebooks: CodebookCache[None] = CodebookCache(library.by_id)
         self._codebooks.update(dict.fromkeys(library.by_id))
-        # Beams, by cycle; true positions, by cycle, user and instance; cycles in the statistics.
+        # Beams by cycle, true positions, and cycles in the statistics.
         self._steered: NewestDict[int, _Steered] = NewestDict(REMEMBERED_CYCLES)
-        self._truths: NewestDict[tuple[int, int, int], m.GroundTruth] = NewestDict(
-            REMEMBERED_CYCLES + _MAX_WAITING)
+        self._truths = TruePositions(REMEMBERED_CYCLES + _MAX_WAITING)
         self._counted: NewestDict[int, None] = NewestDict(REMEMBERED_CYCLES)
         self._waiting: collections.deque[_Waiting] = collections.deque()
         self._active_s = -math.inf
@@ -106,8 +106,8 @@ class Transmission(Role):
                 # A cycle that has a beam keeps its bands and its surface.
                 self._settings.latest = settings
                 self.log(self._settings.apply())
-            case m.GroundTruth() if event.cycle_id:
-                self._truths.put((event.cycle_id, event.user, event.sender), event)
+            case m.GroundTruth():
+                self._truths.add(event)
             case m.PositionEstimate() if event.codebook_id not in ('', *self._codebooks):
                 self.count(Outcome.WRONG_CODEBOOK)
             case m.PositionEstimate() if self._place_of(event)[0] <= 0:
@@ -179,10 +179,10 @@ class Transmission(Role):
         steered, applied, _ = waiting
         beam, result = steered.beam, CapacityReport(math.nan, math.nan)
         if truth := self._truth_of(waiting):
-            used = Beam(applied.analog[0], beam.digital, beam.band)
+            used = Beamformer(applied.analog[0], beam.digital, beam.band)
             result = self._evaluate(
                 self._scenario, used, self._place_of(truth), steered.bands, steered.surface)
-        steering = applied_beam(Beam(beam.analog, beam.digital, beam.band), steered.surface)
+        steering = applied_beam(Beamformer(beam.analog, beam.digital, beam.band), steered.surface)
         at_estimate_bps = float(capacity(
             self._scenario, steering, self._place_of(steered.estimate)[None])[0])
         report = m.derive(
@@ -194,11 +194,7 @@ class Transmission(Role):
 
     def _truth_of(self, waiting: _Waiting) -> m.GroundTruth | None:
         """Return the true position of the user to whom the beam is directed; None if unknown."""
-        estimate = waiting.steered.estimate
-        found = [truth for (cycle_id, user, instance), truth in self._truths.items()
-                 if (cycle_id, user) == (estimate.cycle_id, estimate.user)
-                 and m.same_instance(instance, estimate.user_instance)]
-        return found[-1] if found else None
+        return self._truths.of(waiting.steered.estimate)
 
     def _summarize(self, report: m.Capacity) -> None:
         if not math.isfinite(report.loss_percent) or report.cycle_id in self._counted:

@@ -17,7 +17,7 @@ from rhs_isac_ros.protocol.role import ANY, REMEMBERED_CYCLES, NewestDict, Row, 
 _SILENT_STEPS = 4
 
 
-class State(enum.Enum):
+class UserState(enum.Enum):
     """States of the users of a node; at most one user is served at a time."""
 
     DISCONNECTED = 'disconnected'  # waits for the base station and the channel
@@ -28,7 +28,7 @@ class State(enum.Enum):
 
 
 # States of connected users without a granted cycle.
-NOT_GRANTED = (State.LISTENING, State.NO_BEACON, State.ACKNOWLEDGED)
+NOT_GRANTED = (UserState.LISTENING, UserState.NO_BEACON, UserState.ACKNOWLEDGED)
 
 
 class User(StateMachine):
@@ -53,14 +53,14 @@ class User(StateMachine):
 
     SENDS = (m.Ack, m.GroundTruth, m.GroundTruths, m.Pilot, m.Data)
 
-    STATES = State
-    BLOCKED_STATES = frozenset({State.DISCONNECTED, State.NO_BEACON})
+    STATES = UserState
+    BLOCKED_STATES = frozenset({UserState.DISCONNECTED, UserState.NO_BEACON})
 
     def __init__(
             self, mobilities: Mapping[int, Mobility], step_s: float, beacon_s: float,
             instance: int = 0, world_s: Callable[[], float] | None = None,
             pose: Pose | None = None) -> None:
-        super().__init__(State.DISCONNECTED)
+        super().__init__(UserState.DISCONNECTED)
         self._step_s, self._beacon_s = step_s, beacon_s
         self.users, self._instance = tuple(sorted(mobilities)), instance
         # Description of another node that is served under the same number, by user.
@@ -92,14 +92,14 @@ class User(StateMachine):
         """Process an event, and log that beacons have resumed."""
         before = self.state
         super().react(event)
-        if before is State.NO_BEACON and self.state not in self.BLOCKED_STATES:
+        if before is UserState.NO_BEACON and self.state not in self.BLOCKED_STATES:
             self.log_state('beacons', 'beacons resumed', False)
 
     def timeout_s(self, state: enum.Enum) -> float | None:
         """Return the timeout of a state [s], or None if it has none."""
         timeouts: dict[enum.Enum, float] = {
-            State.LISTENING: self._beacon_s, State.ACKNOWLEDGED: self._step_s,
-            State.GRANTED: _SILENT_STEPS * self._step_s}
+            UserState.LISTENING: self._beacon_s, UserState.ACKNOWLEDGED: self._step_s,
+            UserState.GRANTED: _SILENT_STEPS * self._step_s}
         return timeouts.get(state)
 
     def status(self) -> Mapping[str, str]:
@@ -112,7 +112,7 @@ class User(StateMachine):
         return bool(event.missing or event.lacking)
 
     def _stale_beacon(self, event: m.Beacon) -> bool:
-        granted = self.state is State.GRANTED and event.cycle_id == self._cycle_id
+        granted = self.state is UserState.GRANTED and event.cycle_id == self._cycle_id
         return granted or event.attempt <= self._attempts.get(event.cycle_id, -1)
 
     def _invites_others(self, event: m.Beacon) -> bool:
@@ -138,7 +138,7 @@ class User(StateMachine):
 
     def _other_granted(self, event: m.PilotRequest) -> bool:
         """Return whether the cycle is granted to another user of this node."""
-        return self.state is State.GRANTED and (event.cycle_id, event.user) not in self._truths
+        return self.state is UserState.GRANTED and (event.cycle_id, event.user) not in self._truths
 
     def _not_granted(self, event: m.Data) -> bool:
         return (event.cycle_id, event.user) not in self._truths
@@ -148,7 +148,7 @@ class User(StateMachine):
 
     def _late_grant(self, event: m.Grant) -> bool:
         """Return whether the cycle was granted to the user before and is over."""
-        return (event.cycle_id, event.user) in self._truths and self.state is not State.GRANTED
+        return (event.cycle_id, event.user) in self._truths and self.state is not UserState.GRANTED
 
     def _new_request(self, event: m.PilotRequest) -> bool:
         return self._sounded != (event.cycle_id, event.band, event.last_band)
@@ -211,48 +211,51 @@ class User(StateMachine):
 
     TABLE = (
         *on(PeersChanged, 'peers')(
-            Row(ANY, (_log_missing_peers,), State.DISCONNECTED, guard=_peers_missing),
-            Row((State.DISCONNECTED,), (_log_connected,), State.LISTENING),
+            Row(ANY, (_log_missing_peers,), UserState.DISCONNECTED, guard=_peers_missing),
+            Row((UserState.DISCONNECTED,), (_log_connected,), UserState.LISTENING),
             Row(ANY)),
         *on(Timeout, 'timeout')(
-            Row((State.LISTENING,), (_log_no_beacon,), State.NO_BEACON, outcome=Outcome.NO_BEACON),
-            Row((State.ACKNOWLEDGED,), target=State.LISTENING, outcome=Outcome.NOT_GRANTED),
-            Row((State.GRANTED,), target=State.LISTENING, outcome=Outcome.BS_SILENT)),
+            Row((UserState.LISTENING,), (_log_no_beacon,), UserState.NO_BEACON,
+                outcome=Outcome.NO_BEACON),
+            Row((UserState.ACKNOWLEDGED,), target=UserState.LISTENING,
+                outcome=Outcome.NOT_GRANTED),
+            Row((UserState.GRANTED,), target=UserState.LISTENING, outcome=Outcome.BS_SILENT)),
         *on(m.Beacon, 'beacon')(
             Row(ANY, guard=_stale_beacon, outcome=Outcome.STALE_BEACON),
-            Row((State.DISCONNECTED,)),
+            Row((UserState.DISCONNECTED,)),
             # A beacon to other users shows that the base station is active, and the cycle is over.
-            Row(NOT_GRANTED, (_note_beacon,), State.LISTENING, guard=_invites_others),
-            Row((State.GRANTED,), (_note_beacon,), State.LISTENING, guard=_invites_others,
+            Row(NOT_GRANTED, (_note_beacon,), UserState.LISTENING, guard=_invites_others),
+            Row((UserState.GRANTED,), (_note_beacon,), UserState.LISTENING, guard=_invites_others,
                 outcome=Outcome.ABANDONED),
-            Row(NOT_GRANTED, (_acknowledge,), State.ACKNOWLEDGED),
-            Row((State.GRANTED,), (_acknowledge,), State.ACKNOWLEDGED, outcome=Outcome.ABANDONED)),
+            Row(NOT_GRANTED, (_acknowledge,), UserState.ACKNOWLEDGED),
+            Row((UserState.GRANTED,), (_acknowledge,), UserState.ACKNOWLEDGED,
+                outcome=Outcome.ABANDONED)),
         *on(m.Grant, 'grant')(
-            Row((State.ACKNOWLEDGED,), target=State.LISTENING, guard=_other_user_granted),
+            Row((UserState.ACKNOWLEDGED,), target=UserState.LISTENING, guard=_other_user_granted),
             Row(ANY, guard=_other_user),
-            Row((State.ACKNOWLEDGED,), (_log_other_instance,), State.LISTENING,
+            Row((UserState.ACKNOWLEDGED,), (_log_other_instance,), UserState.LISTENING,
                 guard=_other_instance_granted, outcome=Outcome.NUMBER_TAKEN),
             Row(ANY, (_log_other_instance,), guard=_other_instance, outcome=Outcome.NUMBER_TAKEN),
             Row(ANY, guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE),
             Row(ANY, guard=_late_grant, outcome=Outcome.LATE_GRANT),
             # The base station may wait longer than the user, so a grant may follow the timeout.
-            Row(NOT_GRANTED, (_publish_position,), State.GRANTED),
-            Row((State.GRANTED,))),
+            Row(NOT_GRANTED, (_publish_position,), UserState.GRANTED),
+            Row((UserState.GRANTED,))),
         *on(m.PilotRequest, 'pilot_request', {_other_user: None,
                              _other_instance: None,
                              _wrong_cycle: Outcome.WRONG_CYCLE,
                              _other_granted: Outcome.WRONG_USER})(
             # A request that overtakes the grant replaces it.
-            Row((State.ACKNOWLEDGED,), (_publish_position, _send_pilots), State.GRANTED,
+            Row((UserState.ACKNOWLEDGED,), (_publish_position, _send_pilots), UserState.GRANTED,
                 guard=_new_request),
-            Row((State.GRANTED,), (_send_pilots,), guard=_new_request, restart_timeout=True),
+            Row((UserState.GRANTED,), (_send_pilots,), guard=_new_request, restart_timeout=True),
             # The channel may have missed the pilots or the position.
-            Row((State.GRANTED,), (_publish_position, _send_pilots), outcome=Outcome.ASKED_AGAIN,
-                restart_timeout=True)),
+            Row((UserState.GRANTED,), (_publish_position, _send_pilots),
+                outcome=Outcome.ASKED_AGAIN, restart_timeout=True)),
         *on(m.Data, 'downlink', {_not_delivered_downlink: None,
                      _other_user: None,
                      _wrong_cycle: Outcome.WRONG_CYCLE,
                      _not_granted: None})(
-            Row((State.GRANTED,), (_send_uplink,), State.LISTENING),
-            Row((State.LISTENING,), (_send_uplink,), outcome=Outcome.ASKED_AGAIN)),
+            Row((UserState.GRANTED,), (_send_uplink,), UserState.LISTENING),
+            Row((UserState.LISTENING,), (_send_uplink,), outcome=Outcome.ASKED_AGAIN)),
     )

@@ -23,9 +23,9 @@ from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.ros.diagnostics import publish_reports
 from rhs_isac_ros.ros.frames import Frame
+from rhs_isac_ros.ros.node_surface import NodeSurface
 from rhs_isac_ros.ros.parameters import CODEBOOK, ParameterizedNode
 from rhs_isac_ros.ros.peers import Peers
-from rhs_isac_ros.ros.place import Place
 from rhs_isac_ros.ros.roster import MEMBERS
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import ParameterError
@@ -152,12 +152,12 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
         super().__init__(executable, name, **node_options)
-        self.place = Place.of(
+        self.surface = NodeSurface.of(
             self.values, self.get_namespace(), MEMBERS[executable].of_site)
-        self.scenario = self.place.scenario
+        self.scenario = self.surface.scenario
         self.library = self._load_library(getattr(self.values, 'library_file', ''))
         if hasattr(self.values, 'seed'):
-            self.values.seed = self.place.seed(self.values.seed)
+            self.values.seed = self.surface.seed(self.values.seed)
         self.instance = time.time_ns()
         self.frame = Frame.of(self, self.values)
         self.clocks = Clocks(self)
@@ -186,7 +186,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         publish_reports(self, self.report)
         self._peers = Peers(
             self, self._executable, self.instance, self.scenario, self._on_missing,
-            self._on_rival, self.place.site_prefix,
+            self._on_rival, self.surface.site_prefix,
             self.library.id if hasattr(self.values, 'library_file') else '')
         self.endings.callback(self._peers.close)
         if subscribe and not needs_codebook:
@@ -197,7 +197,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def _load_library(self, file: str) -> Library:
         if not file:
             return EMPTY
-        if self.place.site:
+        if self.surface.site:
             # The fusion, which locates the users of a site, proposes no codebooks.
             raise ParameterError(f'library_file: {file!r}, expected none in a site')
         with translated((CodebookError, OSError), ParameterError, 'library_file'):
@@ -214,7 +214,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         """Create the subscriptions, and announce the role, which is now ready."""
         kinds = [kind for kind in self.role.RECEIVES if kind not in self._receiving]
         self._receiving.update(kinds)
-        for kind, prefix, scenario in self.place.sources(
+        for kind, prefix, scenario in self.surface.sources(
                 kinds, MEMBERS[self._executable].from_all):
             endpoints.subscribe_messages(
                 self, [kind], scenario, self._on_message, self._on_malformed,
@@ -315,7 +315,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         if self.stands_by:
             return False
         stamp_ns = message.stamp_ns or self.get_clock().now().nanoseconds
-        scenario_id = message.scenario_id if self.place.is_carried(message) else self.scenario.id
+        scenario_id = message.scenario_id if self.surface.is_carried(message) else self.scenario.id
         try:
             m.check(message, self.scenario)
             content = convert.to_bytes(
@@ -348,7 +348,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def _on_foreign(self, scenario: Scenario, message: m.Message) -> None:
         """Count and log a message of another scenario, but no data of another surface."""
-        if self.place.is_carried(message):
+        if self.surface.is_carried(message):
             return
         self.role.counters[events.Outcome.WRONG_SCENARIO.value] += 1
         endpoints.journal(self).event(

@@ -89,14 +89,13 @@ class PilotLog(SignalLog):
         groups: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
         for signals, truth in self._known():
             groups.setdefault(signals.codebook_id, []).append(
-                (self._pose.to_surface(truth.position),
-                 signals.signals.reshape(len(signals.signals), -1)))
+                (self._pose.to_surface(truth.position), signals.stacked))
         return [Pilots(self.codebooks[codebook_id], *map(np.array, zip(*group, strict=True)))
                 for codebook_id, group in groups.items()]
 
     def _known(self) -> list[tuple[m.ReceivedSignals, m.GroundTruth]]:
         return [(signals, truth) for signals in self.signals.values()
-                if (truth := self.truth_of(signals)) and signals.codebook_id in self.codebooks]
+                if (truth := self.truths.of(signals)) and signals.codebook_id in self.codebooks]
 
 
 class CalibratorNode(Node):

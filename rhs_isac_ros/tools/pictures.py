@@ -12,7 +12,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_intervals_m, feed_positions
 from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
-from rhs_isac_ros.monitoring.network_state import SceneState, UserState
+from rhs_isac_ros.monitoring.network_state import SceneState, SceneUser
 from rhs_isac_ros.monitoring.shapes import MIN_LEVEL_DB
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.support.pictures import PAGE_IN, label_decades, look, new_figure, paper_style
@@ -213,7 +213,7 @@ def _draw_lobe(
     axes.plot(*cut, color=colour, alpha=0.5, linewidth=0.8, zorder=1)
 
 
-def _draw_user(axes: Any, plane: list[int], user: UserState) -> None:
+def _draw_user(axes: Any, plane: list[int], user: SceneUser) -> None:
     own, estimate = look(user.user - 1), user.estimate
     colour = own.colour
     true_path = np.array([point[plane] for point in user.true_path]).reshape(-1, 2)

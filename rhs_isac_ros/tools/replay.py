@@ -349,7 +349,7 @@ class Recording:
         self.scenarios, leader = scenarios, next(iter(self.logs.values()))
         self.truths: _Positions = {
             key: truth.position for log in self.logs.values()
-            for key, signals in log.signals.items() if (truth := leader.truth_of(signals))}
+            for key, signals in log.signals.items() if (truth := leader.truths.of(signals))}
         if self.truths and (last := max(self.truths)) not in self.logs[''].ended:
             del self.truths[last]
         if not self.truths:
@@ -387,10 +387,10 @@ def locate(
     tracks, log, found = Tracks(), recording.logs[''], {}
     for key in recording.truths:
         signals = log.signals[key]
-        estimator, received = estimators[signals.codebook_id], signals.signals
-        estimate = estimator.estimate(
-            received.reshape(len(received), -1)) if track_speed_mps is None else tracks.locate(
-            signals, estimator, track_speed_mps, signals.time_s(log.arrived_s[key]))
+        estimator = estimators[signals.codebook_id]
+        estimate = estimator.estimate(signals.stacked) if track_speed_mps is None else (
+            tracks.locate(signals, estimator, track_speed_mps,
+                          signals.time_s(log.arrived_s[key])))
         if estimate.fix:
             found[key] = estimate.to_site(recording.scenarios[''].pose).mean
     return found
@@ -415,8 +415,7 @@ class SiteRecording(Recording):
                 signals = self.logs[name].signals.get(key)
                 if signals is None:
                     continue
-                posterior = find(name, signals.codebook_id).posterior(
-                    signals.signals.reshape(len(signals.signals), -1))
+                posterior = find(name, signals.codebook_id).posterior(signals.stacked)
                 if sighting := Sighting.of(posterior, scenario.pose):
                     again[name][key] = posterior.estimate.to_site(scenario.pose).mean
                     sightings.append(sighting)

@@ -11,7 +11,7 @@ from rclpy.node import Node
 
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle
 from rhs_isac_ros.monitoring.network_state import Overview
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station import BsState
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
 from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
@@ -43,7 +43,7 @@ def render(overview: Overview, now_s: float) -> 'RenderableType':
 def _header(overview: Overview, now_s: float) -> 'RenderableType':
     from rich.text import Text
 
-    phase = State.PAUSED.value if overview.paused else overview.phase
+    phase = BsState.PAUSED.value if overview.paused else overview.phase
     if not overview.phase:
         return Text(phase or 'waiting for a base station', style='yellow')
     user = f' of user {overview.user}' if overview.user else ''

@@ -15,7 +15,7 @@ import numpy as np
 from parts import frame
 from scipy.optimize import minimize
 
-from rhs_isac_ros.link import Beam, capacity, choose_beam, steer
+from rhs_isac_ros.link import Beamformer, capacity, choose_beam, steer
 from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.link.steering import steer_bands
 from rhs_isac_ros.model import Scenario
@@ -81,7 +81,7 @@ def compare_times(scenario: Scenario, bands: Sequence[int], positions: np.ndarra
     return {name: np.median(values) for name, values in times_ms.items()}
 
 
-def rate_bps(scenario: Scenario, beam: Beam, position: np.ndarray) -> float:
+def rate_bps(scenario: Scenario, beam: Beamformer, position: np.ndarray) -> float:
     """Return the capacity of a beam at a position [bit/s]."""
     return float(capacity(scenario, beam, position[None])[0])
 
@@ -121,7 +121,7 @@ def long_optimisation(
         ends.append(np.clip(result.x, 0, 1))
     ends.sort(key=link.best_rate, reverse=True)
     analog = max((refine(link, end) for end in ends[:REFINED]), key=link.best_rate)
-    return rate_bps(scenario, Beam(analog, link.best_digital(analog), band), position)
+    return rate_bps(scenario, Beamformer(analog, link.best_digital(analog), band), position)
 
 
 def negative_capacity(link: BandLink) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:

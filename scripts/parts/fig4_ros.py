@@ -42,10 +42,9 @@ def compare(codebook_file: Path, cycles: int, output: Path) -> None:
     records = run_networks(codebook_file, cycles)
     truth = np.array([record.truth.position for record in records])
     estimator = make_estimator('bayes', scenario, codebook)
-    received = np.stack([record.signals.signals for record in records])
+    received = np.stack([record.signals.stacked for record in records])
     # One by one, as in the network: estimates of several phases in one call round differently.
-    repeated = np.array([estimator.estimate(signals).mean for signals in received.reshape(
-        len(records), scenario.n_bands, -1)])
+    repeated = np.array([estimator.estimate(signals).mean for signals in received])
     published = np.array([record.estimate.position for record in records])
     difference_m = np.abs(published - repeated).max()
 

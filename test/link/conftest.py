@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.link import Beam
+from rhs_isac_ros.link import Beamformer
 
 
 class ReferenceLink:
@@ -47,7 +47,7 @@ class ReferenceLink:
             gains.append(values[-1] / self.noise)
             directions.append(vectors[:, -1].conj())
         shares = water_filling_by_bisection(np.array(gains), scenario.max_power_w)
-        return Beam(analog, np.array(directions) * np.sqrt(shares)[:, None], self.band)
+        return Beamformer(analog, np.array(directions) * np.sqrt(shares)[:, None], self.band)
 
 
 def water_filling_by_bisection(gains, power):

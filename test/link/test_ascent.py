@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rhs_isac_ros.link import Beam, capacity
+from rhs_isac_ros.link import Beamformer, capacity
 from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.link.steering import ascend
 from rhs_isac_ros.model import Scenario
@@ -18,7 +18,7 @@ WIDE = Scenario(
 
 
 def rate(scenario, analog, digital, band):
-    return capacity(scenario, Beam(analog, digital, band), POSITION[None])[0]
+    return capacity(scenario, Beamformer(analog, digital, band), POSITION[None])[0]
 
 
 @pytest.fixture(params=['small', 'table1', 'wide'])

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rhs_isac_ros.link import Beam, candidates, capacity
+from rhs_isac_ros.link import Beamformer, candidates, capacity
 from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.link.candidates import candidate_configurations, tables
 from rhs_isac_ros.link.steering import ascend
@@ -113,6 +113,6 @@ def test_multipath_from_a_side_is_used(small):
     corners = np.random.default_rng(0).integers(0, 2, (1, 3000, 16)).astype(float)
     ends, rates = ascend(link, found)
     assert rates.max() >= link.best_rate(corners).max()
-    beam = Beam(ends[0, rates[0].argmax()], link.best_digital(ends)[0, rates[0].argmax()])
+    beam = Beamformer(ends[0, rates[0].argmax()], link.best_digital(ends)[0, rates[0].argmax()])
     rate = capacity(scenario, beam, POSITION[None])[0]
     assert rate == pytest.approx(rates.max() * scenario.subband_width_hz / np.log(2), rel=1e-9)

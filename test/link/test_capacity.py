@@ -7,7 +7,7 @@ import pytest
 
 from rhs_isac_ros.calibration import survey
 from rhs_isac_ros.link import (
-    Beam,
+    Beamformer,
     actual_capacity,
     beam_pattern,
     capacity,
@@ -28,11 +28,11 @@ LONG = np.diag([0.9, 0.2, 0.12])**2
 def random_beam(scenario, rng, band=0):
     digital = rng.normal(size=(scenario.n_subbands, scenario.n_feeds, 2)) @ [1, 1j]
     digital *= np.sqrt(scenario.max_power_w / np.sum(np.abs(digital)**2))
-    return Beam(rng.uniform(size=scenario.n_elements), digital, band)
+    return Beamformer(rng.uniform(size=scenario.n_elements), digital, band)
 
 
 def test_capacity_matches_the_reference_values(case):
-    beam = Beam(case.vectors['tx_analog'], case.vectors['tx_digital'], 0)
+    beam = Beamformer(case.vectors['tx_analog'], case.vectors['tx_digital'], 0)
     values = capacity(case.scenario, beam, case.vectors['positions'])
     assert values.shape == case.vectors['capacity_band1'].shape
     np.testing.assert_allclose(values, case.vectors['capacity_band1'], rtol=1e-8)
@@ -52,7 +52,8 @@ def test_a_beam_that_is_off_has_no_capacity(small):
     scenario = small.scenario
     positions = scenario.sample_positions(3, np.random.default_rng(2))
     beam = random_beam(scenario, np.random.default_rng(2))
-    for off in (Beam(np.zeros(16), beam.digital), Beam(beam.analog, np.zeros((3, 2), complex))):
+    for off in (Beamformer(np.zeros(16), beam.digital),
+                Beamformer(beam.analog, np.zeros((3, 2), complex))):
         assert (capacity(scenario, off, positions) == 0).all()
 
 
@@ -66,7 +67,7 @@ def test_a_beam_that_is_off_has_no_capacity(small):
 ])
 def test_a_beam_that_does_not_fit_the_scenario_is_an_error(small, changes, words):
     beam = dataclasses.replace(
-        Beam(small.vectors['tx_analog'], small.vectors['tx_digital']), **changes)
+        Beamformer(small.vectors['tx_analog'], small.vectors['tx_digital']), **changes)
     with pytest.raises(ValueError, match='expected') as caught:
         capacity(small.scenario, beam, np.array([[9.0, 0.0, 0.0]]))
     for word in words:
@@ -228,7 +229,7 @@ def test_the_strongest_direction_is_the_direction_of_steering(azimuth_deg):
 
 def test_the_pattern_of_a_beam_that_is_off_is_zero(small):
     beam = random_beam(small.scenario, np.random.default_rng(5))
-    found = beam_pattern(small.scenario, Beam(np.zeros(16), beam.digital), 5.0)
+    found = beam_pattern(small.scenario, Beamformer(np.zeros(16), beam.digital), 5.0)
     assert (found.relative == 0).all()
 
 
@@ -239,4 +240,4 @@ def test_errors_name_field_value_and_expectation(small):
     with pytest.raises(ValueError, match='step_deg: -1, expected a positive number'):
         beam_pattern(small.scenario, beam, 1, step_deg=-1)
     with pytest.raises(ValueError, match='band: 7'):
-        beam_pattern(small.scenario, Beam(beam.analog, beam.digital, 7), 1)
+        beam_pattern(small.scenario, Beamformer(beam.analog, beam.digital, 7), 1)

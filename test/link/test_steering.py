@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.link import (
-    Beam,
+    Beamformer,
     CapacityReport,
     applied_beam,
     band_link,
@@ -188,7 +188,7 @@ def test_a_beam_for_a_calibrated_surface_has_the_capacity_of_the_search(table1, 
     for element in (0, 17, 44):
         changed = beam.analog.copy()
         changed[element] = 1 - changed[element]
-        other = applied_beam(Beam(changed, beam.digital), damaged)
+        other = applied_beam(Beamformer(changed, beam.digital), damaged)
         change = capacity(scenario, other, POSITION[None])[0] - best
         # A failed element does not follow.
         assert change == 0 if element == 44 else change < 0

@@ -9,7 +9,7 @@ from rhs_isac_ros.bounds.range_ambiguity import range_confusion_error_of
 from rhs_isac_ros.calibration import Pilots, survey
 from rhs_isac_ros.codebook import Codebook, CodebookError, optimize
 from rhs_isac_ros.link import (
-    Beam,
+    Beamformer,
     actual_capacity,
     capacity,
     capacity_report,
@@ -118,7 +118,7 @@ def test_signals_and_beams_are_numbers(small):
             Pilots(codebook, GOOD, changed)
     beam = steer(scenario, GOOD[0])
     with pytest.raises(ValueError, match='^analog: a masked array'):
-        capacity(scenario, Beam(masked(beam.analog), beam.digital), GOOD)
+        capacity(scenario, Beamformer(masked(beam.analog), beam.digital), GOOD)
     with pytest.raises(ValueError, match='^covariance: complex numbers, expected real'):
         expected_capacities(scenario, [beam], GOOD[0], 1j * np.eye(3))
 

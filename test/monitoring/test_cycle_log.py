@@ -7,7 +7,7 @@ import pytest
 
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CycleLog
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station import BsState
 
 
 def log_of(*networks, without=()):
@@ -68,7 +68,7 @@ def test_a_cycle_begins_with_the_last_beacon_before_its_grant(network, places):
 
 def test_a_cycle_that_is_given_up_has_a_reason_and_no_result(network):
     net = network()
-    net.run_to(State.SOUNDING)
+    net.run_to(BsState.SOUNDING)
     net.remove('positioner', noticed=False)
     net.run_cycles(1)
     log = log_of(net)
@@ -116,7 +116,7 @@ def test_the_order_of_topics_does_not_matter(network):
         assert log.given_up == []
 
 
-@pytest.mark.parametrize('state', [State.CONFIGURING, State.ESTIMATING, State.TRANSMITTING])
+@pytest.mark.parametrize('state', [BsState.CONFIGURING, BsState.ESTIMATING, BsState.TRANSMITTING])
 def test_an_interrupted_cycle_is_not_mixed_with_the_next_one_of_its_number(network, state):
     before = network()
     before.run_to(state)

@@ -19,7 +19,7 @@ from rhs_isac_ros.model.multipath import complex_normal
 from rhs_isac_ros.model.surface import combine, element_signals, feed_signals
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Send
-from rhs_isac_ros.protocol.user import State
+from rhs_isac_ros.protocol.user import UserState
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import LATCHED
 from rhs_isac_ros.ros.roster import ROSTER
@@ -133,7 +133,7 @@ def test_one_message_by_hand_is_answered(bench, probe):
     presence = probe.create_publisher(ros.Presence, topics.PRESENCE, LATCHED)
     probe.create_timer(0.4, lambda: presence.publish(
         ros.Presence(sender=1, role='bs', node='/bs', scenario='{}')))
-    bench.until(lambda: user.role.state is not State.DISCONNECTED, 'the presence of all roles')
+    bench.until(lambda: user.role.state is not UserState.DISCONNECTED, 'the presence of all roles')
     bench.publisher(probe, m.Beacon).publish(
         ros.Beacon(cycle_id=5, first_user=1, last_user=9))
     bench.until(lambda: answers, 'the answer')

@@ -99,7 +99,7 @@ def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
 @pytest.mark.parametrize('namespace', ['region', 'board', 'beam', 'traced'])
 def test_the_surface_and_its_shapes_are_at_its_pose(namespace):
     body = shapes.Lines((np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),), (1.0, 1.0, 1.0), 1.0)
-    placed = scene.place(
+    placed = scene.in_site(
         scene.marker(namespace, 0, body, STAMP), Frame('odom'), Pose((1, 2, 3), (0, 0, 1, 1)))
     assert placed.header.frame_id == 'odom'
     assert of(placed.pose.position) == pytest.approx([1.0, 2.0, 3.0])
@@ -111,7 +111,7 @@ def test_the_surface_and_its_shapes_are_at_its_pose(namespace):
 def test_users_are_where_their_messages_say():
     marker, _ = an_estimate(np.eye(3), 1)
     before = of(marker.pose.position)
-    placed = scene.place(marker, Frame('odom'), Pose((1, 2, 3), (0, 0, 1, 1)))
+    placed = scene.in_site(marker, Frame('odom'), Pose((1, 2, 3), (0, 0, 1, 1)))
     assert placed.header.frame_id == 'odom'
     assert of(placed.pose.position) == pytest.approx(before)
 

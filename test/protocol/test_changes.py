@@ -5,7 +5,7 @@ import pytest
 from in_memory_network import on_time
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import STEPS, State
+from rhs_isac_ros.protocol.base_station import STEPS, BsState
 from rhs_isac_ros.protocol.events import PeersChanged, StoodBy
 from rhs_isac_ros.protocol.settings import PositionerSettings
 
@@ -36,7 +36,7 @@ def estimators(net):
 
 
 each_state = pytest.mark.parametrize(
-    'state', [State.RESTING, State.BEACONING, *STEPS], ids=lambda state: state.value)
+    'state', [BsState.RESTING, BsState.BEACONING, *STEPS], ids=lambda state: state.value)
 
 
 @each_state
@@ -46,7 +46,7 @@ def test_codebook_and_settings_take_effect_with_the_next_cycle(network, codebook
     net.run_to(state)
     net.offer(codebooks[1])
     net.change('bs', receiver_noise=False)
-    waits = state is not State.RESTING
+    waits = state is not BsState.RESTING
     assert status_of(net, 'bs', 'pending') == (
         {'pending.receiver_noise': 'false'} if waits else {})
     assert status_of(net, 'bs', 'parameter.receiver') == {
@@ -75,43 +75,43 @@ def test_a_list_of_users_without_any_present_user_can_be_corrected(network):
 
 @pytest.mark.parametrize(('options', 'state', 'event'), [
     # An unanswered cycle is given up; another base station serves; there is no cycle yet.
-    ({'allowed_users': '99'}, State.BEACONING, PeersChanged(('positioner',))),
-    ({}, State.SOUNDING, StoodBy()), ({'codebook': None}, State.WAITING, None)])
+    ({'allowed_users': '99'}, BsState.BEACONING, PeersChanged(('positioner',))),
+    ({}, BsState.SOUNDING, StoodBy()), ({'codebook': None}, BsState.WAITING, None)])
 def test_settings_take_effect_when_no_cycle_follows(network, options, state, event):
     net = network(**options)
     net.run_to(state)
     net.change('bs', policy='random')
     if event:
         net.dispatch('bs', event)
-    net.run(limit_s=2.0 if state is State.BEACONING else 0.0)
-    assert net['bs'].state is State.WAITING
+    net.run(limit_s=2.0 if state is BsState.BEACONING else 0.0)
+    assert net['bs'].state is BsState.WAITING
     assert status_of(net, 'bs', 'pending') == {}
     assert status_of(net, 'bs', 'parameter.policy') == {'parameter.policy': 'random'}
 
 
 def test_a_rest_set_in_a_cycle_applies_after_it_and_can_be_shortened(network):
     net = network(rest_s=0.1)
-    net.run_to(State.STEERING)
+    net.run_to(BsState.STEERING)
     net.change('bs', rest_s=3000.0)
     net.run_cycles(1)
     end_s = net.now_s
     net.run(limit_s=1.0)
-    assert net['bs'].state is State.RESTING
+    assert net['bs'].state is BsState.RESTING
     net.change('bs', rest_s=29.0)
-    net.run_to(State.BEACONING)
+    net.run_to(BsState.BEACONING)
     assert net.now_s == pytest.approx(end_s + 30.0, abs=0.01)
 
 
 def test_retries_change_after_the_cycle(network):
     net = network(retries=0, step_timeout_s=1.0)
-    net.run_to(State.SOUNDING)
+    net.run_to(BsState.SOUNDING)
     net.transport = lambda message, recipient: []
     net.change('bs', retries=3)
     net.run_cycles(1)
     assert net.outcomes() == [(1, 1, 'user_gone')]
     assert not net.sent(m.PilotRequest)[1:]
     net.transport = on_time
-    net.run_to(State.SOUNDING)
+    net.run_to(BsState.SOUNDING)
     net.transport = lambda message, recipient: []
     before = len(net.sent(m.PilotRequest))
     net.run_cycles(1)
@@ -185,7 +185,7 @@ def test_the_last_of_several_estimators_is_used(network):
 def test_estimator_and_codebook_change_together(network, codebooks, codebook_first, changed):
     net = network(make_s=0.4, step_timeout_s=2.0)
     net.run_cycles(2)
-    net.run_to(State.SOUNDING)
+    net.run_to(BsState.SOUNDING)
     acts = [lambda: net.offer(codebooks[1]), lambda: net.change('positioner', **changed)]
     for act in acts if codebook_first else acts[::-1]:
         act()
@@ -209,13 +209,13 @@ def test_without_a_codebook_no_estimator_is_requested(network, codebooks):
 def test_impairments_change_when_a_cycle_begins(network):
     net = network()
     net.run_cycles(1)
-    net.run_to(State.SOUNDING)
+    net.run_to(BsState.SOUNDING)
     net.change('channel', delay_s=0.2)
     begin_s = net.now_s
     assert status_of(net, 'channel', 'pending') == {'pending.delay_s': '0.2'}
     net.run_cycles(1)
     assert net.now_s - begin_s < 0.2
-    net.run_to(State.CONFIGURING)
+    net.run_to(BsState.CONFIGURING)
     begin_s = net.now_s
     net.run_cycles(1)
     # Two bands and the data.
@@ -232,8 +232,8 @@ def test_impairments_change_when_a_cycle_begins(network):
 
 @pytest.mark.parametrize(('before', 'state', 'offered', 'used'), [
     # Of two codebooks in one cycle, the last takes effect, even if it is the one in use.
-    *(((), state, (1, 2), (0, 0, 2)) for state in (State.BEACONING, *STEPS)),
-    ((), State.SOUNDING, (1, 0), (0, 0, 0)), ((1,), State.BEACONING, (2,), (0, 1, 2))])
+    *(((), state, (1, 2), (0, 0, 2)) for state in (BsState.BEACONING, *STEPS)),
+    ((), BsState.SOUNDING, (1, 0), (0, 0, 0)), ((1,), BsState.BEACONING, (2,), (0, 1, 2))])
 def test_the_last_codebook_that_was_offered_takes_effect(
         network, codebooks, before, state, offered, used):
     net = network()

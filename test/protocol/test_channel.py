@@ -10,7 +10,7 @@ from in_memory_network import emulated_front_end, feed
 
 from rhs_isac_ros.calibration import known_states
 from rhs_isac_ros.frontend import EmulatedSurface, RadioFault, Sounding, SurfaceFault
-from rhs_isac_ros.link import Beam, capacity
+from rhs_isac_ros.link import Beamformer, capacity
 from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.hall import PathChannel
 from rhs_isac_ros.model.los import los_gain
@@ -137,7 +137,7 @@ def test_the_channel_delivers_the_capacity_at_the_true_position(
         scenario, truth, beam, applied, downlink):
     channel = Channel(scenario, 0)
     feed(channel, [truth, beam, applied])
-    rate = capacity(scenario, Beam(beam.analog, beam.digital), PLACE[None])[0]
+    rate = capacity(scenario, Beamformer(beam.analog, beam.digital), PLACE[None])[0]
     ((delivered,),) = feed(channel, [downlink])
     assert delivered.bits == math.floor(rate * 1e-3)
     assert (delivered.direction, delivered.stage) == (m.Direction.DOWNLINK, m.Stage.DELIVERED)

@@ -10,7 +10,7 @@ from in_memory_network import Fault, Network
 from rhs_isac_ros.model import Pose, Scenario, mobility
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station import BsState
 from rhs_isac_ros.protocol.settings import TRACK, PositionerSettings
 
 pytestmark = pytest.mark.slow
@@ -118,7 +118,7 @@ def test_the_same_seed_gives_the_same_run(network):
 
 def test_positions_outside_a_cycle_change_nothing(network, example):
     net, plain = (network(plain_beams=False) for _ in range(2))
-    for state in (State.CONFIGURING, State.SOUNDING, State.STEERING, State.TRANSMITTING):
+    for state in (BsState.CONFIGURING, BsState.SOUNDING, BsState.STEERING, BsState.TRANSMITTING):
         net.run_to(state)
         for user in (1, 9):
             net.publish(example(m.GroundTruth, cycle_id=0, user=user))

@@ -11,7 +11,7 @@ from rhs_isac_ros.link import CapacityReport
 from rhs_isac_ros.model import Pose
 from rhs_isac_ros.positioning import Mixture, Sighting, Site
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station import BsState
 from rhs_isac_ros.protocol.channel import Channel
 from rhs_isac_ros.protocol.cycle import combiner
 from rhs_isac_ros.protocol.events import Outcome
@@ -21,7 +21,7 @@ from rhs_isac_ros.protocol.receiver import Receiver
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.protocol.settings import Impairments
 from rhs_isac_ros.protocol.transmission import Transmission
-from rhs_isac_ros.ros.place import Place
+from rhs_isac_ros.ros.node_surface import NodeSurface
 from rhs_isac_ros.ros.roster import FOLLOWING, MEMBERS
 from rhs_isac_ros.system import System
 
@@ -68,7 +68,7 @@ class Sighter(Role):
 
 
 class SiteNetwork(Network):
-    """The roles of a site with one walking user; `Place` routes their messages."""
+    """The roles of a site with one walking user; `NodeSurface` routes their messages."""
 
     def __init__(self, site, **options):
         self.walker, self.site = Walker(), site
@@ -83,7 +83,7 @@ class SiteNetwork(Network):
     def _place(self, name):
         surface = '' if name == 'fusion' else name.rpartition('/')[0] or self.site.leader
         one = self.site.surfaces[surface or self.site.leader]
-        return Place(one.scenario, self.site, '', surface)
+        return NodeSurface(one.scenario, self.site, '', surface)
 
     def _codebook_of(self, name):
         return self.site.surfaces[self._place(name).name].codebook
@@ -251,7 +251,7 @@ def test_data_under_way_during_a_handover_arrive(make_network):
     assert {net.ids[one.scenario_id] for one in delivered} == {'front', 'side'}
     assert {one.cycle_id for one in delivered} == {net.outcomes()[-1][0]}
     assert net.outcomes()[-1][2] == 'served'
-    assert net['bs'].state is State.RESTING
+    assert net['bs'].state is BsState.RESTING
 
 
 @pytest.mark.parametrize('kind', [m.PositionEstimate, m.Beam])

@@ -5,7 +5,7 @@ import pytest
 from in_memory_network import Noisy
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station import BsState
 from rhs_isac_ros.protocol.events import PauseRequested, PeersChanged, Resumed, StoodBy
 
 pytestmark = pytest.mark.slow
@@ -56,9 +56,9 @@ def test_the_second_user_is_served_when_the_first_has_gone(network, places):
 
 @pytest.mark.parametrize(('n_users', 'state', 'limit_s'), [
     *((n, state, 3.0) for n in (1, 2)
-      for state in (State.BEACONING, State.SOUNDING, State.ESTIMATING)),
+      for state in (BsState.BEACONING, BsState.SOUNDING, BsState.ESTIMATING)),
     # A beacon invites eight users.
-    (16, State.SOUNDING, 10.0)])
+    (16, BsState.SOUNDING, 10.0)])
 def test_a_restarted_user_is_served_soon(network, places, n_users, state, limit_s):
     net = network({user: places[0] for user in range(1, n_users + 1)})
     net.run(lambda: len({*net.served()}) == n_users)
@@ -114,13 +114,13 @@ def test_two_nodes_of_another_role_do_no_harm_until_one_stands_by(network, twin)
 def test_the_older_of_two_base_stations_stands_by_and_resumes(network):
     net = network(2)
     net.run_cycles(3)
-    net.run_to(State.SOUNDING)
+    net.run_to(BsState.SOUNDING)
     older = net['bs']
     net.add('bs_twin')
     net.dispatch('bs_twin', PeersChanged(()))
     net.run(limit_s=0.05)
     net.dispatch('bs', StoodBy())
-    assert (older.state, older.next_deadline()) == (State.WAITING, None)
+    assert (older.state, older.next_deadline()) == (BsState.WAITING, None)
     since = len(net.log)
     net.run_cycles(6)
     assert net.instances['bs'] not in {beacon.sender for beacon in net.sent(m.Beacon, since)}
@@ -150,5 +150,5 @@ def test_a_pause_outlasts_a_time_as_the_older_station(network):
     for event in (PauseRequested(), StoodBy(), Resumed(1), PeersChanged(())):
         net.dispatch('bs', event)
     net.run(limit_s=10.0)
-    assert net['bs'].state is State.PAUSED
+    assert net['bs'].state is BsState.PAUSED
     assert net.sent(m.Beacon, since) == []

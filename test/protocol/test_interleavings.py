@@ -11,7 +11,7 @@ from in_memory_network import Fault, Network, Noisy, faults, on_time
 
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station import BsState
 
 pytestmark = pytest.mark.slow
 
@@ -133,10 +133,10 @@ def change_settings(net, change):
 
 def check_end(net):
     """Check that the base station sends beacons again and serves every user."""
-    net.run_to(State.BEACONING, limit_s=RECOVERY_S)
+    net.run_to(BsState.BEACONING, limit_s=RECOVERY_S)
     before = len(net.served())
     net.run(lambda: {1, 2} <= set(net.served()[before:]), RECOVERY_S)
-    net.run_to(State.BEACONING, limit_s=RECOVERY_S)
+    net.run_to(BsState.BEACONING, limit_s=RECOVERY_S)
 
 
 @given(affected=FAULTS, crashes=CRASHES, offers=OFFERS, changes=CHANGES, ordered=st.booleans(),

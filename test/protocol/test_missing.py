@@ -3,16 +3,16 @@
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station import BsState
 
 ROLE_FAULTS = [
-    ('rhs_controller', State.CONFIGURING, 'rhs_silent'),
-    ('rhs_controller', State.ESTIMATING, 'transmission_silent'),
-    ('channel', State.CONFIGURING, 'channel_silent'),
-    ('channel', State.SOUNDING, 'channel_silent'),
-    ('channel', State.ESTIMATING, 'data_lost'),
-    ('positioner', State.SOUNDING, 'positioner_silent'),
-    ('transmission', State.SOUNDING, 'transmission_silent'),
+    ('rhs_controller', BsState.CONFIGURING, 'rhs_silent'),
+    ('rhs_controller', BsState.ESTIMATING, 'transmission_silent'),
+    ('channel', BsState.CONFIGURING, 'channel_silent'),
+    ('channel', BsState.SOUNDING, 'channel_silent'),
+    ('channel', BsState.ESTIMATING, 'data_lost'),
+    ('positioner', BsState.SOUNDING, 'positioner_silent'),
+    ('transmission', BsState.SOUNDING, 'transmission_silent'),
 ]
 
 
@@ -28,13 +28,13 @@ def test_a_lost_role_causes_a_timeout_and_may_return(network, role, state, reaso
     assert net.outcomes()[-1] == (2, 1, reason)
     assert net.now_s - gone_s < 1.1
     assert net['bs'].counters == {reason: 1}
-    assert net['bs'].state is State.RESTING
+    assert net['bs'].state is BsState.RESTING
     net.run(limit_s=10.0)
     if noticed:
-        assert net['bs'].state is State.WAITING
+        assert net['bs'].state is BsState.WAITING
         assert net['bs'].counters == {reason: 1}
     else:
-        assert net['bs'].state is not State.WAITING
+        assert net['bs'].state is not BsState.WAITING
         assert net['bs'].counters.total() > 5
         assert net.served() == [1]
     net.add(role)
@@ -45,8 +45,8 @@ def test_a_lost_role_causes_a_timeout_and_may_return(network, role, state, reaso
 
 @pytest.mark.parametrize('role', ['rhs_controller', 'positioner', 'transmission', 'channel'])
 @pytest.mark.parametrize('state', [
-    State.BEACONING, State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
-    State.TRANSMITTING, State.RESTING])
+    BsState.BEACONING, BsState.CONFIGURING, BsState.SOUNDING, BsState.ESTIMATING, BsState.STEERING,
+    BsState.TRANSMITTING, BsState.RESTING])
 def test_a_role_that_restarts_costs_one_cycle_at_most(network, role, state):
     net = network(2)
     net.run_cycles(4)
@@ -63,7 +63,7 @@ def test_the_base_station_waits_for_a_role_and_logs_it_once(network, role):
     net = network(absent=[role])
     net.run(limit_s=30.0)
     assert net.sent(m.Beacon) == []
-    assert net['bs'].state is State.WAITING
+    assert net['bs'].state is BsState.WAITING
     assert net.logged('bs') == [f'waiting for {role}']
     net.add(role)
     net.run_cycles(2)
@@ -85,7 +85,7 @@ def beacon_to_grant_s(network, cycle_id):
 def test_a_user_lost_while_positioning_is_not_waited_for(network):
     net = network(2)
     net.run_cycles(2)
-    net.run_to(State.SOUNDING)
+    net.run_to(BsState.SOUNDING)
     assert net.sent(m.Grant)[-1].user == 1
     net.remove('user1')
     net.run_cycles(3)
@@ -108,7 +108,7 @@ def test_a_missing_user_is_waited_for_three_times_without_ending_a_cycle_of_anot
     assert net['user1'].counters == {'not_granted': 3}
 
 
-@pytest.mark.parametrize('state', [State.ESTIMATING, State.STEERING, State.TRANSMITTING])
+@pytest.mark.parametrize('state', [BsState.ESTIMATING, BsState.STEERING, BsState.TRANSMITTING])
 def test_a_user_lost_after_positioning_loses_only_its_data(network, state):
     net = network(2)
     net.run_cycles(2)

@@ -9,7 +9,7 @@ from in_memory_network import Fault
 
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station import BsState
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def test_a_lost_no_fix_costs_the_timeout_of_one_step(network, make):
 def test_a_no_fix_of_another_cycle_does_not_end_the_cycle(network, codebooks, changes):
     net = network()
     net.run_cycles(1)
-    net.run_to(State.ESTIMATING)
+    net.run_to(BsState.ESTIMATING)
     net.publish(m.NoFix(**{'cycle_id': 2, 'user': 1, 'codebook_id': codebooks[0].id,
                            'reason': ''} | changes))
     net.run_cycles(1)

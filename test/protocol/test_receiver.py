@@ -8,7 +8,7 @@ from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.cycle import combiner
 from rhs_isac_ros.protocol.events import CodebookOffered, LogMessage, SettingsOffered
-from rhs_isac_ros.protocol.receiver import Receiver, State
+from rhs_isac_ros.protocol.receiver import Receiver, ReceiverState
 from rhs_isac_ros.protocol.settings import ReceiverSettings
 
 
@@ -36,7 +36,7 @@ def test_a_grant_of_another_surface_commands_the_own_surface(receiver, scenario,
     (commands,) = feed(receiver, [grant()])
     assert [(one.cycle_id, one.band, one.codebook_id) for one in commands] == [
         (5, band, codebooks[0].id) for band in range(scenario.n_bands)]
-    assert receiver.state is State.SOUNDING
+    assert receiver.state is ReceiverState.SOUNDING
 
 
 @pytest.mark.parametrize('adds_noise', [True, False])
@@ -50,7 +50,7 @@ def test_the_signals_of_all_bands_are_combined_with_the_own_codebook(
     noiseless = receive_feeds(scenario, codebooks[0], feeds, None)
     noise = np.abs(received.signals - noiseless).max()
     assert noise < 10 * np.sqrt(scenario.noise_power_w) and (noise > 0) == adds_noise
-    assert receiver.state is State.LISTENING
+    assert receiver.state is ReceiverState.LISTENING
 
 
 def test_surfaces_with_different_seeds_have_independent_noise(scenario, codebooks, signals):
@@ -77,7 +77,7 @@ def test_signals_of_something_else_do_not_count(receiver, signals, fields, outco
     feed(receiver, [grant(), signals(0)])
     assert feed(receiver, [signals(0, **fields)]) == [[]]
     assert receiver.counters == {outcome: 1}
-    assert receiver.state is State.SOUNDING
+    assert receiver.state is ReceiverState.SOUNDING
 
 
 def test_late_signals_change_nothing(receiver, signals):

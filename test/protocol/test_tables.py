@@ -12,7 +12,7 @@ from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.protocol import base_station as bs
 from rhs_isac_ros.protocol import cycle, events, receiver, rhs_controller, user
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station import BsState
 from rhs_isac_ros.protocol.role import ANY, SAME, StateMachine, always, rows_for
 from rhs_isac_ros.protocol.settings import BaseStationSettings, ReceiverSettings
 from rhs_isac_ros.protocol.user_registry import POLICIES
@@ -20,8 +20,9 @@ from rhs_isac_ros.ros.roster import MEMBERS
 
 MACHINES = {name: member.role for name, member in MEMBERS.items() if hasattr(member.role, 'TABLE')}
 # A state that leads to all others, or that a role reaches if it receives no messages.
-FINAL = {'bs': State.BEACONING, 'user': user.State.NO_BEACON,
-         'rhs_controller': rhs_controller.State.POSITIONING, 'receiver': receiver.State.SOUNDING}
+FINAL = {'bs': BsState.BEACONING, 'user': user.UserState.NO_BEACON,
+         'rhs_controller': rhs_controller.RhsControllerState.POSITIONING,
+         'receiver': receiver.ReceiverState.SOUNDING}
 each_role = pytest.mark.parametrize('name', MACHINES)
 
 
@@ -97,7 +98,7 @@ def test_timeouts_alone_lead_to_the_final_state(name, machine):
     for start, row in last.items():
         assert row.guard is always
         # All timeouts but the end of the pause between cycles are counted.
-        assert (row.outcome is None) == (start is State.RESTING)
+        assert (row.outcome is None) == (start is BsState.RESTING)
         path = [start]
         while path[-1] is not FINAL[name]:
             path.append(last[path[-1]].target)
@@ -111,7 +112,7 @@ def test_the_base_station_gives_up_exactly_with_the_lost_outcomes():
             if row.outcome and row.outcome.kind is events.Kind.LOST]
     assert lost == [row for row in bs.BaseStation.TABLE
                     if '_abandon' in {action.__name__ for action in row.actions}]
-    assert {row.target for row in lost} == {State.RESTING}
+    assert {row.target for row in lost} == {BsState.RESTING}
 
 
 # The machines

@@ -8,7 +8,7 @@ import pytest
 from in_memory_network import feed, plain_choice
 
 from rhs_isac_ros.link import (
-    Beam,
+    Beamformer,
     CapacityReport,
     capacity,
     choose_beam,
@@ -68,8 +68,8 @@ def test_the_beam_is_that_of_the_posterior(beam, scenario, estimate):
 def test_the_transmission_reports_the_capacities_of_the_beam_and_of_the_applied_one(
         transmission, scenario, truth, estimate, beam):
     (*_, (report, _)) = feed(transmission, [truth, configured(beam, 0.5), Timeout()])
-    used = Beam(beam.analog / 2, beam.digital, beam.band)
-    sent = Beam(beam.analog, beam.digital, beam.band)
+    used = Beamformer(beam.analog / 2, beam.digital, beam.band)
+    sent = Beamformer(beam.analog, beam.digital, beam.band)
     assert (report.band, report.expected_bps) == (beam.band, beam.expected_bps)
     assert report.at_estimate_bps == pytest.approx(
         capacity(scenario, sent, estimate.position[None])[0])

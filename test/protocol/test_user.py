@@ -8,7 +8,7 @@ import pytest
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, PeersChanged, Send, Timeout
-from rhs_isac_ros.protocol.user import State, User
+from rhs_isac_ros.protocol.user import User, UserState
 
 DOWN, UP = m.Direction.DOWNLINK, m.Direction.UPLINK
 OFFERED, DELIVERED = m.Stage.OFFERED, m.Stage.DELIVERED
@@ -45,7 +45,7 @@ def answers(user, event, now_s):
 
 
 GRANTED = [(beacon(), 10.0), (grant(), 10.0)]
-LISTENING, ACKNOWLEDGED = State.LISTENING, State.ACKNOWLEDGED
+LISTENING, ACKNOWLEDGED = UserState.LISTENING, UserState.ACKNOWLEDGED
 
 
 @pytest.mark.parametrize((
@@ -54,23 +54,23 @@ LISTENING, ACKNOWLEDGED = State.LISTENING, State.ACKNOWLEDGED
     # Every further beacon is answered and restarts the timeout.
     ([(beacon(), 10.0)], beacon(7, 1), 11.5, [m.Ack], ACKNOWLEDGED, 13.5, {}),
     ([(beacon(), 10.0)], beacon(8, 1), 11.5, [m.Ack], ACKNOWLEDGED, 13.5, {}),
-    ([(beacon(), 10.0)], grant(), 10.0, [m.GroundTruth], State.GRANTED, 18.0, {}),
+    ([(beacon(), 10.0)], grant(), 10.0, [m.GroundTruth], UserState.GRANTED, 18.0, {}),
     # A grant to another user ends the wait; other messages to another user are ignored.
     ([(beacon(), 10.0)], grant(user=5), 10.5, [], LISTENING, math.inf, {}),
     *(([(beacon(), 10.0)], other, 10.5, [], ACKNOWLEDGED, 12.0, {})
       for other in (grant(6, 5), request(user=5), data(6, 5))),
-    *((GRANTED, other, 10.5, [], State.GRANTED, 18.0, {})
+    *((GRANTED, other, 10.5, [], UserState.GRANTED, 18.0, {})
       for other in (grant(6, 5), request(user=5), data(6, 5))),
     # A pilot request that overtakes the grant implies it.
-    ([(beacon(), 10.0)], request(), 10.5, [m.GroundTruth, m.Pilot], State.GRANTED, 18.5, {}),
-    ([(beacon(), 10.0), (request(), 10.5)], grant(), 11.0, [], State.GRANTED, 18.5, {}),
-    (GRANTED, request(band=1), 12.5, [m.Pilot], State.GRANTED, 20.5, {}),
+    ([(beacon(), 10.0)], request(), 10.5, [m.GroundTruth, m.Pilot], UserState.GRANTED, 18.5, {}),
+    ([(beacon(), 10.0), (request(), 10.5)], grant(), 11.0, [], UserState.GRANTED, 18.5, {}),
+    (GRANTED, request(band=1), 12.5, [m.Pilot], UserState.GRANTED, 20.5, {}),
     # The downlink is answered and ends the cycle; other data are ignored.
     (GRANTED, data(), 11.0, [m.Data], LISTENING, math.inf, {}),
-    *((GRANTED, data(direction=way, stage=stage), 11.0, [], State.GRANTED, 18.0, {})
+    *((GRANTED, data(direction=way, stage=stage), 11.0, [], UserState.GRANTED, 18.0, {})
       for way, stage in ((DOWN, OFFERED), (UP, OFFERED), (UP, DELIVERED))),
     # Another beacon of a cycle may be in transit while the first ack is granted.
-    (GRANTED, beacon(7, 1), 11.0, [], State.GRANTED, 18.0, {'stale_beacon': 1}),
+    (GRANTED, beacon(7, 1), 11.0, [], UserState.GRANTED, 18.0, {'stale_beacon': 1}),
     (GRANTED, beacon(8), 11.0, [m.Ack], ACKNOWLEDGED, 13.0, {'abandoned': 1}),
     ([*GRANTED, (data(), 11.0)], grant(), 11.5, [], LISTENING, math.inf, {'late_grant': 1}),
     ([*GRANTED, (data(), 11.0)], beacon(), 11.5, [], LISTENING, math.inf, {'stale_beacon': 1}),
@@ -105,22 +105,22 @@ def test_the_answers_have_the_position_the_pilots_and_the_data_of_the_cycle(user
     assert again is truth
 
 
-@pytest.mark.parametrize('state', State)
+@pytest.mark.parametrize('state', UserState)
 def test_a_disconnected_user_logs_it_and_sends_nothing(user, state):
     user.state = state
     assert user.handle(PeersChanged(('channel', 'bs')), 1.0) == [
         LogMessage('waiting for channel, bs', warning=True, key='peers', holds=True)]
-    assert user.state is State.DISCONNECTED
+    assert user.state is UserState.DISCONNECTED
     assert user.handle(PeersChanged((), 'odometry'), 1.0) == [
         LogMessage('waiting for odometry', warning=True, key='peers', holds=True)]
     assert user.handle(beacon(), 1.0) == []
     assert user.counters == {}
     assert user.handle(PeersChanged(()), 2.0) == [
         LogMessage('listening for beacons', key='peers', holds=False)]
-    assert user.state is State.LISTENING
+    assert user.state is UserState.LISTENING
 
 
-@pytest.mark.parametrize('state', [State.LISTENING, State.ACKNOWLEDGED, State.GRANTED])
+@pytest.mark.parametrize('state', [UserState.LISTENING, UserState.ACKNOWLEDGED, UserState.GRANTED])
 def test_a_connected_user_keeps_its_state(user, state):
     user.state = state
     assert user.handle(PeersChanged(()), 1.0) == []
@@ -142,17 +142,17 @@ def test_each_invited_user_of_a_node_answers(users, first, last, invited):
     acks = answers(users, beacon(first_user=first, last_user=last), 1.0)
     assert [(type(ack), ack.cycle_id, ack.user) for ack in acks] == [
         (m.Ack, 7, user) for user in invited]
-    assert users.state is State.ACKNOWLEDGED
+    assert users.state is UserState.ACKNOWLEDGED
 
 
 @pytest.mark.parametrize(('state', 'counters'), [
-    (State.LISTENING, {}), (State.NO_BEACON, {}), (State.ACKNOWLEDGED, {}),
-    (State.GRANTED, {'abandoned': 1})])
+    (UserState.LISTENING, {}), (UserState.NO_BEACON, {}), (UserState.ACKNOWLEDGED, {}),
+    (UserState.GRANTED, {'abandoned': 1})])
 def test_a_beacon_to_other_users_is_not_answered_but_proves_an_active_base_station(
         users, state, counters):
     users.state = state
     assert answers(users, beacon(first_user=7, last_user=9), 1.0) == []
-    assert users.state is State.LISTENING
+    assert users.state is UserState.LISTENING
     assert users.next_deadline() == 2.5
     assert users.counters == counters
     assert answers(users, grant(user=5), 1.5) == []
@@ -171,7 +171,7 @@ def test_a_cycle_serves_the_user_of_the_node_that_is_granted_it(users, user):
     assert users.counters == {'wrong_user': 2}
     (uplink,) = answers(users, data(user=user), 1.3)
     assert uplink.user == user
-    assert users.state is State.LISTENING
+    assert users.state is UserState.LISTENING
 
 
 def test_the_true_positions_of_all_users_of_a_node(users):

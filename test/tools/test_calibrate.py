@@ -139,7 +139,7 @@ def compare(watch, estimates, surface):
         truths = watch.of_cycle(m.GroundTruth, estimate.cycle_id)
         if signals and truths:
             place = truths[-1].position
-            other = estimator.estimate(signals[-1].signals.reshape(2, -1))
+            other = estimator.estimate(signals[-1].stacked)
             live.append(np.sum((estimate.position - place)**2))
             exact.append(np.sum((other.mean - place)**2))
     assert len(live) >= N_FRESH / 2

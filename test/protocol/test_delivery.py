@@ -1,20 +1,20 @@
-"""Messages on the air, and the multipath of users over their cycles."""
+"""Messages under way, and the multipath of users over their cycles."""
 
 import numpy as np
 import pytest
 
 from rhs_isac_ros.model.multipath import multipath_covariance, time_correlation
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.channel import Air, Fading
+from rhs_isac_ros.protocol.channel import Delivery, Fading
 from rhs_isac_ros.protocol.settings import Impairments
 
 
 def through(n, **impairments):
     """Return the cycle ids of n messages sent at time 0, as they arrive, and what was counted."""
-    air = Air(np.random.default_rng(0))
-    counted = [air.send(m.Beacon(cycle_id=cycle, attempt=0), Impairments(**impairments), 0.0)
+    delivery = Delivery(np.random.default_rng(0))
+    counted = [delivery.send(m.Beacon(cycle_id=cycle, attempt=0), Impairments(**impairments), 0.0)
                for cycle in range(n)]
-    return [message.cycle_id for message in air.arrived(np.inf)], counted
+    return [message.cycle_id for message in delivery.arrived(np.inf)], counted
 
 
 def test_without_impairments_messages_arrive_at_once_in_order():
@@ -35,14 +35,14 @@ def test_losses_and_duplicates_have_their_probabilities_and_are_counted():
 
 
 def test_messages_are_delayed_at_random_and_reordered():
-    air = Air(np.random.default_rng(0))
-    air.send(m.Beacon(cycle_id=1, attempt=0), Impairments(delay_s=0.5, jitter_s=0.2), 10.0)
-    due_s = air.in_flight[0][0]
+    delivery = Delivery(np.random.default_rng(0))
+    delivery.send(m.Beacon(cycle_id=1, attempt=0), Impairments(delay_s=0.5, jitter_s=0.2), 10.0)
+    due_s = delivery.in_flight[0][0]
     assert 10.5 <= due_s <= 10.7
-    assert air.arrived(due_s - 1e-6) == []
-    (message,) = air.arrived(due_s)
+    assert delivery.arrived(due_s - 1e-6) == []
+    (message,) = delivery.arrived(due_s)
     assert message.cycle_id == 1
-    assert air.arrived(np.inf) == []
+    assert delivery.arrived(np.inf) == []
     arrived, _ = through(100, delay_s=0.5, jitter_s=0.2)
     assert sorted(arrived) == [*range(100)]
     assert arrived != sorted(arrived)

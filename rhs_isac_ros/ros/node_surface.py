@@ -1,4 +1,4 @@
-"""The place of a node: its surface, and the site to which the surface belongs."""
+"""The surface of a node, and the site to which the surface belongs."""
 
 import dataclasses
 import types
@@ -25,22 +25,23 @@ class Source(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Place:
+class NodeSurface:
     """The surface of a node, and its site, if any.
 
-    In a site, the surface is named after the last part of the namespace, and all surfaces share
-    the part before. A node of the whole site is in this part, and has the scenario of the surface
-    whose base station leads.
+    In a site, the surface is named after the last part of the namespace; the part before is the
+    same for all surfaces. A node of the whole site is in this part, and has the scenario of the
+    surface whose base station leads.
     """
 
     scenario: Scenario
     site: Site | None = None
-    base: str = ''  #: Namespace that the surfaces of the site share, without a final slash.
+    base: str = ''  #: Namespace of the surfaces of the site, without a final slash.
     name: str = ''  #: Name of the surface; empty without a site, and for a node of the whole site.
 
     @classmethod
-    def of(cls, values: types.SimpleNamespace, namespace: str, of_site: bool = False) -> 'Place':
-        """Return the place given by the parameters and the namespace of a node.
+    def of(cls, values: types.SimpleNamespace, namespace: str, of_site: bool = False
+           ) -> 'NodeSurface':
+        """Return the surface given by the parameters and the namespace of a node.
 
         A node `of_site` belongs to no surface. Raises ScenarioError or ParameterError if a file is
         invalid, or no surface has the name of the namespace.
@@ -87,7 +88,7 @@ class Place:
                 ) -> Iterator[Source]:
         """Yield the topics on which the node receives messages of some classes.
 
-        In a site, messages in `SHARED` come from the surface whose base station leads, and those
+        In a site, messages in `OF_USERS` come from the surface whose base station leads, and those
         in `LOCATED` from the fusion. The leader also sends all `Data`, with the scenario of the
         surface that carries them. Classes in `from_all` come from every surface.
         """
@@ -100,7 +101,7 @@ class Place:
         for kind in kinds:
             if kind in from_all:
                 yield from (Source(kind, *surface) for surface in surfaces)
-            elif kind in m.SHARED:
+            elif kind in m.OF_USERS:
                 yield Source(kind, prefix, scenario)
             elif kind in m.LOCATED:
                 yield Source(kind, self.site_prefix, scenario)

@@ -8,7 +8,7 @@ import pytest
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import Site
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros.place import Place
+from rhs_isac_ros.ros.node_surface import NodeSurface
 from rhs_isac_ros.ros.roster import MEMBERS
 from rhs_isac_ros.support.fields import ParameterError
 
@@ -20,9 +20,9 @@ def site():
     return Site.from_yaml(FILE)
 
 
-def place(namespace, site_file=FILE, scenario_file='', of_site=False):
+def surface_of(namespace, site_file=FILE, scenario_file='', of_site=False):
     values = types.SimpleNamespace(site_file=site_file, scenario_file=scenario_file)
-    return Place.of(values, namespace, of_site)
+    return NodeSurface.of(values, namespace, of_site)
 
 
 def listed(one, role):
@@ -34,7 +34,7 @@ def listed(one, role):
 
 
 def test_without_a_site_every_message_is_of_the_own_scenario():
-    one = place('/lab', '')
+    one = surface_of('/lab', '')
     assert one.scenario.id == Scenario().id
     assert one.codebook is None
     assert one.seed(5) == 5
@@ -45,7 +45,7 @@ def test_without_a_site_every_message_is_of_the_own_scenario():
 
 @pytest.mark.parametrize(('namespace', 'base'), [('/side', ''), ('/lab/two/side', '/lab/two')])
 def test_a_surface_receives_shared_messages_from_the_leader(site, namespace, base):
-    one, (front, side) = place(namespace), site.surfaces.values()
+    one, (front, side) = surface_of(namespace), site.surfaces.values()
     assert one.scenario.id == side.scenario.id != front.scenario.id
     assert one.codebook.id == side.codebook.id
     assert listed(one, 'channel') == {
@@ -60,7 +60,7 @@ def test_a_surface_receives_shared_messages_from_the_leader(site, namespace, bas
 
 
 def test_the_base_station_receives_from_the_fusion_and_from_every_surface(site):
-    one, (front, side) = place('/lab/front'), site.surfaces.values()
+    one, (front, side) = surface_of('/lab/front'), site.surfaces.values()
     every = {m.Beam, m.RhsConfiguration, m.Data}
     assert listed(one, 'bs') == {
         ('', front.scenario.id): {m.Ack, m.FeedSignals},
@@ -71,16 +71,16 @@ def test_the_base_station_receives_from_the_fusion_and_from_every_surface(site):
 
 
 def test_data_of_a_surface_of_the_site_are_not_foreign(site, example):
-    one, (front, side) = place('/front'), site.surfaces.values()
+    one, (front, side) = surface_of('/front'), site.surfaces.values()
     assert one.is_carried(example(m.Data, scenario_id=side.scenario.id))
     assert not one.is_carried(example(m.Data, scenario_id='other'))
     assert not one.is_carried(example(m.Beam, scenario_id=side.scenario.id))
-    assert not place('/', '').is_carried(example(m.Data, scenario_id=front.scenario.id))
+    assert not surface_of('/', '').is_carried(example(m.Data, scenario_id=front.scenario.id))
 
 
 @pytest.mark.parametrize(('namespace', 'base'), [('/', ''), ('/lab', '/lab')])
 def test_a_node_of_the_site_receives_the_messages_of_every_surface(site, namespace, base):
-    one = place(namespace, of_site=True)
+    one = surface_of(namespace, of_site=True)
     assert one.scenario.id == site.surfaces['front'].scenario.id
     assert listed(one, 'fusion') == {
         (f'{base}/{name}/', of_name.scenario.id): {m.Posterior, m.NoFix}
@@ -88,10 +88,11 @@ def test_a_node_of_the_site_receives_the_messages_of_every_surface(site, namespa
 
 
 def test_surfaces_have_seeds_of_their_own():
-    seeds = [place(name).seed(seed) for name in ('/front', '/side') for seed in (0, 2**31 - 1)]
+    seeds = [surface_of(name).seed(seed)
+             for name in ('/front', '/side') for seed in (0, 2**31 - 1)]
     assert len(set(seeds)) == 4
     assert seeds[:2] == [0, 2**31 - 1]
-    assert place('/', of_site=True).seed(3) == 3
+    assert surface_of('/', of_site=True).seed(3) == 3
 
 
 @pytest.mark.parametrize(('options', 'text'), [
@@ -102,5 +103,5 @@ def test_surfaces_have_seeds_of_their_own():
     ({'namespace': '/side', 'site_file': 'none.yaml'}, 'site_file: none.yaml')])
 def test_a_place_that_does_not_exist_is_named(options, text):
     with pytest.raises(ParameterError) as error:
-        place(**options)
+        surface_of(**options)
     assert text in str(error.value)
