@@ -9,29 +9,22 @@ Brackets contain 95 % intervals.
 """
 
 import functools
-from collections.abc import Callable
 
 import numpy as np
 from parts import frame
+from parts.emulated_cycle import EmulatedLink
 
 from rhs_isac_ros.calibration.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.frontend import (
     Air,
     EmulatedRadio,
-    EmulatedSurface,
-    FrontEnd,
     Radio,
     Waveform,
     WaveformRadio,
 )
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.elements import SurfaceEstimate
-from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.positioning import make_estimator
-from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.channel import Channel, apply_patterns
-from rhs_isac_ros.protocol.settings import Impairments
 from rhs_isac_ros.support.arguments import nonnegative_float
 
 
@@ -75,46 +68,12 @@ def main() -> None:
     estimator = make_estimator('bayes', scenario, codebook, surface=states)
     figures = {}
     for name, make in radios.items():
-        received = measured(scenario, codebook, states, make, positions, options.seed)
+        link = EmulatedLink(scenario, options.seed, make, states)
+        received = np.array([link.received(codebook, cycle_id, cycle_id, position)
+                             for cycle_id, position in enumerate(positions, 1)])
         fixes = frame.Fixes.of(estimator.estimate(received), positions)
         figures[name] = table.row(name, **fixes.figures())
     frame.write_results(options.json, figures)
-
-
-def measured(scenario: Scenario, codebook: Codebook, states: SurfaceEstimate,
-             make: Callable[[Scenario, Air], Radio], positions: np.ndarray, seed: int
-             ) -> np.ndarray:
-    """Return the received signals of one cycle at each position, complex128 [N, N_B, N_SB F]."""
-    rng = np.random.default_rng(seed)
-    air = Air(scenario, rng)
-    radio = make(scenario, air)
-    front_end = FrontEnd(EmulatedSurface(scenario.n_elements), radio, air)
-    channel = Channel(scenario, seed, Impairments(multipath_memory=False), states)
-    # Other radios have noise of their own.
-    noise = rng if isinstance(radio, EmulatedRadio) else None
-    received = []
-    for cycle_id, position in enumerate(positions, 1):
-        # Its start and carrier are drawn again.
-        radio.close()
-        feeds = [_feeds(channel, front_end, codebook, cycle_id, position, band)
-                 for band in range(scenario.n_bands)]
-        received.append(receive_feeds(scenario, codebook, np.stack(feeds), noise))
-    return np.reshape(received, (len(positions), scenario.n_bands, -1))
-
-
-def _feeds(channel: Channel, front_end: FrontEnd, codebook: Codebook, cycle_id: int,
-           position: np.ndarray, band: int) -> np.ndarray:
-    """Return the signals at the feeds for the pilots of a band, complex128 [F, N_SB, K]."""
-    analog, user = codebook.analog[band], cycle_id
-    for event in (
-            m.GroundTruth(cycle_id=cycle_id, user=user, position=position, velocity=np.zeros(3)),
-            m.RhsConfiguration(cycle_id=cycle_id, mode=m.Mode.POSITIONING, band=band,
-                               codebook_id=codebook.id, analog=analog),
-            m.Pilot(cycle_id=cycle_id, user=user, band=band,
-                    symbols=np.ones(len(analog), complex))):
-        actions = channel.handle(event, 0.0)
-    (answer,) = channel.handle(apply_patterns(front_end, actions[0]), 0.0)
-    return answer.message.signals
 
 
 if __name__ == '__main__':

@@ -1,0 +1,423 @@
+"""What is combined with what: consistency of positions for all pairs of capabilities.
+
+Problem: sites, tracks, priors, impairments and the rest are each measured alone. Are positions
+also consistent where two of them meet? Each cell of the table combines two ingredients, each
+ingredient with itself is a cell without another. The band plan of config/bandplan.yaml, with one
+surface, exact knowledge and one cycle for each user, is what the ingredients change. A cell that
+the software refuses has the reason instead of figures.
+
+The role `channel` emulates the signals, and a part of what it draws is constant: elements, gain
+and carrier, and whether a user is blocked, for each user and surface; a wrong pose for each user.
+With tracks, users walk at 1 m/s and are located 20 times, in intervals of 0.1 s; otherwise every
+position belongs to a new user. All estimators reject users outside, as those of the nodes.
+
+The 95 % region is the ellipsoid of the covariance that contains 95 % of a Gaussian. NEES is the
+squared error normalised by the covariance; its mean is the number of dimensions in which the
+position is uncertain. The MSE ratio is the squared error relative to the trace of the covariance,
+1 for a consistent estimate. These figures and the share of fixes are for users inside whom at
+least one surface has in sight; the share of wrong fixes is that of positions of other users. The
+intervals are from resampling the users.
+
+With --json FILE --resume, cells in the file with the same seed and number of positions are kept.
+"""
+
+import argparse
+import dataclasses
+import functools
+import inspect
+import itertools
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from parts import frame
+from parts.emulated_cycle import EmulatedLink
+from scipy.special import chdtri
+
+from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.codebook.library import EMPTY, Library
+from rhs_isac_ros.frontend import Air, EmulatedRadio, Radio, WaveformRadio
+from rhs_isac_ros.model import Pose, Scenario, ScenarioError
+from rhs_isac_ros.model.mobility import RandomWalk
+from rhs_isac_ros.positioning import BayesEstimator, Estimate, Mixture, Sighting, Tracker, fuse
+from rhs_isac_ros.positioning.tracking import MixtureTracker, Motion
+from rhs_isac_ros.support import streams
+
+N_CYCLES, PERIOD_S, SPEED_MPS = 20, 0.1, 1.0
+SHELL_M = (0.5, 5.0)
+# A variance above this counts as a dimension [m^2].
+LEAST_M2 = 1e-8
+POSES = {'front': Pose(), 'side': Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.0, 1.0))}
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """What a cell simulates, and how it locates users; the defaults are those of no ingredient."""
+
+    declared: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # scenario fields
+    surfaces: tuple[str, ...] = ('front',)
+    pose_error: tuple[float, float] = (0.0, 0.0)  # [m], [deg]; drawn and declared
+    size_m: tuple[float, float, float] = (10.0, 10.0, 2.0)  # of the region
+    n_cycles: int = 1  # of each user; several are a track
+    outside: float = 0.0  # share of users
+    prior_std_m: float = 0.0  # of a mixture around the user; 0 without one
+    library: Callable[[], Library] = lambda: EMPTY
+    radio: Callable[[Scenario, Air], Radio] = EmulatedRadio
+
+    @property
+    def bounds_m(self) -> np.ndarray:
+        """Bounds of the region in the frame of the site, float64 [2, 3] [m]."""
+        return np.array([10.0, 0.0, 0.0]) + np.outer([-0.5, 0.5], self.size_m)
+
+
+Ingredient = Callable[[Setting], Setting]
+
+
+def change(**values: Any) -> Ingredient:
+    """Return the ingredient that sets fields of the setting."""
+    return lambda setting: dataclasses.replace(setting, **values)
+
+
+def declare(others: Ingredient = lambda setting: setting, **fields: Any) -> Ingredient:
+    """Return the ingredient that declares fields of the scenario; those of others are kept."""
+    return lambda setting: dataclasses.replace(
+        others(setting), declared=fields | dict(setting.declared))
+
+
+INGREDIENTS: dict[str, Ingredient] = {
+    'site': change(surfaces=('front', 'side')),
+    'track': change(n_cycles=N_CYCLES),
+    'prior': change(prior_std_m=0.3),
+    'library': change(library=functools.partial(
+        Library.load, frame.CONFIG / 'library_bandplan.npz')),
+    'gain': declare(user_gain_std_db=3.0),
+    'band_phases': declare(band_phase_std_rad=0.3),
+    'timing': declare(timing_std_s=1e-7),
+    'carrier': declare(carrier_offset_std_hz=300.0),
+    'elements': declare(element_error_rms=0.03),
+    'failures': declare(failed_element_share=0.01),
+    'pose': change(pose_error=(0.1, 1.0)),
+    'outside': declare(change(outside=0.25), outside_probability=0.25),
+    'blocked': declare(blocked_probability=0.2),
+    'thin': change(size_m=(10.0, 10.0, 0.0)),
+    # What pilots as samples require of a scenario.
+    'waveform': declare(change(radio=WaveformRadio), timing_std_s=1e-7, frame_duration_s=1e-4,
+                        band_phase_std_rad=6.2832),
+}
+
+
+class Refused(Exception):
+    """The software has no such combination."""
+
+
+REFUSALS = (Refused, CodebookError, ScenarioError)
+
+
+class Surface:
+    """What is known about one surface in a cell."""
+
+    def __init__(self, setting: Setting, name: str) -> None:
+        base, self.codebook = frame.system('bandplan')
+        pose = dataclasses.replace(POSES[name], uncertainty=setting.pose_error)
+        corners = np.stack(np.meshgrid(*setting.bounds_m.T), axis=-1).reshape(-1, 3)
+        # Rounded, because a region without extent along an axis has none in any frame.
+        places = np.round(pose.to_surface(corners), 6)
+        low, high = places.min(axis=0), places.max(axis=0)
+        self.scenario = dataclasses.replace(
+            base, pose=pose, roi_center_m=tuple((low + high) / 2), roi_size_m=tuple(high - low),
+            **setting.declared)
+        self._library = adapted(setting.library(), self.scenario)
+        self._make_radio = setting.radio
+        self.estimator = functools.cache(self._estimator)
+
+    def codebook_at(self, predicted: tuple[np.ndarray, np.ndarray] | None) -> Codebook:
+        """Return the codebook for a predicted position and covariance in the site's frame."""
+        if predicted is None:
+            return self.codebook
+        mean, covariance = predicted
+        return self._library.codebook_at(
+            self.scenario.pose.to_surface(mean),
+            float(np.sqrt(np.trace(covariance) / 3))) or self.codebook
+
+    def link(self, seed: int, error: np.ndarray) -> EmulatedLink:
+        """Return the link of a user, with a wrong pose: errors [6] in standard deviations."""
+        pose = self.scenario.pose
+        std = np.sqrt(np.diag(pose.covariance))
+        return EmulatedLink(dataclasses.replace(
+            self.scenario, pose=pose.displaced(std * error)), seed, self._make_radio)
+
+    def _estimator(self, codebook: Codebook) -> BayesEstimator:
+        # The positioner creates the estimators of a library like this, too.
+        return BayesEstimator(self.scenario, codebook, reject_outside=True,
+                              lazy=codebook is not self.codebook)
+
+
+def adapted(library: Library, scenario: Scenario) -> Library:
+    """Return the library for another scenario with the same codebooks, by the nearest cells."""
+    if not library.codebooks:
+        return library
+    plan = dataclasses.replace(library.plan, scenario=scenario.unplaced.id)
+    cells = plan.cells(scenario)
+    found = Library.of(plan, cells, [
+        library.codebook_at(np.array(cell.centre_m), cell.std_m) for cell in cells])
+    found.check(scenario)
+    return found
+
+
+class Look(NamedTuple):
+    """The signals that one surface has received in a cycle, and the estimator for them."""
+
+    surface: Surface
+    estimator: BayesEstimator
+    signals: np.ndarray
+
+
+class OneSurface:
+    """Locates a user from one surface, with a tracker if there are several cycles."""
+
+    def __init__(self, setting: Setting, surfaces: Sequence[Surface]) -> None:
+        (self._surface,) = surfaces
+        self._tracker = Tracker(self._surface.estimator(
+            self._surface.codebook), Motion(SPEED_MPS)) if setting.n_cycles > 1 else None
+
+    def predict(self, time_s: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the predicted position and covariance in the frame of the site, if any."""
+        found = self._tracker and self._tracker.predict(time_s)
+        pose = self._surface.scenario.pose
+        return found and (pose.to_site(found[0]), pose.covariances_to_site(found[1]))
+
+    def locate(self, time_s: float, looks: Sequence[Look], prior: Mixture | None) -> Estimate:
+        """Return the position in the frame of the site."""
+        (look,) = looks
+        if self._tracker:
+            self._tracker.estimator = look.estimator
+            found = with_prior(self._tracker.update, prior)(time_s, look.signals)
+        else:
+            found = look.estimator.posterior(look.signals, prior).estimate
+        return found.to_site(self._surface.scenario.pose)
+
+
+class SeveralSurfaces:
+    """Locates a user from several surfaces, as the role `Fusion` does."""
+
+    def __init__(self, setting: Setting, surfaces: Sequence[Surface]) -> None:
+        self._bounds_m = setting.bounds_m
+        self._tracker = MixtureTracker(
+            surfaces[0].scenario, setting.bounds_m, Motion(SPEED_MPS)
+        ) if setting.n_cycles > 1 else None
+
+    def predict(self, time_s: float) -> None:
+        """Return None: the codebooks of a site do not follow a user."""
+
+    def locate(self, time_s: float, looks: Sequence[Look], prior: Mixture | None) -> Estimate:
+        """Return the position in the frame of the site; a prior counts like a surface."""
+        found = [Sighting.of(look.estimator.posterior(look.signals, prior),
+                             look.surface.scenario.pose) for look in looks]
+        sightings = [one for one in found if one]
+        if not sightings:
+            return Estimate.without_fix('no surface has a position')
+        if prior:
+            sightings.append(Sighting(Pose(), prior))
+        mixture = fuse(sightings, self._bounds_m).mixture
+        if not self._tracker:
+            return Estimate(*mixture.moments())
+        missing = float(np.prod([one.missing for one in sightings]))
+        tracked = self._tracker.update(time_s, mixture, missing)
+        return tracked or Estimate.without_fix('late')
+
+
+def with_prior(function: Callable[..., Any], prior: Mixture | None) -> Callable[..., Any]:
+    """Return the function with a prior; raise Refused if it takes none."""
+    if prior is None:
+        return function
+    if 'prior' not in inspect.signature(function).parameters:
+        raise Refused(f'{function.__qualname__} takes no prior: it is that of the track')
+    return functools.partial(function, prior=prior)
+
+
+class Results(NamedTuple):
+    """The positions of a cell, one row for each cycle of each user."""
+
+    estimate: Estimate
+    positions: np.ndarray  # Float64 [N, 3] [m].
+    expected: np.ndarray  # Whether the user should have a position, bool [N].
+    users: np.ndarray  # Number of the user, int [N].
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures of the cell; None where there is nothing to average."""
+        fix = np.asarray(self.estimate.fix)
+        counted = fix & self.expected
+        errors = (self.estimate.mean - self.positions)[counted]
+        covariances, users = self.estimate.covariance[counted], self.users[counted]
+        squares = np.sum(errors * np.linalg.solve(covariances, errors[..., None])[..., 0], axis=1)
+        dimensions = np.sum(np.linalg.eigvalsh(covariances) > LEAST_M2, axis=1)
+        squared = np.sum(errors**2, axis=1)
+        traces = np.trace(covariances, axis1=1, axis2=2)
+
+        def share(flags: np.ndarray, chosen: np.ndarray) -> frame.Interval | None:
+            return frame.mean_interval(100.0 * flags[chosen], self.users[chosen])
+        ratio = frame.mean_interval(squared / traces.mean(), users) if len(users) else None
+        return {
+            'in_region': frame.mean_interval(
+                100.0 * (squares <= chdtri(dimensions, 0.05)), users),
+            'nees': frame.mean_interval(squares, users),
+            'dimensions': float(dimensions.mean()) if len(users) else None,
+            'mse_ratio': ratio, 'fix': share(fix, self.expected),
+            'wrong_fix': share(fix, ~self.expected), 'mse_m2': frame.mean_interval(squared, users),
+            'n': len(fix)}
+
+
+def run_cell(setting: Setting, n: int, rng: np.random.Generator) -> Results:
+    """Locate users in about n cycles."""
+    surfaces = [Surface(setting, name) for name in setting.surfaces]
+    locator = SeveralSurfaces if len(surfaces) > 1 else OneSurface
+    rows: list[tuple[Estimate, np.ndarray, bool, int]] = []
+    for user in range(1, 1 + max(1, n // setting.n_cycles)):
+        is_outside = bool(rng.random() < setting.outside)
+        path = outside_path(setting, surfaces, rng) if is_outside else inside_path(setting, rng)
+        links = {one: one.link(int(rng.integers(2**31)), rng.standard_normal(6))
+                 for one in surfaces}
+        expected = not is_outside and not all(
+            link.is_blocked(user) for link in links.values())
+        rows += [(estimate, place, expected, user) for estimate, place in zip(
+            located(setting, locator(setting, surfaces), links, user, path, rng), path,
+            strict=True)]
+    estimates, positions, flags, users = zip(*rows, strict=True)
+    return Results(Estimate.of_each(estimates), np.array(positions), np.array(flags),
+                   np.array(users))
+
+
+def located(setting: Setting, locator: OneSurface | SeveralSurfaces,
+            links: Mapping[Surface, EmulatedLink], user: int, path: np.ndarray,
+            rng: np.random.Generator) -> Iterator[Estimate]:
+    """Yield the estimates of one user along a path, float64 [C, 3] [m]."""
+    for cycle_id, place in enumerate(path, 1):
+        time_s, std_m = PERIOD_S * cycle_id, setting.prior_std_m
+        centre = place + std_m * rng.standard_normal(3)
+        prior = Mixture(np.zeros(1), centre[None], std_m**2 * np.eye(3)[None]) if std_m else None
+        predicted = prior.moments() if prior else locator.predict(time_s)
+        looks = []
+        for surface, link in links.items():
+            codebook = surface.codebook_at(predicted)
+            looks.append(Look(surface, surface.estimator(codebook),
+                              link.received(codebook, cycle_id, user, place)))
+        yield locator.locate(time_s, looks, prior)
+
+
+def inside_path(setting: Setting, rng: np.random.Generator) -> np.ndarray:
+    """Return the positions of a walk in the region, float64 [C, 3] [m]."""
+    low, high = setting.bounds_m
+    walk = RandomWalk(Scenario(roi_center_m=(low + high) / 2, roi_size_m=setting.size_m),
+                      SPEED_MPS, rng)
+    return np.array([walk.state(PERIOD_S * cycle)[0] for cycle in range(setting.n_cycles)])
+
+
+def outside_path(setting: Setting, surfaces: Sequence[Surface], rng: np.random.Generator
+                 ) -> np.ndarray:
+    """Return a place outside of the region, in front of all surfaces, float64 [C, 3] [m]."""
+    low, high = setting.bounds_m
+    while True:
+        place = rng.uniform(low - SHELL_M[1], high + SHELL_M[1])
+        distance_m = np.linalg.norm(place - np.clip(place, low, high))
+        if SHELL_M[0] < distance_m < SHELL_M[1] and all(
+                one.scenario.pose.to_surface(place)[0] > 1 for one in surfaces):
+            return np.tile(place, (setting.n_cycles, 1))
+
+
+def pairs(names: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield each ingredient with itself and with those after it, if one of both is named."""
+    for one, other in itertools.combinations_with_replacement(INGREDIENTS, 2):
+        if not names or one in names or other in names:
+            yield one, other
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = frame.benchmark_parser('combinations', __doc__, positions=800)
+    add = parser.add_argument
+    add('--only', choices=INGREDIENTS, action='append', default=[],
+        help='only cells with this ingredient; may be repeated')
+    add('--resume', action='store_true', help='keep the cells in the file of the results')
+    options = parser.parse_args()
+    if options.resume and not options.json:
+        parser.error('argument --resume: expected together with --json')
+    print(f'{options.positions} positions, seed {options.seed}\n')
+    results = measure(options, kept(options))
+    print(f'\n{matrix(results)}\n')
+    for cell, refused in reasons(results).items():
+        print(f'{cell}: {refused}')
+
+
+Cells = dict[str, dict[str, dict[str, Any]]]
+
+
+def kept(options: argparse.Namespace) -> Cells:
+    """Return the cells in the file of results that are as requested."""
+    file: Path | None = options.json
+    if not options.resume or file is None or not file.exists():
+        return {}
+    return {one: {other: cell for other, cell in row.items()
+                  if (cell['positions'], cell['seed']) == (options.positions, options.seed)}
+            for one, row in json.loads(file.read_text(encoding='utf-8')).items()}
+
+
+def measure(options: argparse.Namespace, results: Cells) -> Cells:
+    """Measure the requested cells that are not in the results, and write each into the file.
+
+    A cell is stored under both orders of its ingredients.
+    """
+    table = frame.Table(['ingredients'], {
+        'fix [%]': ('fix', 1), 'wrong fix [%]': ('wrong_fix', 1),
+        'in the 95 % region [%]': ('in_region', 1), 'NEES': ('nees', 2),
+        'dimensions': ('dimensions', 1), 'MSE ratio': ('mse_ratio', 2)})
+    for number, (one, other) in enumerate(pairs(())):
+        if (one, other) not in set(pairs(options.only)):
+            continue
+        known = results.setdefault(one, {})
+        if other not in known:
+            # The random numbers of a cell do not depend on the other cells.
+            rng = streams.generator(options.seed, streams.HELD_OUT, number)
+            known[other] = cell(one, other, options.positions, rng) | {
+                'positions': options.positions, 'seed': options.seed}
+            results.setdefault(other, {})[one] = known[other]
+            frame.write_results(options.json, results)
+        names = ' + '.join(dict.fromkeys((one, other)))
+        table.row(names, **known[other] | {'fix': known[other].get('refused') or
+                                           known[other]['fix']})
+    return results
+
+
+def cell(one: str, other: str, n: int, rng: np.random.Generator) -> dict[str, Any]:
+    """Return the figures of a cell, or why the software refuses it."""
+    setting = Setting()
+    for name in dict.fromkeys((one, other)):
+        setting = INGREDIENTS[name](setting)
+    try:
+        return run_cell(setting, n, rng).figures()
+    except REFUSALS as error:
+        return {'refused': str(error)}
+
+
+def matrix(results: Cells) -> str:
+    """Return the coverage of all cells as a table in Markdown."""
+    lines = [['', *results], ['---'] * (1 + len(results))]
+    for one in results:
+        lines.append([one])
+        for other in results:
+            found = results[one].get(other, {})
+            covered = found.get('in_region')
+            lines[-1].append('refused' if 'refused' in found else
+                             f'{covered[0]:.1f}' if covered else '-')
+    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+
+
+def reasons(results: Cells) -> dict[str, str]:
+    """Return why cells are refused."""
+    return {f'{one} + {other}': results[one][other]['refused'] for one, other in pairs(())
+            if 'refused' in results.get(one, {}).get(other, {})}
+
+
+if __name__ == '__main__':
+    frame.run(main)

@@ -1,0 +1,63 @@
+"""Combinations of capabilities: which cells there are, what they measure, and what is refused."""
+
+import argparse
+
+import numpy as np
+import pytest
+from benchmarks import combinations
+from benchmarks.combinations import INGREDIENTS, Setting, cell, measure, pairs
+
+N = len(INGREDIENTS)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(1)
+
+
+def test_each_ingredient_meets_each_other_one_and_stands_alone():
+    assert len({frozenset(pair) for pair in pairs(())}) == N * (N + 1) // 2
+    assert len(list(pairs(['site']))) == N
+    assert len(list(pairs(['site', 'thin']))) == 2 * N - 1
+
+
+def test_declarations_of_two_ingredients_add_up():
+    setting = INGREDIENTS['gain'](INGREDIENTS['waveform'](Setting()))
+    assert setting.declared['user_gain_std_db'] == 3
+    assert setting.declared['timing_std_s'] == 1e-7
+
+
+@pytest.mark.parametrize(('pair', 'reason'), [
+    (('band_phases', 'waveform'), 'band_phase_std_rad: 0.3 rad, expected at least'),
+    (('track', 'prior'), 'Tracker.update takes no prior')])
+def test_the_software_refuses_a_combination_with_a_reason(pair, reason, rng):
+    assert cell(*pair, 1, rng)['refused'].startswith(reason)
+
+
+def test_users_outside_count_only_for_wrong_fixes():
+    found = cell('thin', 'outside', 12, np.random.default_rng(3))
+    assert found['n'] == 12
+    assert found['dimensions'] == 2
+    assert found['fix'][0] == 100
+    assert found['wrong_fix'] is not None
+    assert found['mse_m2'][0] < 1
+
+
+def test_cells_with_the_same_options_are_kept(monkeypatch, tmp_path, capsys):
+    options = argparse.Namespace(
+        positions=5, seed=1, only=['site'], json=tmp_path / 'cells.json', resume=True)
+    measured = []
+
+    def counted(one, other, n, rng):
+        measured.append((one, other))
+        return {'refused': 'no'}
+    monkeypatch.setattr(combinations, 'cell', counted)
+    first = measure(options, combinations.kept(options))
+    assert len(measured) == N
+    assert first['site']['track'] == first['track']['site']
+    again = measure(options, combinations.kept(options))
+    assert (again, len(measured)) == (first, N)
+    options.seed = 2
+    measure(options, combinations.kept(options))
+    assert len(measured) == 2 * N
+    assert '| site + track | no |' in capsys.readouterr().out
