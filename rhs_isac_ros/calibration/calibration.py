@@ -24,7 +24,7 @@ from rhs_isac_ros.model.arrays import check_arrays, numbers, read_only
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import energy_limit
 from rhs_isac_ros.support.errors import translated
-from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
+from rhs_isac_ros.support.files import ArchiveError, read_archive, read_once, write_archive
 
 _FORMAT = 1
 # Arrays in a file with their types, and standard deviations, which are only for human readers.
@@ -104,6 +104,7 @@ class Calibration:
             'format': _FORMAT, 'scenario_id': self.scenario_id, **self.about})
 
     @classmethod
+    @read_once
     def load(cls, path: str | Path) -> 'Calibration':
         """Read a calibration from a file; raise CalibrationError if the file is invalid."""
         with translated(ArchiveError, CalibrationError):

@@ -16,7 +16,6 @@ The modules, in reading order:
 """
 
 import inspect
-import shlex
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -35,7 +34,6 @@ from rhs_isac_ros.frontend.surface import EmulatedSurface, Surface, SurfaceFault
 from rhs_isac_ros.frontend.waveform import Waveform
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.support import plugins
-from rhs_isac_ros.support.files import parse_yaml
 
 SURFACES: Mapping[str, Callable[..., Surface]] = {
     'emulated': EmulatedSurface, 'opensourceris': OpenSourceRis}
@@ -45,21 +43,7 @@ RADIOS: Mapping[str, Callable[..., Radio]] = {
 __all__ = [
     'RADIOS', 'SURFACES', 'Air', 'EmulatedRadio', 'EmulatedSurface', 'FrontEnd', 'OpenSourceRis',
     'PlaybackRadio', 'Radio', 'RadioFault', 'SampleRecorder', 'Sounding', 'Surface',
-    'SurfaceFault', 'Waveform', 'WaveformRadio', 'make_radio', 'make_surface', 'parse_options']
-
-
-def parse_options(text: str) -> dict[str, Any]:
-    """Parse options such as ``port=/dev/ttyUSB0 read_back=false``; the values are those of YAML.
-
-    Quotes enclose a value with spaces. Raises ValueError if the text has another form.
-    """
-    options: dict[str, Any] = {}
-    for word in shlex.split(text):
-        name, equals, value = word.partition('=')
-        if not (name.isidentifier() and equals) or name in options:
-            raise ValueError(f'{word!r}, expected NAME=VALUE, each name once')
-        options[name] = parse_yaml(value)
-    return options
+    'SurfaceFault', 'Waveform', 'WaveformRadio', 'make_radio', 'make_surface']
 
 
 def make_surface(name: str, n_elements: int, **options: Any) -> Surface:

@@ -12,7 +12,6 @@ from rhs_isac_ros.frontend import (
     SampleRecorder,
     make_radio,
     make_surface,
-    parse_options,
 )
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import events
@@ -22,6 +21,7 @@ from rhs_isac_ros.ros.parameters import calibrated_surface
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import parse_options
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import ParameterError
 

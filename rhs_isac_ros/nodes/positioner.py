@@ -22,8 +22,10 @@ from rhs_isac_ros.ros.parameters import calibrated_surface
 from rhs_isac_ros.ros.poses import LocatingNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.arguments import parse_options
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import ParameterError
+from rhs_isac_ros.system import System
 
 # Minimum time between log messages about the progress of a table [s].
 _LOG_PERIOD_S = 5.0
@@ -48,43 +50,42 @@ class PositionerNode(LocatingNode[Positioner]):
         """
         settings: PositionerSettings = super().make_settings(values)
         calibrated_surface(values, self.scenario)
-        if settings.estimator not in positioning.ESTIMATORS:
+        with translated(plugins.PluginError, ParameterError, 'estimator'):
             # A plug-in that can be imported may still fail when the estimator is built.
-            with translated(plugins.PluginError, ParameterError, 'estimator'):
-                plugins.load(plugins.ESTIMATORS, settings.estimator)
-            return settings
-        if settings.estimator != positioning.NeuralEstimator.name:
-            # Other estimators do not use the model, so a new `model_file` must not rebuild them.
-            return dataclasses.replace(settings, model_file='')
-        if settings.calibration_file:
+            kind = positioning.Kind(settings.estimator)
+        if settings.calibration_file and not kind.uses_surface:
             raise ParameterError(
                 f'calibration_file: {settings.calibration_file!r}, expected none for the '
-                'estimator neural, whose model is trained for the surface of the scenario')
-        if not settings.model_file:
-            raise ParameterError(
-                "model_file: '', expected a trained model for the estimator neural")
-        with translated(positioning.ModelError, ParameterError, 'model_file'):
-            positioning.Network.load(settings.model_file)
+                f'estimator {kind.name}, which assumes the surface of the scenario')
+        with translated(ValueError, ParameterError, 'estimator_options'):
+            for name in parse_options(settings.estimator_options):
+                if not (kind.takes_any or name in kind.options):
+                    raise ValueError(f'{name!r}, expected an option of {kind.name}: '
+                                     f'{", ".join(sorted(kind.options))}')
+        if 'model_file' not in kind.options:
+            # A new `model_file` must not rebuild an estimator that does not use it.
+            settings = dataclasses.replace(settings, model_file='')
+        for name, read in kind.readers.items():
+            with translated(ValueError, ParameterError):
+                read(getattr(settings, name))
         return settings
 
     def _make_estimator(
             self, settings: PositionerSettings, codebook: Codebook) -> positioning.Estimator:
-        options = positioning.file_options(
-            settings.estimator, self.table_folder, settings.model_file)
-        if settings.estimator in positioning.REGION_ESTIMATORS:
-            options['reject_outside'] = settings.reject_outside
-            options['progress'] = self._on_progress
-        if settings.calibration_file:
-            options['surface'] = load_surface(settings.calibration_file, self.scenario)
-        estimator = positioning.make_estimator(
-            settings.estimator, self.scenario, codebook, **options)
+        kind = positioning.Kind(settings.estimator)
+        surface = load_surface(settings.calibration_file, self.scenario)
+        options = kind.accepted(
+            table_folder=self.table_folder, model_file=settings.model_file,
+            reject_outside=settings.reject_outside, progress=self._on_progress)
+        estimator = kind.create(System(self.scenario, codebook, surface), **{
+            **options, **parse_options(settings.estimator_options)})
         # The first estimate takes longer than later ones; no user should have to wait for it.
         center = np.array([self.scenario.roi_center_m])
         estimator.estimate(simulate_received(
             self.scenario, codebook, center, np.random.default_rng(0))[0])
         for cell in self.library.codebooks[:1]:
             # The same applies to the first estimator without a table, whose imports take a second.
-            positioning.BayesEstimator(self.scenario, cell, lazy=True)
+            positioning.BayesEstimator(System(self.scenario, cell), lazy=True)
         return estimator
 
     def _on_progress(self, share: float) -> None:

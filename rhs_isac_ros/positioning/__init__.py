@@ -27,12 +27,13 @@ The modules, in reading order:
 * `tracking`: moving users; `neural`: the paper's network; `store`: tables in files
 """
 
+import inspect
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.measurement import KnownSurface
 from rhs_isac_ros.positioning.estimate import Estimate, Estimator, SignalError, estimate_each
 from rhs_isac_ros.positioning.estimators import (
     BayesEstimator,
@@ -47,26 +48,25 @@ from rhs_isac_ros.positioning.neural import ModelError, Network, NeuralEstimator
 from rhs_isac_ros.positioning.site import Site, SiteError, SiteEstimator
 from rhs_isac_ros.positioning.tracking import Motion, Tracker, TrackEstimate
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.system import System
 
 ESTIMATORS: Mapping[str, Callable[..., Estimator]] = {
     kind.name: kind for kind in (BayesEstimator, MlEstimator, NeuralEstimator)}
-# Estimators with the option ``reject_outside``.
-REGION_ESTIMATORS = (BayesEstimator.name, MlEstimator.name)
 
 __all__ = [
-    'ESTIMATORS', 'REGION_ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'Fused',
+    'ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'Fused', 'Kind',
     'Mixture', 'MlEstimator', 'ModelError', 'Motion', 'Network', 'NeuralEstimator',
     'SearchEstimator', 'Sighting', 'SignalError', 'Site', 'SiteError', 'SiteEstimator',
-    'TrackEstimate', 'Tracker', 'WeightedModes', 'estimate_each', 'file_options',
-    'fuse', 'make_estimator', 'train', 'weighted_modes',
+    'TrackEstimate', 'Tracker', 'WeightedModes', 'estimate_each', 'fuse', 'make_estimator',
+    'train', 'weighted_modes',
 ]
 
 
-def make_estimator(
-        name: str, scenario: Scenario, codebook: Codebook, **options: Any) -> Estimator:
-    """Create an estimator by its name.
+def make_estimator(name: str, scenario: Scenario, codebook: Codebook, *,
+                   surface: KnownSurface | None = None, **options: Any) -> Estimator:
+    """Create an estimator of a system by its name; see `Kind.create`.
 
-    `REGION_ESTIMATORS` take the options of `SearchEstimator`. `neural` requires ``model_file``, a
+    `bayes` and `ml` take the options of `SearchEstimator`. `neural` requires ``model_file``, a
     `Network` or its file. Plug-ins define their own options.
 
     Raises ValueError if there is no estimator of that name; PluginError if a plug-in cannot be
@@ -74,29 +74,56 @@ def make_estimator(
     read, or was trained for another codebook or scenario; and CodebookError if the codebook does
     not fit the scenario.
     """
-    if name in ESTIMATORS:
-        return ESTIMATORS[name](scenario, codebook, **options)
-    installed = plugins.names(plugins.ESTIMATORS)
-    if name not in installed:
-        raise ValueError(
-            f'estimator: {name!r}, expected one of {sorted({*ESTIMATORS, *installed})}')
-    estimator: Estimator = plugins.make(plugins.ESTIMATORS, name, scenario, codebook, **options)
-    if not (callable(getattr(estimator, 'estimate', None))
-            and isinstance(getattr(estimator, 'name', None), str)):
-        raise plugins.PluginError(
-            f'{plugins.describe(plugins.ESTIMATORS, name)}: returned {estimator!r}, expected '
-            'an object with a method estimate and a string name')
-    return estimator
+    return Kind(name).create(System(scenario, codebook, surface), **options)
 
 
-def file_options(
-        name: str, table_folder: Path | None, model_file: str | Path) -> dict[str, Any]:
-    """Return the options of `make_estimator` that specify the files of an estimator.
+class Kind:
+    """The estimators of one name, with what their class or plug-in declares.
 
-    The estimators `bayes` and `ml` take the table folder; without one, they keep tables only in
-    memory. The model file goes to `neural` and,
-    unless it is empty, to plug-ins.
+    The options are the parameters of the constructor. A class declares with ``uses_tracks`` that a
+    track may be the prior, as in `BayesEstimator`; with ``uses_surface = False`` that it assumes
+    the surface of the scenario; and with ``readers`` the options that are required files, each
+    with the function that reads it. Raises ValueError if there is no estimator of that name, and
+    PluginError if a plug-in cannot be loaded.
     """
-    if name == NeuralEstimator.name or (name not in ESTIMATORS and model_file):
-        return {'model_file': model_file}
-    return {'table_folder': table_folder} if name in ESTIMATORS else {}
+
+    def __init__(self, name: str) -> None:
+        self.name, made, self._is_plugin = name, ESTIMATORS.get(name), name not in ESTIMATORS
+        if self._is_plugin:
+            if name not in (installed := plugins.names(plugins.ESTIMATORS)):
+                raise ValueError(
+                    f'estimator: {name!r}, expected one of {sorted({*ESTIMATORS, *installed})}')
+            made = plugins.load(plugins.ESTIMATORS, name)
+        parameters = inspect.signature(cast('Callable[..., Estimator]', made)).parameters
+        #: Names of the options; a plug-in with ``**options`` takes any others as well.
+        self.options = {*parameters} - {'system', 'scenario', 'codebook'}
+        self.takes_any = any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+        if self.takes_any:
+            self.options |= {'model_file', 'surface'}
+        # A plug-in takes a system, or a scenario, a codebook and perhaps a surface.
+        self._takes_system = 'system' in parameters
+        self.uses_tracks: bool = getattr(made, 'uses_tracks', False)
+        self.uses_surface: bool = getattr(
+            made, 'uses_surface', self._takes_system or 'surface' in self.options)
+        self.readers: Mapping[str, Callable[[str], Any]] = getattr(made, 'readers', {})
+
+    def accepted(self, **offered: Any) -> dict[str, Any]:
+        """Return those of the offered options that the estimator takes, without empty texts."""
+        return {name: value for name, value in offered.items()
+                if name in self.options and value != ''}
+
+    def create(self, system: System, **options: Any) -> Estimator:
+        """Create an estimator for a system; see `make_estimator` for options and errors."""
+        if not self._is_plugin:
+            return ESTIMATORS[self.name](system, **options)
+        parts: tuple[Any, ...] = (system,)
+        if not self._takes_system:
+            parts = system.scenario, system.codebook
+            options |= {} if system.surface is None else {'surface': system.surface}
+        estimator: Estimator = plugins.make(plugins.ESTIMATORS, self.name, *parts, **options)
+        if not (callable(getattr(estimator, 'estimate', None))
+                and isinstance(getattr(estimator, 'name', None), str)):
+            raise plugins.PluginError(
+                f'{plugins.describe(plugins.ESTIMATORS, self.name)}: returned {estimator!r}, '
+                'expected an object with a method estimate and a string name')
+        return estimator

@@ -10,12 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.gaussian import moments, share_of_level
 from rhs_isac_ros.model.geometry import to_positions
-from rhs_isac_ros.model.measurement import KnownSurface
 from rhs_isac_ros.positioning.alternatives import Alternative, Blocked, Outside, rejection
 from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.draws import DrawnPosterior
@@ -59,6 +56,7 @@ from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.positioning.templates import N_NORMAL, standard_normal, tabulate
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
+from rhs_isac_ros.system import System
 
 
 class _Limits(NamedTuple):
@@ -112,8 +110,6 @@ class SearchEstimator(abc.ABC):
         `Scenario.outside_probability`. The estimate then contains the probability of this; if it
         exceeds `alternatives.LIMIT`, there is no fix. Position and covariance always apply to a
         user inside.
-    surface
-        Knowledge of the surface, such as a calibration; see `MeasurementModel`.
     progress
         Called with the completed share while a table is computed, from any thread.
     lazy
@@ -125,15 +121,14 @@ class SearchEstimator(abc.ABC):
 
     @one_blas_thread
     def __init__(
-            self, scenario: Scenario, codebook: Codebook,
-            table_folder: Path | None = None, *, reject_outside: bool = False,
-            surface: KnownSurface | None = None,
-            progress: Callable[[float], None] | None = None, lazy: bool = False) -> None:
-        self.scenario, self.surface = scenario, surface
-        self._likelihood = likelihood = Likelihood(scenario, codebook, surface)
+            self, system: System, table_folder: Path | None = None, *,
+            reject_outside: bool = False, progress: Callable[[float], None] | None = None,
+            lazy: bool = False) -> None:
+        self.system, self.scenario = system, system.scenario
+        scenario = system.scenario
+        self._likelihood = likelihood = Likelihood(system)
         self._rejects_outside = reject_outside and bool(scenario.outside_probability)
-        self._load = functools.partial(
-            load_table, likelihood.model, codebook.id, table_folder, progress)
+        self._load = functools.partial(load_table, system, table_folder, progress)
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
         median_db, std_db = scenario.multipath_level_db
         # Median multipath level of users in sight, and the share of a residual's deviation that
@@ -161,7 +156,7 @@ class SearchEstimator(abc.ABC):
     @functools.cached_property
     def _region(self) -> Scope:
         """The whole region."""
-        scenario, arrays = self.scenario, self._load()
+        scenario, arrays = self.scenario, self._load(outside=self._rejects_outside)
         scope = Scope.of(self._likelihood, arrays, lay_grid(scenario))
         if self._rejects_outside:
             scope = scope._replace(
@@ -378,7 +373,7 @@ class SearchEstimator(abc.ABC):
 class BayesEstimator(SearchEstimator):
     """Mean and covariance of the posterior, from samples inside the region."""
 
-    name = 'bayes'
+    name, uses_tracks = 'bayes', True
 
     def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
         mean, covariance = samples.moments()

@@ -17,8 +17,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.arrays import adjoint, blocks, mixture_weights
 from rhs_isac_ros.model.gaussian import (
     covariance_root,
@@ -32,9 +31,9 @@ from rhs_isac_ros.model.impairments import (
     Exponents,
     nuisance_of,
 )
-from rhs_isac_ros.model.measurement import KnownSurface
 from rhs_isac_ros.model.scenario import ScenarioError
 from rhs_isac_ros.positioning.lattice import Resolution
+from rhs_isac_ros.system import System
 
 # Standard deviation of a Gaussian whose density at its centre equals that of a uniform phase.
 _UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
@@ -309,14 +308,13 @@ class NuisancePrior(Exponents):
 class Likelihood:
     """The likelihood with one covariance, in which element errors are averaged over the region."""
 
-    def __init__(self, scenario: Scenario, codebook: Codebook,
-                 surface: KnownSurface | None = None) -> None:
-        codebook.check(scenario)
-        self.scenario, self.codebook, self.surface = scenario, codebook, surface
+    def __init__(self, system: System) -> None:
+        self.scenario, self.codebook, self.surface = (
+            system.scenario, system.codebook, system.surface)
         # Estimators are built between cycles; the first estimate should be as fast as later ones.
-        self.model = MeasurementModel(scenario, codebook, surface).prepare()
+        self.model = system.prepare()
         self.nuisance = NuisancePrior(self.model)
-        self.resolution = Resolution.of(scenario)
+        self.resolution = Resolution.of(self.scenario)
         self.log_det = float(log_determinant(self.model.root).sum())
 
     def signals(self, received: np.ndarray) -> Signals:

@@ -20,13 +20,13 @@ import numpy as np
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import check_arrays, numbers
 from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.errors import translated
-from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
+from rhs_isac_ros.support.files import ArchiveError, read_archive, read_once, write_archive
 from rhs_isac_ros.support.optional import optional_import
 from rhs_isac_ros.support.threads import one_blas_thread
 from rhs_isac_ros.system import System
@@ -112,6 +112,7 @@ class Network:
                       {'format': _FORMAT, 'inputs': self.inputs, **self.about})
 
     @classmethod
+    @read_once
     def load(cls, path: str | Path) -> 'Network':
         """Read a model from a file, or raise `ModelError`."""
         with translated(ArchiveError, ModelError):
@@ -123,41 +124,47 @@ class Network:
             return cls(**fields, about=about, inputs=inputs)
 
 
+def read_model(file: str | Path) -> Network:
+    """Read a model from a file; raise `ModelError` if there is none or it is invalid."""
+    if file == '':
+        raise ModelError("model_file: '', expected a trained model of the codebook, from "
+                         'python3 -m rhs_isac_ros.positioning')
+    with translated(ModelError, ModelError, 'model_file'):
+        return Network.load(file)
+
+
 class NeuralEstimator:
     """Positions from a trained network, all with the covariance of the validation residuals.
 
     The estimator does not test whether signals fit the position. It rejects only signals that are
     weaker than multipath and noise alone, or stronger than any position could explain. Raises
-    CodebookError if the codebook does not fit the scenario, and ModelError if the model is
-    missing, cannot be read, or was trained for another codebook or scenario.
+    ModelError if the model is missing, cannot be read, or was trained for another codebook,
+    scenario or surface.
     """
 
-    name = 'neural'
+    name, uses_surface = 'neural', False
+    readers = {'model_file': read_model}
 
     def __init__(
-            self, scenario: Scenario, codebook: Codebook,
-            model_file: Network | str | Path = '') -> None:
-        codebook.check(scenario)
-        self._codebook = codebook
-        self._model = MeasurementModel(scenario, codebook).prepare()
-        if model_file == '':
-            raise ModelError(
-                'model_file: none, expected a model of this codebook, trained with '
-                'python3 -m rhs_isac_ros.positioning')
-        if isinstance(model_file, Network):
-            self._network, source = model_file, 'model'
-        else:
-            self._network, source = Network.load(model_file), str(model_file)
-        _check_purpose(self._network, scenario, codebook, source)
-        self._test = FitTest(int(np.prod(self._model.shape)))
+            self, system: System, model_file: Network | str | Path = '') -> None:
+        self.system = system
+        system.prepare()
+        if system.surface is not None:
+            raise ModelError('surface: known or calibrated, expected none, because the network is '
+                             'trained for the surface of the scenario')
+        self._network = (
+            model_file if isinstance(model_file, Network) else read_model(model_file))
+        source = 'model' if isinstance(model_file, Network) else str(model_file)
+        _check_purpose(self._network, system, source)
+        self._test = FitTest(int(np.prod(system.shape)))
 
     @one_blas_thread
     def estimate(self, received: np.ndarray) -> Estimate:
         """Estimate positions from received signals; see `Estimator.estimate`."""
-        return estimate_each(self._codebook, received, self._locate)
+        return estimate_each(self.system.codebook, received, self._locate)
 
     def _locate(self, batch: np.ndarray) -> Iterator[Estimate]:
-        energies = np.sum(np.abs(self._model.whiten(batch))**2, axis=(1, 2))
+        energies = np.sum(np.abs(self.system.whiten(batch))**2, axis=(1, 2))
         positions = self._network.positions(batch)
         max_mean_energy = float(self._network.max_energy)
         for energy, position in zip(energies.tolist(), positions, strict=True):
@@ -166,15 +173,14 @@ class NeuralEstimator:
             yield Estimate(position, self._network.covariance, reason)
 
 
-def _check_purpose(
-        network: Network, scenario: Scenario, codebook: Codebook, source: str) -> None:
-    for key, subject, expected in (('codebook', 'codebook', codebook.id),
-                                   ('scenario', 'the scenario', scenario.unplaced.changes())):
+def _check_purpose(network: Network, system: System, source: str) -> None:
+    scenario = system.scenario.unplaced.changes()
+    for key, subject, expected in (('codebook', 'codebook', system.codebook.id),
+                                   ('scenario', 'the scenario', scenario)):
         found = network.about.get(key)
         if found != expected:
             raise ModelError(f'{source}: trained for {subject} {found}, expected {expected}')
-    n_bands, n_subbands, n_frames, _, _ = codebook.shape
-    n_inputs = (2 if network.inputs == 'parts' else 1) * n_bands * n_subbands * n_frames
+    n_inputs = (2 if network.inputs == 'parts' else 1) * math.prod(system.shape)
     if len(network.w_in) != n_inputs:
         raise ModelError(f'{source}: {len(network.w_in)} inputs, expected {n_inputs}')
 

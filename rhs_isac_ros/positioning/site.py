@@ -101,11 +101,14 @@ class Site:
 
 
 class SiteEstimator:
-    """The position of a user of a site, from the signals of one cycle."""
+    """The position of a user of a site, from the signals of one cycle.
+
+    As in a running site, a surface for which the user is outside of the region has no position.
+    """
 
     def __init__(self, site: Site, table_folder: Path | None = None) -> None:
         self._site = site
-        self._estimators = {name: BayesEstimator(one.scenario, one.codebook, table_folder)
+        self._estimators = {name: BayesEstimator(one, table_folder, reject_outside=True)
                             for name, one in site.surfaces.items()}
 
     def sightings(self, received: Mapping[str, np.ndarray]) -> dict[str, Sighting]:

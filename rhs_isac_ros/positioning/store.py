@@ -1,6 +1,7 @@
-"""Tables on disk: computed once for a scenario and codebook, then mapped into memory."""
+"""Tables on disk: computed once for a system, then mapped into memory."""
 
 import contextlib
+import functools
 import hashlib
 import os
 import tokenize
@@ -11,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from rhs_isac_ros import __version__
-from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.positioning import alternatives, templates
 from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.system import System
 
-# Maximum number of tables in a folder. Beyond it, the least recently used tables are deleted.
-_MAX_TABLES = 16
+# Maximum number of files in a folder. Beyond it, the least recently used files are deleted.
+_MAX_FILES = 32
 _PREFIX = 'table-'
 # Version of the contents; tables of other versions are ignored.
 _FORMAT = 6
@@ -36,46 +37,54 @@ def default_folder() -> Path | None:
         return None
 
 
-def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = None,
-               progress: Callable[[float], None] | None = None) -> Mapping[str, np.ndarray]:
-    """Load the table of a model from a folder, or compute it and store it there.
+def load_table(system: System, folder: Path | None = None,
+               progress: Callable[[float], None] | None = None, *, outside: bool = False
+               ) -> Mapping[str, np.ndarray]:
+    """Load the table of a system from a folder, or compute it and store it there.
 
-    The result contains the arrays of `tabulate` and `tabulate_outside`. If they come from a
-    folder, they are read-only and mapped into memory. Without a folder, or with a `RuntimeWarning`
-    if the folder cannot be written, the table is kept only in memory. During the computation,
-    `progress` is called with the completed share.
+    The result contains the arrays of `tabulate` and, if `outside`, those of `tabulate_outside`,
+    which have a file of their own. If they come from a folder, they are read-only and mapped into
+    memory. Without a folder, or with a `RuntimeWarning` if the folder cannot be written, the table
+    is kept only in memory. During the computation, `progress` is called with the completed share.
     """
+    parts = {'': templates.tabulate} | (
+        {'-outside': alternatives.tabulate_outside} if outside else {})
+    table: dict[str, np.ndarray] = {}
+    for number, (suffix, tabulate) in enumerate(parts.items()):
+        def report(share: float, number: int = number) -> None:
+            if progress:
+                progress((number + share) / len(parts))
+        table |= _load(functools.partial(tabulate, system, report), table_key(system), suffix,
+                       folder)
+    return table
+
+
+def _load(compute: Callable[[], dict[str, np.ndarray]], key: str, suffix: str,
+          folder: Path | None) -> Mapping[str, np.ndarray]:
+    """Load a part of a table, whose file has a name with a suffix, or compute and store it."""
     if folder is None:
-        return _tabulate(model, progress)
-    key = table_key(model, codebook_id)
-    path = folder / f'{_PREFIX}{key}.npy'
+        return compute()
+    path = folder / f'{_PREFIX}{key}{suffix}.npy'
     table = _read(path, key)
     if table is not None:
         return table
-    table = _tabulate(model, progress)
+    table = compute()
     try:
         _write(path, key, table)
     except OSError as error:
-        warnings.warn(f'the table cannot be stored: {error}', RuntimeWarning, stacklevel=2)
+        warnings.warn(f'the table cannot be stored: {error}', RuntimeWarning, stacklevel=3)
     return _read(path, key) or table
 
 
-def _tabulate(model: MeasurementModel, progress: Callable[[float], None] | None
-              ) -> dict[str, np.ndarray]:
-    report = progress or (lambda _: None)
-    return (templates.tabulate(model, lambda share: report(share / 2))
-            | alternatives.tabulate_outside(model, lambda share: report((1 + share) / 2)))
-
-
-def table_key(model: MeasurementModel, codebook_id: str) -> str:
-    """Return a hash of everything that determines the table of a model, 32 hexadecimal digits."""
-    parts = (model.scenario.unplaced.id, codebook_id, __version__, _FORMAT,
-             *([model.surface.id] if model.surface else []))
+def table_key(system: System) -> str:
+    """Return a hash of everything that determines the table of a system, 32 hexadecimal digits."""
+    parts = (system.scenario.unplaced.id, system.codebook.id, __version__, _FORMAT,
+             *([system.surface.id] if system.surface else []))
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 
 def _write(path: Path, key: str, table: Mapping[str, np.ndarray]) -> None:
-    """Write a table atomically; delete the least recently used ones beyond `_MAX_TABLES`."""
+    """Write a table atomically; delete the least recently used ones beyond `_MAX_FILES`."""
     # The file has one record: key, digest and arrays.
     fields = [(name, array.dtype, array.shape) for name, array in table.items()]
     dtype = np.dtype([('key', 'S32'), ('digest', 'S32'), *fields], align=True)
@@ -86,7 +95,7 @@ def _write(path: Path, key: str, table: Mapping[str, np.ndarray]) -> None:
     # Another process may delete the same files.
     with contextlib.suppress(OSError):
         tables = sorted(path.parent.glob(f'{_PREFIX}*.npy'), key=lambda one: -one.stat().st_mtime)
-        for unused in tables[_MAX_TABLES:]:
+        for unused in tables[_MAX_FILES:]:
             unused.unlink(missing_ok=True)
 
 

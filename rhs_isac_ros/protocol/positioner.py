@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.codebook.library import EMPTY, Library
-from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import position_problem
 from rhs_isac_ros.model.measurement import KnownSurface
 from rhs_isac_ros.positioning import (
@@ -38,6 +37,7 @@ from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.service_log import MAX_NAMED
 from rhs_isac_ros.protocol.settings import TRACK, PendingSettings, PositionerSettings
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
+from rhs_isac_ros.system import System
 
 
 @dataclasses.dataclass
@@ -205,10 +205,10 @@ class _Job(NamedTuple):
 
 
 class _Built(NamedTuple):
-    """An estimator, the job that built it, and the measurement model for its bound."""
+    """An estimator, the job that built it, and the system for its bound."""
 
     job: _Job
-    model: MeasurementModel
+    system: System
     estimator: Estimator
 
 
@@ -302,23 +302,25 @@ class Positioner(Role):
             return
         for known in self._library.by_id:
             self._estimators.pop(known, None)
-        self._surface = estimator.surface if isinstance(estimator, SearchEstimator) else None
-        self._put(job, estimator)
+        self._surface = self._put(job, estimator).surface
         self._settings.in_use = job.settings
         self._residuals.clear()
         self.log(f'{estimator.name} is ready for codebook {codebook.id} after {elapsed_s:.1f} s')
 
-    def _put(self, job: _Job, estimator: Estimator) -> None:
-        model = MeasurementModel(self._scenario, job.codebook, self._surface).prepare()
-        self._estimators.put(job.codebook.id, _Built(job, model, estimator))
+    def _put(self, job: _Job, estimator: Estimator) -> System:
+        """Store an estimator, and return its system, which a plug-in need not have."""
+        system = getattr(estimator, 'system', None) or System(self._scenario, job.codebook)
+        system.prepare()
+        self._estimators.put(job.codebook.id, _Built(job, system, estimator))
+        return system
 
     def _has_estimator(self, codebook_id: str) -> bool:
         """Return whether there is an estimator; first create one for a codebook of the library."""
         settings, cell = self._settings.in_use, self._library.by_id.get(codebook_id)
         if cell and settings.prior == TRACK and codebook_id not in self._estimators:
             estimator = BayesEstimator(
-                self._scenario, cell, reject_outside=settings.reject_outside,
-                surface=self._surface, lazy=True)
+                System(self._scenario, cell, self._surface),
+                reject_outside=settings.reject_outside, lazy=True)
             self._put(_Job(cell, settings), estimator)
             self.act(events.PrepareEstimator(estimator))
         return codebook_id in self._estimators
@@ -360,7 +362,7 @@ class Positioner(Role):
             self.count(Outcome.WRONG_CODEBOOK)
 
     def _locate(self, received: m.ReceivedSignals, now_s: float) -> None:
-        job, model, estimator = self._estimators.take(received.codebook_id)
+        job, system, estimator = self._estimators.take(received.codebook_id)
         begin = self._stopwatch()
         try:
             estimate, posterior = self._estimate(received, job.settings, estimator, now_s)
@@ -377,7 +379,7 @@ class Positioner(Role):
             self.send(m.derive(
                 m.PositionEstimate, received, stamp_ns=received.stamp_ns,
                 position=placed.mean, covariance_m2=placed.covariance,
-                crlb_m2=float(crlb_of(model, estimate.mean[None])[0]), estimator=estimator.name,
+                crlb_m2=float(system.crlb(estimate.mean[None])[0]), estimator=estimator.name,
                 latency_s=latency_s, **probabilities, **self._proposal(received.user, estimate)))
             self._publish_track(received, placed)
             self._publish_posterior(received, posterior, probabilities)

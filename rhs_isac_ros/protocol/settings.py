@@ -6,12 +6,13 @@ description from this declaration.
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from rhs_isac_ros.model import Pose, Scenario
-from rhs_isac_ros.positioning import ESTIMATORS, BayesEstimator
+from rhs_isac_ros.positioning import ESTIMATORS, Kind
 from rhs_isac_ros.protocol.admission import parse_users
 from rhs_isac_ros.protocol.user_registry import MAX_USERS, POLICIES
 from rhs_isac_ros.support import plugins
@@ -85,16 +86,26 @@ def _track_speed_mps() -> Any:
         1.0, 'Typical speed of the users, for new tracks.', unit='m/s', low=0.01, high=1e3)
 
 
+def _declaring(does: Callable[[Kind], bool]) -> str:
+    """Return the names of the built-in estimators that declare something."""
+    return ' and '.join(name for name in ESTIMATORS if does(Kind(name)))
+
+
 @dataclasses.dataclass(frozen=True)
 class PositionerSettings:
     """Settings of the positioner; raises ValueError if the estimator cannot use the prior."""
 
     estimator: str = setting(
         'bayes', 'Position estimator.', choices=tuple(ESTIMATORS), plugins=plugins.ESTIMATORS)
-    model_file: str = setting('', 'Trained model; required by the estimator neural.')
+    model_file: str = setting(
+        '', 'Trained model; required by the estimator '
+        f'{_declaring(lambda kind: "model_file" in kind.readers)}.')
     reject_outside: bool = setting(
         True, 'Whether users who are more probably outside of the region than inside get no fix; '
-        'the scenario declares the prior probability. Only bayes and ml use it.')
+        'the scenario declares the prior probability. Only '
+        f'{_declaring(lambda kind: "reject_outside" in kind.options)} use it.')
+    estimator_options: str = setting(
+        '', 'Further options of the estimator, such as log2_points=12.')
     calibration_file: str = _calibration_file()
     prior: str = setting(
         'region', 'Prior of the position: uniform in the region of interest, or the track of the '
@@ -103,10 +114,10 @@ class PositionerSettings:
 
     def __post_init__(self) -> None:
         """Check that the estimator can use the prior."""
-        if self.prior == TRACK and self.estimator != BayesEstimator.name:
+        if self.prior == TRACK and not Kind(self.estimator).uses_tracks:
             raise ValueError(
                 f"prior: '{TRACK}', expected '{REGION}' with the estimator {self.estimator}; "
-                f'tracks need {BayesEstimator.name}')
+                f'tracks need {_declaring(lambda kind: kind.uses_tracks)}')
 
 
 @dataclasses.dataclass(frozen=True)

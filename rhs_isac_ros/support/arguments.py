@@ -3,6 +3,7 @@
 import argparse
 import math
 import os
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, NoReturn
 
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field
-from rhs_isac_ros.support.files import check_writable
+from rhs_isac_ros.support.files import check_writable, parse_yaml
 from rhs_isac_ros.support.pictures import picture_format
 
 
@@ -131,6 +132,20 @@ def output_folder(text: str) -> Path:
             f'{text!r}, expected a folder that is writable or can be created'
         ) from None
     return path
+
+
+def parse_options(text: str) -> dict[str, Any]:
+    """Parse options such as ``port=/dev/ttyUSB0 read_back=false``; the values are those of YAML.
+
+    Quotes enclose a value with spaces. Raises ValueError if the text has another form.
+    """
+    options: dict[str, Any] = {}
+    for word in shlex.split(text):
+        name, equals, value = word.partition('=')
+        if not (name.isidentifier() and equals) or name in options:
+            raise ValueError(f'{word!r}, expected NAME=VALUE, each name once')
+        options[name] = parse_yaml(value)
+    return options
 
 
 def check_distinct(

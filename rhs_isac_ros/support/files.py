@@ -1,6 +1,7 @@
 """Atomic writing of files, reading of YAML, and files of arrays with a description."""
 
 import contextlib
+import functools
 import json
 import os
 import re
@@ -10,13 +11,14 @@ import zipfile
 import zlib
 from collections.abc import Callable, Hashable, Mapping, Set
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 import yaml
 
 from rhs_isac_ros.support.fields import DECIMAL
 
+_T = TypeVar('_T')
 # Methods by which NumPy stores arrays. Others have errors whose types some Pythons lack.
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # Maximum sizes [bytes] of the arrays of an archive, and of a YAML file. The memory needed to read
@@ -65,6 +67,23 @@ for _tag, _pattern, _first in (
 
 class ArchiveError(ValueError):
     """A file cannot be read, or is not an archive of the expected kind."""
+
+
+def read_once(load: Callable[[Any, str | Path], _T]) -> Callable[[Any, str | Path], _T]:
+    """Decorate a class method that reads a file: until the file changes, it is read only once."""
+    @functools.lru_cache(maxsize=8)
+    def read(kind: Any, path: str, _: tuple[int, ...]) -> _T:
+        return load(kind, path)
+
+    @functools.wraps(load)
+    def read_unless_known(kind: Any, path: str | Path) -> _T:
+        # The content of a pipe can be read only once. `load` describes other errors.
+        if not os.path.isfile(path):
+            return load(kind, path)
+        status = os.stat(path)
+        return read(kind, str(path), (
+            status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size))
+    return read_unless_known
 
 
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:

@@ -81,10 +81,10 @@ def entry(
         parser, arguments = make_parser(), sys.argv[1:] if arguments is None else list(arguments)
         parser.epilog = 'ROS arguments select the namespace: --ros-args -r __ns:=/lab'
         options = parse(parser, arguments)
-        if problem := conflict(options):
-            parser.error(problem)
-        check_distinct(parser, options)
         try:
+            if problem := conflict(options):
+                parser.error(problem)
+            check_distinct(parser, options)
             return work(options, [parser.prog, *arguments])
         except (KeyboardInterrupt, ExternalShutdownException):
             return 0

@@ -30,7 +30,6 @@ from rhs_isac_ros.frontend import (
     Waveform,
     make_radio,
     make_surface,
-    parse_options,
 )
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.model import Scenario, ScenarioError
@@ -53,6 +52,7 @@ from rhs_isac_ros.support.arguments import (
     input_file,
     integer,
     output_file,
+    parse_options,
     picture_file,
     positive_int,
     seed,

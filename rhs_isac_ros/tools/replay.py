@@ -27,15 +27,13 @@ from rhs_isac_ros.monitoring.cycle_log import ANSWERS, Key, SignalLog
 from rhs_isac_ros.nodes.optimizer import OptimizerNode, ros_parameters
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
-    REGION_ESTIMATORS,
     BayesEstimator,
     Estimator,
+    Kind,
     Motion,
     Sighting,
     Site,
-    file_options,
     fuse,
-    make_estimator,
 )
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
@@ -59,6 +57,7 @@ from rhs_isac_ros.ros.recording import (
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
+from rhs_isac_ros.system import System
 from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.command import ToolError
 
@@ -426,9 +425,9 @@ class SiteRecording(Recording):
     def _estimator(self, folder: Path | None, name: str, codebook_id: str) -> BayesEstimator:
         if codebook_id not in self.logs[name].codebooks:
             raise RecordingError(f'{self._path}: codebook {codebook_id} of {name}: not recorded')
-        return BayesEstimator(
-            self._networks.surfaces[name], self.logs[name].codebooks[codebook_id], folder,
-            reject_outside=True)
+        system = System(
+            self._networks.surfaces[name], self.logs[name].codebooks[codebook_id])
+        return BayesEstimator(system, folder, reject_outside=True)
 
 
 def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
@@ -453,25 +452,30 @@ def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
     return 0
 
 
+def _kinds(options: argparse.Namespace) -> list[Kind]:
+    return [Kind(name) for name in options.estimator or [BayesEstimator.name]]
+
+
 def _conflict(options: argparse.Namespace) -> str:
-    estimators = options.estimator or [BayesEstimator.name]
+    kinds = _kinds(options)
     if options.publish and (
             options.estimator or options.model or options.calibration or options.track):
         return ('argument --publish: not allowed with --estimator, --model, --calibration or '
                 '--track, because running nodes estimate')
-    if options.calibration and 'neural' in estimators:
-        return ('argument --calibration: not allowed with --estimator neural, whose model '
-                'is trained for an ideal surface')
+    ideal = next((kind.name for kind in kinds if not kind.uses_surface), '')
+    if options.calibration and ideal:
+        return (f'argument --calibration: not allowed with --estimator {ideal}, which assumes the '
+                'surface of the scenario')
     if not options.publish and (options.topic, options.rate, options.timeout) != (
             None, _RATE, _TIMEOUT_S):
         return 'arguments --topic, --rate and --timeout: expected together with --publish'
     if options.config and options.site:
         return 'argument --config: not allowed with --site'
-    if options.track and BayesEstimator.name not in estimators:
+    if options.track and not any(kind.uses_tracks for kind in kinds):
         return 'argument --track: expected together with --estimator bayes'
     if options.track_speed is not None and not options.track:
         return 'argument --track-speed: expected together with --track'
-    if options.model and 'neural' not in estimators:
+    if options.model and not any('model_file' in kind.options for kind in kinds):
         return 'argument --model: expected together with --estimator neural'
     return ''
 
@@ -491,17 +495,14 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     names = sorted({estimate.estimator for estimate in log.estimates.values()})
     command.print_now(f'{len(recording.truths)} cycles')
     rows = [_row(f'live {", ".join(names)}', recording.errors_m(recording.live()))]
-    known = {}
-    if options.calibration:
-        known['surface'] = load_surface(str(options.calibration), scenario)
-    for name in options.estimator or [BayesEstimator.name]:
-        region = {'reject_outside': True} if name in REGION_ESTIMATORS else {}
-        estimators = {codebook_id: make_estimator(
-            name, scenario, codebook, **region, **known,
-            **file_options(name, default_folder(), options.model or ''))
-            for codebook_id, codebook in codebooks.items()}
-        rows.append(_row(name, recording.errors_m(locate(recording, estimators))))
-        if options.track and name == BayesEstimator.name:
+    surface = load_surface(str(options.calibration or ''), scenario)
+    for kind in _kinds(options):
+        accepted = kind.accepted(table_folder=default_folder(), model_file=options.model or '',
+                                 reject_outside=True)
+        estimators = {codebook_id: kind.create(System(scenario, codebook, surface), **accepted)
+                      for codebook_id, codebook in codebooks.items()}
+        rows.append(_row(kind.name, recording.errors_m(locate(recording, estimators))))
+        if options.track and kind.uses_tracks:
             rows.append(_row('track', recording.errors_m(locate(
                 recording, estimators, options.track_speed or Motion.speed_mps))))
     _print_table(rows)

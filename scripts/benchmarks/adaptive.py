@@ -39,6 +39,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Positioner
 from rhs_isac_ros.protocol.settings import TRACK, PositionerSettings
 from rhs_isac_ros.support.arguments import input_file, integer
+from rhs_isac_ros.system import System
 
 STD_M = 0.2
 WRONG_M = (1.0, 2.0, 3.0)
@@ -222,13 +223,13 @@ def jumps(world: World, n: int, rng: np.random.Generator) -> dict:
 
 def new_estimator(scenario: Scenario, codebook: Codebook) -> BayesEstimator:
     """Return an estimator that has not seen the codebook."""
-    return BayesEstimator(scenario, codebook, lazy=True)
+    return BayesEstimator(System(scenario, codebook), lazy=True)
 
 
 @functools.lru_cache(maxsize=512)
 def known_estimator(scenario: Scenario, codebook: Codebook) -> BayesEstimator:
     """Return an estimator with the table of the region, which it keeps."""
-    return BayesEstimator(scenario, codebook)
+    return BayesEstimator(System(scenario, codebook))
 
 
 @functools.lru_cache(maxsize=1024)

@@ -40,6 +40,7 @@ from rhs_isac_ros.positioning.agreement import WINDOW, PoseTest, pair_agreements
 from rhs_isac_ros.positioning.alignment import estimate_pose
 from rhs_isac_ros.positioning.fusion import Fuser
 from rhs_isac_ros.positioning.posterior import Posterior
+from rhs_isac_ros.system import System
 
 EXACT, DECLARED = (0.0, 0.0), (0.02, 0.2)
 POSES = {'front': Pose(uncertainty=EXACT),
@@ -132,7 +133,7 @@ def measure(scenario: Scenario, codebook: Codebook, options: argparse.Namespace)
 def make_world(scenario: Scenario, codebook: Codebook, positions: np.ndarray) -> World:
     """Return the model and the estimator of a surface."""
     return World(scenario, MeasurementModel(scenario, codebook),
-                 BayesEstimator(scenario, codebook), positions)
+                 BayesEstimator(System(scenario, codebook)), positions)
 
 
 def sightings_of(found: list[list[Posterior]], poses: list[Pose], position: int

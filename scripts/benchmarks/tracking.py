@@ -23,6 +23,7 @@ from rhs_isac_ros.model.mobility import RandomWalk
 from rhs_isac_ros.model.multipath import complex_normal, square_root, time_correlation
 from rhs_isac_ros.positioning import BayesEstimator, Estimate, Tracker
 from rhs_isac_ros.support.arguments import input_file, positive_int
+from rhs_isac_ros.system import System
 
 N_CYCLES, PERIOD_S, SPEED_MPS = 60, 0.1, 1.0
 # Time after which the cycles of a walk count [s].
@@ -43,7 +44,7 @@ def main() -> None:
     scenario, codebook = frame.scenario_of(options.config), Codebook.load(options.codebook)
     codebook.check(scenario)
     positions, signals = simulate_walks(scenario, codebook, options.walks, TIMES_S, options.seed)
-    estimator = BayesEstimator(scenario, codebook)
+    estimator = BayesEstimator(System(scenario, codebook))
     estimates, times_s = measure({
         'single cycles': lambda: lambda _, received: estimator.estimate(received),
         'track': lambda: Tracker(estimator).update}, signals)

@@ -25,6 +25,7 @@ from rhs_isac_ros.positioning.search import marginal_at
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.templates import tabulate
 from rhs_isac_ros.support.threads import one_blas_thread
+from rhs_isac_ros.system import System
 
 # Points evaluated at a time.
 _BLOCK = 4096
@@ -81,7 +82,7 @@ class _Posterior:
     """The likelihood of N shots, as a cheap profile of all points and exactly at a few."""
 
     def __init__(self, scenario: Scenario, codebook: Codebook, received: np.ndarray) -> None:
-        self._likelihood = likelihood = Likelihood(scenario, codebook)
+        self._likelihood = likelihood = Likelihood(System(scenario, codebook))
         self._dispersed = DispersedLikelihood.of(likelihood)
         self._signals, self._phases = likelihood.signals(received), BandPhases(likelihood)
         alignment = Alignment(likelihood, tabulate(likelihood.model)['spread'])

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.frontend import SURFACES, Surface, make_surface, parse_options
+from rhs_isac_ros.frontend import SURFACES, Surface, make_surface
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.arguments import parse_options
 
 PLUGIN = """
 class Twelve:

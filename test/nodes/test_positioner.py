@@ -11,9 +11,8 @@ from ros_messages import to_ros
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
-from rhs_isac_ros.nodes import positioner
 from rhs_isac_ros.nodes.positioner import PositionerNode
-from rhs_isac_ros.positioning import Network, make_estimator
+from rhs_isac_ros.positioning import Kind, Network, make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.ros.endpoints import EXCHANGE
@@ -69,18 +68,18 @@ def test_the_estimate_equals_that_of_the_library(bench, node, send, codebooks, t
         'bayes', node.scenario, codebooks[0], reject_outside=True).estimate(signals)
     np.testing.assert_array_equal(estimate.position, expected.mean)
     np.testing.assert_array_equal(estimate.covariance_m2, expected.covariance)
-    assert len(list((tmp_path / 'tables').iterdir())) == 1
+    assert len(list((tmp_path / 'tables').iterdir())) == 2
 
 
 def test_the_diagnostics_contain_the_progress_of_a_table(bench, node, codebooks, monkeypatch):
-    released, original = threading.Event(), positioner.positioning.make_estimator
+    released, original = threading.Event(), Kind.create
 
-    def half(name, scenario, codebook, *, progress, **options):
+    def half(kind, system, *, progress, **options):
         progress(0.5)
         released.wait(30)
-        return original(name, scenario, codebook, progress=progress, **options)
+        return original(kind, system, progress=progress, **options)
 
-    monkeypatch.setattr(positioner.positioning, 'make_estimator', half)
+    monkeypatch.setattr(Kind, 'create', half)
     node.dispatch(CodebookOffered(codebooks[0]))
     bench.until(lambda: node.report().values.get('table.progress') == '50 %', 'the progress')
     released.set()
@@ -89,14 +88,14 @@ def test_the_diagnostics_contain_the_progress_of_a_table(bench, node, codebooks,
 
 def test_signals_are_answered_while_another_estimator_is_built(
         bench, node, send, codebooks, monkeypatch):
-    released, begun = threading.Event(), threading.Event()
+    released, begun, original = threading.Event(), threading.Event(), Kind.create
 
-    def slowly(name, scenario, codebook, **options):
-        if codebook.id == codebooks[1].id:
+    def slowly(kind, system, **options):
+        if system.codebook.id == codebooks[1].id:
             begun.set()
             released.wait()
-        return make_estimator(name, scenario, codebook, **options)
-    monkeypatch.setattr(positioner.positioning, 'make_estimator', slowly)
+        return original(kind, system, **options)
+    monkeypatch.setattr(Kind, 'create', slowly)
     estimates = bench.collect(bench.add(Node, 'receiver'), m.PositionEstimate)
     node.dispatch(CodebookOffered(codebooks[0]))
     send(6)

@@ -84,7 +84,7 @@ def test_the_evidence_is_the_average_over_an_unknown_gain(random_beams):
     received = MeasurementModel(scenario, codebook).sample(
         np.array([[8.0, 1.0, 0.5]]), np.random.default_rng(6))
     declared = dataclasses.replace(scenario, user_gain_std_db=0.5)
-    likelihood = Likelihood(declared, codebook)
+    likelihood = Likelihood(System(declared, codebook))
     table = Outside(declared, tabulate_outside(likelihood.model))
     std = 0.5 * np.log(10) / 20
     gains = np.linspace(-6, 6, 601) * std

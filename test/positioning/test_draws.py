@@ -13,6 +13,7 @@ from rhs_isac_ros.positioning.draws import SAMPLING, DrawnPosterior
 from rhs_isac_ros.positioning.grid import TemplateTable
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.templates import tabulate
+from rhs_isac_ros.system import System
 
 # The noise hides most users; many positions explain the signals.
 WEAK = Scenario(elements_per_side=6, multipath_to_los_db=-30.0, noise_psd_dbm_hz=-95.0,
@@ -27,7 +28,7 @@ def codebook(random_beams):
 
 def found_and_exact(scenario, codebook, n=N, sampling=SAMPLING):
     """Draws for n shots, and mean, covariance and log evidence from 2^15 points."""
-    likelihood = Likelihood(scenario, codebook)
+    likelihood = Likelihood(System(scenario, codebook))
     table = TemplateTable(scenario, tabulate(likelihood.model))
     drawn, rng = DrawnPosterior(scenario, table, sampling), np.random.default_rng(1)
     received = simulate_received(scenario, codebook, scenario.sample_positions(n, rng), rng)
@@ -78,7 +79,7 @@ def test_later_rounds_follow_earlier_ones_without_bias(codebook):
 
 def table_and_query(codebook, sampling=SAMPLING, **changes):
     scenario = dataclasses.replace(WEAK, **changes)
-    likelihood = Likelihood(scenario, codebook)
+    likelihood = Likelihood(System(scenario, codebook))
     table = TemplateTable(scenario, tabulate(likelihood.model))
     return DrawnPosterior(scenario, table, sampling), table, table.query(
         likelihood.model.whiten(likelihood.model.mean(np.array([[6.0, 1.0, 0.2]]))),

@@ -20,6 +20,7 @@ from rhs_isac_ros.positioning.failures import (
     first_places,
 )
 from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
+from rhs_isac_ros.system import System
 
 SCENARIO = Scenario(
     center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
@@ -39,7 +40,7 @@ def codebook(random_beams):
 
 @pytest.fixture(scope='module')
 def model(codebook):
-    return FailureModel(Likelihood(SCENARIO, codebook))
+    return FailureModel(Likelihood(System(SCENARIO, codebook)))
 
 
 def with_failures(elements, levels) -> ElementErrors:
@@ -121,8 +122,8 @@ def test_the_likelihood_has_the_moments_of_surfaces_with_a_given_set(codebook, m
 def test_element_errors_have_their_covariance_at_the_position(codebook):
     """With no failure, the likelihood is that of element errors alone."""
     declared = dataclasses.replace(SCENARIO, element_error_rms=0.1)
-    alone = Likelihood(dataclasses.replace(declared, failed_element_share=0.0), codebook)
-    both = Likelihood(declared, codebook)
+    alone = Likelihood(System(dataclasses.replace(declared, failed_element_share=0.0), codebook))
+    both = Likelihood(System(declared, codebook))
     points = to_polar(np.array([[3.1, 0.0, 0.2], POSITION, [4.9, -0.8, 0.4]]))
     received = MeasurementModel(declared, codebook).sample(
         to_positions(points), np.random.default_rng(3))
@@ -142,7 +143,7 @@ def weighing(request, codebook):
     scenario = dataclasses.replace(SCENARIO, **request.param)
     received = MeasurementModel(scenario, codebook).sample(
         POSITION[None], np.random.default_rng(3))
-    model = FailureModel(Likelihood(scenario, codebook))
+    model = FailureModel(Likelihood(System(scenario, codebook)))
     (site,) = model.places(
         POINT[None], np.full((1, len(request.param)), 0.1), model.likelihood.signals(received))
     return model, site
@@ -204,7 +205,7 @@ def test_sets_are_searched_if_failures_are_rare(share, enumerated):
 def ambiguous(random_beams):
     """The model of two bands."""
     codebook = random_beams(AMBIGUOUS, np.random.default_rng(1))
-    return FailureModel(Likelihood(AMBIGUOUS, codebook))
+    return FailureModel(Likelihood(System(AMBIGUOUS, codebook)))
 
 
 def sample_with(model, failed, seed):
@@ -235,7 +236,7 @@ def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):
     scenario = dataclasses.replace(
         AMBIGUOUS, elements_per_side=2, failed_element_share=0.1)
     codebook = random_beams(scenario, np.random.default_rng(1))
-    model = FailureModel(Likelihood(scenario, codebook))
+    model = FailureModel(Likelihood(System(scenario, codebook)))
     strong = 100 * MeasurementModel(scenario, codebook).mean(POSITION[None])
     search, sites = search_at_the_truth(model, strong)
     search.grow(sites)

@@ -14,8 +14,9 @@ import pytest
 
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook, directional_codebook, random_codebook
-from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import BayesEstimator
+from rhs_isac_ros.system import System
 
 CONFIG = Path(__file__).parents[2] / 'config'
 FILE = Path(__file__).parents[1] / 'data' / 'frozen_estimates.npz'
@@ -40,23 +41,23 @@ CASES = {
 
 
 def case(name):
-    """Return scenario, codebook, the known surface, and the number of shots."""
+    """Return the system and the number of shots."""
     file, codebook, changes, n = CASES[name]
     whole = Scenario.from_yaml(CONFIG / f'{file}.yaml')
     scenario = dataclasses.replace(whole, **changes)
     codebook = (Codebook.load(CONFIG / f'{codebook}.yaml') if isinstance(codebook, str)
                 else codebook(scenario, np.random.default_rng(0)))
     surface = load_surface(str(CONFIG / 'lab_states.npz'), whole) if name == 'lab' else None
-    return scenario, codebook, surface, n
+    return System(scenario, codebook, surface), n
 
 
 @pytest.mark.parametrize('name', CASES)
 def test_estimates_do_not_change(name):
-    scenario, codebook, surface, n = case(name)
+    system, n = case(name)
     with np.load(FILE) as frozen:
         received, mean, covariance = (
             frozen[f'{name} {key}'] for key in ('received', 'mean', 'covariance'))
-    estimate = BayesEstimator(scenario, codebook, surface=surface).estimate(received)
+    estimate = BayesEstimator(system).estimate(received)
     assert len(mean) == n
     assert estimate.fix.all()
     root = np.linalg.cholesky(covariance)
@@ -70,12 +71,12 @@ def freeze():
     """Write signals at random positions, and the estimates for those that have a position."""
     arrays = {}
     for name in CASES:
-        scenario, codebook, surface, n = case(name)
+        system, n = case(name)
         rng = np.random.default_rng(5)
-        positions = scenario.sample_positions(2 * n, rng)
-        received = MeasurementModel(scenario, codebook, surface).sample(positions, rng)
+        positions = system.scenario.sample_positions(2 * n, rng)
+        received = system.sample(positions, rng)
         received = received.astype(np.complex64)
-        estimator = BayesEstimator(scenario, codebook, surface=surface)
+        estimator = BayesEstimator(system)
         received = received[estimator.estimate(received).fix][:n]
         estimate = estimator.estimate(received)
         arrays |= {f'{name} received': received, f'{name} mean': estimate.mean,

@@ -11,6 +11,7 @@ from rhs_isac_ros.positioning.lattice import lay_grid, subband_wavenumbers
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.segments import Segments, select
 from rhs_isac_ros.positioning.templates import tabulate
+from rhs_isac_ros.system import System
 
 
 def test_arrays_of_the_table_match_their_definitions(random_beams):
@@ -63,7 +64,7 @@ def test_arrays_of_the_table_match_their_definitions(random_beams):
 def test_no_template_promises_more_than_the_maximum(shipped, changes):
     """Without noise, the true position has the largest log-likelihood, half of the energy."""
     scenario, rng = Scenario(**changes), np.random.default_rng(5)
-    likelihood = Likelihood(scenario, shipped)
+    likelihood = Likelihood(System(scenario, shipped))
     table = TemplateTable(scenario, tabulate(likelihood.model))
     positions = scenario.sample_positions(30, rng)
     whitened = likelihood.signals(likelihood.model.mean(positions)).whitened
@@ -81,7 +82,7 @@ def test_the_value_of_a_peak_is_that_of_its_range_and_of_the_most_likely_gain(
         shipped, gain_std_db):
     scenario, rng = Scenario(multipath_to_los_db=-20.0, user_gain_std_db=gain_std_db), (
         np.random.default_rng(5))
-    likelihood = Likelihood(scenario, shipped)
+    likelihood = Likelihood(System(scenario, shipped))
     table = TemplateTable(scenario, tabulate(likelihood.model))
     signals = likelihood.signals(
         likelihood.model.sample(scenario.sample_positions(10, rng), rng))
@@ -109,7 +110,7 @@ def scenario() -> Scenario:
 
 @pytest.fixture(scope='module')
 def likelihood(scenario, random_beams) -> Likelihood:
-    return Likelihood(scenario, random_beams(scenario, np.random.default_rng(0)))
+    return Likelihood(System(scenario, random_beams(scenario, np.random.default_rng(0))))
 
 
 @pytest.fixture(scope='module')
@@ -164,7 +165,7 @@ def test_starts_are_sorted_separate_and_within_the_margin(scenario, likelihood, 
 ], ids=['aperture', 'bandwidth', 'near field', 'large region'])
 def test_the_search_finds_the_true_mode_at_every_scale(changes, random_beams):
     scenario = Scenario(n_frames=4, multipath_to_los_db=-10.0, **changes)
-    likelihood = Likelihood(scenario, random_beams(scenario, np.random.default_rng(0)))
+    likelihood = Likelihood(System(scenario, random_beams(scenario, np.random.default_rng(0))))
     table = TemplateTable(scenario, tabulate(likelihood.model))
     positions = scenario.sample_positions(20, np.random.default_rng(1))
     radii = likelihood.resolution.separation(is_coarse=False)

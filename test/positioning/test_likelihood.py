@@ -14,6 +14,7 @@ from rhs_isac_ros.positioning.failures import FailureModel
 from rhs_isac_ros.positioning.likelihood import Alignment, DispersedLikelihood, Likelihood
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.templates import tabulate
+from rhs_isac_ros.system import System
 
 SCENARIO = Scenario(
     center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
@@ -24,7 +25,7 @@ ALL = {'user_gain_std_db': 1.0, 'carrier_offset_std_hz': 500.0, 'phase_std_rad':
 
 @pytest.fixture(scope='module')
 def likelihood(case) -> Likelihood:
-    return Likelihood(case.scenario, case.codebook)
+    return Likelihood(System(case.scenario, case.codebook))
 
 
 @pytest.fixture(scope='module')
@@ -68,7 +69,7 @@ def test_the_value_is_the_gaussian_log_likelihood(case, likelihood):
 @pytest.mark.parametrize('changes', [{}, ALL], ids=['position', 'all parameters'])
 def test_the_gradient_is_that_of_the_log_likelihood(codebook, changes):
     scenario, rng = declaring(**changes), np.random.default_rng(3)
-    likelihood = Likelihood(scenario, codebook)
+    likelihood = Likelihood(System(scenario, codebook))
     position = np.array([[4.2, 0.3, -0.1]])
     signals = likelihood.signals(MeasurementModel(scenario, codebook).sample(position, rng))
     values = 0.3 * rng.normal(size=(1, len(likelihood.nuisance)))
@@ -94,7 +95,7 @@ def test_the_information_is_the_covariance_of_the_gradient(codebook, changes):
     The information about parameters that move the multipath varies from phase to phase.
     """
     rng = np.random.default_rng(4)
-    likelihood = Likelihood(declaring(**changes), codebook)
+    likelihood = Likelihood(System(declaring(**changes), codebook))
     point = to_polar(np.array([[4.2, 0.3, -0.1]]))
     received = MeasurementModel(SCENARIO, codebook).sample(
         np.tile(to_positions(point), (2000, 1)), rng)
@@ -110,7 +111,7 @@ def test_the_information_is_the_covariance_of_the_gradient(codebook, changes):
 
 def test_the_signals_alone_reveal_the_offsets_of_carrier_and_timing(codebook):
     scenario = declaring(carrier_offset_std_hz=2e3, timing_std_s=1e-7)
-    likelihood = Likelihood(scenario, codebook)
+    likelihood = Likelihood(System(scenario, codebook))
     alignment = Alignment(likelihood, tabulate(likelihood.model)['spread'])
     rng = np.random.default_rng(5)
     values = rng.normal(size=(20, 2))
@@ -123,7 +124,7 @@ def test_the_signals_alone_reveal_the_offsets_of_carrier_and_timing(codebook):
 
 def test_errors_of_elements_have_the_covariance_at_the_position(codebook):
     scenario = declaring(element_error_rms=0.05)
-    likelihood = Likelihood(scenario, codebook)
+    likelihood = Likelihood(System(scenario, codebook))
     exact = MeasurementModel(scenario, codebook)
     positions = np.array([[3.2, 0.1, 0.0], [4.8, 0.1, 0.0]])
     received = exact.sample(positions[:1], np.random.default_rng(6))
@@ -142,7 +143,8 @@ def test_errors_of_elements_have_the_covariance_at_the_position(codebook):
 
 def test_the_likelihood_is_the_average_over_the_number_of_failures(codebook):
     scenario = declaring(element_error_rms=0.02, failed_element_share=0.02)
-    likelihood, exact = Likelihood(scenario, codebook), MeasurementModel(scenario, codebook)
+    exact = System(scenario, codebook)
+    likelihood = Likelihood(exact)
     user = np.array([[4.2, 0.3, -0.1]])
     received = exact.sample(user, np.random.default_rng(7))
     positions = user + [[0.001, 0.002, 0], [0, 0, 0.003]]
@@ -175,13 +177,13 @@ def test_the_likelihood_is_the_average_over_the_number_of_failures(codebook):
 def test_nuisance_parameters_and_element_errors_combine(codebook, changes, conditional):
     """The value at parameters is that of the signals divided by their factors."""
     scenario, rng = declaring(**ALL, **changes), np.random.default_rng(3)
-    likelihood = Likelihood(scenario, codebook)
+    likelihood = Likelihood(System(scenario, codebook))
     position = np.array([[4.2, 0.3, -0.1]])
     received = MeasurementModel(scenario, codebook).sample(position, rng)
     values = 0.3 * rng.normal(size=(1, len(likelihood.nuisance)))
     found = conditional(likelihood).local(
         to_polar(position), values, likelihood.signals(received))
-    alone = Likelihood(declaring(**changes), codebook)
+    alone = Likelihood(System(declaring(**changes), codebook))
     divided = received / np.exp(
         np.tensordot(values, nuisance_of(scenario).scaled_patterns, axes=1))
     expected = conditional(alone).local(
@@ -195,7 +197,7 @@ def test_nuisance_parameters_and_element_errors_combine(codebook, changes, condi
 
 
 def test_the_profile_over_the_gain_is_the_maximum_with_its_prior(codebook):
-    prior = Likelihood(declaring(user_gain_std_db=3.0), codebook).nuisance
+    prior = Likelihood(System(declaring(user_gain_std_db=3.0), codebook)).nuisance
     std, energy, n_rows = 3 * np.log(10) / 20, 40.0, 30
     amplitude = np.linspace(5.0, 80.0, 200)
     gain = np.linspace(-4 * std, 4 * std, 20_001)

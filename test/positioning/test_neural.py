@@ -47,7 +47,7 @@ def training(scenario, codebook):
 
 def mse(network, scenario, codebook, first, n):
     positions, received = System(scenario, codebook).pairs(n, 1, first)
-    estimate = NeuralEstimator(scenario, codebook, network).estimate(received)
+    estimate = NeuralEstimator(System(scenario, codebook), network).estimate(received)
     return np.mean(np.sum((estimate.mean - positions)[estimate.fix]**2, axis=1))
 
 
@@ -92,7 +92,7 @@ def test_a_network_of_magnitudes_locates_signals_of_any_phase(scenario, codebook
     network = train(scenario, codebook, 600, 4, 8, 2, inputs='magnitudes')
     assert len(network.w_in) == scenario.n_bands * scenario.n_subbands * scenario.n_frames
     received = System(scenario, codebook).pairs(5, 9)[1]
-    estimator = NeuralEstimator(scenario, codebook, network)
+    estimator = NeuralEstimator(System(scenario, codebook), network)
     np.testing.assert_allclose(
         estimator.estimate(-received).mean, estimator.estimate(received).mean, rtol=1e-12)
 
@@ -128,7 +128,7 @@ def test_batches_grow_and_training_stops_when_the_validation_error_does_not_fall
     (0.0, 'expected at least'), (1e-3, 'expected at least'), (100.0, 'expected at most')])
 def test_signals_too_weak_or_too_strong_give_no_fix(scenario, codebook, training, factor, message):
     received = factor * System(scenario, codebook).pairs(5, 9)[1]
-    estimate = NeuralEstimator(scenario, codebook, training[0]).estimate(received)
+    estimate = NeuralEstimator(System(scenario, codebook), training[0]).estimate(received)
     assert not estimate.fix.any()
     assert np.isnan(estimate.mean).all()
     assert np.isnan(estimate.covariance).all()
@@ -153,7 +153,7 @@ def test_a_model_of_another_purpose_is_rejected(
                     *(getattr(network, f.name) for f in dataclasses.fields(network)[3:]))
     with pytest.raises(ModelError, match='31 inputs, expected 32'):
         make_estimator('neural', scenario, codebook, model_file=short)
-    with pytest.raises(ModelError, match='model_file: none, expected'):
+    with pytest.raises(ModelError, match="model_file: '', expected"):
         make_estimator('neural', scenario, codebook)
 
 

@@ -5,13 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rhs_isac_ros.positioning import Estimate, file_options, make_estimator
+from rhs_isac_ros.model import ElementErrors
+from rhs_isac_ros.positioning import Estimate, Kind, make_estimator
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.plugins import PluginError
+from rhs_isac_ros.system import System
 
 CODE = '''
 import numpy as np
-from rhs_isac_ros.positioning import Estimate
+from rhs_isac_ros.positioning import BayesEstimator, Estimate
 
 class Centre:
     name = 'centre'
@@ -21,6 +23,14 @@ class Centre:
 
     def estimate(self, received):
         return self._estimate
+
+class AnyOptions(Centre):
+    def __init__(self, scenario, codebook, **options):
+        self.options = options
+
+class Mine(BayesEstimator):
+    def __init__(self, system, *, weight=1.0, **options):
+        super().__init__(system, **options)
 
 def no_estimator(scenario, codebook):
     return None
@@ -34,8 +44,9 @@ bayes = Centre
 
 @pytest.fixture(autouse=True)
 def installed(install):
-    names = {'centre': 'Centre', 'no_estimator': 'no_estimator', 'nameless': 'Nameless',
-             'bayes': 'Centre', 'absent': 'Absent'}
+    names = {'any_options': 'AnyOptions', 'mine': 'Mine', 'centre': 'Centre',
+             'no_estimator': 'no_estimator', 'nameless': 'Nameless', 'bayes': 'Centre',
+             'absent': 'Absent'}
     install('guesses', CODE, {plugins.ESTIMATORS: names})
 
 
@@ -57,8 +68,8 @@ def test_built_in_estimators_cannot_be_replaced(small):
 def test_the_error_for_an_unknown_name_lists_all_estimators(small):
     # Further plug-ins may be installed.
     with pytest.raises(ValueError, match=(
-            r"estimator: 'best', expected one of \['absent', 'bayes', 'centre', (.*, )?'ml', "
-            r"(.*, )?'nameless', (.*, )?'neural', (.*, )?'no_estimator'")):
+            r"estimator: 'best', expected one of \['absent', 'any_options', 'bayes', 'centre', "
+            r"(.*, )?'ml', (.*, )?'nameless', (.*, )?'neural', (.*, )?'no_estimator'")):
         make_estimator('best', small.scenario, small.codebook)
 
 
@@ -74,10 +85,29 @@ def test_the_error_for_an_invalid_plug_in_names_its_entry_point(small, name, opt
         make_estimator(name, small.scenario, small.codebook, **options)
 
 
+OFFERED = {'table_folder': Path('t'), 'reject_outside': True, 'scale': 2.0}
+
+
 @pytest.mark.parametrize(('name', 'model', 'options'), [
-    ('bayes', '', {'table_folder': Path('t')}), ('bayes', 'm', {'table_folder': Path('t')}),
-    ('ml', '', {'table_folder': Path('t')}), ('neural', '', {'model_file': ''}),
-    ('neural', 'm', {'model_file': 'm'}), ('centre', '', {}),
-    ('centre', 'm', {'model_file': 'm'})])
-def test_file_options_depend_on_the_estimator(name, model, options):
-    assert file_options(name, Path('t'), model) == options
+    ('bayes', 'm', {'table_folder': Path('t'), 'reject_outside': True}),
+    ('ml', '', {'table_folder': Path('t'), 'reject_outside': True}),
+    ('neural', 'm', {'model_file': 'm'}), ('centre', 'm', {'scale': 2.0}),
+    ('any_options', '', {}), ('any_options', 'm', {'model_file': 'm'})])
+def test_an_estimator_is_offered_the_options_that_it_declares(name, model, options):
+    assert Kind(name).accepted(model_file=model, **OFFERED) == options
+
+
+def test_a_plug_in_may_declare_what_a_class_of_the_package_does(small):
+    declared = {name: Kind(name) for name in ('bayes', 'neural', 'centre', 'any_options', 'mine')}
+    assert [name for name, kind in declared.items() if kind.uses_tracks] == ['bayes', 'mine']
+    assert [name for name, kind in declared.items() if not kind.uses_surface] == [
+        'neural', 'centre']
+    assert [name for name, kind in declared.items() if kind.readers] == ['neural']
+    system = System(small.scenario, small.codebook)
+    assert declared['mine'].create(system, reject_outside=True, weight=3.0).system is system
+
+
+def test_a_plug_in_with_a_scenario_gets_a_known_surface_as_an_option(small):
+    surface = ElementErrors(np.ones(16), np.full(16, np.nan))
+    assert make_estimator('any_options', small.scenario, small.codebook, surface=surface
+                          ).options == {'surface': surface}

@@ -12,6 +12,7 @@ from rhs_isac_ros.positioning import estimators, make_estimator
 from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
 from rhs_isac_ros.positioning.posterior import _SAMPLING, BandPhases, _log_density, _log_share
 from rhs_isac_ros.positioning.search import Modes
+from rhs_isac_ros.system import System
 
 SCENARIO = Scenario(
     center_frequencies_hz=(2.5e9, 2.54e9, 2.6e9), elements_per_side=6, angular_spread_deg=2.0,
@@ -96,7 +97,7 @@ def test_the_factors_average_the_series_over_a_wavelength_and_the_shared_phase(
         random_beams, frequencies_hz, tolerance, phase_std_rad):
     scenario = dataclasses.replace(
         SCENARIO, center_frequencies_hz=frequencies_hz, phase_std_rad=phase_std_rad)
-    likelihood = Likelihood(scenario, random_beams(scenario, np.random.default_rng(1)))
+    likelihood = Likelihood(System(scenario, random_beams(scenario, np.random.default_rng(1))))
     rng = np.random.default_rng(4)
     outputs = rng.uniform(5, 20, (3, 25)) * np.exp(1j * rng.uniform(-np.pi, np.pi, (3, 25)))
     phases = BandPhases(likelihood)
@@ -130,7 +131,7 @@ def test_a_wrapped_density_is_the_sum_over_all_turns(std_rad):
     (0.0, False), (0.3, False), (0.8, True), (UNIFORM_RAD, False)])
 def test_only_broad_phases_are_left_to_the_samples(codebook, std_rad, is_informative):
     scenario = dataclasses.replace(SCENARIO, band_phase_std_rad=std_rad)
-    assert BandPhases(Likelihood(scenario, codebook)).is_informative is is_informative
+    assert BandPhases(Likelihood(System(scenario, codebook))).is_informative is is_informative
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from rhs_isac_ros.positioning import BayesEstimator, Mixture
 from rhs_isac_ros.positioning.lattice import Resolution, lay_grid
 from rhs_isac_ros.positioning.prior import bend, cells_of, flatten, multiply
 from rhs_isac_ros.positioning.search import Modes
+from rhs_isac_ros.system import System
 
 PLACE = np.array([8.5, -1.5, 0.2])
 STD_M = 0.15
@@ -31,7 +32,7 @@ def model(shipped):
 @pytest.fixture
 def lazy(shipped):
     """An estimator that has not seen the codebook."""
-    return BayesEstimator(Scenario(), shipped, lazy=True)
+    return BayesEstimator(System(Scenario(), shipped), lazy=True)
 
 
 def has_searched_the_region(estimator):
@@ -165,7 +166,7 @@ def test_the_region_is_searched_if_the_signals_disagree_with_the_prior(
 
 def test_positions_are_in_the_frame_of_the_surface_and_mixtures_in_that_of_the_site(
         shipped, table1_estimator, model):
-    placed = BayesEstimator(dataclasses.replace(Scenario(), pose=POSE), shipped)
+    placed = BayesEstimator(System(dataclasses.replace(Scenario(), pose=POSE), shipped))
     signals = model.sample(PLACE[None], np.random.default_rng(9))[0]
     expected = table1_estimator.posterior(signals, around(PLACE))
     found = placed.posterior(signals, around(POSE.to_site(PLACE)))

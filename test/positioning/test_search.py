@@ -25,7 +25,7 @@ SCENARIO = Scenario(
 def setting(shipped):
     """Likelihood, grid, signals, positions and modes of some phases of Table I."""
     scenario = Scenario()
-    likelihood = Likelihood(scenario, shipped)
+    likelihood = Likelihood(System(scenario, shipped))
     grid = TemplateTable(scenario, tabulate(likelihood.model))
     positions, received = System(scenario, shipped).pairs(30, 3)
     signals = likelihood.signals(received)
@@ -73,7 +73,7 @@ def test_no_ascent_ends_below_its_start(random_beams):
     scenario = dataclasses.replace(
         SCENARIO, center_frequencies_hz=(2.5e9,), n_subbands=1, n_frames=2)
     rng = np.random.default_rng(4)
-    likelihood = Likelihood(scenario, random_beams(scenario, rng))
+    likelihood = Likelihood(System(scenario, random_beams(scenario, rng)))
     signals = likelihood.signals(
         likelihood.model.sample(scenario.sample_positions(1, rng), rng))
     starts = scenario.sample_positions(200, rng)
@@ -91,8 +91,8 @@ def test_modes_that_mirror_each_other_have_the_same_order_on_all_machines():
     places = element_positions(SCENARIO)
     mirrored = [np.argmin(np.linalg.norm(places - one, axis=1)) for one in places * [1, -1, 1]]
     codebook = random_codebook(SCENARIO, np.random.default_rng(2))
-    likelihood = Likelihood(SCENARIO, Codebook(
-        (codebook.analog + codebook.analog[:, :, mirrored]) / 2, codebook.digital))
+    likelihood = Likelihood(System(SCENARIO, Codebook(
+        (codebook.analog + codebook.analog[:, :, mirrored]) / 2, codebook.digital)))
     positions = SCENARIO.sample_positions(20, np.random.default_rng(0))
     signals = likelihood.signals(
         likelihood.model.sample(positions, np.random.default_rng(1)))
@@ -122,7 +122,7 @@ def test_the_curvature_is_the_information_in_polar_coordinates(setting):
 
 
 def test_steps_continue_until_they_gain_nothing(codebook):
-    likelihood = Likelihood(SCENARIO, codebook)
+    likelihood = Likelihood(System(SCENARIO, codebook))
     points = to_polar(SCENARIO.sample_positions(50, np.random.default_rng(2)))
     signals = likelihood.signals(likelihood.model.mean(to_positions(points)))
     # A tenth of a wavelength.
@@ -135,7 +135,7 @@ def test_steps_continue_until_they_gain_nothing(codebook):
 def test_the_likelihood_of_a_mode_is_the_average_over_the_parameter(codebook, changes):
     """The reference integrates numerically at the position of the mode."""
     scenario, rng = dataclasses.replace(SCENARIO, **changes), np.random.default_rng(5)
-    likelihood = Likelihood(scenario, codebook)
+    likelihood = Likelihood(System(scenario, codebook))
     signals = likelihood.signals(
         MeasurementModel(scenario, codebook).sample(np.array([[4.2, 0.3, -0.1]]), rng))
     modes = find_modes(likelihood, TemplateTable(scenario, tabulate(likelihood.model)), signals,
@@ -161,7 +161,7 @@ def test_the_weights_of_modes_are_likelihoods_and_no_predictions(codebook):
     """Far from a mode, the prediction of a step may be arbitrarily wrong."""
     scenario = dataclasses.replace(SCENARIO, carrier_offset_std_hz=3e3, user_gain_std_db=2.0)
     rng = np.random.default_rng(8)
-    likelihood = Likelihood(scenario, codebook)
+    likelihood = Likelihood(System(scenario, codebook))
     grid = TemplateTable(scenario, tabulate(likelihood.model))
     alignment = Alignment(likelihood, grid.spread)
     received = MeasurementModel(scenario, codebook).sample(scenario.sample_positions(8, rng), rng)
@@ -176,7 +176,7 @@ def test_the_weights_of_modes_are_likelihoods_and_no_predictions(codebook):
 
 def test_a_step_predicts_the_likelihood_after_it(codebook):
     scenario = dataclasses.replace(SCENARIO, element_error_rms=0.02, failed_element_share=0.02)
-    likelihood, user = Likelihood(scenario, codebook), np.array([[4.2, 0.3, -0.1]])
+    likelihood, user = Likelihood(System(scenario, codebook)), np.array([[4.2, 0.3, -0.1]])
     signals = likelihood.signals(
         MeasurementModel(scenario, codebook).sample(user, np.random.default_rng(7)))
     errors = DispersedLikelihood(likelihood)

@@ -22,6 +22,7 @@ from rhs_isac_ros.protocol.events import (
 from rhs_isac_ros.protocol.fusion import sighting_of
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PRIORS, PositionerSettings
+from rhs_isac_ros.system import System
 
 NOTHING = np.full(3, np.nan), np.full((3, 3), np.nan)
 
@@ -96,7 +97,7 @@ def located(beside, codebooks):
         role = Positioner(
             scenario, lambda: 0.0, PositionerSettings(**settings), lambda: observed)
         feed(role, [CodebookOffered(codebook),
-                    EstimatorBuilt(codebook, BayesEstimator(scenario, codebook))])
+                    EstimatorBuilt(codebook, BayesEstimator(System(scenario, codebook)))])
         message = m.ReceivedSignals(
             cycle_id=3, user=2, user_instance=7, codebook_id=codebook.id, stamp_ns=5,
             signals=received[0].reshape(codebook.shape[:3]))

@@ -35,9 +35,9 @@ def test_a_malformed_list_of_users_is_an_error():
 
 def test_tracks_need_the_estimator_bayes():
     assert PositionerSettings(prior='track').estimator == 'bayes'
-    expected = "prior: 'track', expected 'region' with the estimator mine; tracks need bayes"
+    expected = "prior: 'track', expected 'region' with the estimator ml; tracks need bayes"
     with pytest.raises(ValueError, match=expected):
-        PositionerSettings('mine', prior='track')
+        PositionerSettings('ml', prior='track')
 
 
 def test_the_latest_settings_are_pending_until_they_are_applied():
@@ -50,8 +50,8 @@ def test_the_latest_settings_are_pending_until_they_are_applied():
     assert pending.describe() == {
         'parameter.estimator': 'bayes', 'parameter.model_file': '',
         'parameter.reject_outside': 'true', 'parameter.calibration_file': '',
-        'parameter.prior': 'region', 'parameter.track_speed_mps': '1.0',
-        'pending.estimator': 'ml'}
+        'parameter.estimator_options': '', 'parameter.prior': 'region',
+        'parameter.track_speed_mps': '1.0', 'pending.estimator': 'ml'}
     assert pending.apply() == "settings applied: estimator 'ml'"
     assert pending.in_use == new
     assert 'pending.estimator' not in pending.describe()

@@ -14,6 +14,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import PauseRequested, ResumeRequested
 from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.protocol.settings import PositionerSettings
+from rhs_isac_ros.system import System
 
 PLACE = np.array([8.0, -2.0, 0.5])
 TRACK = PositionerSettings(prior='track')
@@ -41,7 +42,7 @@ def library(scenario, region):
 
 @pytest.fixture(scope='module')
 def estimator(scenario, region):
-    return BayesEstimator(scenario, region)
+    return BayesEstimator(System(scenario, region))
 
 
 @pytest.fixture

@@ -94,6 +94,8 @@ def test_an_invalid_value_is_rejected_with_a_reason(make, executable):
     ('transmission', {'band': 2}, 'band: 2, expected 0 to 0 of the scenario, or -1'),
     ('positioner', {'estimator': 'ml', 'prior': 'track'}, "prior: 'track', expected 'region'"),
     ('positioner', {'estimator': 'neural'}, "model_file: '', expected a trained model"),
+    ('positioner', {'estimator_options': 'n=1'},
+     "estimator_options: 'n', expected an option of bayes: lazy, "),
     ('positioner', {'estimator': 'neural', 'model_file': '/no/model.npz'},
      'model_file: /no/model.npz: '),
     ('positioner', {'calibration_file': '/no/file.npz'}, 'calibration_file: /no/file.npz: '),

@@ -3,7 +3,6 @@
 import numpy as np
 from scipy.stats import qmc
 
-from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 
 
@@ -12,21 +11,20 @@ class GridEstimator:
 
     name = 'grid'
 
-    def __init__(self, scenario, codebook, log2_points=14):
-        self._codebook = codebook
-        low, high = scenario.roi_bounds_m
+    def __init__(self, system, log2_points=14):
+        self.system = system
+        low, high = system.scenario.roi_bounds_m
         self._points = low + (high - low) * qmc.Sobol(3, seed=0).random_base2(log2_points)
         # Whitening turns squared distances between signals into negative log-likelihoods.
-        self._model = MeasurementModel(scenario, codebook)
-        means = self._model.whiten(self._model.mean(self._points))
+        means = system.whiten(system.mean(self._points))
         self._means = means.reshape(len(means), -1)
 
     def estimate(self, received):
         """Estimate the position for each phase of received signals, [..., N_B, N_SB F]."""
-        return estimate_each(self._codebook, received, self._locate)
+        return estimate_each(self.system.codebook, received, self._locate)
 
     def _locate(self, batch):
-        for whitened in self._model.whiten(batch):
+        for whitened in self.system.whiten(batch):
             distance2 = np.sum(np.abs(whitened.ravel() - self._means)**2, axis=1)
             weights = np.exp(distance2.min() - distance2)
             weights /= weights.sum()
