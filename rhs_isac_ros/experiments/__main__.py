@@ -31,7 +31,7 @@ from rhs_isac_ros.experiments.sweep_settings import (
     settings_of,
 )
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.positioning import ESTIMATORS, Kind
+from rhs_isac_ros.positioning import ESTIMATORS, EstimatorKind
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
@@ -134,7 +134,7 @@ def _check(parser: ArgumentParser, options: argparse.Namespace) -> None:
 def _check_names(settings: Sequence[Setting]) -> None:
     """Raise ValueError if an estimator is unknown, or a codebook is neither a kind nor a file."""
     # An estimator with a file would have to be trained for each codebook.
-    estimators = {name for name in ESTIMATORS if not Kind(name).readers} | {
+    estimators = {name for name in ESTIMATORS if not EstimatorKind(name).readers} | {
         *plugins.names(plugins.ESTIMATORS)}
     for name, known in ((ESTIMATOR, estimators), (CODEBOOK, {*KINDS})):
         for value in sorted({getattr(setting, name) for setting in settings} - known):

@@ -52,7 +52,7 @@ class PositionerNode(LocatingNode[Positioner]):
         calibrated_surface(values, self.scenario)
         with translated(plugins.PluginError, ParameterError, 'estimator'):
             # A plug-in that can be imported may still fail when the estimator is built.
-            kind = positioning.Kind(settings.estimator)
+            kind = positioning.EstimatorKind(settings.estimator)
         if settings.calibration_file and not kind.uses_surface:
             raise ParameterError(
                 f'calibration_file: {settings.calibration_file!r}, expected none for the '
@@ -72,7 +72,7 @@ class PositionerNode(LocatingNode[Positioner]):
 
     def _make_estimator(
             self, settings: PositionerSettings, codebook: Codebook) -> positioning.Estimator:
-        kind = positioning.Kind(settings.estimator)
+        kind = positioning.EstimatorKind(settings.estimator)
         surface = load_surface(settings.calibration_file, self.scenario)
         options = kind.accepted(
             table_folder=self.table_folder, model_file=settings.model_file,

@@ -54,7 +54,7 @@ ESTIMATORS: Mapping[str, Callable[..., Estimator]] = {
     kind.name: kind for kind in (BayesEstimator, MlEstimator, NeuralEstimator)}
 
 __all__ = [
-    'ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'Fused', 'Kind',
+    'ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'Fused', 'EstimatorKind',
     'Mixture', 'MlEstimator', 'ModelError', 'Motion', 'Network', 'NeuralEstimator',
     'SearchEstimator', 'Sighting', 'SignalError', 'Site', 'SiteError', 'SiteEstimator',
     'TrackEstimate', 'Tracker', 'WeightedModes', 'estimate_each', 'fuse', 'make_estimator',
@@ -64,7 +64,7 @@ __all__ = [
 
 def make_estimator(name: str, scenario: Scenario, codebook: Codebook, *,
                    surface: KnownSurface | None = None, **options: Any) -> Estimator:
-    """Create an estimator of a system by its name; see `Kind.create`.
+    """Create an estimator of a system by its name; see `EstimatorKind.create`.
 
     `bayes` and `ml` take the options of `SearchEstimator`. `neural` requires ``model_file``, a
     `Network` or its file. Plug-ins define their own options.
@@ -74,10 +74,10 @@ def make_estimator(name: str, scenario: Scenario, codebook: Codebook, *,
     read, or was trained for another codebook or scenario; and CodebookError if the codebook does
     not fit the scenario.
     """
-    return Kind(name).create(System(scenario, codebook, surface), **options)
+    return EstimatorKind(name).create(System(scenario, codebook, surface), **options)
 
 
-class Kind:
+class EstimatorKind:
     """The estimators of one name, with what their class or plug-in declares.
 
     The options are the parameters of the constructor. A class declares with ``uses_tracks`` that a

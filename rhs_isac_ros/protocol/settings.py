@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from rhs_isac_ros.model import Pose, Scenario
-from rhs_isac_ros.positioning import ESTIMATORS, Kind
+from rhs_isac_ros.positioning import ESTIMATORS, EstimatorKind
 from rhs_isac_ros.protocol.admission import parse_users
 from rhs_isac_ros.protocol.user_registry import MAX_USERS, POLICIES
 from rhs_isac_ros.support import plugins
@@ -86,9 +86,9 @@ def _track_speed_mps() -> Any:
         1.0, 'Typical speed of the users, for new tracks.', unit='m/s', low=0.01, high=1e3)
 
 
-def _declaring(does: Callable[[Kind], bool]) -> str:
+def _declaring(does: Callable[[EstimatorKind], bool]) -> str:
     """Return the names of the built-in estimators that declare something."""
-    return ' and '.join(name for name in ESTIMATORS if does(Kind(name)))
+    return ' and '.join(name for name in ESTIMATORS if does(EstimatorKind(name)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +114,7 @@ class PositionerSettings:
 
     def __post_init__(self) -> None:
         """Check that the estimator can use the prior."""
-        if self.prior == TRACK and not Kind(self.estimator).uses_tracks:
+        if self.prior == TRACK and not EstimatorKind(self.estimator).uses_tracks:
             raise ValueError(
                 f"prior: '{TRACK}', expected '{REGION}' with the estimator {self.estimator}; "
                 f'tracks need {_declaring(lambda kind: kind.uses_tracks)}')

@@ -29,7 +29,7 @@ from rhs_isac_ros.positioning import (
     ESTIMATORS,
     BayesEstimator,
     Estimator,
-    Kind,
+    EstimatorKind,
     Motion,
     Sighting,
     Site,
@@ -452,8 +452,8 @@ def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
     return 0
 
 
-def _kinds(options: argparse.Namespace) -> list[Kind]:
-    return [Kind(name) for name in options.estimator or [BayesEstimator.name]]
+def _kinds(options: argparse.Namespace) -> list[EstimatorKind]:
+    return [EstimatorKind(name) for name in options.estimator or [BayesEstimator.name]]
 
 
 def _conflict(options: argparse.Namespace) -> str:

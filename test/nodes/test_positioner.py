@@ -12,7 +12,7 @@ from ros_messages import to_ros
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
 from rhs_isac_ros.nodes.positioner import PositionerNode
-from rhs_isac_ros.positioning import Kind, Network, make_estimator
+from rhs_isac_ros.positioning import EstimatorKind, Network, make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.ros.endpoints import EXCHANGE
@@ -72,14 +72,14 @@ def test_the_estimate_equals_that_of_the_library(bench, node, send, codebooks, t
 
 
 def test_the_diagnostics_contain_the_progress_of_a_table(bench, node, codebooks, monkeypatch):
-    released, original = threading.Event(), Kind.create
+    released, original = threading.Event(), EstimatorKind.create
 
     def half(kind, system, *, progress, **options):
         progress(0.5)
         released.wait(30)
         return original(kind, system, progress=progress, **options)
 
-    monkeypatch.setattr(Kind, 'create', half)
+    monkeypatch.setattr(EstimatorKind, 'create', half)
     node.dispatch(CodebookOffered(codebooks[0]))
     bench.until(lambda: node.report().values.get('table.progress') == '50 %', 'the progress')
     released.set()
@@ -88,14 +88,14 @@ def test_the_diagnostics_contain_the_progress_of_a_table(bench, node, codebooks,
 
 def test_signals_are_answered_while_another_estimator_is_built(
         bench, node, send, codebooks, monkeypatch):
-    released, begun, original = threading.Event(), threading.Event(), Kind.create
+    released, begun, original = threading.Event(), threading.Event(), EstimatorKind.create
 
     def slowly(kind, system, **options):
         if system.codebook.id == codebooks[1].id:
             begun.set()
             released.wait()
         return original(kind, system, **options)
-    monkeypatch.setattr(Kind, 'create', slowly)
+    monkeypatch.setattr(EstimatorKind, 'create', slowly)
     estimates = bench.collect(bench.add(Node, 'receiver'), m.PositionEstimate)
     node.dispatch(CodebookOffered(codebooks[0]))
     send(6)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model import ElementErrors
-from rhs_isac_ros.positioning import Estimate, Kind, make_estimator
+from rhs_isac_ros.positioning import Estimate, EstimatorKind, make_estimator
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.plugins import PluginError
 from rhs_isac_ros.system import System
@@ -94,11 +94,12 @@ OFFERED = {'table_folder': Path('t'), 'reject_outside': True, 'scale': 2.0}
     ('neural', 'm', {'model_file': 'm'}), ('centre', 'm', {'scale': 2.0}),
     ('any_options', '', {}), ('any_options', 'm', {'model_file': 'm'})])
 def test_an_estimator_is_offered_the_options_that_it_declares(name, model, options):
-    assert Kind(name).accepted(model_file=model, **OFFERED) == options
+    assert EstimatorKind(name).accepted(model_file=model, **OFFERED) == options
 
 
 def test_a_plug_in_may_declare_what_a_class_of_the_package_does(small):
-    declared = {name: Kind(name) for name in ('bayes', 'neural', 'centre', 'any_options', 'mine')}
+    declared = {name: EstimatorKind(name) for name in (
+        'bayes', 'neural', 'centre', 'any_options', 'mine')}
     assert [name for name, kind in declared.items() if kind.uses_tracks] == ['bayes', 'mine']
     assert [name for name, kind in declared.items() if not kind.uses_surface] == [
         'neural', 'centre']
