@@ -44,6 +44,7 @@ from rhs_isac_ros.model.mobility import RandomWalk
 from rhs_isac_ros.positioning import BayesEstimator, Estimate, Mixture, Sighting, Tracker, fuse
 from rhs_isac_ros.positioning.tracking import MixtureTracker, Motion
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.system import System
 
 N_CYCLES, PERIOD_S, SPEED_MPS = 20, 0.1, 1.0
 SHELL_M = (0.5, 5.0)
@@ -150,7 +151,7 @@ class Surface:
 
     def _estimator(self, codebook: Codebook) -> BayesEstimator:
         # The positioner creates the estimators of a library like this, too.
-        return BayesEstimator(self.scenario, codebook, reject_outside=True,
+        return BayesEstimator(System(self.scenario, codebook), reject_outside=True,
                               lazy=codebook is not self.codebook)
 
 
@@ -401,15 +402,16 @@ def cell(one: str, other: str, n: int, rng: np.random.Generator) -> dict[str, An
 
 
 def matrix(results: Cells) -> str:
-    """Return the coverage of all cells as a table in Markdown."""
-    lines = [['', *results], ['---'] * (1 + len(results))]
-    for one in results:
+    """Return share in the 95 % region [%] and NEES of all cells as a table in Markdown."""
+    names = [name for name in INGREDIENTS if name in results]
+    lines = [['', *names], ['---'] * (1 + len(names))]
+    for one in names:
         lines.append([one])
-        for other in results:
+        for other in names:
             found = results[one].get(other, {})
-            covered = found.get('in_region')
+            covered, nees = found.get('in_region'), found.get('nees')
             lines[-1].append('refused' if 'refused' in found else
-                             f'{covered[0]:.1f}' if covered else '-')
+                             f'{covered[0]:.0f}, {nees[0]:.1f}' if covered and nees else '-')
     return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
 
 
