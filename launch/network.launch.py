@@ -40,6 +40,8 @@ ARGUMENTS = {
     'users': ('2', 'Number of users; more than 16 share one process.'),
     'config': ('', 'Scenario file; empty: Table I of the paper.'),
     'codebook': ('', 'Codebook file that fits the scenario; empty: the default codebook.'),
+    'system': ('', 'System file, which names a scenario, a codebook and a calibration, in place '
+               'of config; empty: none.'),
     'site': ('', 'Site file, which takes the place of config and codebook: one network for each '
              'surface, and their fusion; empty: a single surface.'),
     'seed': ('0', 'Seed of all random numbers.'),
@@ -88,7 +90,7 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     users = _integer('users', given, 1)
     values = {'seed': _integer('seed', given, 0), 'codebook_file': given['codebook'],
               'estimator': given['estimator']}
-    others = [name for name in ('config', 'codebook') if given[name]]
+    others = [name for name in ('config', 'system', 'codebook') if given[name]]
     if given['site'] and others:
         raise ValueError(f'site: {given["site"]!r}, expected none with {others[0]}')
     parts = networks(Site.from_yaml(given['site']).surfaces if given['site'] else ())
@@ -175,7 +177,8 @@ def _node(given: dict[str, str], executable: str, name: str | None, **values: in
     # JSON quotes a string so that YAML does not read it as another type.
     pairs = [f'{key}:={json.dumps(value, ensure_ascii=False)}'
              for key, value in {
-                 **values, 'scenario_file': given['config'], 'site_file': given['site'],
+                 **values, 'scenario_file': given['config'],
+                 'system_file': given['system'], 'site_file': given['site'],
                  # By default not set, because a parent may have set it for all nodes.
                  **({'use_sim_time': True} if _boolean('use_sim_time', given) else {})}.items()]
     return _process(
@@ -190,8 +193,9 @@ def _recorder(given: dict[str, str]) -> list[Node]:
     # Not restarted, because a second process would replace the recording. If the disk is full, the
     # network does not end with the recorder.
     return [_process(given, 'record', False, [], is_optional=True, executable='record',
-                     name='recorder', arguments=[given['record'], '--config', given['config'],
-                                                 '--site', given['site']])]
+                     name='recorder', arguments=[given['record'], *(
+                         word for name in ('config', 'system', 'site')
+                         for word in (f'--{name}', given[name]))])]
 
 
 def _process(

@@ -39,13 +39,11 @@ class System(MeasurementModel):
 
     Examples
     --------
-    >>> import numpy as np
     >>> system = System(Scenario(), Codebook.default())
-    >>> rng = np.random.default_rng(1)
-    >>> positions = system.scenario.sample_positions(2, rng)
-    >>> system.sample(positions, rng).shape
-    (2, 2, 20)
-    >>> np.sqrt(system.crlb(positions)).round(2)  # [m]
+    >>> users = np.array([[8.0, 1.0, 0.2], [12.0, -2.0, 0.5]])
+    >>> received = system.sample(users, np.random.default_rng(1))
+    >>> received.shape, np.sqrt(system.crlb(users)).round(2)  # [m]
+    ((2, 2, 32), array([0.11, 0.25]))
     """
 
     def __init__(self, scenario: Scenario, codebook: Codebook,
@@ -100,6 +98,10 @@ class System(MeasurementModel):
         return positions, received
 
 
+class SystemFileError(ValueError):
+    """The file of a system is invalid."""
+
+
 class SystemFiles(NamedTuple):
     """Paths of the files of a system."""
 
@@ -109,9 +111,10 @@ class SystemFiles(NamedTuple):
 
     @classmethod
     def named_in(cls, path: str | Path) -> 'SystemFiles':
-        """Read the file of a system; raise ValueError if it is invalid."""
-        content = read_yaml(path)
-        with translated((ValueError, TypeError), ValueError, path):
+        """Read the file of a system; raise SystemFileError if it is invalid."""
+        with translated(ValueError, SystemFileError):
+            content = read_yaml(path)
+        with translated((ValueError, TypeError), SystemFileError, path):
             return cls.of(content, Path(path).parent)
 
     @classmethod

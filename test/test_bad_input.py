@@ -64,6 +64,8 @@ CALLS = [
     pytest.param('tools.calibrate', ['garbage'], 'garbage: not a complete recording',
                  marks=NEEDS_MCAP),
     ('tools.calibrate', ['--site', 'garbage'], 'garbage: cannot be read'),
+    ('tools.calibrate', ['--states', '1,-1', '--system', 'garbage'], 'garbage: '),
+    ('tools.calibrate', ['--site', 'garbage', '--system', 'garbage'], 'not allowed with system'),
     ('tools.calibrate', ['--cycles', '0'], 'argument --cycles: 0, expected 1 to 1000000000'),
     ('tools.calibrate', ['--states', '1,-1', '--calibration', 'garbage'], 'with --multipath'),
     ('tools.calibrate', ['--states', '1,-1', '--codebook', 'garbage'], 'not allowed with'),

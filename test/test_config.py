@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.codebook.library import Library
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_intervals_m
+from rhs_isac_ros.system import System
 
 CONFIG = Path(__file__).parents[1] / 'config'
 CODEBOOKS = {path.stem for path in CONFIG.glob('codebook*.yaml')}
@@ -19,7 +19,7 @@ SCENARIOS = {name: Scenario.from_yaml(CONFIG / f'{name}.yaml')
 
 def test_every_file_is_a_scenario_a_codebook_a_site_or_one_of_parameters():
     assert {path.stem for path in CONFIG.glob('*.yaml')} == {
-        *SCENARIOS, *CODEBOOKS, 'site', 'parameters'}
+        *SCENARIOS, *CODEBOOKS, 'lab_system', 'site', 'parameters'}
 
 
 @pytest.mark.parametrize(('name', 'changed'), [
@@ -47,7 +47,10 @@ def test_the_lab_has_the_elements_and_the_times_of_its_board():
     lab = SCENARIOS['lab']
     np.testing.assert_allclose(element_intervals_m(lab), [0.020, 0.013], atol=5e-6)
     assert (lab.n_elements, lab.amplitude_levels, lab.n_feeds) == (256, 2, 1)
-    surface = load_surface(str(CONFIG / 'lab_states.npz'), lab)
+    system = System.from_yaml(CONFIG / 'lab_system.yaml')
+    assert (system.scenario, system.codebook.id) == (
+        lab, Codebook.load(CONFIG / 'codebook_lab.yaml').id)
+    surface = system.surface
     np.testing.assert_array_equal(surface.applied(np.eye(256)), 1 - 2 * np.eye(256))
     assert surface.is_exact
 

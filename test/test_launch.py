@@ -76,7 +76,7 @@ def test_the_files_are_installed_and_their_dependencies_declared():
 def test_the_python_file_uses_all_arguments():
     text = (ROOT / 'launch' / 'network.launch.py').read_text(encoding='utf-8')
     (arguments,) = [node.value for node in ast.parse(text).body if isinstance(node, ast.Assign)
-                    and node.targets[0].id == 'ARGUMENTS']
+                    and getattr(node.targets[0], 'id', '') == 'ARGUMENTS']
     unused = [name for name in ast.literal_eval(arguments)
               if f"given['{name}']" not in text and f"('{name}', given" not in text]
     assert not unused
@@ -145,7 +145,7 @@ def test_rviz_opens_the_layout_of_the_network_in_its_namespace(values, file, mon
 
 
 @needs_launch
-@pytest.mark.parametrize('other', ['config', 'codebook'])
+@pytest.mark.parametrize('other', ['config', 'system', 'codebook'])
 def test_a_site_excludes_arguments_of_a_single_surface(other):
     with pytest.raises(ValueError, match=f"^site: 'site.yaml', expected none with {other}"):
         started(site='site.yaml', **{other: 'true'})

@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario, simulate_received
-from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.positioning import BayesEstimator
+from rhs_isac_ros.system import System
 
 scenario = Scenario.from_yaml('config/quick.yaml')  # Scenario() is Table I of the paper
-codebook = Codebook.load('config/codebook_quick.yaml')
+system = System(scenario, Codebook.load('config/codebook_quick.yaml'))
 rng = np.random.default_rng(1)
 positions = scenario.sample_positions(3, rng)  # [N, 3], metres
-received = simulate_received(scenario, codebook, positions, rng)
-fix = make_estimator('bayes', scenario, codebook).estimate(received)
+received = system.sample(positions, rng)
+fix = BayesEstimator(system).estimate(received)
 print(fix.mean - positions)  # m
-print(crlb(scenario, codebook, positions))  # m^2
+print(system.crlb(positions))  # m^2

@@ -154,6 +154,13 @@ def average_crlb(
     Takes positions of the user, float64 [N, 3] [m]. The value and its derivative with respect to C
     are in m^2; the derivative with respect to S is in m^2/sqrt(W).
     Raises ValueError if `positions` is not a finite [N, 3] array, or contains no position.
+
+    Examples
+    --------
+    >>> users = np.array([[8.0, 1.0, 0.2], [12.0, -2.0, 0.5]])
+    >>> value_m2, by_analog, by_digital = average_crlb(Scenario(), Codebook.default(), users)
+    >>> by_analog.shape, by_digital.shape
+    ((2, 4, 100), (2, 8, 4, 3))
     """
     return AverageCrlb(scenario, positions)(codebook)
 

@@ -27,6 +27,12 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
     averaged over the region. The prior of a phase is that of the wrapped density, and an unknown
     parameter has none. `region_prior` adds a Gaussian prior that has the variances of the
     region, size^2 / 12. Raises ValueError if `positions` is not a finite [N, 3] array.
+
+    Examples
+    --------
+    >>> users = np.array([[8.0, 1.0, 0.2], [12.0, -2.0, 0.5]])
+    >>> np.sqrt(crlb(Scenario(), Codebook.default(), users)).round(2)  # [m]
+    array([0.11, 0.25])
     """
     return crlb_of(MeasurementModel(scenario, codebook), positions, region_prior=region_prior)
 

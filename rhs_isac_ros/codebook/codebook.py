@@ -43,6 +43,13 @@ class Codebook:
 
     Raises CodebookError if an array is empty, has the wrong number of dimensions or contains
     anything but finite numbers, if the sizes disagree, or if `analog` is not within [0, 1].
+
+    Examples
+    --------
+    >>> codebook = Codebook.default()
+    >>> codebook.check(Scenario())  # An error if it did not fit.
+    >>> codebook.shape, codebook.id
+    ((2, 8, 4, 3, 100), 'cbc9e0547b8d8915e7')
     """
 
     analog: np.ndarray  #: Configurations C, float64 [N_B, F, N_E], each entry in [0, 1].
@@ -205,7 +212,13 @@ def _array(parameters: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.
 
 
 def default_codebook_file() -> Path:
-    """Return the path of ``config/codebook.yaml``; raise CodebookError if it is not found."""
+    """Return the path of ``config/codebook.yaml``; raise CodebookError if it is not found.
+
+    Examples
+    --------
+    >>> Codebook.load(default_codebook_file()).id == Codebook.default().id
+    True
+    """
     # Every installation scheme puts share/ into a folder above the modules: the prefix of pip and
     # colcon, or the folder of pip's --target. A clone has config/ beside the package.
     package = Path(__file__).resolve().parents[1]

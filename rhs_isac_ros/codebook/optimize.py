@@ -117,6 +117,12 @@ def optimize(
         Called at most every ten seconds with the result so far.
     prior
         Where the user may be: the region, or a `Cell` of it.
+
+    Examples
+    --------
+    >>> result = optimize(Scenario(), n_positions=16, max_steps=5)
+    >>> result.history[-1].value_m2 < 0.6 * result.history[0].value_m2
+    True
     """
     design = _Design.of(
         scenario, positions, method, objective, sampling, n_positions, seed, start, resume,

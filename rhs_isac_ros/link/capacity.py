@@ -38,6 +38,12 @@ def capacity(scenario: Scenario, beam: Beamformer, positions: np.ndarray) -> np.
 
     The result is float64 [N] [bit/s]. Raises ValueError if `positions` is not a finite [N, 3]
     array, or the beam does not fit the scenario.
+
+    Examples
+    --------
+    >>> users = np.array([[8.0, 1.0, 0.2], [12.0, -2.0, 0.5]])
+    >>> (capacity(Scenario(), steer(Scenario(), users[0]), users) / 1e6).round(1)  # [Mbit/s]
+    array([29.4, 27.3])
     """
     return capacities(scenario, [beam], positions)[0]
 

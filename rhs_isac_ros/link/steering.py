@@ -157,6 +157,12 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
     number of amplitude levels. The power over all sub-bands is P_max. The beam is deterministic.
     Bands are counted from 0. A calibrated surface applies its coefficients to the configuration.
     Raises ValueError if the position is not a finite [3] array, or the band is out of range.
+
+    Examples
+    --------
+    >>> beam = steer(Scenario(), np.array([8.0, 1.0, 0.2]))
+    >>> beam.analog.shape, beam.digital.shape
+    ((100,), (8, 3))
     """
     return steer_bands(scenario, position, [band], surface)[0]
 

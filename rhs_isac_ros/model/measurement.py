@@ -85,6 +85,12 @@ def simulate_received(
     a new cycle for each position, and one surface for all positions unless `surface` is given.
     With a channel file, the nearest user of the file replaces each position. Raises ValueError if
     `positions` is not a finite [N, 3] array, or a size differs from the scenario's.
+
+    Examples
+    --------
+    >>> users, rng = np.array([[8.0, 1.0, 0.2], [12.0, -2.0, 0.5]]), np.random.default_rng(1)
+    >>> simulate_received(Scenario(), Codebook.default(), users, rng).shape
+    (2, 2, 32)
     """
     positions = checked_positions(positions)
     drawn, factors = draw_impairments(scenario, len(positions), rng)

@@ -235,6 +235,12 @@ class Scenario(Extensions, Table1):
     installed plug-in; in a file, it is a number or a name. `multipath` and `channel` are objects
     or paths of files. Raises ScenarioError if a value has the wrong type, is out of range, or
     contradicts another one.
+
+    Examples
+    --------
+    >>> scenario = Scenario(n_frames=2, roi_size_m=(4.0, 4.0, 1.0))
+    >>> scenario.changes()
+    {'n_frames': 2, 'roi_size_m': [4.0, 4.0, 1.0]}
     """
 
     def __post_init__(self) -> None:

@@ -53,7 +53,7 @@ class ChannelNode(RoleNode[Channel]):
         self.endings.callback(worker.close)
         self.start(Channel(
             self.scenario, values.seed, self.make_settings(values),
-            calibrated_surface(values, self.scenario, 'states_file')))
+            calibrated_surface(values, self.surface, 'states_file')))
         self.get_logger().info(  # type: ignore[no-untyped-call]
             f'serving: {self.scenario.n_bands} bands, {self.scenario.n_elements} elements, '
             f'surface {values.surface}, radio {values.radio}')

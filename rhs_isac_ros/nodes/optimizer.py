@@ -3,7 +3,6 @@
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -108,37 +107,28 @@ class OptimizerNode(RoleNode[Holder]):
     def __init__(self, **node_options: Any) -> None:
         super().__init__(
             topics.OPTIMIZER_NODE, start_parameter_services=False, **node_options)
-        file = self.values.codebook_file or default_codebook_file()
-        defaults = (Codebook.load(file) if self.values.codebook_file or not self.surface.codebook
-                    else self.surface.codebook).to_parameters()
+        file, system = self.values.codebook_file, self.surface.system
+        self._codebook = (system.codebook if system and not file
+                          else Codebook.load(file or default_codebook_file()))
+        defaults = self._codebook.to_parameters()
         for name, text in CODEBOOK.items():
             self.declare_parameter(name, defaults[name], ParameterDescriptor(description=text))
+        given = {name: self.get_parameter(name).value for name in CODEBOOK}
+        if given != defaults:
+            self._codebook = Codebook.from_parameters(given)
+        try:
+            self._codebook.check(self.scenario)
+        except CodebookError as error:
+            raise CodebookError(
+                f'codebook_file: {str(file or default_codebook_file())!r} does not fit '
+                f'scenario_file {self.values.scenario_file or "Table I"!r}: {error}; set '
+                'codebook_file (codebook:= of a launch) to a codebook of this scenario') from None
         # In a file of an earlier version, the provenance differs and the id may be missing.
-        super().set_parameters_atomically(
-            ros_parameters(self._first_codebook(file).to_parameters()))
+        super().set_parameters_atomically(ros_parameters(self._codebook.to_parameters()))
         self.start(Holder(), subscribe=False)
         # Last, so that no request arrives before the parameters are declared.
         self.resume()
         self.subscribe()
-
-    def _first_codebook(self, file: Path | str) -> Codebook:
-        codebook = Codebook.from_parameters(self._codebook_values())
-        try:
-            codebook.check(self.scenario)
-        except CodebookError as error:
-            raise CodebookError(
-                f'codebook_file: {str(file)!r} does not fit scenario_file '
-                f'{self.values.scenario_file or "Table I"!r}: {error}; set codebook_file '
-                '(codebook:= of a launch) to a codebook of this scenario') from None
-        return codebook
-
-    def _codebook_values(self) -> dict[str, Any]:
-        return {name: self.get_parameter(name).value for name in CODEBOOK}
-
-    def _codebook_of(self, values: dict[str, Any]) -> Codebook:
-        codebook = Codebook.from_parameters(values)
-        codebook.check(self.scenario)
-        return codebook
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set all parameters or none; a new codebook must be complete and valid.
@@ -154,7 +144,8 @@ class OptimizerNode(RoleNode[Holder]):
                 raise CodebookError(
                     f'{", ".join(given)}: set without {", ".join(missing)}, expected the whole '
                     'codebook in one request')
-            codebook = self._codebook_of(given)
+            codebook = Codebook.from_parameters(given)
+            codebook.check(self.scenario)
         except CodebookError as error:
             self.role.count(events.Outcome.WRONG_CODEBOOK)
             return SetParametersResult(successful=False, reason=str(error))
@@ -162,7 +153,8 @@ class OptimizerNode(RoleNode[Holder]):
             *(p for p in parameter_list if p.name not in given),
             *ros_parameters(codebook.to_parameters())])
         if result.successful:
-            self._publish(codebook)
+            self._codebook = codebook
+            self._publish()
         return result
 
     def stand_by(self) -> None:
@@ -174,9 +166,10 @@ class OptimizerNode(RoleNode[Holder]):
         """Offer and announce the codebook."""
         self._codebook_services = CodebookParameterService(self)  # type: ignore[no-untyped-call]
         self._publisher = create_publisher(self, ros.Codebook, topics.CODEBOOK, LATCHED)
-        self._publish(self._codebook_of(self._codebook_values()))
+        self._publish()
 
-    def _publish(self, codebook: Codebook) -> None:
+    def _publish(self) -> None:
+        codebook = self._codebook
         self.dispatch(events.CodebookOffered(codebook))
         if self.stands_by:
             return

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros import positioning
-from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
 from rhs_isac_ros.monitoring.role_statistics import Report
@@ -49,11 +48,11 @@ class PositionerNode(LocatingNode[Positioner]):
         A model is checked against the codebook only when the estimator is built.
         """
         settings: PositionerSettings = super().make_settings(values)
-        calibrated_surface(values, self.scenario)
+        surface = calibrated_surface(values, self.surface)
         with translated(plugins.PluginError, ParameterError, 'estimator'):
             # A plug-in that can be imported may still fail when the estimator is built.
             kind = positioning.EstimatorKind(settings.estimator)
-        if settings.calibration_file and not kind.uses_surface:
+        if surface and not kind.uses_surface:
             raise ParameterError(
                 f'calibration_file: {settings.calibration_file!r}, expected none for the '
                 f'estimator {kind.name}, which assumes the surface of the scenario')
@@ -73,7 +72,7 @@ class PositionerNode(LocatingNode[Positioner]):
     def _make_estimator(
             self, settings: PositionerSettings, codebook: Codebook) -> positioning.Estimator:
         kind = positioning.EstimatorKind(settings.estimator)
-        surface = load_surface(settings.calibration_file, self.scenario)
+        surface = calibrated_surface(settings, self.surface)
         options = kind.accepted(
             table_folder=self.table_folder, model_file=settings.model_file,
             reject_outside=settings.reject_outside, progress=self._on_progress)

@@ -29,7 +29,7 @@ class TransmissionNode(RoleNode[Transmission]):
         if values.band >= n_bands:
             raise ParameterError(
                 f'band: {values.band}, expected 0 to {n_bands - 1} of the scenario, or -1')
-        surface = calibrated_surface(values, self.scenario)
+        surface = calibrated_surface(values, self.surface)
         self._surfaces[values.calibration_file] = surface
         prepare_steering(self.scenario, surface)
         return super().make_settings(values)

@@ -73,6 +73,14 @@ def make_estimator(name: str, scenario: Scenario, codebook: Codebook, *,
     loaded, fails, or does not return an estimator; ModelError if a model is missing, cannot be
     read, or was trained for another codebook or scenario; and CodebookError if the codebook does
     not fit the scenario.
+
+    Examples
+    --------
+    >>> scenario, codebook, user = Scenario(), Codebook.default(), np.array([8.0, 1.0, 0.2])
+    >>> received = simulate_received(scenario, codebook, user[None], np.random.default_rng(1))
+    >>> fix = make_estimator('bayes', scenario, codebook).estimate(received[0])
+    >>> bool(np.linalg.norm(fix.mean - user) < 2 * np.sqrt(np.trace(fix.covariance)))
+    True
     """
     return EstimatorKind(name).create(System(scenario, codebook, surface), **options)
 

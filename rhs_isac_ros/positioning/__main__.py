@@ -65,8 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> None:
     output = options.output
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
-    codebook = Codebook.load(options.codebook)
-    codebook.check(scenario)
+    codebook = Codebook.load(options.codebook, scenario)
     with progress_bar(options.epochs, 'epoch', quiet=options.quiet) as show:
         network = train(
             scenario, codebook, options.pairs, options.seed, options.hidden, options.epochs,

@@ -178,6 +178,6 @@ def _surface(name: str, content: Any, folder: Path, bounds_m: np.ndarray) -> Sys
         return dataclasses.replace(scenario, roi_center_m=(low + high) / 2, roi_size_m=high - low)
 
     with translated(ValueError, SiteError, name):
-        files = dict(mapping_of(content, {'scenario', 'codebook'}, {'pose'}))
+        files = dict(mapping_of(content, {'scenario', 'codebook'}, {'calibration', 'pose'}))
         pose = [files.pop('pose')] if 'pose' in files else []
         return SystemFiles.of(files, folder).load(adapted)

@@ -5,12 +5,12 @@ import types
 from collections.abc import Container, Iterable, Iterator
 from typing import NamedTuple
 
-from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning.site import Site, SiteError
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import ParameterError
+from rhs_isac_ros.system import System
 
 # Distance between the seeds of two surfaces, which exceeds every seed that a parameter may have.
 _SEED_STEP = 2**31
@@ -26,7 +26,7 @@ class Source(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class NodeSurface:
-    """The surface of a node, and its site, if any.
+    """The scenario of a node, its system if a file names one, and its site, if any.
 
     In a site, the surface is named after the last part of the namespace; the part before is the
     same for all surfaces. A node of the whole site is in this part, and has the scenario of the
@@ -34,6 +34,7 @@ class NodeSurface:
     """
 
     scenario: Scenario
+    system: System | None = None  #: Of the system file, or of the surface in the site file.
     site: Site | None = None
     base: str = ''  #: Namespace of the surfaces of the site, without a final slash.
     name: str = ''  #: Name of the surface; empty without a site, and for a node of the whole site.
@@ -46,27 +47,28 @@ class NodeSurface:
         A node `of_site` belongs to no surface. Raises ScenarioError or ParameterError if a file is
         invalid, or no surface has the name of the namespace.
         """
-        if not (values.site_file or of_site):
-            file = values.scenario_file
-            return cls(Scenario.from_yaml(file) if file else Scenario())
-        if not values.site_file or values.scenario_file:
-            raise ParameterError(
-                f'site_file: {values.site_file!r}, scenario_file: {values.scenario_file!r}, '
-                'expected only a site file')
+        files = {name: getattr(values, name) for name in (
+            'scenario_file', 'system_file', 'site_file') if getattr(values, name)}
+        if len(files) > 1 or of_site and 'site_file' not in files:
+            given = ', '.join(f'{name}: {file!r}' for name, file in files.items())
+            raise ParameterError(f'{given or "site_file: none"}, expected only '
+                                 f'{"a site file" if of_site else "one of these"}')
+        if not values.site_file:
+            if not values.system_file:
+                return cls(Scenario.from_yaml(*files.values()) if files else Scenario())
+            with translated(ValueError, ParameterError, 'system_file'):
+                system = System.from_yaml(values.system_file)
+            return cls(system.scenario, system)
         with translated(SiteError, ParameterError, 'site_file'):
             site = Site.from_yaml(values.site_file)
         base, _, name = namespace.rpartition('/')
         if of_site:
-            return cls(site.surfaces[site.leader].scenario, site, namespace.rstrip('/'))
+            return cls(site.surfaces[site.leader].scenario, None, site, namespace.rstrip('/'))
         if name not in site.surfaces:
             raise ParameterError(f'namespace: {namespace!r}, expected the name of a surface of '
                                  f'{values.site_file} at its end: {", ".join(site.surfaces)}')
-        return cls(site.surfaces[name].scenario, site, base, name)
-
-    @property
-    def codebook(self) -> Codebook | None:
-        """Codebook of the surface in the site file; None without a site."""
-        return self.site.surfaces[self.name].codebook if self.site else None
+        system = site.surfaces[name]
+        return cls(system.scenario, system, site, base, name)
 
     def seed(self, seed: int) -> int:
         """Return the seed of the surface, so that surfaces have independent random numbers."""

@@ -29,12 +29,13 @@ from rclpy.parameter import Parameter as RosParameter
 
 from rhs_isac_ros.calibration import CalibrationError, load_surface
 from rhs_isac_ros.frontend import RADIOS, SURFACES
-from rhs_isac_ros.model import Scenario, mobility
+from rhs_isac_ros.model import mobility
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import create_or_refuse, refusals
+from rhs_isac_ros.ros.node_surface import NodeSurface
 from rhs_isac_ros.ros.roster import MEMBERS
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import ArgumentParser
@@ -97,9 +98,13 @@ def _declared_by(settings: type[Any] | None) -> dict[str, Parameter]:
 
 _SCENARIO = _parameter(
     'scenario_file', '', "YAML file of the scenario; empty: Table I of the paper.")
+_SYSTEM = _parameter(
+    'system_file', '', 'System file, which names a scenario, a codebook and a calibration, in '
+    'place of scenario_file; empty: none.')
 _SITE = _parameter(
     'site_file', '', 'Site file, which takes the place of scenario_file. The surface of a node is '
     'named after the last part of its namespace; empty: no site.')
+_FILES = _SCENARIO, _SYSTEM, _SITE
 _SEED = _parameter('seed', 0, 'Seed of all random numbers.', low=0, high=2**31 - 1)
 _USER_TOPICS = _parameter(
     'user_topics', 64, 'Highest user number for which separate topics are created.',
@@ -194,11 +199,10 @@ _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
 }
 
 NODES: Mapping[str, tuple[Parameter, ...]] = {
-    **{name: (_SCENARIO, _SITE, *_declared_by(member.settings).values(), *_OTHERS.get(name, ()))
+    **{name: (*_FILES, *_declared_by(member.settings).values(), *_OTHERS.get(name, ()))
        for name, member in sorted(MEMBERS.items())},
     'visualizer': (
-        _SCENARIO,
-        _SITE,
+        *_FILES,
         _FRAME,
         _USER_TOPICS,
         _parameter('period_s', 0.2, 'Period at which the scene is published.',
@@ -433,11 +437,14 @@ def settings_of(kind: type[Any], values: types.SimpleNamespace) -> Any:
 
 
 def calibrated_surface(
-        values: types.SimpleNamespace, scenario: Scenario, name: str = 'calibration_file'
-) -> SurfaceEstimate | None:
-    """Return the surface in the calibration file of a parameter; None if this is empty."""
+        values: Any, node: NodeSurface, name: str = 'calibration_file') -> SurfaceEstimate | None:
+    """Return the surface in the calibration file of a parameter, or else that of the system."""
+    if not (file := getattr(values, name)):
+        surface = node.system.surface if node.system else None
+        assert surface is None or isinstance(surface, SurfaceEstimate)
+        return surface
     with translated(CalibrationError, ParameterError, name):
-        return load_surface(getattr(values, name), scenario)
+        return load_surface(file, node.scenario)
 
 
 _FLOATING = (RosParameter.Type.DOUBLE, RosParameter.Type.DOUBLE_ARRAY)

@@ -189,7 +189,7 @@ def _calibrate(options: argparse.Namespace, arguments: list[str]) -> int:
             if options.file:
                 raise CalibrationError(f'{options.file}: expected no file with --states')
             return _save(known_states(scenario, *options.states), options.output)
-        pilots = ([_arrays(options)] if has_arrays
+        pilots = ([_arrays(options, scenario)] if has_arrays
                   else _collected(options, scenario, arguments))
         with warnings.catch_warnings():
             # The reports contain these warnings.
@@ -213,13 +213,13 @@ def _save(calibration: Calibration, output: Path) -> int:
     return 0
 
 
-def _arrays(options: argparse.Namespace) -> Pilots:
+def _arrays(options: argparse.Namespace, scenario: Scenario) -> Pilots:
     """Return the pilots in a file with the arrays ``positions`` and ``received``."""
     arrays = read_arrays(options.file)
     for name in ('positions', 'received'):
         if name not in arrays:
             raise ArchiveError(f'{options.file}: {name}: missing, expected an array of this name')
-    codebook = Codebook.load(options.codebook or default_codebook_file())
+    codebook = Codebook.load(options.codebook or default_codebook_file(), scenario)
     return Pilots(codebook, arrays['positions'], arrays['received'])
 
 
@@ -234,8 +234,7 @@ def _collected(
         _collect(lambda: CalibratorNode(log, scenario), lambda: log.n_pilots, 'pilots',
                  options, arguments)
     if options.codebook:
-        codebook = Codebook.load(options.codebook)
-        codebook.check(scenario)
+        codebook = Codebook.load(options.codebook, scenario)
         log.codebooks.update(dict.fromkeys(log.missing_codebooks, codebook))
     source = options.file or 'network'
     if log.missing_codebooks:
@@ -324,7 +323,8 @@ def _states(text: str) -> tuple[complex, ...]:
 def _conflict(options: argparse.Namespace) -> str:
     options.output = options.output or (_SITE_OUTPUT if options.site else _OUTPUT)
     others = [name for name in (
-        'file', 'multipath', 'states', 'config', 'codebook', 'calibration', 'namespace')
+        'file', 'multipath', 'states', 'system', 'config', 'codebook', 'calibration',
+        'namespace')
         if getattr(options, name) not in (None, False, '/')]
     if options.site and others:
         return f'argument --site: not allowed with {", ".join(others)}'
@@ -362,7 +362,7 @@ def _parser() -> argparse.ArgumentParser:
         'from users that two surfaces locate; write a site file')
     add('--output', type=output_file, metavar='FILE',
         help=f'file to write (default: {_OUTPUT}, or {_SITE_OUTPUT} with --site)')
-    command.add_files(parser, 'config', 'codebook', 'calibration')
+    command.add_files(parser, 'config', 'codebook', 'calibration', 'system')
     add('--namespace', default='/', help='namespace of the recorded network (default: /)')
     add('--cycles', type=positive_int, default=_CYCLES, metavar='N',
         help='pilots, or users that two surfaces locate, to collect from a running network '

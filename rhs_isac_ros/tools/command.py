@@ -37,6 +37,7 @@ from rhs_isac_ros.support.arguments import check_distinct, input_file
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.exits import discard_stdout, on_end_signals, print_error
 from rhs_isac_ros.support.optional import MissingLibraryError
+from rhs_isac_ros.system import SystemFileError, SystemFiles
 
 # Period of polling the graph [s], because changes to the graph do not wake the executor.
 _POLL_PERIOD_S = 0.02
@@ -44,15 +45,16 @@ _POLL_PERIOD_S = 0.02
 # discovery pauses while keys are exchanged.
 _SETTLE_S = 1.0 if is_secure() else 0.4
 # Errors in arguments and files.
-INVALID = (StartError, RecordingError, ScenarioError, SiteError, CodebookError, CalibrationError,
-           ModelError, plugins.PluginError, OSError)
+INVALID = (StartError, RecordingError, ScenarioError, SiteError, SystemFileError, CodebookError,
+           CalibrationError, ModelError, plugins.PluginError, OSError)
 # Advice after an error about messages that do not match the scenario.
 OTHER_SCENARIO = '; if the network uses another scenario, pass it with --config FILE'
 _NodeT = TypeVar('_NodeT', bound=Node)
 _FILES = {
     'config': "scenario file; by default the recorded scenario, or the paper's Table I",
     'codebook': 'codebook to assume; by default the recorded one',
-    'calibration': 'calibration of the surface; by default the surface of the scenario'}
+    'calibration': 'calibration of the surface; by default the surface of the scenario',
+    'system': 'system file, which names these files, except for those that are also given'}
 
 
 class ToolError(RuntimeError):
@@ -84,6 +86,7 @@ def entry(
         try:
             if problem := conflict(options):
                 parser.error(problem)
+            fill_in(options)
             check_distinct(parser, options)
             return work(options, [parser.prog, *arguments])
         except (KeyboardInterrupt, ExternalShutdownException):
@@ -104,6 +107,15 @@ def add_files(parser: argparse.ArgumentParser, *names: str) -> None:
     """Add options for files that describe a network; the names are keys of `_FILES`."""
     for name in names:
         parser.add_argument(f'--{name}', type=input_file, metavar='FILE', help=_FILES[name])
+
+
+def fill_in(options: argparse.Namespace) -> None:
+    """Fill in the files that are named by a system file and are not given as options."""
+    if getattr(options, 'system', None):
+        for name, path in SystemFiles.named_in(options.system)._asdict().items():
+            option = 'config' if name == 'scenario' else name
+            if getattr(options, option, path) is None:
+                setattr(options, option, path)
 
 
 def print_now(*values: object, end: str = '\n') -> None:

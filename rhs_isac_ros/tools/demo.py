@@ -61,7 +61,8 @@ from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.exits import on_end_signals, print_error
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.pictures import write_picture
-from rhs_isac_ros.tools.command import choose_scenario, text_table
+from rhs_isac_ros.system import SystemFileError
+from rhs_isac_ros.tools.command import add_files, choose_scenario, fill_in, text_table
 from rhs_isac_ros.tools.pictures import compose_cycles, prepare_drawing
 
 # Maximum time between two complete cycles [s].
@@ -94,7 +95,7 @@ def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Pa
     """
     scenario = choose_scenario(config)
     codebook_file = Path(codebook or default_codebook_file()).resolve()
-    Codebook.load(codebook_file).check(scenario)
+    Codebook.load(codebook_file, scenario)
     return scenario, codebook_file
 
 
@@ -285,6 +286,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     check_environment(parser)
     check_distinct(parser, options)
     try:
+        fill_in(options)
         if options.site:
             demonstration: _Demonstration = _SiteDemonstration(parser, options)
         else:
@@ -294,7 +296,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except CodebookError as error:
         print_error(f'{error}; to create a codebook for a scenario: python3 -m '
                     'rhs_isac_ros.codebook --scenario FILE --output FILE', parser.prog)
-    except (ScenarioError, SiteError, RecordingError, StartError) as error:
+    except (ScenarioError, SiteError, SystemFileError, RecordingError, StartError) as error:
         print_error(error, parser.prog)
     except MissingLibraryError as error:
         print_error(error, parser.prog)
@@ -387,8 +389,8 @@ class _SiteDemonstration(_Demonstration):
 
     def __init__(self, parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
         if other := [name for name in (
-                'config', 'codebook', 'follow', 'calibration', 'surface', 'port', 'radio',
-                'radio_options', 'samples', 'picture')
+                'system', 'config', 'codebook', 'follow', 'calibration', 'surface', 'port',
+                'radio', 'radio_options', 'samples', 'picture')
                 # Defaults of files are texts.
                 if str(getattr(options, name)) != str(parser.get_default(name))]:
             option = other[0].replace('_', '-')
@@ -488,8 +490,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--users', type=integer(1, MAX_USERS), default=2, help='number of users')
     add('--cycles', type=positive_int, default=20, help='cycles to wait for')
     add_network_options(parser)
-    add('--calibration', type=input_file, metavar='FILE',
-        help='calibration file of the surface; by default the surface of the scenario')
+    add_files(parser, 'calibration', 'system')
     add('--surface', metavar='NAME', default='emulated',
         help=f'surface that shows the configurations: {", ".join(SURFACES)}, or a plug-in')
     add('--port', metavar='PORT',

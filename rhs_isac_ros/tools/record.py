@@ -50,6 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     files = parser.add_mutually_exclusive_group()
     for name, text in [
             ('config', "scenario file of the network; the paper's Table I if empty"),
+            ('system', 'system file, instead of a scenario file'),
             ('site', 'site file, instead of a scenario file')]:
         # Launch files pass an empty name by default.
         files.add_argument(f'--{name}', metavar='FILE', help=text,

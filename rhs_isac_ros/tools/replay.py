@@ -432,8 +432,9 @@ class SiteRecording(Recording):
 
 def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
     """Compare the errors of each surface and of the fusion with the recorded errors."""
-    given = [name for name in ('publish', 'codebook', 'config', 'calibration', 'model', 'track')
-             if getattr(options, name)]
+    given = [name for name in (
+        'publish', 'system', 'codebook', 'config', 'calibration', 'model', 'track')
+        if getattr(options, name)]
     if options.estimator and options.estimator != [BayesEstimator.name]:
         given.append('estimator')
     if given:
@@ -525,8 +526,7 @@ def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
     log = recording.logs['']
     used = sorted({log.signals[key].codebook_id for key in recording.truths})
     if file:
-        codebook = Codebook.load(file)
-        codebook.check(recording.scenarios[''])
+        codebook = Codebook.load(file, recording.scenarios[''])
         for codebook_id in used:
             if codebook_id != codebook.id:
                 print(f'signals received with codebook {codebook_id} are evaluated with '
@@ -551,7 +551,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--track', action='store_true', help='also track the users with the estimator bayes')
     add('--track-speed', type=positive_float, metavar='MPS',
         help=f'typical speed of the users (default: {Motion.speed_mps:g} m/s)')
-    command.add_files(parser, 'codebook', 'config', 'calibration')
+    command.add_files(parser, 'codebook', 'config', 'calibration', 'system')
     add('--model', type=input_file, metavar='FILE', help='model of the estimator neural')
     add('--site', type=input_file, metavar='FILE',
         help='site file; by default the recorded scenarios of the surfaces')

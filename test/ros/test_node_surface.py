@@ -9,10 +9,12 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import Site
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.node_surface import NodeSurface
+from rhs_isac_ros.ros.parameters import calibrated_surface
 from rhs_isac_ros.ros.roster import MEMBERS
 from rhs_isac_ros.support.fields import ParameterError
 
-FILE = str(Path(__file__).parents[2] / 'config' / 'site.yaml')
+FILE, LAB = (str(Path(__file__).parents[2] / 'config' / f'{name}.yaml')
+             for name in ('site', 'lab_system'))
 
 
 @pytest.fixture(scope='module')
@@ -20,8 +22,9 @@ def site():
     return Site.from_yaml(FILE)
 
 
-def surface_of(namespace, site_file=FILE, scenario_file='', of_site=False):
-    values = types.SimpleNamespace(site_file=site_file, scenario_file=scenario_file)
+def surface_of(namespace, site_file=FILE, scenario_file='', system_file='', of_site=False):
+    values = types.SimpleNamespace(
+        site_file=site_file, scenario_file=scenario_file, system_file=system_file)
     return NodeSurface.of(values, namespace, of_site)
 
 
@@ -36,18 +39,27 @@ def listed(one, role):
 def test_without_a_site_every_message_is_of_the_own_scenario():
     one = surface_of('/lab', '')
     assert one.scenario.id == Scenario().id
-    assert one.codebook is None
+    assert one.system is None
     assert one.seed(5) == 5
     assert one.site_prefix == ''
     for role in ('bs', 'channel'):
         assert listed(one, role) == {('', Scenario().id): set(MEMBERS[role].role.RECEIVES)}
 
 
+def test_a_system_file_names_scenario_codebook_and_calibration():
+    one = surface_of('/lab', '', system_file=LAB)
+    assert one.scenario == one.system.scenario == Scenario.from_yaml(LAB.replace('_system', ''))
+    for name in ('calibration_file', 'states_file'):
+        values = types.SimpleNamespace(calibration_file='', states_file='')
+        assert calibrated_surface(values, one, name) is one.system.surface
+        assert calibrated_surface(values, surface_of('/side'), name) is None
+
+
 @pytest.mark.parametrize(('namespace', 'base'), [('/side', ''), ('/lab/two/side', '/lab/two')])
 def test_a_surface_receives_shared_messages_from_the_leader(site, namespace, base):
     one, (front, side) = surface_of(namespace), site.surfaces.values()
     assert one.scenario.id == side.scenario.id != front.scenario.id
-    assert one.codebook.id == side.codebook.id
+    assert one.system.codebook.id == side.codebook.id
     assert listed(one, 'channel') == {
         ('', side.scenario.id): {m.RhsConfiguration, m.Beam},
         (f'{base}/front/', front.scenario.id): {m.GroundTruth, m.Pilot},
@@ -98,8 +110,9 @@ def test_surfaces_have_seeds_of_their_own():
 @pytest.mark.parametrize(('options', 'text'), [
     ({'namespace': '/rear'}, "namespace: '/rear', expected the name of a surface"),
     ({'namespace': '/'}, 'at its end: front, side'),
-    ({'namespace': '/side', 'scenario_file': 'a.yaml'}, 'expected only a site file'),
-    ({'namespace': '/', 'site_file': '', 'of_site': True}, "site_file: '', "),
+    ({'namespace': '/side', 'scenario_file': 'a.yaml'}, 'expected only one of these'),
+    ({'namespace': '/', 'site_file': '', 'of_site': True}, 'site_file: none, expected'),
+    ({'namespace': '/', 'site_file': '', 'system_file': 'none.yaml'}, 'system_file: none.yaml'),
     ({'namespace': '/side', 'site_file': 'none.yaml'}, 'site_file: none.yaml')])
 def test_a_place_that_does_not_exist_is_named(options, text):
     with pytest.raises(ParameterError) as error:
