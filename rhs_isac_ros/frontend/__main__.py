@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -21,7 +22,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     The code is 0; 1 if `check` finds wrong patterns; 2 after an error; or 130 after Ctrl-C.
     """
     parser = ArgumentParser(
-        prog='python3 -m rhs_isac_ros.frontend', description=__doc__,
+        # The script names itself.
+        prog=os.environ.get('RHS_ISAC_PROGRAM', 'python3 -m rhs_isac_ros.frontend'),
+        description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     commands = parser.add_subparsers(dest='command', required=True)
     for name, text in (

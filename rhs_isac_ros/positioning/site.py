@@ -154,8 +154,10 @@ def site_text(path: str | Path, poses: Mapping[str, Pose], folder: Path) -> str:
     """
     content = read_yaml(path)
     for name, surface in content['surfaces'].items():
-        surface.update({key: os.path.relpath(Path(path).parent / surface[key], folder)
-                        for key in SystemFiles._fields if key in surface})
+        # A relative path begins at the real folder, also behind a link.
+        surface.update({key: os.path.relpath(
+            os.path.realpath(Path(path).parent / surface[key]), os.path.realpath(folder))
+            for key in SystemFiles._fields if key in surface})
         if name in poses:
             # A copy through JSON shares no values, for which YAML would write anchors and aliases.
             surface['pose'] = json.loads(json.dumps(dataclasses.asdict(poses[name])))

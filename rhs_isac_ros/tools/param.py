@@ -1,23 +1,24 @@
 """``scripts/param``: commands of ``ros2 param``, which has no wheel, with the same output."""
 
 import argparse
+import contextlib
+import re
 import sys
 from collections.abc import Callable
 from typing import Any
 
 import yaml
-from rcl_interfaces.msg import Parameter, ParameterType, SetParametersResult
-from rclpy.parameter import (
-    get_parameter_value,
-    parameter_dict_from_yaml_file,
-    parameter_value_to_python,
-)
+from rcl_interfaces.msg import ParameterType, SetParametersResult
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run_verb
 
+# Texts that the parser of rcl, unlike that of Python, reads as something else.
+_AMBIGUOUS = re.compile(
+    r'y|n|yes|no|on|off|true|false|null|nan|inf|infinity|[-+.\d].*', re.IGNORECASE | re.DOTALL)
 # Maximum time to discover a node [s], including the exchange of keys for DDS security.
 _DISCOVERY_TIMEOUT_S = 10.0
 # Maximum time to discover a node's services, and to wait for a response [s].
@@ -48,11 +49,11 @@ def get(session: Session, options: argparse.Namespace) -> None:
 
 def set_value(session: Session, options: argparse.Namespace) -> None:
     """Set a parameter to a YAML value."""
-    parameter = Parameter(
-        name=options.parameter_name, value=get_parameter_value(string_value=options.value))
-    response = _call(session, _find(session, options),
-                     lambda client: client.set_parameters([parameter]))
-    (result,) = response.results
+    try:
+        content = yaml.load(options.value, yaml.BaseLoader)
+    except yaml.YAMLError:
+        content = options.value
+    (result,) = _set(session, options, {options.parameter_name: content})
     if not result.successful:
         raise ToolError(f'Setting parameter failed{_reason(result)}')
     print_now(f'Set parameter successful{_reason(result)}')
@@ -88,29 +89,92 @@ def dump(session: Session, options: argparse.Namespace) -> None:
         for key in groups:
             group = group.setdefault(key, {})
         group[leaf] = parameter_value_to_python(value)
-    print_now(yaml.dump({node: {'ros__parameters': tree}}, default_flow_style=False))
+    print_now(yaml.dump({node: {'ros__parameters': tree}}, Dumper=_Dumper,
+                        default_flow_style=False))
 
 
 def load(session: Session, options: argparse.Namespace) -> None:
     """Set all parameters in a parameter file on one node, even those meant for other nodes."""
     file = options.parameter_file
     try:
-        names = list(parameter_dict_from_yaml_file(file, use_wildcard=True))
-    except (OSError, ValueError, AttributeError, AssertionError, TypeError, RuntimeError,
-            yaml.YAMLError) as error:
+        with open(file, encoding='utf-8') as stream:
+            found = yaml.load(stream, yaml.BaseLoader)
+        contents: dict[str, Any] = {}
+        # Values for single nodes have precedence over those for all.
+        for _, tree in sorted(found.items(), key=lambda pair: pair[0] != '/**'):
+            contents |= _flat(tree['ros__parameters'])
+    except (OSError, ValueError, AttributeError, TypeError, LookupError, yaml.YAMLError) as error:
         reason = ' '.join(str(error).split())
         raise ToolError(f'{file}: {reason}, expected a parameter file') from None
-    response = _call(session, _find(session, options),
-                     lambda client: client.load_parameter_file(file, use_wildcard=True))
     failed = 0
-    for name, result in zip(names, response.results, strict=True):
+    for name, result in zip(contents, _set(session, options, contents), strict=True):
         if result.successful:
             print_now(f'Set parameter {name} successful{_reason(result)}')
         else:
             failed += 1
             print(f'Set parameter {name} failed{_reason(result)}', file=sys.stderr)
     if failed:
-        raise ToolError(f'{failed} of {len(names)} parameters not set')
+        raise ToolError(f'{failed} of {len(contents)} parameters not set')
+
+
+class _Dumper(yaml.SafeDumper):
+    """A dumper that quotes the texts that the readers of ROS take for numbers or truth values."""
+
+
+_Dumper.add_representer(str, lambda dumper, text: dumper.represent_scalar(
+    'tag:yaml.org,2002:str', text, style="'" if _AMBIGUOUS.fullmatch(text) else None))
+
+
+def _flat(tree: dict[str, Any], prefix: str = '') -> dict[str, Any]:
+    """Return the values in nested mappings, by names with dots."""
+    return {name: value for key, found in tree.items() for name, value in (
+        _flat(found, f'{prefix}{key}.') if isinstance(found, dict) else {f'{prefix}{key}': found}
+    ).items()}
+
+
+def _set(session: Session, options: argparse.Namespace, contents: dict[str, Any]
+         ) -> list[SetParametersResult]:
+    """Set parameters to texts, or lists of texts, with the types that the node declares."""
+    node = _find(session, options)
+    # A node of rclpy that is asked for the type of an unknown parameter returns no types at all.
+    names = [name for name in _names(session, node) if name in contents]
+    types = dict(zip(names, _call(
+        session, node, lambda client: client.get_parameter_types(names)).types, strict=True))
+    try:
+        parameters = [_parameter(name, content, Parameter.Type(types.get(name, 0)))
+                      for name, content in contents.items()]
+    except (TypeError, ValueError, AssertionError) as error:
+        raise ToolError(f'{error}, expected values of parameters') from None
+    return list(_call(session, node, lambda client: client.set_parameters(parameters)).results)
+
+
+def _parameter(name: str, content: str | list[str], declared: Parameter.Type) -> Parameter:
+    """Return a parameter of the declared type or, if the text does not fit, of that in YAML."""
+    converters: dict[str, Callable[[str], Any]] = {'STRING': str, 'DOUBLE': _float}
+    convert = converters.get(declared.name.removesuffix('_ARRAY'), _value)
+    with contextlib.suppress(TypeError, ValueError):
+        value = list(map(convert, content)) if isinstance(content, list) else convert(content)
+        # Python has no difference between the truth values and the numbers 0 and 1.
+        if isinstance(value, bool) <= (declared is Parameter.Type.BOOL):
+            return Parameter(name, declared, value)
+    return Parameter(name, value=(
+        list(map(_value, content)) if isinstance(content, list) else _value(content)))
+
+
+def _value(text: str) -> Any:
+    """Return the number or truth value of a text in YAML, or else the text itself."""
+    # An impossible date is a ValueError.
+    with contextlib.suppress(yaml.YAMLError, ValueError):
+        if isinstance(value := yaml.safe_load(text), bool | int | float):
+            return value
+    return text
+
+
+def _float(text: str) -> float:
+    value = _value(text)
+    if isinstance(value, bool):
+        raise ValueError(text)
+    return float(value)
 
 
 def _reason(result: SetParametersResult) -> str:

@@ -6,21 +6,30 @@ import collections
 import importlib
 import operator
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import yaml
-from rclpy.qos import QoSPresetProfiles, qos_profile_sensor_data
+from rclpy.qos import (
+    DurabilityPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_profile_sensor_data,
+)
+from rclpy.subscription import Subscription
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
 from rhs_isac_ros.protocol.messages import MessageError
+from rhs_isac_ros.protocol.role import NewestDict
 from rhs_isac_ros.ros.convert import deserialize
-from rhs_isac_ros.ros.endpoints import log_dropped, steady_timer, subscribe
+from rhs_isac_ros.ros.endpoints import OBSERVATION, log_dropped, steady_timer, subscribe
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run_verb
 
 _MAX_LENGTH = 128
+# Number of latest messages that are not printed twice.
+_MAX_KNOWN = 256
 # Maximum number of latest messages from which a rate is computed.
 _MAX_TIMES = 10001
 # Time to discover other nodes [s]; unlike ``ros2``, this tool has no daemon.
@@ -94,12 +103,18 @@ def echo(session: Session, options: argparse.Namespace) -> None:
     kind = _published_type(session, name, options.topic_name, options.spin_time)
     max_length = None if options.full_length else _MAX_LENGTH
     printed = 0
+    # Of the publishers that appear one after the other, each needs a subscription that suits it; a
+    # message may arrive at several.
+    subscriptions: dict[tuple[ReliabilityPolicy, DurabilityPolicy], Subscription | None] = {}
+    known: NewestDict[tuple[int, int], None] = NewestDict(_MAX_KNOWN)
 
-    def show(content: bytes) -> None:
+    def show(content: bytes, info: Mapping[str, int]) -> None:
         nonlocal printed
         # With --once, further messages may already have arrived.
-        if options.once and printed:
+        if options.once and printed or (key := (
+                info['source_timestamp'], info['publication_sequence_number'])) in known:
             return
+        known.put(key, None)
         try:
             message = deserialize(content, kind)
         except MessageError as error:
@@ -113,14 +128,21 @@ def echo(session: Session, options: argparse.Namespace) -> None:
                 else f'{value}\n')
         print_now(f'{text}---')
         printed += 1
-    # The strictest profile that suits all publishers, or one that suits any future publisher.
-    profile = (QoSPresetProfiles.BEST_AVAILABLE.value
-               if session.node.get_publishers_info_by_topic(name) else qos_profile_sensor_data)
-    subscription = session.node.create_subscription(kind, name, show, profile, raw=True)
+
+    def done() -> bool:
+        for publisher in session.node.get_publishers_info_by_topic(name):
+            offered = publisher.qos_profile
+            policies = offered.reliability, offered.durability
+            if policies not in subscriptions:
+                subscriptions[policies] = subscribe(session.node, kind, name, show, QoSProfile(
+                    depth=OBSERVATION.depth, reliability=policies[0], durability=policies[1]),
+                    raw=True)
+        return bool(options.once and printed)
     try:
-        session.spin_until(lambda: bool(options.once and printed), options.timeout)
+        session.spin_until(done, options.timeout)
     finally:
-        session.node.destroy_subscription(subscription)
+        for subscription in filter(None, subscriptions.values()):
+            session.node.destroy_subscription(subscription)
 
 
 def show_rate(session: Session, options: argparse.Namespace) -> None:

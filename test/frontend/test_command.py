@@ -66,11 +66,13 @@ def test_ctrl_c_ends_a_sweep_and_restores_the_pattern(board, pattern, monkeypatc
     assert (board.configuration == pattern).all()
 
 
-def test_a_fault_is_one_line(board, capsys):
+def test_a_fault_is_one_line(board, capsys, monkeypatch):
+    """It begins with the name that was typed."""
+    monkeypatch.setenv('RHS_ISAC_PROGRAM', 'scripts/board')
     board.faults = {7: 'silence'}
     assert main(['check', board.port, '--timeout', '0.05']) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f'python3 -m rhs_isac_ros.frontend: error: {board.port}: no answer to ')
+    assert line.startswith(f'scripts/board: error: {board.port}: no answer to ')
 
 
 def test_the_emulated_board_needs_no_hardware(capsys):

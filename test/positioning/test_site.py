@@ -135,6 +135,17 @@ def test_a_file_with_other_poses_is_the_same_site(tmp_path):
     assert after.surfaces['side'].codebook.id == before.surfaces['side'].codebook.id
 
 
+def test_a_file_behind_a_link_names_the_same_files(tmp_path):
+    (tmp_path / 'deep' / 'er' / 'real').mkdir(parents=True)
+    link = tmp_path / 'link'
+    link.symlink_to(tmp_path / 'deep' / 'er' / 'real')
+    first = written(tmp_path)
+    for source, folder in ((first, link), (link / 'moved.yaml', tmp_path)):
+        path = folder / 'moved.yaml'
+        path.write_text(site_text(source, {}, folder), encoding='utf-8')
+        assert Site.from_yaml(path).surfaces.keys() == Site.from_yaml(first).surfaces.keys()
+
+
 def test_the_region_of_a_turned_surface_may_be_larger():
     turned = dataclasses.replace(
         SCENARIO, pose=Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.1, 1.0), EXACT))

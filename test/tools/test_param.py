@@ -1,7 +1,10 @@
 """``scripts/param`` on a network in another process."""
 
+import math
+import re
 import threading
 
+import pytest
 import rclpy
 import yaml
 from rclpy.executors import SingleThreadedExecutor
@@ -37,23 +40,11 @@ def test_dump_is_a_parameter_file(output_of):
     assert values['user_id'] == 1 and values['position_m'] == []
 
 
-def test_parameters_without_a_value_are_left_out(output_of):
+def test_parameters_without_a_value_are_left_out(foreign, output_of):
     """Those of this package have values, but not those of every node."""
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node, executor = Node('foreign', context=context), SingleThreadedExecutor(context=context)
-    node.declare_parameter('gain', Parameter.Type.DOUBLE)
-    node.declare_parameter('count', 3)
-    executor.add_node(node)
-    thread = threading.Thread(target=executor.spin)
-    thread.start()
-    try:
-        values = yaml.safe_load(output_of(main, 'dump', 'foreign'))['/foreign']['ros__parameters']
-    finally:
-        executor.shutdown()
-        thread.join()
-        node.destroy_node()
-        rclpy.shutdown(context=context)
+    foreign.declare_parameter('gain', Parameter.Type.DOUBLE)
+    foreign.declare_parameter('count', 3)
+    values = yaml.safe_load(output_of(main, 'dump', 'foreign'))['/foreign']['ros__parameters']
     assert values['count'] == 3 and 'gain' not in values
 
 
@@ -73,6 +64,65 @@ def test_set_changes_the_parameter_or_prints_the_reason(output_of, call):
                    'first, random\n')
     assert output_of(main, 'get', '/bs', 'policy') == 'String value is: random\n'
     output_of(main, 'set', '/bs', 'policy', 'round_robin')
+
+
+TEXTS = ['1e3', 'nan', 'y', 'on', '~', '010', '.5', '0x1F', 'a: b', '', '- 1', 'é', '[1]']
+
+
+@pytest.fixture
+def foreign():
+    """A node of another package, which is spun in a thread."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node, executor = Node('foreign', context=context), SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    yield node
+    executor.shutdown()
+    thread.join()
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_a_dump_has_the_same_values_and_types_for_load_and_for_a_start(
+        foreign, output_of, call, tmp_path):
+    values = {**{f'text.{n}': text for n, text in enumerate(TEXTS)}, 'texts': TEXTS,
+              'small': 1e-5, 'large': 1e20, 'infinite': math.inf, 'numbers': [1e-5, 2.0, -1e300],
+              'count': 3, 'counts': [1, 2], 'yes': True, 'flags': [True, False]}
+    for name, value in values.items():
+        foreign.declare_parameter(name, value)
+    path = tmp_path / 'dump.yaml'
+    path.write_text(output_of(main, 'dump', 'foreign'), encoding='utf-8')
+    # Every node of rclpy has one that is read-only.
+    _, err, _ = call(main, 'load', 'foreign', str(path))
+    assert re.findall('parameter (.*) failed', err) == ['start_type_description_service']
+    for name, value in values.items():
+        found = foreign.get_parameter(name).value
+        assert (list(found) if isinstance(value, list) else found) == value, name
+    context = rclpy.Context()
+    rclpy.init(args=['--ros-args', '--params-file', str(path)], context=context)
+    other = Node('foreign', context=context, automatically_declare_parameters_from_overrides=True)
+    found = {name: other.get_parameter(name).value for name in values}
+    other.destroy_node()
+    rclpy.shutdown(context=context)
+    assert {name: list(value) if isinstance(values[name], list) else value
+            for name, value in found.items()} == values
+
+
+def test_values_are_set_with_the_declared_type(foreign, output_of, call):
+    for name, value in (('text', 'a'), ('gain', 0.5), ('gains', [0.5]), ('count', 1)):
+        foreign.declare_parameter(name, value)
+    for name, text, expected in (
+            ('text', '1e3', '1e3'), ('text', 'on', 'on'), ('text', '12', '12'),
+            ('gain', '1e-5', 1e-5), ('gain', '3', 3.0), ('gain', '.inf', math.inf),
+            ('gains', '[1, 1e-5]', [1.0, 1e-5]), ('count', '7', 7)):
+        output_of(main, 'set', 'foreign', name, text)
+        value = foreign.get_parameter(name).value
+        assert (type(value)(expected) if name != 'gains' else expected) == (
+            value if name != 'gains' else list(value)), name
+    for name, text in (('gain', 'much'), ('gain', 'true'), ('count', '1.5'), ('count', 'true')):
+        assert call(main, 'set', 'foreign', name, text)[2] == 1
 
 
 def test_load_sets_the_parameters_of_a_dump(output_of, call, tmp_path):

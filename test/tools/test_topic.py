@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from geometry_msgs.msg import Point32, Polygon
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
 import rhs_isac_msgs.msg as ros
@@ -50,6 +51,37 @@ def test_echo_prints_documents(output_of):
 def test_echo_receives_latched_messages(output_of):
     text = output_of(main, 'echo', '--once', 'codebook', '--full-length')
     assert len(yaml.safe_load(text.removesuffix('---\n'))['analog']['data']) == 216
+
+
+def test_echo_receives_the_message_of_a_late_publisher_that_latches_it(
+        shared_session, output_of):
+    """The topic is known from a volatile subscription and publisher."""
+    node = shared_session.node
+    node.create_subscription(Header, 'late', lambda message: None, 1)
+    node.create_publisher(Header, 'late', 1)
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+    def appear():
+        timer.cancel()
+        publisher = node.create_publisher(Header, 'late', latched)
+        publisher.publish(Header(frame_id='last'))
+    timer = node.create_timer(0.5, appear)
+    assert output_of(main, 'echo', '--once', '--field', 'frame_id', 'late', '--timeout', '30') == (
+        'last\n---\n')
+
+
+def test_a_message_that_several_subscriptions_receive_is_printed_once(shared_session, output_of):
+    node = shared_session.node
+    publishers = [node.create_publisher(Header, 'mixed', QoSProfile(depth=1, durability=one))
+                  for one in (DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE)]
+
+    def publish():
+        timer.cancel()
+        for publisher in publishers:
+            publisher.publish(Header(frame_id='both'))
+    timer = node.create_timer(1.0, publish)
+    assert output_of(main, 'echo', '--field', 'frame_id', 'mixed', '--timeout', '2') == (
+        2 * 'both\n---\n')
 
 
 def test_echo_of_a_field(output_of):
