@@ -21,6 +21,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.cycle import combiner
 from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.cdr import TINY
 from rhs_isac_ros.ros.endpoints import SERVICES, create_or_refuse, steady_timer
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
@@ -30,7 +31,8 @@ _DEFAULT_TIMEOUT_S = 10.0
 _MAX_TIMEOUT_S = 3600.0
 # Maximum number of goals in progress: each takes memory and a timer.
 _MAX_GOALS = 100
-
+# Time for which a result is kept; each status message lists all goals with results [s].
+_RESULT_S = 10
 
 # Minimum time between two answers of the action, in all and for each client [s]. By default, a
 # client of rclpy keeps the latest ten answers, including those to other clients, so it would lose
@@ -90,6 +92,7 @@ class _Goal:
     handle: Any
     future: Future
     cycle_id: int = 0
+    has_answered: bool = False  # whether the user has answered a beacon
 
 
 class LocateServer:
@@ -112,12 +115,14 @@ class LocateServer:
             node, Locate, topics.LOCATE, self._execute, goal_callback=self._accept,
             cancel_callback=self._cancel, goal_service_qos_profile=SERVICES,
             result_service_qos_profile=SERVICES, cancel_service_qos_profile=SERVICES,
-            feedback_pub_qos_profile=SERVICES, callback_group=ReentrantCallbackGroup()))
+            feedback_pub_qos_profile=SERVICES, callback_group=ReentrantCallbackGroup(),
+            result_timeout=_RESULT_S))
 
-    def observe(self, message: m.ProtocolState | m.PositionEstimate | m.NoFix) -> None:
+    def observe(self, message: m.Ack | m.ProtocolState | m.PositionEstimate | m.NoFix) -> None:
         """Update the goals with a message that the base station has sent or received."""
         phase = message.phase if isinstance(message, m.ProtocolState) else None
         for goal in [one for one in self._goals if one.handle.request.user == message.user]:
+            goal.has_answered |= isinstance(message, m.Ack)
             if phase is m.Phase.POSITIONING:
                 goal.cycle_id = message.cycle_id
             if goal.cycle_id != message.cycle_id:
@@ -151,14 +156,16 @@ class LocateServer:
 
     async def _accept(self, request: Locate.Goal) -> GoalResponse:
         await self._turns.wait()
-        valid = 1 <= request.user <= self._max_users and 0 <= request.timeout_s <= _MAX_TIMEOUT_S
+        valid = 1 <= request.user <= self._max_users and (
+            request.timeout_s == 0 or TINY <= request.timeout_s <= _MAX_TIMEOUT_S)
         if valid and self._n_accepted < self._max_goals:
             self._n_accepted += 1
             return GoalResponse.ACCEPT
         self._node.get_logger().warning(
             f'{topics.LOCATE}: {self._max_goals} goals are in progress' if valid else
             f'{topics.LOCATE}: user {request.user}, timeout_s {request.timeout_s:g}, expected a '
-            f'user from 1 to {self._max_users} and a timeout from 0 to {_MAX_TIMEOUT_S:g} s',
+            f'user from 1 to {self._max_users} and a timeout from 0 to {_MAX_TIMEOUT_S:g} s, as a '
+            'float such as 5.0',
             throttle_duration_sec=1.0)
         return GoalResponse.REJECT
 
@@ -173,8 +180,9 @@ class LocateServer:
         goal = _Goal(handle, Future())
         self._goals.append(goal)
         timeout_s = handle.request.timeout_s or _DEFAULT_TIMEOUT_S
-        timer = _later(self._node, timeout_s, functools.partial(
-            self._end, goal, f'no position within {timeout_s:g} s'))
+        timer = _later(self._node, timeout_s, lambda: self._end(goal, (
+            'no position' if goal.has_answered else
+            f'user {handle.request.user} has answered no beacon') + f' within {timeout_s:g} s'))
         self._feed_back(goal, m.Phase.BEACONING)
         self._request(handle.request.user)
         result = await goal.future
@@ -237,9 +245,9 @@ class BsNode(RoleNode[BaseStation]):
         self._begin_locate()
 
     def dispatch(self, event: events.Event) -> None:
-        """Pass an event to the role, and a `PositionEstimate` or `NoFix` also to ``locate``."""
+        """Pass an event to the role, and that of a user or positioner also to ``locate``."""
         super().dispatch(event)
-        if self._locate and isinstance(event, m.PositionEstimate | m.NoFix):
+        if self._locate and isinstance(event, m.Ack | m.PositionEstimate | m.NoFix):
             self._locate.observe(event)
 
     def publish(self, message: m.Message) -> bool:

@@ -16,6 +16,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import convert, endpoints, topics
+from rhs_isac_ros.ros.cdr import check_floats
 from rhs_isac_ros.ros.frames import vector
 from rhs_isac_ros.ros.parameters import ODOMETRY, ROBOTS
 from rhs_isac_ros.ros.role_node import RoleNode
@@ -54,6 +55,11 @@ class RobotMobility:
         if not np.isfinite([position, velocity]).all():
             self.reject(f'position {position.tolist()} m, velocity {velocity.tolist()} m/s, '
                         'expected finite numbers')
+            return
+        try:
+            check_floats(position)
+        except ValueError as error:
+            self.reject(f'position: {error}')
             return
         self._error = ''
         self._arrived_s = time.monotonic()

@@ -9,7 +9,8 @@ import dataclasses
 import enum
 import math
 import struct
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +27,24 @@ class Type(NamedTuple):
     wire: tuple[str, ...]
     encode: Callable[[Any], Sequence[Any]]
     decode: Callable[[Sequence[Any]], Any]
+
+
+# Smallest normal number. Python sends an integer in a field for one float as a smaller number; the
+# entries of a sequence are converted.
+TINY = sys.float_info.min
+
+
+def check_floats(values: Iterable[float]) -> None:
+    """Raise ValueError if one of the numbers is an integer that was sent as a float."""
+    for value in values:
+        if 0 < abs(value) < TINY:
+            raise ValueError(f'{value:g}, which is how Python sends an integer, expected a float '
+                             'such as 1.0')
+
+
+def _flushed(value: Any) -> Any:
+    """Return 0 instead of a smaller number, such as a probability, and others unchanged."""
+    return 0.0 if isinstance(value, float) and 0 < abs(value) < TINY else value
 
 
 def _encode_complex(values: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -57,8 +76,12 @@ def _shape(values: np.ndarray, shape: np.ndarray) -> list[int]:
     return sizes
 
 
-def _numbers(n: int) -> Type:
-    return Type(('d',) * n, lambda values: values.ravel().tolist(), np.array)
+def _numbers(*shape: int) -> Type:
+    def decode(items: Sequence[float]) -> np.ndarray:
+        check_floats(items)
+        return np.array(items).reshape(shape)
+    return Type(('d',) * math.prod(shape),
+                lambda values: list(map(_flushed, values.ravel().tolist())), decode)
 
 
 # Types that are one item on the wire.
@@ -71,8 +94,8 @@ TYPES = {
     'geometry_msgs/Quaternion': _numbers(4),
     'double[3]': _numbers(3),
     'double[4]': _numbers(4),
-    'double[9]': _numbers(9)._replace(decode=lambda items: np.array(items).reshape(3, 3)),
-    'double[36]': _numbers(36)._replace(decode=lambda items: np.array(items).reshape(6, 6)),
+    'double[9]': _numbers(3, 3),
+    'double[36]': _numbers(6, 6),
     'sequence<uint32>': Type(
         ('*I',), lambda values: (values.astype('<u4'),), lambda items: items[0].astype(int)),
     'rhs_isac_msgs/RealArray': Type(
@@ -163,7 +186,7 @@ class Codec:
             elif name == 'scenario_id':
                 items.append(scenario_id)
             else:
-                items.append(value)
+                items.append(_flushed(value))
         pieces = [HEADER]
         position, first = len(HEADER), 0
         for layouts, n_items, tail in self._runs:
@@ -218,10 +241,12 @@ class Codec:
                                    f'expected less than {_NANOSECONDS}')
             values['stamp_ns'] = _NANOSECONDS * items[0] + items[1]
         for name, first, last, encode, decode in self._fields:
-            if decode is None:
-                values[name] = items[first]
-                continue
             try:
+                if decode is None:
+                    values[name] = value = items[first]
+                    if isinstance(value, float):
+                        check_floats((value,))
+                    continue
                 values[name] = decode(items[first] if encode is None else items[first:last])
             except ValueError as error:
                 raise MessageError(f'{self._kind.__name__}.{name}: {error}') from None

@@ -5,7 +5,7 @@ import types
 
 import numpy as np
 import pytest
-from action_msgs.msg import GoalStatus
+from action_msgs.msg import GoalStatus, GoalStatusArray
 from builtin_interfaces.msg import Time
 from rclpy.action.client import ActionClient
 from rclpy.node import Node
@@ -16,6 +16,7 @@ from rhs_isac_ros.nodes import bs
 from rhs_isac_ros.nodes.bs import LocateServer
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, endpoints
+from rhs_isac_ros.ros.endpoints import LATCHED
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.topics import LOCATE
 
@@ -117,7 +118,25 @@ def test_signals_without_a_position_abort_the_goal(bench, action):
 
 def test_a_goal_ends_after_its_timeout(bench, action):
     assert finish(bench, action.send(1, 0.05), GoalStatus.STATUS_ABORTED).reason == (
-        'no position within 0.05 s')
+        'user 1 has answered no beacon within 0.05 s')
+    goal = action.send(1, 0.5)
+    action.server.observe(m.Ack(cycle_id=7, user=1))
+    assert finish(bench, goal, GoalStatus.STATUS_ABORTED).reason == 'no position within 0.5 s'
+
+
+def test_results_are_kept_for_a_short_time(bench, request, monkeypatch):
+    """Each status message lists all of them, so that many goals would cost more and more."""
+    monkeypatch.setattr(bs, '_RESULT_S', 0.2)
+    action, lists = request.getfixturevalue('action'), []
+    bench.add(Node, 'probe').create_subscription(
+        GoalStatusArray, f'{LOCATE}/_action/status', lambda found: lists.append(
+            len(found.status_list)), LATCHED)
+
+    for _ in range(2):
+        finish(bench, action.send(1, 0.05), GoalStatus.STATUS_ABORTED)
+        end_s = time.monotonic() + 0.5
+        bench.until(lambda end_s=end_s: time.monotonic() > end_s)
+    assert max(lists) == 1
 
 
 @pytest.mark.parametrize('action', [3], indirect=True)
@@ -179,7 +198,8 @@ def test_an_action_that_is_to_be_withdrawn_later_ends_with_its_node(bench, actio
     bench.until(lambda: not action.client.server_is_ready(), 'the end of the action')
 
 
-@pytest.mark.parametrize(('user', 'timeout_s'), [(0, 1.0), (9, 1.0), (1, -1.0), (1, np.nan)])
+@pytest.mark.parametrize(('user', 'timeout_s'), [
+    (0, 1.0), (9, 1.0), (1, -1.0), (1, np.nan), (1, 5e-324)])
 def test_an_invalid_goal_is_rejected(action, user, timeout_s):
     assert not action.send(user, timeout_s).handle.accepted
     assert not action.requested

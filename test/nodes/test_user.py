@@ -56,6 +56,7 @@ def test_a_robot_is_continued_with_its_velocity():
     (10**9, [2.0, 6.0, 3.5], 'use_sim_time'), (0, [2.0, -6.0, 3.5], 'in front of the surface'),
     (0, [2.0, np.nan, 3.5], 'position [2.0, nan, 3.5] m, velocity [0.0, 0.0, 0.0] m/s, expected '
      'finite numbers'),
+    (0, [2.0, 5e-324, 3.5], 'position: 4.94066e-324, which is how Python sends an integer'),
     (0, [2.0, 2e6, 3.5], '2e+06 m from the surface, expected coordinates up to 1e+06 m')])
 def test_a_position_that_cannot_be_used_is_named(stamp_ns, position, words):
     mobility = robot()

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point
 from rclpy.serialization import deserialize_message, serialize_message
 from ros_messages import codebook_from_ros, from_ros, to_ros
 
@@ -42,7 +43,7 @@ def random_scalar(field, rng):
         return [0, 1, 2**bits - 1, int(rng.integers(2**32))][rng.integers(4)]
     if field.type is float:
         special = [math.nan, math.inf] if 'nan_allowed' in meta else [0.0]
-        return float(rng.choice([-0.0, 5e-324, 1.7e308, rng.normal(), *special]))
+        return float(rng.choice([-0.0, cdr.TINY, 1.7e308, rng.normal(), *special]))
     assert field.type is str
     return ''.join(rng.choice(list('aZ09 _/µ漢\n"'), size=rng.integers(0, 20)))
 
@@ -144,6 +145,16 @@ def test_every_message_has_a_ros_type_and_every_ros_type_a_message():
     files = {path.stem for path in FILES.glob('*.msg')}
     assert files == kinds | OTHER_TYPES
     assert files == {name for name in dir(ros) if isinstance(getattr(ros, name), type)}
+
+
+@pytest.mark.parametrize(
+    'path', sorted(FILES.parent.glob('*/*.[ma][sc]*')), ids=lambda path: path.name)
+def test_every_field_has_a_comment(path):
+    """It tells the author of another node what to fill in."""
+    lines = path.read_text(encoding='utf-8').splitlines()
+    fields = [line for line in lines if re.match(r'[\w/\[\]]+ +[a-z]\w*', line)]
+    assert fields
+    assert [line for line in fields if not re.search(r'  # \S', line)] == []
 
 
 def test_no_sequence_is_bounded():
@@ -278,3 +289,24 @@ def test_pose_holds_position_and_covariance():
     np.testing.assert_allclose(covariance[3:, 3:], np.eye(3) * np.var(angles), rtol=1e-4)
     assert not covariance[:3, 3:].any()
     assert not covariance[3:, :3].any()
+
+
+@pytest.mark.parametrize(('kind', 'name', 'value'), [
+    (ros.PositionEstimate, 'crlb_m2', 1), (ros.GroundTruth, 'position', Point(x=5, y=1.0)),
+    (ros.ProtocolState, 'began_s', np.array([1, 2, 3, 4]))],
+    ids=lambda value: getattr(value, '__name__', None))
+def test_an_integer_in_a_field_for_floats_is_an_error(kind, name, value):
+    """Python sends it as a number near 0, unless messages check their fields."""
+    message = kind()
+    # As messages do without the environment variable of the tests.
+    object.__setattr__(message, f'_{name}', value)
+    content = serialize_message(message)
+    with pytest.raises(MessageError, match=f'{kind.__name__}.{name}: [0-9.]+e-32[34], which is '
+                                           'how Python sends an integer, expected a float such'):
+        convert.from_bytes(getattr(m, kind.__name__), content)
+
+
+def test_small_probabilities_are_sent_as_zero(example):
+    estimate = example(m.PositionEstimate, outside_probability=1e-310, blocked_probability=1e-300)
+    found = convert.from_bytes(m.PositionEstimate, convert.to_bytes(estimate, 0))
+    assert (found.outside_probability, found.blocked_probability) == (0.0, 1e-300)
