@@ -156,13 +156,11 @@ class Recorder:
         self._writer.flush()
 
     def record_topics(
-            self, node: Node,
-            on_message: Callable[[str, bytes, float], object] = lambda *_: None) -> None:
+            self, node: Node, on_message: Callable[[str], None] = lambda name: None) -> None:
         """Record the topics of `recorded_topics` in the namespace of a node and of the surfaces.
 
-        `on_message` is called with the name of the topic, as in `recorded_topics` after the name
-        of the surface, the serialized message, and its arrival as in `endpoints.arrived_s`, once
-        the message is written or writing has failed.
+        `on_message` is called for each message with the name of its topic, as in `recorded_topics`
+        after the name of the surface.
         """
         # Absolute names are the same in all namespaces.
         for name, (kind, profile) in {
@@ -184,13 +182,13 @@ class Recorder:
         self._attempt(self._writer.flush)
 
     def _write(
-            self, channel: int, name: str, on_message: Callable[[str, bytes, float], object],
-            message: bytes, info: Mapping[str, int]) -> None:
+            self, channel: int, name: str, on_message: Callable[[str], None], message: bytes,
+            info: Mapping[str, int]) -> None:
         if self._attempt(lambda: self._writer.add_message(
                 channel_id=channel, log_time=info['received_timestamp'],
                 publish_time=info['source_timestamp'], data=message)):
             self.count += 1
-        on_message(name, message, endpoints.arrived_s(info))
+        on_message(name)
 
     def _attempt(self, write: Callable[[], object]) -> bool:
         """Write unless the file is closed or an attempt has failed; return whether none has."""
@@ -396,9 +394,8 @@ def _decompressed(chunk: Any) -> Any:
 class CycleObserver(Node):
     """Collects the cycles of the network in its namespace, with times of `time.monotonic`.
 
-    With a `recorder`, which the caller closes, the observer also records the topics of the
-    namespace, and collects the cycles from the recorded messages. Without a recorder, it passes
-    `receives`, `scenario` and `on_malformed` to `subscribe_messages`.
+    `receives`, `scenario` and `on_malformed` are those of `subscribe_messages`. With a `recorder`,
+    which the caller closes, the observer also records the topics of the namespace.
     """
 
     def __init__(
@@ -409,13 +406,8 @@ class CycleObserver(Node):
             log: cycle_log.CycleLog | None = None, **node_options: Any) -> None:
         super().__init__('cycle_observer', **node_options)
         self.log = log or cycle_log.CycleLog()
-        if recorder is not None:
-            # The log and the recording share subscriptions, so that a replay yields the same
-            # cycles in the same order.
-            kinds = {topics.NAMES[kind]: kind for kind in cycle_log.RECEIVES}
-            recorder.record_topics(self, lambda name, message, arrived_s: self._on_recorded(
-                kinds.get(name), message, arrived_s))
-            return
+        if recorder:
+            recorder.record_topics(self)
         endpoints.subscribe_messages(self, receives, scenario, self.observe, on_malformed,
                                      exchange=endpoints.OBSERVATION)
 
@@ -428,11 +420,3 @@ class CycleObserver(Node):
         """Process a message that arrived at `now_s` [s]; subclasses may extend this method."""
         if isinstance(message, cycle_log.RECEIVES):
             self.log.add(message, now_s)
-
-    def _on_recorded(
-            self, kind: type[m.Message] | None, message: bytes, arrived_s: float) -> None:
-        try:
-            if kind:
-                self.observe(convert.from_bytes(kind, message), arrived_s)
-        except m.MessageError as error:
-            endpoints.log_dropped(self, error)

@@ -201,9 +201,7 @@ class SiteObserver(CycleObserver):
     """
 
     def __init__(self, site: Site, recorder: Recorder | None = None, **options: Any) -> None:
-        super().__init__(receives=(), **options)
-        if recorder:
-            recorder.record_topics(self)
+        super().__init__(recorder, receives=(), **options)
         endpoints.subscribe_messages(
             self, RECEIVES, None, self.observe, exchange=endpoints.OBSERVATION,
             prefix=f'/{site.leader}/')

@@ -21,7 +21,7 @@ class RecorderNode(Node):
         self._log = self.get_logger()  # type: ignore[no-untyped-call]
         self._log.info('recording; press Ctrl-C to stop')
 
-    def _log_topic(self, name: str, *_: object) -> None:
+    def _log_topic(self, name: str) -> None:
         if name not in self._topics:
             self._topics.add(name)
             self._log.info(f'first message of {name}')
