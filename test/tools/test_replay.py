@@ -1,10 +1,12 @@
 """``scripts/record`` and ``scripts/replay`` on a network in another process."""
 
 import dataclasses
+import itertools
 import os
 import re
 import signal
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -50,22 +52,47 @@ def test_the_recording_contains_the_cycles_observed_live(run):
     assert list(codebooks) == [shipped.id] == [codebook.id for codebook in codebooks.values()]
 
 
-def filtered(path, keep):
-    """Copy the messages of a recording that a function of topic and content selects."""
+def filtered(path, keep, namespaces=('',)):
+    """Copy the messages of a recording that a function of topic and content selects.
+
+    The copy contains them once for each namespace, one after the other.
+    """
     from mcap.reader import make_reader
     from mcap.writer import Writer
     copy, channels = path.with_name('filtered.mcap'), {}
     with path.open('rb') as source, copy.open('wb') as target:
         writer = Writer(target)
         writer.start()
-        for about, channel, message in make_reader(source).iter_messages():
-            if keep(channel.topic, message.data):
-                if channel.id not in channels:
-                    channels[channel.id] = writer.register_channel(
-                        channel.topic, 'cdr', writer.register_schema(about.name, '', b''))
-                writer.add_message(channels[channel.id], message.log_time, message.data, 0)
+        for namespace, (about, channel, message) in itertools.product(
+                namespaces, make_reader(source).iter_messages()):
+            topic = f'{namespace}{channel.topic}'
+            if keep(topic, message.data):
+                if topic not in channels:
+                    channels[topic] = writer.register_channel(
+                        topic, 'cdr', writer.register_schema(about.name, '', b''))
+                writer.add_message(channels[topic], message.log_time, message.data, 0)
         writer.finish()
     return copy
+
+
+@pytest.mark.parametrize('copy', ['converted', 'merged'])
+def test_a_copy_by_another_program_has_the_same_table(run, capsys, tmp_path, copy):
+    """With definitions in other words, and no scenario; or with messages of two networks."""
+    if copy == 'converted':
+        pytest.importorskip('rosbags', reason='there is no rosbags here')
+        subprocess.run(
+            [Path(sys.executable).with_name('rosbags-convert'), '--src', run.path, '--dst',
+             tmp_path / 'copy', '--dst-storage', 'mcap'], check=True, timeout=60)
+        path = tmp_path / 'copy' / 'copy.mcap'
+    else:
+        path = filtered(run.path, lambda *_: True, ('', '/other'))
+    tables = []
+    for arguments in ([run.path], [path, '--config', CONFIG / 'quick.yaml'],
+                      [path, '--config', CONFIG / 'quick.yaml', '--namespace', '/other']):
+        if copy == 'merged' or '--namespace' not in arguments:
+            assert main([*map(str, arguments)]) == 0
+            tables.append(capsys.readouterr().out)
+    assert len({*tables}) == 1
 
 
 def test_cycles_that_had_no_fix_live_count_for_every_estimator(run, capsys):
