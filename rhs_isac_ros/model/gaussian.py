@@ -31,8 +31,12 @@ class Marginal(NamedTuple):
     log_volume: np.ndarray
 
 
-def covariance_root(scenario: Scenario, covariance: np.ndarray) -> np.ndarray:
-    """Compute Cholesky factors of covariances of received signals, [..., n, n].
+def covariance_root(scenario: Scenario, covariance: np.ndarray, *, orthogonal: bool = False
+                    ) -> np.ndarray:
+    """Compute Cholesky factors, or such with orthogonal columns, of covariances [..., n, n].
+
+    The covariances are those of received signals. With orthogonal columns, whitening also
+    diagonalises the part of the thermal noise.
 
     Raises ScenarioError if the noise is so weak, compared with the multipath, that the factors
     would be dominated by rounding errors.
@@ -53,6 +57,9 @@ def covariance_root(scenario: Scenario, covariance: np.ndarray) -> np.ndarray:
         raise ScenarioError(
             f'noise_psd_dbm_hz: {scenario.noise_psd_dbm_hz:g} dBm/Hz, expected stronger noise: '
             f'with {fields}, the covariance of the signals is singular up to rounding errors')
+    if orthogonal:
+        values, vectors = np.linalg.eigh(covariance)
+        return vectors * np.sqrt(np.maximum(values, scenario.noise_power_w))[..., None, :]
     return roots
 
 

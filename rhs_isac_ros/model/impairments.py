@@ -34,6 +34,8 @@ UNIFORM_STD_RAD = 2.0
 # Standard deviation below which the tails of a wrapped phase do not overlap, points of its density
 # around the circle, and smallest information relative to a Gaussian's. It keeps matrices regular.
 _SEPARATE_STD_RAD, _CIRCLE, NO_INFORMATION = 0.25, 256, 1e-12
+# Standard deviation of the gain below which the gain has no effect [nepers].
+_MIN_GAIN_STD = 1e-9
 # Relative deviation of phases from whole multiples of the smallest one.
 _ROUNDING = 1e-9
 
@@ -110,7 +112,9 @@ class Nuisance(Exponents):
     dimensionless. `patterns` and `scaled_patterns`, complex128 [Q, N_B, N_SB F], are the exponents
     per unit of x and of z. `needs_search`, bool [Q], is the flag of `Linear` for each parameter.
     `phases`, float64 [N_B, Q], is the phase of each band per unit of z; it is 0 for every
-    parameter that does more than rotate the phases of whole bands. `precision`, float64 [Q], is
+    parameter that does more than rotate the phases of whole bands. `gains`, float64 [N_B, Q], is
+    the gain of each band per unit of z [nepers], and `has_gain` is whether any is not negligible.
+    `precision`, float64 [Q], is
     the information of the prior about z, from `NO_INFORMATION` to 1; see `wrapped_precision`.
     `period`, float64 [Q], is the change of z that does not change the factors; infinite if there
     is none. Parameters without information, whose effect others have as well, are left out of
@@ -135,6 +139,8 @@ class Nuisance(Exponents):
         with np.errstate(divide='ignore'):
             self.period = read_only(2 * np.pi / steps[kept])
         self.moves_multipath = np.ptp(self.scaled_patterns, axis=2).any(axis=1)
+        self.gains = read_only(self.scaled_patterns.real.mean(axis=2).T)
+        self.has_gain = bool(np.abs(self.gains).max(initial=0.0) > _MIN_GAIN_STD)
         turns = ~self.moves_multipath & ~self.scaled_patterns.real.any(axis=(1, 2))
         self.phases = read_only(np.where(turns, self.scaled_patterns[:, :, 0].imag.T, 0.0))
 

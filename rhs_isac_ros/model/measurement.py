@@ -18,7 +18,7 @@ from rhs_isac_ros.model.elements import (
 )
 from rhs_isac_ros.model.gaussian import covariance_root
 from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
-from rhs_isac_ros.model.impairments import draw_impairments
+from rhs_isac_ros.model.impairments import draw_impairments, nuisance_of
 from rhs_isac_ros.model.los import (
     direct_gain,
     draw_blocked,
@@ -198,12 +198,17 @@ class MeasurementModel:
 
     @functools.cached_property
     def root(self) -> np.ndarray:
-        """Cholesky factor L_i of Lambda_i, complex128 [N_B, N_SB F, N_SB F], read-only."""
-        return read_only(covariance_root(self.scenario, self.covariance()))
+        """Factor L_i with L_i L_i^H = Lambda_i, complex128 [N_B, N_SB F, N_SB F], read-only.
+
+        It is the Cholesky factor. With an unknown gain, which does not act on the noise, its
+        columns are orthogonal instead.
+        """
+        return read_only(covariance_root(
+            self.scenario, self.covariance(), orthogonal=nuisance_of(self.scenario).has_gain))
 
     @functools.cached_property
     def whitener(self) -> np.ndarray:
-        """Inverse of `root`, lower triangular, complex128 [N_B, N_SB F, N_SB F], read-only."""
+        """Inverse of `root`, complex128 [N_B, N_SB F, N_SB F], read-only."""
         return read_only(np.linalg.inv(self.root))
 
     @one_blas_thread

@@ -333,8 +333,9 @@ class SearchEstimator(abc.ABC):
                 whitened, aligned, fit.residual, self._likelihood.nuisance)
             for one in alternatives)])
         probabilities, _ = mixture_weights(log_weights)
-        reason = self._reason(
-            alternatives, whitened * np.exp(-fit.gain), fit.residual, probabilities)
+        weights = self._likelihood.weights_at(np.array([fit.gain]))[0]
+        reason = self._reason(alternatives, whitened * np.exp(-fit.gain) * weights,
+                              fit.residual, probabilities)
         # Without a fix, only a residual that nothing explains is evidence against the scenario.
         # The residual is the reason if the texts are equal.
         is_evidence = (reason == self._test.residual_test(fit.residual) if reason

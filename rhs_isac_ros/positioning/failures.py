@@ -25,7 +25,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
-from rhs_isac_ros.model.gaussian import covariance_root, energy_limit
+from rhs_isac_ros.model.gaussian import energy_limit
 from rhs_isac_ros.model.geometry import jacobian, to_positions
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
@@ -34,13 +34,12 @@ from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.likelihood import (
     Columns,
     Conditional,
+    Factors,
     Likelihood,
     Local,
     NuisancePrior,
     Signals,
     assemble,
-    log_determinant,
-    whiten_each,
 )
 from rhs_isac_ros.positioning.search import Modes, OneState, Refinement, ascend, predict
 from rhs_isac_ros.positioning.segments import concatenate, select
@@ -234,18 +233,19 @@ class FailureEffects(NamedTuple):
 class Whitening(NamedTuple):
     """Factors of the covariance matrices of H sets of failed elements."""
 
-    whitener: np.ndarray  # Inverse Cholesky factors, complex128 [N_B, H, N_SB F, N_SB F].
+    whitener: np.ndarray  # Inverse factors, complex128 [H, N_B, N_SB F, N_SB F].
     log_det: np.ndarray  # Logarithms of the determinants, float64 [H].
+    noise: np.ndarray | None  # As in `Factors`, float64 [H, n].
     information: np.ndarray  # Information of one covariance about parameters, float64 [Q, Q].
 
     @classmethod
     def of(cls, covariance: np.ndarray, prior: NuisancePrior, parent: 'Whitening | None' = None
            ) -> 'Whitening':
-        """Factorise covariances [N_B, H, N_SB F, N_SB F]; a parent provides the information."""
-        roots = covariance_root(prior.scenario, covariance)
+        """Factorise covariances [H, N_B, N_SB F, N_SB F]; a parent provides the information."""
+        roots, log_det, noise = Factors.of(prior, covariance)
         whitener = np.linalg.inv(roots)
-        return cls(whitener, log_determinant(roots).sum(axis=0), parent.information if parent
-                   else prior.information_of(roots[:, 0], whitener[:, 0]))
+        return cls(whitener, log_det, noise, parent.information if parent
+                   else prior.information_of(roots[0], whitener[0]))
 
 
 class FailedSurfaces:
@@ -268,7 +268,7 @@ class FailedSurfaces:
         cache = functools.lru_cache(maxsize=_MAX_SURFACES)
         self.surface = cache(self._surface)
         self.whitening = cache(lambda failed: Whitening.of(
-            self.surface(failed).covariance[:, None], likelihood.nuisance))
+            self.surface(failed).covariance[None], likelihood.nuisance))
 
     def _surface(self, failed: Failed) -> FailedSurface:
         if failed:
@@ -287,9 +287,8 @@ class FailedSurfaces:
         found = known.get((failed, remainder))
         if found is None:
             surface = self.surface(failed)
-            covariance = surface.covariance[:, None] + np.swapaxes(
-                self.effects.growth(surface), 0, 1)
-            covariance += remainder * self._error[:, None]
+            covariance = surface.covariance + self.effects.growth(surface)
+            covariance += remainder * self._error
             found = Whitening.of(covariance, self.likelihood.nuisance, self.whitening(failed))
             # Only extensions of the intact surface serve all shots; each takes a few megabytes.
             self._extensions = {(failed, remainder): found} | {
@@ -302,11 +301,11 @@ class FailedSurfaces:
         share = self.likelihood.scenario.failed_element_share
         return float(np.log(share / (1 - share)))
 
-    def roots_at(self, failed: Failed, positions: np.ndarray) -> np.ndarray:
-        """Return Cholesky factors of the covariance with the element errors at positions."""
+    def factors_at(self, failed: Failed, positions: np.ndarray) -> Factors:
+        """Return factors of the covariance with the element errors at positions."""
         excess = self.intact.covariance_at(positions) - self.surface(()).covariance
-        return covariance_root(
-            self.likelihood.scenario, self.surface(failed).covariance + excess)
+        return Factors.of(
+            self.likelihood.nuisance, self.surface(failed).covariance + excess)
 
 
 @dataclasses.dataclass(eq=False)
@@ -367,13 +366,14 @@ class FailedSet:
         whitening = self._surfaces.whitening(self._failed)
         if self._surfaces.intact.elements.is_exact:
             white = np.einsum(
-                'irs,mcis->mcir', whitening.whitener[:, 0], columns, optimize=True)
-            white, log_det = white.reshape(*columns.shape[:2], -1), whitening.log_det
+                'irs,mcis->mcir', whitening.whitener[0], columns, optimize=True)
+            white, log_det, noise = (
+                white.reshape(*columns.shape[:2], -1), whitening.log_det, whitening.noise)
         else:
-            white, log_det = whiten_each(
-                self._surfaces.roots_at(self._failed, positions), columns)
+            factors = self._surfaces.factors_at(self._failed, positions)
+            white, log_det, noise = factors.whiten(columns), factors.log_det, factors.noise
         local = assemble(prior, values, Columns.of(white, len(prior), len(failed)),
-                         whitening.information)
+                         whitening.information, noise)
         return local._replace(value=local.value + self._offset - log_det)
 
 
@@ -443,11 +443,12 @@ class FailureModel:
                    n_failed: int) -> np.ndarray:
         """Predict log-likelihoods [H] after a Newton step from columns [H, C, N_B, N_SB F]."""
         n = len(columns)
-        white = np.matmul(np.moveaxis(columns, 2, 0), np.swapaxes(whitening.whitener, 2, 3))
-        white = np.moveaxis(white, 0, 2).reshape(n, columns.shape[1], -1)
+        white = np.matmul(np.swapaxes(columns, 1, 2), np.swapaxes(whitening.whitener, 2, 3))
+        white = np.swapaxes(white, 1, 2).reshape(n, columns.shape[1], -1)
         prior = self.likelihood.nuisance
         local = assemble(
-            prior, values, Columns.of(white, len(prior), n_failed), whitening.information)
+            prior, values, Columns.of(white, len(prior), n_failed), whitening.information,
+            whitening.noise)
         return predict(local, self.likelihood)
 
 

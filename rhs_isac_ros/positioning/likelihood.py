@@ -1,11 +1,12 @@
 """The likelihood of positions and nuisance parameters: one Gaussian for each state of the surface.
 
 Nuisance parameters z multiply the direct path and the multipath in the signals y by exp(z P); see
-`model.impairments`. Thermal noise is assumed to be far weaker than the multipath. The divided
-signals y exp(-z P) then have the distribution of the model without the factor, apart from the
-change of volume. With mean mu(p) and covariance Lambda at a position p, the log-likelihood is, up
-to a constant, ``-|W (y exp(-z P) - mu(p))|^2 - 2 Re(sum z P) - log det Lambda`` with ``W^H W =
-Lambda^-1``.
+`model.impairments`. The divided signals y exp(-z P) have the distribution of the model without the
+factor, apart from the change of volume, and but for the thermal noise, which a gain does not
+multiply: its power is divided by that of the gain. With mean mu(p) and covariance Lambda at a
+position p and gain g [nepers], the log-likelihood is, up to a constant, ``-|W (y exp(-z P) -
+mu(p))|^2 - 2 Re(sum z P) - log det Lambda`` with ``W^H W = Lambda^-1``. In the basis in which the
+multipath is diagonal, so is the noise, and the gain changes W by a factor for each measurement.
 
 A `Conditional` evaluates the log-likelihood and its derivatives. The search, the posterior and the
 tracker use this interface for all impairments and errors of elements.
@@ -41,8 +42,6 @@ _UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
 # density then has many peaks along the range, too narrow for Gaussians. Its information is added
 # to the samples of the posterior afterwards.
 COARSE_STD_RAD = 0.75
-# Standard deviation of the gain below which the gain has no effect [nepers].
-_MIN_GAIN_STD = 1e-9
 
 
 class _Search(NamedTuple):
@@ -66,6 +65,8 @@ _MIN_SPREAD = 1e-12
 # Numbers of failures to average over: smallest probability of each, and how many at most.
 _MIN_PROBABILITY = 1e-5
 _MAX_COUNTS = 12
+# Largest logarithm of the power of noise relative to signals, which keeps it finite.
+_MAX_EXPONENT = 300.0
 # Share of the whitened energy up to which errors of an estimated surface need no covariance for
 # each position.
 _MIN_ERROR_SHARE = 0.05
@@ -126,6 +127,15 @@ class Columns(NamedTuple):
         return cls(residual[:, 0], by_point, by_values, linear,
                    observed if observed.shape[1] else by_values)
 
+    def weighted(self, weights: np.ndarray) -> 'Columns':
+        """Multiply all measurements by weights [M, n]."""
+        weights = weights[:, None]
+        by_values = self.by_values * weights
+        return Columns(
+            self.residual * weights[:, 0], self.by_point * weights, by_values,
+            self.linear * weights, by_values if self.observed is self.by_values
+            else self.observed * weights)
+
 
 class NuisancePrior(Exponents):
     """Prior and effect of the nuisance parameters, in units in which they are standard normal.
@@ -142,6 +152,8 @@ class NuisancePrior(Exponents):
     phases: np.ndarray  #: Phase of each band per unit [rad], float64 [N_B, Q].
     #: Information of the prior, as in `Nuisance`, but 0 for a uniform phase, float64 [Q].
     precision: np.ndarray
+    gains: np.ndarray  #: Of the bands per unit of each parameter [nepers], float64 [N_B, Q].
+    has_gain: bool  #: Whether any of them is not negligible.
     #: Half of the change of a parameter that does not change the signals, float64 [Q].
     half_period: np.ndarray
     information: np.ndarray  #: Contribution of the model's covariance, float64 [Q, Q].
@@ -172,6 +184,7 @@ class NuisancePrior(Exponents):
                 'timing_std_s: unknown, expected an unknown phase_std_rad or band_phase_std_rad '
                 'as well: half a period of the timing turns all phases by half a turn')
         self.precision, self.half_period = np.where(uniform, 0.0, precision), period / 2
+        self.gains, self.has_gain = self.scaled_patterns.real.mean(axis=2).T, declared.has_gain
         self._operators = self._multiplying(model.root, model.whitener)
         self.information = self.information_of(model.root, model.whitener)
 
@@ -191,8 +204,7 @@ class NuisancePrior(Exponents):
 
         It is far above `gain_unit` if the gain has no prior.
         """
-        gain_std = float(np.sqrt(self.gain @ self._gain_variance))
-        return gain_std if gain_std > _MIN_GAIN_STD else 0.0
+        return self.has_gain * float(np.sqrt(self.gain @ self._gain_variance))
 
     @functools.cached_property
     def _gain_variance(self) -> np.ndarray:
@@ -301,8 +313,51 @@ class NuisancePrior(Exponents):
         variance = np.where(self.precision > 0, 1.0, 1e6)
         spread = self.phases * variance
         values: np.ndarray = (spread.T @ np.linalg.pinv(spread @ self.phases.T) @ angles).T
-        values += np.outer(gain, self._gain_variance) / max(self.gain_std, _MIN_GAIN_STD)**2
+        if self.gain_std:
+            values += np.outer(gain, self._gain_variance / self.gain_std**2)
         return values
+
+    def noise_weights(self, gains: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return factors of whitened measurements, and the shares of noise in them, [M, n] each.
+
+        `gains` are those of the bands, [M, N_B] [nepers], and `noise` is the share of noise in
+        each measurement at a gain of 0, [n] or [M, n].
+        """
+        power = np.exp(np.minimum(-2 * gains, _MAX_EXPONENT))
+        power = np.repeat(power, noise.shape[-1] // gains.shape[1], axis=1)
+        total = 1 + noise * (power - 1)
+        return 1 / np.sqrt(total), noise * power / total
+
+
+class Factors(NamedTuple):
+    """Factors of covariances of signals, [..., N_B, N_SB F, N_SB F]."""
+
+    roots: np.ndarray
+    log_det: np.ndarray  # Logarithms of the determinants, added over the bands, float64 [...].
+    # Share of thermal noise in the whitened measurements, float64 [..., n]; None without a gain.
+    noise: np.ndarray | None
+
+    @classmethod
+    def of(cls, prior: NuisancePrior, covariance: np.ndarray) -> 'Factors':
+        """Factorise covariances."""
+        return cls.of_roots(prior, covariance_root(
+            prior.scenario, covariance, orthogonal=prior.has_gain))
+
+    @classmethod
+    def of_roots(cls, prior: NuisancePrior, roots: np.ndarray) -> 'Factors':
+        """Take Cholesky factors, or, with a gain, such with orthogonal columns."""
+        if not prior.has_gain:
+            diagonal = np.diagonal(roots, axis1=-2, axis2=-1).real
+            return cls(roots, 2 * np.log(diagonal).sum(axis=(-2, -1)), None)
+        variance = np.sum(np.abs(roots)**2, axis=-2)
+        noise = prior.scenario.noise_power_w / variance
+        return cls(roots, np.log(variance).sum(axis=(-2, -1)),
+                   noise.reshape(*noise.shape[:-2], -1))
+
+    def whiten(self, columns: np.ndarray) -> np.ndarray:
+        """Whiten columns [M, C, N_B, N_SB F] by the factors of each point; [M, C, n]."""
+        white = np.linalg.solve(self.roots, np.moveaxis(columns, 1, 3))
+        return np.moveaxis(white, 3, 1).reshape(*columns.shape[:2], -1)
 
 
 class Likelihood:
@@ -315,7 +370,8 @@ class Likelihood:
         self.model = system.prepare()
         self.nuisance = NuisancePrior(self.model)
         self.resolution = Resolution.of(self.scenario)
-        self.log_det = float(log_determinant(self.model.root).sum())
+        self.factors = Factors.of_roots(self.nuisance, self.model.root)
+        self.log_det = float(self.factors.log_det)
 
     def signals(self, received: np.ndarray) -> Signals:
         """Whiten signals [N, N_B, N_SB F]."""
@@ -326,6 +382,17 @@ class Likelihood:
         if not len(self.nuisance):
             return signals.whitened
         return self.model.whiten(self.nuisance.divide(signals.received, values))
+
+    def weights_at(self, gains: np.ndarray) -> np.ndarray:
+        """Return the factors of whitened measurements, [M, N_B, N_SB F]; without a gain, 1.
+
+        The gains [nepers] are [M], or [M, N_B] for each band.
+        """
+        if self.factors.noise is None:
+            return np.ones((len(gains), 1, 1))
+        gains = np.broadcast_to(gains.reshape(len(gains), -1), (len(gains), self.model.shape[0]))
+        weights, _ = self.nuisance.noise_weights(gains, self.factors.noise)
+        return weights.reshape(len(gains), *self.model.shape)
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate the likelihood at points; see `Conditional.local`."""
@@ -340,7 +407,8 @@ class Likelihood:
             moves = self.nuisance.moves_multipath[:, None]
             by_values = np.where(moves, observed, self.nuisance.slopes(mean))
         columns = Columns(residual, by_point, by_values, by_point[:, :0], observed)
-        return assemble(self.nuisance, values, columns, self.nuisance.information)
+        return assemble(
+            self.nuisance, values, columns, self.nuisance.information, self.factors.noise)
 
     def settle(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Replace uniform band phases in parameters [M, Q] by the most likely phases."""
@@ -354,16 +422,22 @@ class Likelihood:
     def outputs(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Compute the outputs of the bands' matched filters, complex128 [M, N_B]."""
         mean = self.model.whiten(self.model.mean(to_positions(points)))
-        return np.sum(mean.conj() * self.whitened(values, signals), axis=2)
+        return np.sum(
+            mean.conj() * self.whitened(values, signals)
+            * self.weights_at(values @ self.nuisance.gains.T)**2, axis=2)
 
 
 def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
-             information_of_covariance: np.ndarray) -> Local:
+             information_of_covariance: np.ndarray, noise: np.ndarray | None = None) -> Local:
     """Combine whitened columns into the likelihood and its derivatives at parameters [M, Q].
 
     `information_of_covariance`, float64 [Q, Q], is the information of the covariance about the
-    parameters. The further parameters of the columns are integrated out.
+    parameters. The further parameters of the columns are integrated out. `noise` is that of
+    `Factors`.
     """
+    if noise is not None:
+        weights, shares = prior.noise_weights(values @ prior.gains.T, noise)
+        columns = columns.weighted(weights)
     n, n_linear = 3 + len(prior), columns.linear.shape[1]
     # The residual energy, and gradient and information of its negative.
     expected = np.concatenate([columns.by_point, columns.by_values, columns.linear], axis=1)
@@ -381,10 +455,21 @@ def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
     # Derivatives of parameters that move the multipath already include this information.
     still = ~prior.moves_multipath
     information[:, 3:n, 3:n] += np.outer(still, still) * information_of_covariance
+    value = prior.log_prior(values) - energy
+    if noise is not None:
+        # By the share of noise, a gain scales the covariance less, and so does the density.
+        by_band = (len(values), *prior.gains.shape[:1], -1)
+        squares = parts.reshape(len(parts), -1, 2)**2
+        surplus = np.sum((shares * (1 - squares.sum(axis=2))).reshape(by_band), axis=2)
+        lost = np.sum((4 * (1 - shares)**2 - 4).reshape(by_band), axis=2)
+        gains = prior.gains * still
+        value += 2 * np.log(weights).sum(axis=1)
+        gradient[:, 3:n] += 2 * surplus @ prior.gains
+        information[:, 3:n, 3:n] += np.einsum('bq,mb,bp->mqp', gains, lost, gains)
     marginal = marginalise(information, gradient, n)
     rise = np.sum(gradient[:, n:] * marginal.offset, axis=1) / 2
-    return Local(prior.log_prior(values) - energy + rise + marginal.log_volume, marginal.gradient,
-                 marginal.information, energy - rise)
+    return Local(value + rise + marginal.log_volume, marginal.gradient, marginal.information,
+                 energy - rise)
 
 
 def _relative_std(phase_covariance: np.ndarray) -> float:
@@ -395,21 +480,6 @@ def _relative_std(phase_covariance: np.ndarray) -> float:
     # If all bands share one phase, only rounding errors remain.
     is_shared = relative <= 1e-9 * np.trace(phase_covariance)
     return 0.0 if is_shared else float(np.sqrt(relative))
-
-
-def log_determinant(roots: np.ndarray) -> np.ndarray:
-    """Return the logarithms of determinants from Cholesky factors [..., S, S], float64 [...]."""
-    return 2 * np.log(np.diagonal(roots, axis1=-2, axis2=-1).real).sum(axis=-1)
-
-
-def whiten_each(roots: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whiten columns [M, C, N_B, N_SB F] by the Cholesky factors of each point.
-
-    Returns [M, C, N_B N_SB F], and the logarithms of the determinants, float64 [M].
-    """
-    white = np.linalg.solve(roots, np.moveaxis(columns, 1, 3))
-    return (np.moveaxis(white, 3, 1).reshape(*columns.shape[:2], -1),
-            log_determinant(roots).sum(axis=1))
 
 
 class DispersedLikelihood:
@@ -431,7 +501,7 @@ class DispersedLikelihood:
         self._intact = MeasurementModel(intact, likelihood.codebook, likelihood.surface)
         self._scales, log_weights = _failure_counts(scenario.n_elements, share)
         self._offsets = log_weights + likelihood.log_det
-        self._latest: tuple[np.ndarray, list[np.ndarray]] | None = None
+        self._latest: tuple[np.ndarray, list[Factors]] | None = None
         average, least = self._average.covariance(), self._intact.covariance()
         roots = covariance_root(
             scenario, least + self._scales[:, None, None, None] * (average - least))
@@ -457,15 +527,15 @@ class DispersedLikelihood:
         prior, states = self._base.nuisance, []
         mean, slopes = self._average.mean_and_jacobian(to_positions(points), jacobian(points))
         columns = prior.columns(values, signals.received, mean, slopes)
-        for roots, offset, information in zip(
-                self._roots_at(points), self._offsets, self._information, strict=True):
-            white, log_det = whiten_each(roots, columns)
-            local = assemble(prior, values, Columns.of(white, len(prior)), information)
-            states.append(local._replace(value=local.value + offset - log_det))
+        for factors, offset, information in zip(
+                self._factors_at(points), self._offsets, self._information, strict=True):
+            white = Columns.of(factors.whiten(columns), len(prior))
+            local = assemble(prior, values, white, information, factors.noise)
+            states.append(local._replace(value=local.value + offset - factors.log_det))
         return _average_of(states)
 
-    def _roots_at(self, points: np.ndarray) -> list[np.ndarray]:
-        """Return Cholesky factors of the covariance at points for each number of failures."""
+    def _factors_at(self, points: np.ndarray) -> list[Factors]:
+        """Return factors of the covariance at points for each number of failures."""
         # Numerical integration evaluates many parameters at the same points. Another thread may
         # replace `_latest` at any time.
         latest = self._latest
@@ -475,7 +545,7 @@ class DispersedLikelihood:
             excess = (self._average.covariance_at(positions) - intact if any(self._scales)
                       else np.zeros(1))
             self._latest = latest = points, [
-                covariance_root(self._average.scenario, intact + scale * excess)
+                Factors.of(self._base.nuisance, intact + scale * excess)
                 for scale in self._scales]
         return latest[1]
 

@@ -171,7 +171,7 @@ def test_the_remainder_adds_to_the_covariance(weighing, codebook, monkeypatch):
         failed = tuple(sorted((5, element)))
         surface = model.surfaces.surface(failed)
         larger = surface._replace(covariance=surface.covariance + remainder)
-        whitening = Whitening.of(larger.covariance[:, None], model.likelihood.nuisance)
+        whitening = Whitening.of(larger.covariance[None], model.likelihood.nuisance)
         monkeypatch.setattr(model.surfaces, 'whitening', lambda _, whitening=whitening: whitening)
         (expected,), _ = model.weigh(failed, [site])
         assert values[element] == pytest.approx(expected, **tolerance(model))

@@ -21,6 +21,8 @@ SCENARIO = Scenario(
     roi_center_m=(4, 0, 0), roi_size_m=(2, 2, 1))
 ALL = {'user_gain_std_db': 1.0, 'carrier_offset_std_hz': 500.0, 'phase_std_rad': 0.5,
        'timing_std_s': 1e-8, 'band_phase_std_rad': 0.3}
+# Signals of which about half of the combinations consist of thermal noise.
+NOISY = ALL | {'noise_psd_dbm_hz': -135.0}
 
 
 @pytest.fixture(scope='module')
@@ -66,7 +68,7 @@ def test_the_value_is_the_gaussian_log_likelihood(case, likelihood):
     np.testing.assert_array_equal(local.residual, -local.value)
 
 
-@pytest.mark.parametrize('changes', [{}, ALL], ids=['position', 'all parameters'])
+@pytest.mark.parametrize('changes', [{}, ALL, NOISY], ids=['position', 'all parameters', 'noise'])
 def test_the_gradient_is_that_of_the_log_likelihood(codebook, changes):
     scenario, rng = declaring(**changes), np.random.default_rng(3)
     likelihood = Likelihood(System(scenario, codebook))
@@ -88,16 +90,18 @@ def test_the_gradient_is_that_of_the_log_likelihood(codebook, changes):
         assert difference == pytest.approx(gradient[0, index], rel=1e-3, abs=1e-3 / scale[index])
 
 
-@pytest.mark.parametrize('changes', [{}, ALL], ids=['position', 'all parameters'])
+@pytest.mark.parametrize('changes', [{}, ALL, NOISY], ids=['position', 'all parameters', 'noise'])
 def test_the_information_is_the_covariance_of_the_gradient(codebook, changes):
     """Averaged over signals at the true parameters, without the prior.
 
     The information about parameters that move the multipath varies from phase to phase.
     """
     rng = np.random.default_rng(4)
-    likelihood = Likelihood(System(declaring(**changes), codebook))
+    scenario = declaring(**changes)
+    likelihood = Likelihood(System(scenario, codebook))
     point = to_polar(np.array([[4.2, 0.3, -0.1]]))
-    received = MeasurementModel(SCENARIO, codebook).sample(
+    received = MeasurementModel(
+        declaring(noise_psd_dbm_hz=scenario.noise_psd_dbm_hz), codebook).sample(
         np.tile(to_positions(point), (2000, 1)), rng)
     _, gradients, informations, _ = likelihood.local(
         np.tile(point, (2000, 1)), np.zeros((2000, len(likelihood.nuisance))),
@@ -175,22 +179,26 @@ def test_the_likelihood_is_the_average_over_the_number_of_failures(codebook):
     ({'failed_element_share': 0.02}, lambda one: FailureModel(one).failed_set((3, 17))),
 ], ids=['errors', 'errors and failures', 'failures of a set'])
 def test_nuisance_parameters_and_element_errors_combine(codebook, changes, conditional):
-    """The value at parameters is that of the signals divided by their factors."""
-    scenario, rng = declaring(**ALL, **changes), np.random.default_rng(3)
+    """The value at parameters is that of the signals, and the noise, divided by their factors."""
+    scenario, rng = declaring(**NOISY, **changes), np.random.default_rng(3)
     likelihood = Likelihood(System(scenario, codebook))
     position = np.array([[4.2, 0.3, -0.1]])
     received = MeasurementModel(scenario, codebook).sample(position, rng)
     values = 0.3 * rng.normal(size=(1, len(likelihood.nuisance)))
     found = conditional(likelihood).local(
         to_polar(position), values, likelihood.signals(received))
-    alone = Likelihood(System(declaring(**changes), codebook))
+    gain_db = values[0, 0]
+    alone = Likelihood(System(declaring(
+        **changes, noise_psd_dbm_hz=scenario.noise_psd_dbm_hz - gain_db), codebook))
     divided = received / np.exp(
         np.tensordot(values, nuisance_of(scenario).scaled_patterns, axes=1))
     expected = conditional(alone).local(
         to_polar(position), without_values(1), alone.signals(divided))
-    gain = values[0, 0] * np.log(10) / 20
+    gain = gain_db * np.log(10) / 20
     prior = values[0] @ values[0] / 2 + 2 * received.size * gain
-    assert found.value[0] == pytest.approx(expected.value[0] - prior, rel=1e-9)
+    # Each value omits a constant.
+    expected_value = expected.value[0] - prior + likelihood.log_det - alone.log_det
+    assert found.value[0] == pytest.approx(expected_value, rel=1e-9)
     assert found.residual[0] == pytest.approx(expected.residual[0], rel=1e-9)
     np.testing.assert_allclose(found.gradient[0, :3], expected.gradient[0], rtol=1e-6)
     np.testing.assert_allclose(found.information[0, :3, :3], expected.information[0], rtol=1e-6)
