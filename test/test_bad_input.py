@@ -131,7 +131,7 @@ CALLS = [
 PROCESSES = [
     (['record', ''], "record: error: argument file: '', expected a file"),
     (['run', 'user', 'seed:=1'], 'user: error: unrecognized arguments: seed:=1'),
-    (['board', 'show', 'nothing'], 'frontend: error: nothing: the port cannot be used'),
+    (['board', 'show', 'nothing'], 'scripts/board: error: nothing: the port cannot be used'),
     (['run', '../setup'], 'no executable named ../setup'),
     (['reproduce', 'fig5'], 'no experiment named fig5'),
     (['benchmark', 'combinations', '--resume'],
