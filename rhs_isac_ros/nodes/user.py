@@ -2,6 +2,7 @@
 
 import functools
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -25,8 +26,11 @@ from rhs_isac_ros.support import plugins, streams
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import ParameterError
 
-# Period of looking up a frame, and of checking whether a robot has a position [s].
-_LOOKUP_S = 0.02
+# Period of looking up a frame, and of checking whether a robot has a position [s]; the same while
+# it has none.
+_LOOKUP_S, _ABSENT_S = 0.02, 0.5
+# Minimum period at which the true positions of users at rest are published [s].
+_REST_S = 5.0
 # Maximum difference between a stamp and the clock of the node [s].
 _MAX_AGE_S = 5.0
 # Time in which positions in two frames, or with stamps of two clocks, come from two sources [s],
@@ -45,6 +49,8 @@ class RobotMobility:
         self._clock, self._pose = node.get_clock(), pose
         self._source, self._timeout_s = source, timeout_s
         self._error = ''
+        #: Called after each position, also one that is unusable.
+        self.on_change: Callable[[], None] = lambda: None
         # Time of the latest position [s] by its origin: its frame, and whether its stamp fits.
         self._origins: dict[tuple[str, bool], float] = {}
         self._arrived_s, self._stamp_ns = -np.inf, 0
@@ -67,12 +73,14 @@ class RobotMobility:
         self._origins['', abs(self._age_s()) <= _MAX_AGE_S] = self._arrived_s
         self._position = self._pose.to_surface(position)
         self._velocity = self._pose.vectors_to_surface(velocity)
+        self.on_change()
 
     def reject(self, error: str, frame: str = '') -> None:
         """Store the reason why a position, in another frame if `frame` is given, is unusable."""
         self._error = error
         if frame and len(self._origins) < _MAX_ORIGINS:
             self._origins[frame, True] = time.monotonic()
+        self.on_change()
 
     @property
     def lack(self) -> str:
@@ -155,22 +163,21 @@ def follow_frame(
     source = endpoints.create_or_refuse(node, f'subscription to {topics.TF}', listen)
     last: list[tuple[int, np.ndarray]] = []
 
-    def look() -> None:
-        if not source:
-            return
-        buffer, _ = source  # The reference keeps the listener alive.
-        if not buffer.can_transform(frame, child, Time()):
-            return
+    def look() -> float:
+        # The reference keeps the listener alive.
+        if not source or not (buffer := source[0]).can_transform(frame, child, Time()):
+            return _ABSENT_S
         found = buffer.lookup_transform(frame, child, Time())
         stamp_ns = Time.from_msg(found.header.stamp).nanoseconds
         position = vector(found.transform.translation)
         before_ns, before = last[0] if last else (stamp_ns, position)
         if last and stamp_ns == before_ns:
-            return
+            return _LOOKUP_S
         last[:] = [(stamp_ns, position)]
         elapsed_s = 1e-9 * (stamp_ns - before_ns)
         velocity = (position - before) / elapsed_s if elapsed_s > 0 else np.zeros(3)
         mobility.put(stamp_ns, position, velocity)
+        return _LOOKUP_S
     endpoints.steady_timer(node, _LOOKUP_S, look)
     return mobility
 
@@ -191,10 +198,12 @@ class UserNode(RoleNode[User]):
         self._true_odometry = endpoints.UserTopics(
             self, {topics.TRUE_ODOMETRY: Odometry}, values.user_topics)
         # On the clock of ROS, like the mobilities.
-        self.create_timer(values.ground_truth_period_s, self._publish_ground_truth)
+        self._truth_timer = self.create_timer(
+            values.ground_truth_period_s, self._publish_ground_truth)
         if robot := self._robot:
-            self._watch_robot(robot)
-            endpoints.steady_timer(self, _LOOKUP_S, functools.partial(self._watch_robot, robot))
+            watch = functools.partial(self._watch_robot, robot)
+            timer = endpoints.steady_timer(self, watch(), watch)
+            robot.on_change = lambda: endpoints.set_period(timer, watch())
 
     def _mobilities(self) -> dict[int, mobility.Mobility]:
         values = self.values
@@ -277,6 +286,9 @@ class UserNode(RoleNode[User]):
             return
         role, now_s, stamp = self.role, self.now_s(), self.get_clock().now().to_msg()
         truths = role.ground_truths(now_s)
+        period_s = self.values.ground_truth_period_s
+        endpoints.set_period(self._truth_timer, period_s if self._robot or truths.velocity.any()
+                             else max(period_s, _REST_S))
         self.publish(truths if len(role.users) > 1 else next(truths.each()))
         for truth in truths.each():
             endpoints.publish_if_subscribed(
@@ -284,8 +296,10 @@ class UserNode(RoleNode[User]):
                     convert.true_odometry, truth.user, truth.position, truth.velocity, stamp,
                     self.frame))
 
-    def _watch_robot(self, robot: RobotMobility) -> None:
-        self.set_lacking(robot.lack)
+    def _watch_robot(self, robot: RobotMobility) -> float:
+        """Report what the robot lacks, and return the time until the next check [s]."""
+        self.set_lacking(lack := robot.lack)
+        return _ABSENT_S if lack else _LOOKUP_S
 
 
 main = entry('user', lambda: [UserNode()])

@@ -38,6 +38,8 @@ from rhs_isac_ros.ros.topics import RHS_FRAME, TF, TF_STATIC
 _ELLIPSOID, _OUTLINE, _MESH = 0.35, 0.15, 0.25
 # Width in the scene that corresponds to a line width of one screen point [m].
 _LINE_M = 0.02
+# Minimum period of the scene while nobody receives it [s].
+_UNOBSERVED_S = 2.0
 
 
 def marker(
@@ -174,7 +176,7 @@ class VisualizerNode(Node):
         values = parameters.declare(self, 'visualizer')
         self._scenario = NodeSurface.of(values, self.get_namespace()).scenario
         self._frame = Frame.of(self, values)
-        self._forget_s = values.forget_s
+        self._forget_s, self._period_s = values.forget_s, values.period_s
         self._scene = SceneState()
         # The latest beam and its marker, because a beam pattern is slow to compute.
         self._drawn: tuple[m.Beam, Marker] | None = None
@@ -201,14 +203,20 @@ class VisualizerNode(Node):
                 self._frame, self._frame.user(message.user), message.position,
                 convert.stamp_of(message, self)))
 
-    def _show(self) -> None:
-        """Publish all markers and paths, so that late joiners receive them."""
+    def _show(self) -> float:
+        """Publish all markers and paths, so that late joiners receive them.
+
+        Return the time until the next call [s], which is longer if nobody receives them.
+        """
         for user in self._scene.discard_stale(time.monotonic() - self._forget_s):
             self._paths.remove(user)
         stamp = self.get_clock().now().to_msg()
         for state in self._scene.users.values():
             self._show_paths(state, stamp)
         endpoints.publish_if_subscribed((self._publisher,), lambda: self._markers(stamp))
+        observed = any(one.get_subscription_count() for one in (
+            self._publisher, *self._paths.created()))
+        return self._period_s if observed else max(self._period_s, _UNOBSERVED_S)
 
     def _show_paths(self, user: SceneUser, stamp: Time) -> None:
         paths = user.estimated_path, user.true_path

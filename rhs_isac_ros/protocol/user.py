@@ -170,7 +170,7 @@ class User(StateMachine):
 
     def _log_no_beacon(self, event: Timeout) -> None:
         self.log_state('beacons', f'no beacon for {self._beacon_s:g} s', True,
-                       warning=bool(self._attempts))
+                       warning=bool(self._truths))
 
     def _log_other_instance(self, event: m.Grant) -> None:
         text = m.describe_conflict(event.user, event.user_instance)

@@ -1,6 +1,7 @@
 """The diagnostics of the nodes, published as `diagnostic_msgs/DiagnosticArray`."""
 
 import socket
+import time
 from collections.abc import Callable, Iterator
 
 from builtin_interfaces.msg import Time
@@ -11,7 +12,7 @@ from std_msgs.msg import Header
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import endpoints, topics
 
-_PERIOD_S = 1.0
+_PERIOD_S, _TOLERANCE_S = 1.0, 0.05
 
 
 def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
@@ -43,14 +44,24 @@ def subscribe_reports(node: Node, on_report: Callable[[str, Report], None]) -> N
     endpoints.subscribe(node, DiagnosticArray, topics.DIAGNOSTICS, receive, endpoints.EXCHANGE)
 
 
-def publish_reports(node: Node, report: Callable[[], Report]) -> None:
-    """Call `report` once a second, and publish the result if the topic has subscribers."""
+def make_reporter(node: Node, report: Callable[[], Report]) -> Callable[[], bool]:
+    """Return a function that publishes the result of `report`, at most once a second.
+
+    The function returns whether the topic has subscribers.
+    """
     publisher = endpoints.create_publisher(
         node, DiagnosticArray, topics.DIAGNOSTICS, endpoints.EXCHANGE)
 
-    def publish() -> None:
-        # Called even without subscribers: a report contains the faults since the previous one.
-        found = report()
-        endpoints.publish_if_subscribed((publisher,), lambda: to_ros(
-            found, node.get_fully_qualified_name(), node.get_clock().now().to_msg()))
-    endpoints.steady_timer(node, _PERIOD_S, publish)
+    due_s = 0.0
+
+    def publish() -> bool:
+        nonlocal due_s
+        # A timer may expire early.
+        if time.monotonic() > due_s - _TOLERANCE_S:
+            due_s = time.monotonic() + _PERIOD_S
+            # Called even without subscribers: a report contains the faults since the previous one.
+            found = report()
+            endpoints.publish_if_subscribed((publisher,), lambda: to_ros(
+                found, node.get_fully_qualified_name(), node.get_clock().now().to_msg()))
+        return publisher.get_subscription_count() > 0
+    return publish

@@ -76,7 +76,7 @@ def profile_for(kind: type[m.Message], exchange: QoSProfile = EXCHANGE) -> QoSPr
     return LATCHED if kind in _LATCHED_MESSAGES else exchange
 
 
-# Period of logging what was not logged at once [s].
+# Minimum period of logging what was not logged at once [s].
 _JOURNAL_S = 1.0
 _CreatedT = TypeVar('_CreatedT')
 # For each node: descriptions of refused endpoints, by kind and name.
@@ -105,9 +105,20 @@ def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> 
         return None
 
 
-def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:
-    """Create a running timer on the steady clock."""
-    return node.create_timer(period_s, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+def steady_timer(node: Node, period_s: float, callback: Callable[[], float | None]) -> Timer:
+    """Create a running timer on the steady clock; `callback` may return a new period [s]."""
+    def call() -> None:
+        set_period(timer, callback())
+    timer = node.create_timer(period_s, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    return timer
+
+
+def set_period(timer: Timer, period_s: float | None) -> None:
+    """Let a timer begin another period [s], unless it has this period or None is given."""
+    if period_s is not None and (
+            timer.is_canceled() or timer.timer_period_ns != int(1e9 * period_s)):
+        timer.timer_period_ns = int(1e9 * period_s)
+        timer.reset()
 
 
 class _NoPublisher(Publisher):
@@ -196,7 +207,7 @@ class Journal:
     def __init__(self, node: Node) -> None:
         self._logger, self._log = node.get_logger(), StateLog()
         self._lock = threading.Lock()
-        steady_timer(node, _JOURNAL_S, lambda: self._write(StateLog.due))
+        self._timer = steady_timer(node, _JOURNAL_S, lambda: self._write(StateLog.due))
 
     def state(self, key: str, text: str, holds: bool, warning: bool | None = None) -> None:
         """Log that a state begins or has another text (`holds`), or that it ends."""
@@ -217,7 +228,12 @@ class Journal:
 
     def _write(self, method: Callable[..., list[Line]], *args: Any, **options: Any) -> None:
         with self._lock:
-            lines = method(self._log, *args, now_s=time.monotonic(), **options)
+            now_s = time.monotonic()
+            lines = method(self._log, *args, now_s=now_s, **options)
+            if (due_s := self._log.due_s) is None:
+                self._timer.cancel()
+            else:
+                set_period(self._timer, max(due_s - now_s, _JOURNAL_S))
         # Three calls, because rclpy requires that a line of code always logs with one severity.
         for text, warning, error in lines:
             if error:
@@ -324,6 +340,10 @@ class UserTopics:
                 for name, kind in self._kinds.items())
         return self._publishers[user]
 
+    def created(self) -> Iterator[Publisher]:
+        """Return all publishers that exist."""
+        return itertools.chain(*self._publishers.values())
+
     def remove(self, user: int) -> None:
         """Destroy the publishers for a user, if any."""
         for publisher in self._publishers.pop(user, ()):
@@ -334,49 +354,66 @@ class UserTopics:
 _FOREIGN = ('/rosout', '/parameter_events')
 # Placeholders of the middleware for the name of a node, which may arrive after its endpoints.
 _UNNAMED = ('_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_')
+# Time after which an endpoint without a name belongs to no node of ROS [s].
+_NAMING_S = 3.0
 
 
 class Mismatches:
-    """Endpoints of other nodes that cannot exchange messages with those of a node."""
+    """Endpoints of other programs that cannot exchange messages with those of a node."""
 
     def __init__(self, node: Node) -> None:
         self._node, self._texts = node, dict[str, str]()
-        # Numbers of endpoints by topic at the last update.
+        # Numbers of endpoints by topic at the last examination.
         self._counts: list[tuple[str, int, int]] = []
+        # Time at which each endpoint without a name was found [s], by its GID.
+        self._unnamed: dict[str, float] = {}
+        self._are_named = True
 
     def update(self) -> dict[str, str]:
         """Return a description of each, by its key in the diagnostics.
 
-        The topics of the node in the ROS graph are examined if endpoints have appeared or gone.
+        The topics of the node in the ROS graph are examined if endpoints have appeared or gone, or
+        may receive a name.
         """
         node = self._node
         ours = {*(one.topic_name for one in node.publishers),
                 *(one.topic_name for one in node.subscriptions)} - {*_FOREIGN}
         counts = [(topic, node.count_publishers(topic), node.count_subscribers(topic))
                   for topic in sorted(ours)]
-        if counts != self._counts:
-            self._counts = counts
+        if counts != self._counts or not self._are_named:
+            self._counts, before, self._unnamed = counts, self._unnamed, {}
+            self._are_named = True
             self._texts = {
-                key: text for topic, *_ in counts for key, text in self._find(topic)}
+                key: text for topic, *_ in counts for key, text in self._find(topic, before)}
         return self._texts
 
-    def _find(self, topic: str) -> Iterator[tuple[str, str]]:
+    def _find(self, topic: str, before: Mapping[str, float]) -> Iterator[tuple[str, str]]:
         own = self._node.get_fully_qualified_name()
         for publisher, subscription in itertools.product(
                 self._node.get_publishers_info_by_topic(topic),
                 self._node.get_subscriptions_info_by_topic(topic)):
-            names = {full_name(publisher), full_name(subscription)}
-            if publisher.node_name in _UNNAMED or subscription.node_name in _UNNAMED:
-                # The name may arrive after the endpoint, which the next update examines again.
-                self._counts = []
-            elif own in names:
-                compatibility, reason = qos_check_compatible(
-                    publisher.qos_profile, subscription.qos_profile)
-                if compatibility == QoSCompatibility.ERROR:
-                    (name,) = names - {own} or {own}
-                    reason = reason.removeprefix('ERROR: ').rstrip(';. ')
-                    yield (f'conflict.qos.{topic.lstrip("/")}.{name.lstrip("/")}',
-                           f'{topic}: no messages between this node and {name}: {reason}')
+            mine, other = ((publisher, subscription) if full_name(publisher) == own else
+                           (subscription, publisher))
+            if full_name(mine) != own:
+                continue
+            name = full_name(other)
+            if other.node_name in _UNNAMED:
+                gid = bytes(other.endpoint_gid).hex()
+                self._unnamed[gid] = before.get(gid, time.monotonic())
+                if time.monotonic() < self._unnamed[gid] + _NAMING_S:
+                    self._are_named = False
+                    continue
+                name = f'DDS endpoint {gid}'
+            compatibility, reason = qos_check_compatible(
+                publisher.qos_profile, subscription.qos_profile)
+            kind = 'qos'
+            if other.topic_type != mine.topic_type:
+                kind, reason = 'type', f'type {other.topic_type}, expected {mine.topic_type}'
+            elif compatibility != QoSCompatibility.ERROR:
+                continue
+            reason = reason.removeprefix('ERROR: ').rstrip(';. ')
+            yield (f'conflict.{kind}.{topic.lstrip("/")}.{name.lstrip("/").replace(" ", "_")}',
+                   f'{topic}: no messages between this node and {name}: {reason}')
 
 
 def full_name(info: Any) -> str:

@@ -7,8 +7,12 @@ import os
 import re
 import socket
 import sys
+import xml.etree.ElementTree as ElementTree
 
+from ament_index_python import get_resources
 from ament_index_python.packages import get_package_share_directory
+
+from rhs_isac_ros.support.exits import print_error
 
 LOCALHOST = 'LOCALHOST'
 _DOMAIN, _RANGE = 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'
@@ -28,11 +32,32 @@ _VALID = {
     STRATEGY: ('Enforce|Permissive', 'Enforce or Permissive')}
 
 
+def check_middleware() -> None:
+    """Exit with code 2 if the middleware that the environment selects is not installed.
+
+    Called before rclpy is imported, which would end the process with another code.
+    """
+    if not (name := os.environ.get('RMW_IMPLEMENTATION')):
+        return
+    installed = sorted({*get_resources('rmw_typesupport')} - {'rmw_implementation'})
+    if name not in installed:
+        print_error(f'environment variable RMW_IMPLEMENTATION: {name!r}, expected '
+                    f'{", ".join(installed)}', 'rhs_isac_ros')
+        sys.exit(2)
+
+
 def check_environment(parser: argparse.ArgumentParser) -> None:
     """Exit with a usage error if an environment variable of ROS is invalid."""
     for name, (pattern, expected) in _VALID.items():
         if (value := os.environ.get(name, '')) and not re.fullmatch(pattern, value):
             parser.error(f'environment variable {name}: {value!r}, expected {expected}')
+    # Fast DDS would run without the profile.
+    if file := os.environ.get(_PROFILES):
+        try:
+            ElementTree.parse(file)
+        except (OSError, ElementTree.ParseError) as error:
+            parser.error(f'environment variable {_PROFILES}: {file!r}, expected an XML file: '
+                         f'{getattr(error, "strerror", None) or error}')
 
 
 def is_secure() -> bool:

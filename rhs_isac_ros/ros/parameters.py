@@ -161,7 +161,8 @@ _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
                    unit='m', low=-1e6, high=1e6),
         _parameter('speed_mps', 1.0, 'Speed, at most max_user_speed_mps of the scenario.',
                    unit='m/s', low=0.0, high=1e4),
-        _parameter('ground_truth_period_s', 0.5, 'Period at which the true position is published.',
+        _parameter('ground_truth_period_s', 0.5, 'Period at which the true position is published; '
+                   'at least 5 s for users at rest.',
                    unit='s', low=0.01, high=60.0),
         _declared_by(BaseStationSettings)['step_timeout_s'],
         _parameter('beacon_timeout_s', 1.5,

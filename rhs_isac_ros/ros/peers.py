@@ -15,13 +15,16 @@ from rclpy.publisher import Publisher
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol.messages import MessageError
-from rhs_isac_ros.protocol.presences import PERIOD_S, Presence, Presences
+from rhs_isac_ros.protocol.presences import PERIOD_S, SLOW_PERIOD_S, Presence, Presences
 from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.ros.roster import MEMBERS
 from rhs_isac_ros.support.clock_watch import ClockWatch
 
-# Poll period while a role is missing or nodes are in conflict, and poll period otherwise [s].
-_POLL_S, _IDLE_POLL_S = 0.1, 1.0
+# Poll period while roles appear or nodes are in conflict, poll period otherwise, and of a node
+# without work that nobody observes [s].
+_POLL_S, _IDLE_POLL_S, _SLOW_POLL_S = 0.1, 1.0, 2.0
+# Time after the last message until a node has no work [s].
+_WORK_S = 5.0
 # Number of polls before the first report of missing roles, while discovery is still under way.
 _GRACE_POLLS = 10
 
@@ -51,14 +54,17 @@ class Peers:
         Namespace of the nodes of the whole site, with a final slash; empty without a site.
     library_id
         Id of the library of codebooks; empty for a role that uses none.
+    observe
+        Called after each poll; returns whether an observer expects a poll every second.
     """
 
     def __init__(
             self, node: Node, role: str, instance: int, scenario: Scenario,
             on_missing: Callable[[tuple[str, ...]], None],
-            on_rival: Callable[[bool], None], site_prefix: str = '', library_id: str = ''
-    ) -> None:
+            on_rival: Callable[[bool], None], site_prefix: str = '', library_id: str = '',
+            observe: Callable[[], bool] = lambda: False) -> None:
         self._node, self._on_missing, self._on_rival = node, on_missing, on_rival
+        self._observe, self._work_end_s, self._period_s = observe, 0.0, PERIOD_S
         of_site = MEMBERS[role].requires_of_site if site_prefix else ()
         self._role, self._needed = role, (*of_site, *MEMBERS[role].needed)
         self._presences = Presences(Presence(
@@ -94,6 +100,13 @@ class Peers:
         self._presences.own = dataclasses.replace(self._presences.own, role=self._role)
         self._changed.set()
 
+    def note_work(self) -> None:
+        """Announce the node at the shortest period for some time, because it has work."""
+        now_s = time.monotonic()
+        had_work, self._work_end_s = now_s < self._work_end_s, now_s + _WORK_S
+        if not had_work:
+            self._changed.set()
+
     def close(self) -> None:
         """Announce that the node gives up its role; called before the node is destroyed."""
         self._closed = True
@@ -106,7 +119,7 @@ class Peers:
         self._found: frozenset[str] = frozenset()
         self._reported: tuple[str, ...] | None = None
         self._polls = 0
-        self._set_period(_POLL_S)
+        endpoints.set_period(self._timer, _POLL_S)
 
     def conflicts(self) -> dict[str, str]:
         """Return a description of each conflict and refusal, by its key in the diagnostics."""
@@ -114,7 +127,8 @@ class Peers:
             f'conflict.{what.replace(" ", "_")}': text
             for what, text in endpoints.refusals(self._node).items()}
 
-    def _poll(self) -> None:
+    def _poll(self) -> float:
+        """Report what has changed, and return the time until the next poll [s]."""
         self._polls += 1
         self._presences.now_s = self._now_s()
         before, self._newest = self._newest, self._find()
@@ -128,9 +142,12 @@ class Peers:
         endpoints.journal(self._node).update(self._conflicts)
         if self._newest[self._role] != before[self._role]:
             self._on_rival(self._presences.stands_by)
-        self._report_missing()
-        busy = self._reported != () or self._conflicts or self._presences.own.use_sim_time
-        self._set_period(_POLL_S if busy else _IDLE_POLL_S)
+        has_changed = self._report_missing()
+        is_observed = self._observe()
+        if has_changed or self._conflicts or self._presences.own.use_sim_time:
+            return _POLL_S
+        slow = not is_observed and self._presences.next_period_s(SLOW_PERIOD_S) > _IDLE_POLL_S
+        return _SLOW_POLL_S if slow else _IDLE_POLL_S
 
     def _find(self) -> dict[str, int]:
         return {role: self._presences.newest(role) for role in self._newest}
@@ -138,18 +155,14 @@ class Peers:
     def _now_s(self) -> float:
         """Return the time [s], without the intervals in which this process stalled."""
         now_s = time.monotonic()
-        if now_s - self._last_s > _IDLE_POLL_S + PERIOD_S:
+        if now_s - self._last_s > _SLOW_POLL_S + PERIOD_S:
             # Announcements that arrived meanwhile may still be waiting.
             self._missed_s += now_s - self._last_s
         self._last_s = now_s
         return now_s - self._missed_s
 
-    def _set_period(self, period_s: float) -> None:
-        if self._timer.timer_period_ns != int(1e9 * period_s):
-            self._timer.timer_period_ns = int(1e9 * period_s)
-            self._timer.reset()
-
-    def _report_missing(self) -> None:
+    def _report_missing(self) -> bool:
+        """Report missing roles, and return whether the next poll may find others."""
         before, self._found = self._found, frozenset(
             role for role in self._needed if self._newest[role])
         missing = tuple(role for role in self._needed if role not in self._found & before)
@@ -157,6 +170,7 @@ class Peers:
         if missing != self._reported and not (missing and is_early):
             self._reported = missing
             self._on_missing(missing)
+        return self._found != before or self._reported is None
 
     def _examine_clock(self) -> str:
         """Announce whether the node uses simulated time, and return what is wrong with it."""
@@ -183,8 +197,11 @@ class Peers:
                 endpoints.journal(self._node).event(
                     topics.PRESENCE, f'others may miss this node: {topics.PRESENCE}: {error}')
             if not closed:
-                self._changed.wait(PERIOD_S)
+                has_changed = self._changed.wait(self._period_s)
                 self._changed.clear()
+                has_work = has_changed or time.monotonic() < self._work_end_s
+                self._period_s = (PERIOD_S if has_work else
+                                  self._presences.next_period_s(self._period_s))
 
     def _receive(self, content: bytes, _: object, roles: tuple[str, ...] = ()) -> None:
         """Process an announcement; with `roles`, only of a node that has had one of them."""
@@ -195,6 +212,10 @@ class Peers:
             return
         if roles and presence.role not in roles and not self._presences.knows(presence.sender):
             return
+        was_known = self._presences.knows(presence.sender)
         self._presences.add(presence, time.time_ns(), self._now_s())
+        if self._period_s > PERIOD_S and self._presences.knows(presence.sender) > was_known:
+            # So that the new node soon hears this one.
+            self._changed.set()
         if self._find() != self._newest:
-            self._poll()
+            endpoints.set_period(self._timer, self._poll())

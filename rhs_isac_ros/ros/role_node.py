@@ -21,7 +21,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, endpoints, topics
-from rhs_isac_ros.ros.diagnostics import publish_reports
+from rhs_isac_ros.ros.diagnostics import make_reporter
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.node_surface import NodeSurface
 from rhs_isac_ros.ros.parameters import CODEBOOK, ParameterizedNode
@@ -92,6 +92,8 @@ class CodebookClient:
         self._on_codebook(codebook)
 
 
+# Messages that are also sent while no user is served.
+_WITHOUT_WORK = m.Beacon, m.ProtocolState, m.GroundTruth, m.GroundTruths
 # With simulated time, period of checking whether a state of the emulated world has ended [s].
 _WORLD_POLL_S = 0.002
 
@@ -183,11 +185,11 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         """
         self.role, self._needs_codebook = role, needs_codebook
         self._advertise()
-        publish_reports(self, self.report)
         self._peers = Peers(
             self, self._executable, self.instance, self.scenario, self._on_missing,
             self._on_rival, self.surface.site_prefix,
-            self.library.id if hasattr(self.values, 'library_file') else '')
+            self.library.id if hasattr(self.values, 'library_file') else '',
+            make_reporter(self, self.report))
         self.endings.callback(self._peers.close)
         if subscribe and not needs_codebook:
             self.subscribe()
@@ -327,6 +329,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 error=True)
             return False
         self._sending[type(message)].publish(content)
+        if not isinstance(message, _WITHOUT_WORK):
+            self._peers.note_work()
         return True
 
     def is_observed(self, kind: type[m.Message]) -> bool:

@@ -11,12 +11,14 @@ import os
 import re
 import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import rclpy
 from rclpy.exceptions import InvalidHandle, NameValidationException, ParameterException
+from rclpy.executors import Executor
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -51,8 +53,9 @@ _MEANINGS = {
 # Maximum time to destroy the nodes [s]. Fast DDS 2.14 can deadlock if a publisher is destroyed
 # while another participant times out.
 _DESTRUCTION_S = 10
-# Maximum time between two checks for a signal [s].
-_POLL_S = 0.1
+# Maximum time between two checks of `done`, and of a wait without it [s]. A wait without an end
+# would take all of a processor.
+_POLL_S, _WAIT_S = 0.1, 60.0
 
 
 class StartError(Exception):
@@ -145,8 +148,20 @@ def parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse
     return options
 
 
+def _wake_on_signals(executor: Executor) -> None:
+    """Let each signal end a wait of the executor, which the handler of Python cannot."""
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+
+    def wake() -> None:
+        while os.read(reader, 1):
+            executor.wake()
+    threading.Thread(target=wake, daemon=True).start()
+
+
 def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
-        done: Callable[[], bool] = lambda: False) -> int:
+        done: Callable[[], bool] | None = None) -> int:
     """Create nodes, spin them until a signal arrives or `done` returns True, and destroy them.
 
     `args` is a command line with the name of the program, by default that of the process. The
@@ -168,10 +183,11 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         # A garbage collection that examines all modules can delay a cycle by tens of milliseconds.
         gc.collect()
         gc.freeze()
-        while ok() and not signals and not done():
+        _wake_on_signals(executor)
+        while ok() and not signals and not (done and done()):
             # Other ways of spinning return, and react to signals, only when the queue is empty.
             try:
-                executor.spin_once(timeout_sec=_POLL_S)
+                executor.spin_once(timeout_sec=_POLL_S if done else _WAIT_S)
             # The queue may hold a request to a service that has been destroyed, for instance on
             # stand-by.
             except InvalidHandle:
@@ -180,6 +196,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         print_error(error, os.path.basename(args[0]))
         return 2
     finally:
+        signal.set_wakeup_fd(-1)
         # In a deadlocked middleware, a Python handler of SIGALRM would never run.
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(_DESTRUCTION_S)

@@ -27,7 +27,7 @@ class _Record:
 
     until_s: float  # end of the period [s]
     holds: bool | None = None  # whether the state holds; None for an event
-    # Texts of logged lines, without numbers; '' for the end of a state, and for an event.
+    # Kinds of logged lines: texts without numbers, or '' for the end of a state and for an event.
     logged: set[str] = dataclasses.field(default_factory=set)
     suppressed: Line | None = None  # latest line, if it was not logged
     n: int = 0  # number of changes or repetitions that were not logged
@@ -52,7 +52,7 @@ class StateLog:
 
     def state(self, key: str, line: Line, now_s: float, *, holds: bool = True) -> list[Line]:
         """Log that a state begins or has another text (`holds`), or that it ends."""
-        return self._add(key, line, now_s, holds)
+        return self._add(key, line, now_s, holds, _NUMBER.sub('', line.text) if holds else '')
 
     def event(self, key: str, line: Line, now_s: float) -> list[Line]:
         """Log an event."""
@@ -66,7 +66,8 @@ class StateLog:
             if key not in states:
                 lines += self.state(key, Line(f'no longer: {text}', False), now_s, holds=False)
         for key, text in states.items() - before.items():
-            lines += self.state(key, Line(text, True), now_s)
+            # The names of nodes in the text arrive one after the other.
+            lines += self._add(key, Line(text, True), now_s, True, key)
         return [*self.due(now_s), *sorted(lines)]
 
     def due(self, now_s: float) -> list[Line]:
@@ -86,6 +87,11 @@ class StateLog:
             record.until_s, record.suppressed, record.n = now_s + PERIOD_S, None, 0
         return lines
 
+    @property
+    def due_s(self) -> float | None:
+        """Time at which the next period ends [s]; None if nothing has been logged in any."""
+        return min((record.until_s for record in self._records.values()), default=None)
+
     def renew(self) -> None:
         """Treat states and events as new, because their cause is new.
 
@@ -94,7 +100,8 @@ class StateLog:
         self._records = {key: record for key, record in self._records.items()
                          if record.holds and key in self._states}
 
-    def _add(self, key: str, line: Line, now_s: float, holds: bool | None) -> list[Line]:
+    def _add(self, key: str, line: Line, now_s: float, holds: bool | None, kind: str = ''
+             ) -> list[Line]:
         lines = self.due(now_s)
         record = self._records.get(key)
         if record is None:
@@ -103,9 +110,8 @@ class StateLog:
             record = self._records[key] = _Record(now_s + PERIOD_S)
         is_change = holds is None or holds != record.holds
         record.holds = holds
-        text = _NUMBER.sub('', line.text) if holds else ''
-        if text not in record.logged and len(record.logged) < _MAX_TEXTS:
-            record.logged.add(text)
+        if kind not in record.logged and len(record.logged) < _MAX_TEXTS:
+            record.logged.add(kind)
             # The line also shows the current state, so nothing else remains to be logged.
             if not record.n:
                 record.suppressed = None

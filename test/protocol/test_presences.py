@@ -4,7 +4,13 @@ import dataclasses
 
 import pytest
 
-from rhs_isac_ros.protocol.presences import SILENCE_S, Presence, Presences
+from rhs_isac_ros.protocol.presences import (
+    PERIOD_S,
+    SILENCE_S,
+    SLOW_PERIOD_S,
+    Presence,
+    Presences,
+)
 
 NOW_NS = 1_700_000_000 * 10**9
 OWN = Presence(NOW_NS - 5 * 10**9, 'sc1', 'bs', '/bs', '{"n_frames": 4, "n_feeds": 3}')
@@ -69,11 +75,13 @@ def test_the_same_library_or_none_is_no_conflict(library):
 
 def test_a_role_is_present_while_one_of_its_nodes_announces_it(presences):
     older, newer = (other(age_s, node='/channel', role='channel') for age_s in (2, 1))
-    presences.add(older, NOW_NS, 0.0)
+    presences.add(older, NOW_NS, 1.0)
     presences.add(newer, NOW_NS, 1.0)
     assert presences.newest('channel') == newer.sender
     assert presences.newest('optimizer') == 0
-    presences.now_s = 1.0 + SILENCE_S
+    for node in (older, newer):
+        presences.add(node, NOW_NS, 1.4)
+    presences.now_s = 1.4 + SILENCE_S
     assert presences.newest('channel') == 0
 
 
@@ -99,7 +107,7 @@ def test_nodes_without_a_role_do_not_supersede():
 
 @pytest.mark.parametrize('changes', [
     {'sender': OWN.sender}, {'role': 'channel'}, {'sender': 0}, {'sender': 2**64 - 1},
-    {'sender': NOW_NS + 3700 * 10**9}])
+    {'sender': NOW_NS + 3700 * 10**9, 'stamp_ns': NOW_NS}])
 def test_itself_other_roles_and_impossible_instances_are_no_conflict(presences, changes):
     presences.add(dataclasses.replace(other(), **changes), NOW_NS, 0.0)
     assert not presences.stands_by
@@ -118,7 +126,7 @@ def test_another_scenario_is_named_and_neither_serves_nor_supersedes(presences):
         'conflict.scenario': text.replace('/channel', '/channel (and 1 others)')}
     assert not presences.stands_by
     assert presences.newest('channel') == 0
-    presences.now_s = SILENCE_S
+    presences.now_s = SILENCE_S * SLOW_PERIOD_S / PERIOD_S
     assert presences.conflicts() == {}
 
 
@@ -151,3 +159,77 @@ def test_forged_announcements_fill_neither_the_memory_nor_the_diagnostics(presen
         presences.add(other(scenario_id=f'sc{number}x', age_s=number), NOW_NS, 0.0)
     assert len(presences._known) == 64
     assert [*presences.conflicts()] == ['conflict.scenario']
+
+
+def announce(presences, period_s, n, start_s=0.0, ahead_s=0.0, **changes):
+    """Process announcements of a channel, and return the time of the last one [s]."""
+    for number in range(n):
+        now_ns = NOW_NS + int((start_s + number * period_s) * 1e9)
+        last_s = start_s + number * period_s
+        channel = other(age_s=-ahead_s, role='channel', node='/channel',
+                        stamp_ns=now_ns + int(ahead_s * 1e9))
+        presences.add(dataclasses.replace(channel, **changes), now_ns, last_s)
+    return last_s
+
+
+@pytest.mark.parametrize('period_s', [0.1, PERIOD_S, 1.0, 3.0, SLOW_PERIOD_S])
+def test_a_node_is_gone_after_four_of_its_periods_without_an_announcement(presences, period_s):
+    last_s = announce(presences, period_s, 3)
+    end_s = last_s + 4 * max(period_s, PERIOD_S)
+    for presences.now_s in (end_s - 0.01, end_s):
+        assert bool(presences.newest('channel')) == (presences.now_s < end_s)
+
+
+def test_the_periods_of_nodes_without_work_grow_together_and_follow_one_that_has_work():
+    nodes = {sender: Presences(dataclasses.replace(OWN, sender=NOW_NS + sender))
+             for sender in range(1, 5)}
+    periods_s = dict.fromkeys(nodes, PERIOD_S)
+    due_s = {sender: 0.1 * sender for sender in nodes}
+
+    def run(end_s, working=()):
+        while (now_s := min(due_s.values())) < end_s:
+            sender = min(due_s, key=due_s.get)
+            for each in nodes.values():
+                each.add(nodes[sender].own, NOW_NS + 10**9, now_s)
+                # No node counts as gone while its period grows.
+                assert len(each._present()) >= len(nodes) - 1 or now_s < 0.5
+            periods_s[sender] = (PERIOD_S if sender in working
+                                 else nodes[sender].next_period_s(periods_s[sender]))
+            due_s[sender] = now_s + periods_s[sender]
+    run(10.0, working=[2])
+    assert max(periods_s.values()) < 2 * PERIOD_S
+    run(100.0)
+    assert set(periods_s.values()) == {SLOW_PERIOD_S}
+    run(130.0, working=[2])
+    assert max(periods_s.values()) < 2 * PERIOD_S
+
+
+@pytest.mark.parametrize(('ahead_s', 'text'), [
+    (7200.0, '7200 s ahead of'), (-7200.0, '7200 s behind'), (-1.6e9, '1600000000 s behind'),
+    (10.0, ''), (-10.0, '')])
+def test_a_node_on_a_host_with_another_time_serves_and_is_named(presences, ahead_s, text):
+    announce(presences, PERIOD_S, 1, ahead_s=ahead_s)
+    # The first announcement may be an old one, which the middleware has kept.
+    assert presences.newest('channel') and not presences.conflicts()
+    last_s = announce(presences, PERIOD_S, 2, 0.4, ahead_s)
+    assert presences.conflicts() == ({
+        'conflict.host_clock': f'clock of the host of /channel: {text} that of this node, '
+                               'expected the same time on all hosts'} if text else {})
+    # The clock is set, and the start remains as it was.
+    if ahead_s < 0:
+        announce(presences, PERIOD_S, 1, last_s + 0.4, sender=other(age_s=-ahead_s).sender)
+        assert not presences.conflicts()
+
+
+def test_announcements_that_have_waited_say_nothing_about_clocks(presences):
+    for now_s in (0.0, 0.4, *([60.0] * 100)):
+        presences.add(other(age_s=9, role='channel', stamp_ns=NOW_NS), NOW_NS + int(
+            now_s * 1e9), min(now_s, 0.8))
+    assert not presences.conflicts()
+
+
+def test_simulated_times_are_not_compared_with_clocks():
+    presences = Presences(dataclasses.replace(OWN, use_sim_time=True))
+    for now_s in (0.0, 0.4, 0.8):
+        presences.add(other(role='channel', stamp_ns=1, use_sim_time=True), NOW_NS, now_s)
+    assert presences.newest('channel') and not presences.conflicts()

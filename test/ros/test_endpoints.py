@@ -1,6 +1,8 @@
 """Endpoints that the middleware refuses, topics of single users, and jobs in the background."""
 
 import threading
+import types
+from unittest import mock
 
 import pytest
 from geometry_msgs.msg import Point, Vector3
@@ -241,3 +243,52 @@ def test_closing_waits_for_the_running_job_and_discards_the_others(each_bench, b
     background.close()
     assert done == [1]
     assert not results
+
+
+def endpoint(name, gid=1, topic_type='rhs_isac_msgs/msg/Ack', profile=endpoints.EXCHANGE):
+    return types.SimpleNamespace(
+        node_name=name, node_namespace='/', topic_type=topic_type, qos_profile=profile,
+        endpoint_gid=[gid] * 16)
+
+
+@pytest.fixture
+def graph(monkeypatch):
+    """A node that subscribes to acks, the publishers of which a test sets, and its clock."""
+    node, clock = mock.MagicMock(), mock.MagicMock(return_value=100.0)
+    node.get_fully_qualified_name.return_value = '/bs'
+    node.publishers, node.subscriptions = [], [types.SimpleNamespace(topic_name='/ack')]
+    node.count_publishers.return_value = node.count_subscribers.return_value = 1
+    node.get_subscriptions_info_by_topic.return_value = [endpoint('bs'), endpoint('recorder', 2)]
+    monkeypatch.setattr(endpoints.time, 'monotonic', clock)
+    return node, clock
+
+
+def test_an_endpoint_of_another_type_is_named(graph):
+    node, _ = graph
+    node.get_publishers_info_by_topic.return_value = [
+        endpoint('user_1'), endpoint('chatter', topic_type='std_msgs/msg/String')]
+    assert endpoints.Mismatches(node).update() == {
+        'conflict.type.ack.chatter': '/ack: no messages between this node and /chatter: type '
+                                     'std_msgs/msg/String, expected rhs_isac_msgs/msg/Ack'}
+
+
+@pytest.mark.parametrize('name', endpoints._UNNAMED)
+def test_an_endpoint_that_receives_no_name_is_named_by_its_gid(graph, name):
+    node, clock = graph
+    publishers = [endpoint(name, 171, profile=endpoints.SENSOR), endpoint('user_1')]
+    node.get_publishers_info_by_topic.return_value = publishers
+    mismatches = endpoints.Mismatches(node)
+    for clock.return_value in (100.0, 100.1, 102.9):
+        assert not mismatches.update()
+    clock.return_value = 103.0
+    gid = 16 * 'ab'
+    expected = {f'conflict.qos.ack.DDS_endpoint_{gid}': '/ack: no messages between this node and '
+                f'DDS endpoint {gid}: Best effort publisher and reliable subscription'}
+    assert mismatches.update() == expected
+    # Then, the topics are examined only if endpoints appear or go.
+    n_calls = node.get_publishers_info_by_topic.call_count
+    assert mismatches.update() == expected
+    assert node.get_publishers_info_by_topic.call_count == n_calls
+    node.count_publishers.return_value = 2
+    publishers[0].node_name = 'late'
+    assert [*mismatches.update()] == ['conflict.qos.ack.late']

@@ -7,6 +7,7 @@ import pytest
 
 from rhs_isac_ros.ros.environment import (
     check_environment,
+    check_middleware,
     claim_domain,
     discovery_range,
     log_arguments,
@@ -31,6 +32,31 @@ def test_an_invalid_environment_variable_is_named(name, value, expected, monkeyp
         check_environment(argparse.ArgumentParser(prog='bs'))
     assert (f'bs: error: environment variable {name}: {value!r}, expected {expected}'
             in capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(('content', 'reason'), [
+    (None, 'No such file'), ('<dds>', 'no element found'), ('', 'no element found')])
+def test_a_missing_or_damaged_profile_is_named(content, reason, monkeypatch, capsys, tmp_path):
+    file = tmp_path / 'profile.xml'
+    if content is not None:
+        file.write_text(content, encoding='utf-8')
+    monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', str(file))
+    with pytest.raises(SystemExit, match='2'):
+        check_environment(argparse.ArgumentParser(prog='bs'))
+    assert f"FILE: '{file}', expected an XML file: {reason}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('name', ['rmw_cyclonedds_cpp', 'rmw_implementation', 'nonsense'])
+def test_a_middleware_that_is_not_installed_is_named(name, monkeypatch, capsys):
+    monkeypatch.setattr('rhs_isac_ros.ros.environment.get_resources', lambda kind: {
+        'rmw_implementation': '/', 'rmw_fastrtps_cpp': '/'})
+    monkeypatch.setenv('RMW_IMPLEMENTATION', name)
+    with pytest.raises(SystemExit, match='2'):
+        check_middleware()
+    assert (f'error: environment variable RMW_IMPLEMENTATION: {name!r}, expected '
+            'rmw_fastrtps_cpp\n') in capsys.readouterr().err
+    monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')
+    check_middleware()
 
 
 @pytest.mark.parametrize(('name', 'value'), [

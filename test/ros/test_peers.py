@@ -36,6 +36,8 @@ def frequent_polls(monkeypatch):
     monkeypatch.setattr(peers, '_IDLE_POLL_S', 0.1)
     monkeypatch.setattr(peers, 'PERIOD_S', 0.1)
     monkeypatch.setattr(presences, 'SILENCE_S', 0.5)
+    monkeypatch.setattr(presences, 'PERIOD_S', 0.1)
+    monkeypatch.setattr(presences, 'SLOW_PERIOD_S', 0.1)
 
 
 @pytest.fixture
@@ -365,7 +367,7 @@ def test_a_codebook_that_no_optimizer_holds_is_not_used(bench, probe, bench_file
     codebooks.publish(convert.to_bytes(convert.CodebookMessage.of(
         second, optimizer.instance - 1, small.scenario.id), 0))
     bench.until(lambda: client._announced_id == second.id, 'the announcement')
-    optimizer._publish(first)
+    optimizer._publish()
     bench.until(lambda: not client._announced_id, 'the announcement of the optimizer')
     assert got == [first.id]
     optimizer.set_parameters_atomically(parameters(second.to_parameters()))

@@ -85,7 +85,8 @@ def test_an_event_is_logged_once_and_then_once_a_minute_with_its_number(log):
 def test_a_group_of_states_is_compared_with_the_previous_one(log):
     assert log.update({'role': 'two nodes'}, 0.0) == [Line('two nodes', True)]
     assert log.update({'role': 'two nodes', 'clock': 'slow'}, 1.0) == [Line('slow', True)]
-    assert log.update({'clock': 'slow'}, 2.0) == [Line('no longer: two nodes', False)]
+    assert log.update({'role': 'two other nodes', 'clock': 'slow'}, 1.5) == []
+    assert log.update({'clock': 'slow'}, 2.0) == [Line('no longer: two other nodes', False)]
     assert log.update({'clock': 'slow', 'role': 'two nodes'}, 3.0) == []
 
 
