@@ -5,7 +5,7 @@ import argparse
 import numpy as np
 import pytest
 from benchmarks import combinations
-from benchmarks.combinations import INGREDIENTS, Setting, cell, measure, pairs
+from benchmarks.combinations import INGREDIENTS, Setting, cell, change, measure, pairs
 
 N = len(INGREDIENTS)
 
@@ -32,6 +32,14 @@ def test_declarations_of_two_ingredients_add_up():
     (('track', 'prior'), 'Tracker.update takes no prior')])
 def test_the_software_refuses_a_combination_with_a_reason(pair, reason, rng):
     assert cell(*pair, 1, rng)['refused'].startswith(reason)
+
+
+@pytest.mark.parametrize(('other', 'n'), [('track', 2), ('prior', 1)])
+def test_a_site_has_positions_with_a_track_or_a_prior(other, n, rng, monkeypatch):
+    monkeypatch.setitem(INGREDIENTS, 'track', change(n_cycles=2))
+    found = cell('site', other, n, rng)
+    assert (found['n'], found['fix'][0], found['dimensions']) == (n, 100, 3)
+    assert found['mse_m2'][0] < 1
 
 
 def test_users_outside_count_only_for_wrong_fixes():
