@@ -44,6 +44,8 @@ from rhs_isac_ros.model.mobility import RandomWalk
 from rhs_isac_ros.positioning import BayesEstimator, Estimate, Mixture, Sighting, Tracker, fuse
 from rhs_isac_ros.positioning.tracking import MixtureTracker, Motion
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import output_file
+from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.system import System
 
 N_CYCLES, PERIOD_S, SPEED_MPS = 20, 0.1, 1.0
@@ -341,14 +343,16 @@ def main() -> None:
     add('--only', choices=INGREDIENTS, action='append', default=[],
         help='only cells with this ingredient; may be repeated')
     add('--resume', action='store_true', help='keep the cells in the file of the results')
+    add('--csv', type=output_file, help='CSV file for the table of the documentation')
     options = parser.parse_args()
     if options.resume and not options.json:
         parser.error('argument --resume: expected together with --json')
     print(f'{options.positions} positions, seed {options.seed}\n')
     results = measure(options, kept(options))
-    print(f'\n{matrix(results)}\n')
-    for cell, refused in reasons(results).items():
-        print(f'{cell}: {refused}')
+    if options.csv:
+        write_whole(options.csv, matrix(results) + '\n')
+    for names, refused in reasons(results).items():
+        print(f'{names}: {refused}')
 
 
 Cells = dict[str, dict[str, dict[str, Any]]]
@@ -402,17 +406,17 @@ def cell(one: str, other: str, n: int, rng: np.random.Generator) -> dict[str, An
 
 
 def matrix(results: Cells) -> str:
-    """Return share in the 95 % region [%] and NEES of all cells as a table in Markdown."""
+    """Return the lower triangle of the table as CSV: share in the 95 % region [%], and NEES."""
     names = [name for name in INGREDIENTS if name in results]
-    lines = [['', *names], ['---'] * (1 + len(names))]
-    for one in names:
+    lines = [['', *names]]
+    for number, one in enumerate(names, 1):
         lines.append([one])
-        for other in names:
+        for other in names[:number]:
             found = results[one].get(other, {})
             covered, nees = found.get('in_region'), found.get('nees')
             lines[-1].append('refused' if 'refused' in found else
-                             f'{covered[0]:.0f}, {nees[0]:.1f}' if covered and nees else '-')
-    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+                             f'{covered[0]:.0f}; {nees[0]:.1f}' if covered and nees else '-')
+    return '\n'.join(','.join(line + [''] * (len(lines[0]) - len(line))) for line in lines)
 
 
 def reasons(results: Cells) -> dict[str, str]:

@@ -69,3 +69,12 @@ def test_cells_with_the_same_options_are_kept(monkeypatch, tmp_path, capsys):
     measure(options, combinations.kept(options))
     assert len(measured) == 2 * N
     assert '| site + track | no |' in capsys.readouterr().out
+
+
+def test_the_table_has_coverage_and_nees_of_each_pair_once():
+    found = {'in_region': [95.2, 90, 98], 'nees': [2.94, 2, 4]}
+    results = {'site': {'site': found, 'track': found},
+               'track': {'site': found, 'track': {'refused': 'no'}}}
+    assert combinations.matrix(results).splitlines() == [
+        ',site,track', 'site,95; 2.9,', 'track,95; 2.9,refused']
+    assert combinations.reasons(results) == {'track + track': 'no'}
