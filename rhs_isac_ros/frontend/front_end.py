@@ -56,7 +56,7 @@ class FrontEnd:
         return feeds
 
     def status(self) -> Mapping[str, str]:
-        """Return values of the radio for the diagnostics."""
+        """Return details of the radio for the diagnostics."""
         return self._radio.modem.status()
 
     def close(self) -> None:

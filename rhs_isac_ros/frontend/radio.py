@@ -68,7 +68,7 @@ class Modem(Protocol):
         ...
 
     def status(self) -> Mapping[str, str]:
-        """Return values for the diagnostics."""
+        """Return details for the diagnostics."""
         ...
 
 

@@ -62,11 +62,11 @@ def candidate_configurations(
     By the holographic principle, a configuration enables the elements at which a wave on the
     board, s B, is in phase with a wave in the air, G w. The waves in the air are the line of sight
     and the modes of the multipath, the columns of G. The search improves waves and configuration
-    in turn: the best pair of waves for a configuration belongs to the largest singular value of
-    B diag(c) G. It begins with random waves on the board, the same at all positions, and at first
-    includes only the line of sight, for which the best wave on the board is known. It then adds
-    configurations for the multipath alone and the matched filter to the best of these. All are
-    improved with the strongest modes, and the best results with all modes.
+    alternately: the best pair of waves for a configuration belongs to the largest singular value
+    of B diag(c) G. It begins with random waves on the board, the same at all positions, and at
+    first includes only the line of sight, for which the best wave on the board is known. It then
+    adds configurations for the multipath alone and the matched filter to the best of these. All
+    are improved with the strongest modes, and the best results with all modes.
 
     `index` selects the bands of the link from the tables. The configurations of a band are in no
     particular order, and some may be equal.

@@ -205,7 +205,7 @@ def beam_pattern(
 def _directions(step_deg: float) -> np.ndarray:
     """Return unit vectors over the half space x >= 0, float64 [n_el, n_az, 3], read-only."""
     n_half = max(1, int(np.ceil(90 / step_deg)))
-    # An odd number of angles places the middle one on boresight.
+    # An odd number of angles puts the middle one on boresight.
     angles = np.linspace(-np.pi / 2, np.pi / 2, 2 * n_half + 1)
     elevation, azimuth = np.meshgrid(angles, angles, indexing='ij')
     return read_only(np.stack([np.cos(elevation) * np.cos(azimuth),

@@ -102,10 +102,10 @@ class _Point(NamedTuple):
         low, high = np.log1p(np.maximum(snr, 0)).sum(axis=-2)
         rates = np.maximum(low, high)
         n_bands, n_starts, _ = rates.shape
-        place = np.arange(n_bands)[:, None], np.arange(n_starts), rates.argmax(axis=-1)
+        best = np.arange(n_bands)[:, None], np.arange(n_starts), rates.argmax(axis=-1)
         better = self.analog.copy()
-        better[place] = high[place] > low[place]
-        return better, rates[place] - self.rate
+        better[best] = high[best] > low[best]
+        return better, rates[best] - self.rate
 
     def where(self, condition: np.ndarray, other: '_Point') -> '_Point':
         """Return these points where a condition, bool [N_B, n], holds, and `other` elsewhere."""

@@ -37,7 +37,7 @@ class NodeStatus(NamedTuple):
 
     def counts(self, section: str) -> dict[str, int]:
         """Return the nonzero counts of a section, ``dropped`` or ``cycles``, by reason."""
-        counts = {key.partition('.')[2]: int(value) for key, value in self.report.values.items()
+        counts = {key.partition('.')[2]: int(value) for key, value in self.report.details.items()
                   if key.startswith(f'{section}.') and value.isdecimal()
                   and len(value) <= _MAX_DIGITS}
         return {reason: count for reason, count in counts.items() if count}
@@ -100,7 +100,7 @@ class Overview:
     @property
     def paused(self) -> bool:
         """Whether a base station has reported a pause since the current phase began."""
-        return any(status.report.values.get('phase') == BsState.PAUSED.value
+        return any(status.report.details.get('phase') == BsState.PAUSED.value
                    and not status.received_s < self.phase_began_s
                    for status in self.nodes.values())
 

@@ -142,11 +142,11 @@ class Charts:
 
 def mode_axes() -> tuple[Lines, Points]:
     """Return the grid of the chart of the modes, and its labels."""
-    places = np.arange(-REACH_M, REACH_M + _STEP_M / 2, _STEP_M)
-    grid = [_line(place, HEIGHT_M) for place in places]
+    marks = np.arange(-REACH_M, REACH_M + _STEP_M / 2, _STEP_M)
+    grid = [_line(mark, HEIGHT_M) for mark in marks]
     grid += [np.array([[-REACH_M, -level * HEIGHT_M], [REACH_M, -level * HEIGHT_M]])
              for level in (0.0, *_GRID_LEVELS)]
-    labels = [*((place, _LABEL_OFFSET_M, f'{place:+.1f}') for place in places[1:-1:2]),
+    labels = [*((mark, _LABEL_OFFSET_M, f'{mark:+.1f}') for mark in marks[1:-1:2]),
               *((-REACH_M, -level * HEIGHT_M, f'{level:.0%}') for level in _GRID_LEVELS)]
     return (Lines(tuple(grid), _GRID_COLOUR, _GRID_WIDTH),
             Points(np.array([label[:2] for label in labels]), np.full((len(labels), 3), 0.7),
@@ -171,8 +171,8 @@ def mode_estimate(position: np.ndarray, origin: np.ndarray, surface: np.ndarray)
     return Lines((_line(error, HEIGHT_M),), (1.0, 1.0, 1.0), _LINE_WIDTH)
 
 
-def _line(place: float, height: float) -> np.ndarray:
-    return np.array([[place, 0.0], [place, -height]])
+def _line(mark: float, height: float) -> np.ndarray:
+    return np.array([[mark, 0.0], [mark, -height]])
 
 
 class NetworkView:

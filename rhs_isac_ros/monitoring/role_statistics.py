@@ -22,15 +22,15 @@ _MAX_REASONS = 3
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """Diagnostics of a node: whether there is a fault, a one-line summary, and all values.
+    """Diagnostics of a node: whether there is a fault, a one-line summary, and details.
 
     `fault` is True if a fault persists or has occurred since the last report.
-    ``docs/interfaces.rst`` lists the keys of the values.
+    ``docs/interfaces.rst`` lists the keys of the details.
     """
 
     fault: bool
     summary: str
-    values: Mapping[str, str]
+    details: Mapping[str, str]
 
 
 class RoleStatistics:
@@ -80,19 +80,19 @@ class RoleStatistics:
         `phase` is the state of the role, and `blocked` whether the role lacks something in this
         state. `status` contains the status of the role and the conflicts of the node.
         """
-        values = {'phase': phase} if phase else {}
-        values |= self._codebook_ids(status.get('codebook_id', ''))
-        values |= {name: value for name, value in status.items() if name != 'codebook_id'}
+        details = {'phase': phase} if phase else {}
+        details |= self._codebook_ids(status.get('codebook_id', ''))
+        details |= {name: value for name, value in status.items() if name != 'codebook_id'}
         if self._served:
-            values['cycles.served'] = str(self._served)
+            details['cycles.served'] = str(self._served)
         for reason, count in sorted(counters.items()):
-            values[f'{kind_of(reason).value}.{reason}'] = str(count)
+            details[f'{kind_of(reason).value}.{reason}'] = str(count)
         for section, counts in self._messages.items():
-            values |= {f'{section}.{name}': str(count) for name, count in sorted(counts.items())}
+            details |= {f'{section}.{name}': str(count) for name, count in sorted(counts.items())}
         for name, durations_s in self._durations_s.items():
             for percent, value_s in zip(
                     _PERCENTS, np.percentile(durations_s, _PERCENTS), strict=True):
-                values[f'{name}.p{percent}'] = f'{1e3 * value_s:.3f}'
+                details[f'{name}.p{percent}'] = f'{1e3 * value_s:.3f}'
         faults = collections.Counter(
             {reason: count for reason, count in counters.items() if reason not in _NO_FAULTS})
         new_faults, self._faults = faults - self._faults, faults
@@ -109,8 +109,9 @@ class RoleStatistics:
         elif new_faults:
             summary = _summary(new_faults)
         else:
-            return Report(False, 'paused' if phase == BsState.PAUSED.value else 'no fault', values)
-        return Report(True, summary, values)
+            summary = 'paused' if phase == BsState.PAUSED.value else 'no fault'
+            return Report(False, summary, details)
+        return Report(True, summary, details)
 
     def _codebook_ids(self, in_use: str) -> dict[str, str]:
         """Return the ids of the codebook in use (or else the latest one) and of a pending one."""

@@ -36,11 +36,11 @@ _RESULT_S = 10
 
 # Minimum time between two answers of the action, in all and for each client [s]. By default, a
 # client of rclpy keeps the latest ten answers, including those to other clients, so it would lose
-# most of many answers at once. All clients may be in one process, which takes them in turn.
+# most of many answers at once. All clients may be in one process, which takes one after the other.
 _ANSWER_S, _ANSWER_PER_CLIENT_S = 0.01, 0.001
 
 
-class _Turns:
+class _Slots:
     """Separates answers to many goals at once, so that each client can take them."""
 
     def __init__(self, node: Node) -> None:
@@ -49,31 +49,31 @@ class _Turns:
         self._waiting: collections.deque[Future] = collections.deque()
 
     async def wait(self) -> None:
-        """Return at the next turn; at once if there is none before."""
+        """Return at the next slot; at once if there is none before."""
         delay_s = self._next_s - time.monotonic()
         if self._waiting or delay_s > 0:
             future: Future = Future()
             self._waiting.append(future)
             if len(self._waiting) == 1:
-                _later(self._node, delay_s, self._end_turn)
+                _later(self._node, delay_s, self._end_slot)
             await future
         else:
-            self._begin_turn()
+            self._begin_slot()
 
-    def _begin_turn(self) -> float:
-        """Set the time of the next turn, and return the time until then [s]."""
+    def _begin_slot(self) -> float:
+        """Set the time of the next slot, and return the time until then [s]."""
         length_s = max(_ANSWER_S,
                        _ANSWER_PER_CLIENT_S * self._node.count_subscribers(self._feedback))
         self._next_s = time.monotonic() + length_s
         return length_s
 
-    def _end_turn(self) -> None:
-        # The next turn begins when this one really ends. With times that are fixed in advance, a
+    def _end_slot(self) -> None:
+        # The next slot begins when this one really ends. With times that are fixed in advance, a
         # delayed process would send all overdue answers at once.
-        length_s = self._begin_turn()
+        length_s = self._begin_slot()
         self._waiting.popleft().set_result(None)
         if self._waiting:
-            _later(self._node, length_s, self._end_turn)
+            _later(self._node, length_s, self._end_slot)
 
 
 def _later(node: Node, delay_s: float, callback: Callable[[], None]) -> Timer:
@@ -110,7 +110,7 @@ class LocateServer:
         # Number of goals that were accepted and have not ended, and those that have begun.
         self._n_accepted = 0
         self._goals: list[_Goal] = []
-        self._turns = _Turns(node)
+        self._slots = _Slots(node)
         self._server = create_or_refuse(node, f'action {topics.LOCATE}', lambda: ActionServer(
             node, Locate, topics.LOCATE, self._execute, goal_callback=self._accept,
             cancel_callback=self._cancel, goal_service_qos_profile=SERVICES,
@@ -155,7 +155,7 @@ class LocateServer:
             server.destroy()
 
     async def _accept(self, request: Locate.Goal) -> GoalResponse:
-        await self._turns.wait()
+        await self._slots.wait()
         valid = 1 <= request.user <= self._max_users and (
             request.timeout_s == 0 or TINY <= request.timeout_s <= _MAX_TIMEOUT_S)
         if valid and self._n_accepted < self._max_goals:
@@ -188,7 +188,7 @@ class LocateServer:
         result = await goal.future
         self._n_accepted -= 1
         self._node.destroy_timer(timer)
-        await self._turns.wait()
+        await self._slots.wait()
         return result
 
     def _feed_back(self, goal: _Goal, phase: m.Phase) -> None:

@@ -29,7 +29,7 @@ _Result = TypeVar('_Result')
 
 
 def _run_at_once(job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
-    """Take the place of `BackgroundWorker.run` for jobs that wait for nothing."""
+    """Replace `BackgroundWorker.run` for jobs that wait for nothing."""
     on_result(job())
 
 
@@ -84,7 +84,7 @@ class ChannelNode(RoleNode[Channel]):
         """Return the diagnostics, with those of the radio."""
         report = super().report()
         return dataclasses.replace(
-            report, values={**report.values, **self._front_end.status()})
+            report, details={**report.details, **self._front_end.status()})
 
     def stand_by(self) -> None:
         """Release surface and radio after the request in progress."""

@@ -25,7 +25,7 @@ def _make(role: str, **options: Any) -> Node:
 def make_network() -> list[Node]:
     """Create all nodes of a network or a site, with users numbered from 1.
 
-    More than `MAX_USER_NODES` users share the node ``users``.
+    More than `MAX_USER_NODES` users run in the node ``users``.
     """
     head = Node('network')
     values = parameters.declare(head, 'network')
@@ -40,8 +40,8 @@ def make_network() -> list[Node]:
     for name, roles in networks(surfaces):
         # A rule of its own, because a rule of the process for the namespace applies to all nodes.
         space = f'{head.get_namespace().rstrip("/")}/{name}'
-        place = {'cli_args': ['--ros-args', '-r', f'__ns:={space}']} if name else {}
-        nodes += [_make(role, **place, **options) for role in roles
+        options_of_space = {'cli_args': ['--ros-args', '-r', f'__ns:={space}']} if name else {}
+        nodes += [_make(role, **options_of_space, **options) for role in roles
                   for options in ([{}] if MEMBERS[role].is_unique else users)]
     return nodes
 

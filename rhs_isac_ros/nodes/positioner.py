@@ -100,7 +100,7 @@ class PositionerNode(LocatingNode[Positioner]):
         if not self._table:
             return report
         return dataclasses.replace(
-            report, values={**report.values, 'table.progress': self._table})
+            report, details={**report.details, 'table.progress': self._table})
 
     def execute(self, action: events.Action) -> None:
         """Build or prepare an estimator in the background, or process another action."""

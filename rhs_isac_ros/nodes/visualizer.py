@@ -124,8 +124,8 @@ def _marker(namespace: str, number: int, kind: int, stamp: Time) -> Marker:
     return found
 
 
-def _colour(values: Iterable[float], opacity: float) -> ColorRGBA:
-    red, green, blue = (float(value) for value in values)
+def _colour(channels: Iterable[float], opacity: float) -> ColorRGBA:
+    red, green, blue = map(float, channels)
     return ColorRGBA(r=red, g=green, b=blue, a=opacity)
 
 

@@ -153,7 +153,7 @@ class BaseStation(SignalCollector):
         return ()
 
     def timeout_s(self, state: enum.Enum) -> float | None:
-        """Return the timeout of a state [s], or None; the attempts at a step share it equally."""
+        """Return the timeout of a state [s], or None; attempts at a step have equal parts."""
         settings = self._settings.in_use
         if state is BsState.BEACONING:
             return settings.ack_timeout_s

@@ -159,18 +159,18 @@ class ResidualWatch:
         self._warning = ''
 
     def status(self) -> dict[str, str]:
-        """Return values for the diagnostics, including the result of `diagnose`.
+        """Return details for the diagnostics, including the result of `diagnose`.
 
         ``residual.ratio`` and ``residual.spread`` are the mean and the variance of the energies of
         the residuals, relative to the model. Both cover ``residual.fixes`` residuals.
         ``warning.residual`` is the text of the current warning.
         """
-        values = diagnose(self._estimates, bool(self._warning), self._level_db[1])
+        details = diagnose(self._estimates, bool(self._warning), self._level_db[1])
         if self._all.n_residuals:
-            values |= {'residual.ratio': f'{self._all.ratio:.3f}',
+            details |= {'residual.ratio': f'{self._all.ratio:.3f}',
                        'residual.spread': f'{self._all.spread:.3f}',
                        'residual.fixes': str(self._all.n_residuals)}
-        return values | ({'warning.residual': self._warning} if self._warning else {})
+        return details | ({'warning.residual': self._warning} if self._warning else {})
 
     def _describe(self) -> str:
         users = sorted(user for user, monitor in self._users.items() if monitor.drifts)
@@ -375,13 +375,13 @@ class Positioner(Role):
         if estimate.fix and not problem:
             probabilities = {f'{name}_probability': value
                              for name, value in probabilities_of(estimate).items()}
-            placed = estimate.to_site(self._scenario.pose)
+            of_site = estimate.to_site(self._scenario.pose)
             self.send(m.derive(
                 m.PositionEstimate, received, stamp_ns=received.stamp_ns,
-                position=placed.mean, covariance_m2=placed.covariance,
+                position=of_site.mean, covariance_m2=of_site.covariance,
                 crlb_m2=float(system.crlb(estimate.mean[None])[0]), estimator=estimator.name,
                 latency_s=latency_s, **probabilities, **self._proposal(received.user, estimate)))
-            self._publish_track(received, placed)
+            self._publish_track(received, of_site)
             self._publish_posterior(received, posterior, probabilities)
         else:
             self._no_fix(received, f'position: {problem}' if problem else str(estimate.reason))

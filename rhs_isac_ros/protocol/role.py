@@ -83,7 +83,7 @@ class Role:
         return None
 
     def status(self) -> Mapping[str, str]:
-        """Return values for the diagnostics, by keys such as ``parameter.policy``."""
+        """Return details for the diagnostics, by keys such as ``parameter.policy``."""
         return {}
 
 

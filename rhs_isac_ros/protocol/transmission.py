@@ -62,7 +62,7 @@ class Transmission(Role):
     The true position affects only the reported capacities, never the beam. A report takes as long
     to compute as a beam, so reports are usually computed between cycles. `surface_of` takes the
     name of a calibration file, and returns the surface in the file, or None for an empty name.
-    `choose` and `evaluate` take the place of `choose_beam` and `capacity_report`. Estimates may
+    `choose` and `evaluate` replace `choose_beam` and `capacity_report`. Estimates may
     have the codebooks of a `library`, too.
     """
 

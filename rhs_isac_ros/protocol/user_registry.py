@@ -28,9 +28,9 @@ _CONFLICT_S = 5.0
 class _User:
     """A registered user, and the node that owns its number."""
 
-    # (turn, 1, number) if the user was last served in this turn; (turn, 0, number) if the user was
-    # registered, or answered too late, after this turn and has not been served since then.
-    turn: tuple[int, int, int]
+    # (number of a grant, 1, user) if this grant was the user's last one; (number of a grant, 0,
+    # user) if the user was registered, or late, after this grant and has had none since then.
+    order: tuple[int, int, int]
     missed: int = 0  # consecutive beacons without an answer
     instance: int = 0  # instance of the owner; 0 if unknown
     answered_s: float = 0.0  # time of the owner's last ack [s]
@@ -60,7 +60,7 @@ class UserRegistry:
         self._seniors: dict[int, int] = {}
         # Whether seniors precede all others, and the time at which this ends [s].
         self._seniors_first, self._until_s = False, -math.inf
-        self._turn = 0
+        self._n_grants = 0
         # Whether the latest beacon invited all users.
         self.all_invited = True
         # Users that answered in this cycle, in order; a dictionary serves as an ordered set.
@@ -73,7 +73,7 @@ class UserRegistry:
     def invite(self, attempt: int) -> tuple[int, int]:
         """Choose the users to wait for, and return the first and the last number to invite.
 
-        The range contains the user whose turn it is. As the turn passes on, the ranges cover all
+        The range contains the user who is due. As other users become due, the ranges cover all
         numbers, so that new users are invited, too. `attempt` is the number of beacons in this
         cycle that nobody answered; the range grows with it.
         """
@@ -84,7 +84,7 @@ class UserRegistry:
             self._awaited = set(numbers)
             return 1, m.LAST_USER
         users = self._preferred(numbers)
-        due = users[self._turn * INVITED % len(users)] if self.policy == 'first' else (
+        due = users[self._n_grants * INVITED % len(users)] if self.policy == 'first' else (
             self._choose(users))
         begin = numbers.index(due) // size * size
         invited = numbers[begin:begin + size]
@@ -109,7 +109,7 @@ class UserRegistry:
                 return users[0]
             case 'random':
                 return int(self._rng.choice(users))
-        return min(users, key=lambda user: self._users[user].turn)
+        return min(users, key=lambda user: self._users[user].order)
 
     def is_taken(self, number: int, instance: int, now_s: float) -> bool:
         """Return whether another instance owns a number and is not silent."""
@@ -124,18 +124,18 @@ class UserRegistry:
     def register(self, number: int, instance: int = 0, now_s: float = 0.0) -> str:
         """Register a user that answered, even if too late for this cycle.
 
-        With ``round_robin``, an invited user that answers too late loses the turn. Without this
-        rule, a user that is always late would keep the turn forever, and users in other ranges
+        With ``round_robin``, an invited user that answers too late goes to the end. Without this
+        rule, a user that is always late would be due forever, and users in other ranges
         would not be invited. Returns a warning if the owner of the number answers after another
         instance was rejected and the conflict is new, otherwise ''.
         """
         user = self._users.get(number)
-        # A new user takes its turn after all waiting users and before the one served last, so that
-        # no user gains a turn by leaving and returning.
+        # A new user comes after all waiting users and before the one served last, so that no user
+        # gains by leaving and returning.
         if user is None:
-            user = self._users[number] = _User((self._turn, 0, number), instance=instance)
+            user = self._users[number] = _User((self._n_grants, 0, number), instance=instance)
         elif self.policy == 'round_robin' and number in self._awaited:
-            user.turn = self._turn, 0, number
+            user.order = self._n_grants, 0, number
         warning = ''
         if user.rejected and instance == user.instance:
             text = m.describe_conflict(number, instance)
@@ -197,15 +197,15 @@ class UserRegistry:
         """Choose the user to serve among the users that answered."""
         chosen = self._choose(self._preferred(self.answered))
         self._requested.pop(chosen, None)
-        self._turn += 1
-        self._users[chosen].turn = self._turn, 1, chosen
+        self._n_grants += 1
+        self._users[chosen].order = self._n_grants, 1, chosen
         return chosen
 
     def end_cycle(self, user: int, begin_s: float, now_s: float, *, completed: bool) -> None:
         """Update the seniors, and decide whether they precede all others in the next cycle."""
         seniors = self._seniors
         if completed and user not in seniors and len(seniors) == INVITED:
-            # A senior that has left keeps its place until another user takes it.
+            # A senior that has left keeps this rank until another user takes it.
             seniors.pop(next((other for other in seniors if other not in self._users), 0), None)
         if user in seniors or completed and len(seniors) < INVITED:
             seniors[user] = 0 if completed else seniors[user] + 1

@@ -34,9 +34,9 @@ class Type(NamedTuple):
 TINY = sys.float_info.min
 
 
-def check_floats(values: Iterable[float]) -> None:
+def check_floats(numbers: Iterable[float]) -> None:
     """Raise ValueError if one of the numbers is an integer that was sent as a float."""
-    for value in values:
+    for value in numbers:
         if 0 < abs(value) < TINY:
             raise ValueError(f'{value:g}, which is how Python sends an integer, expected a float '
                              'such as 1.0')
@@ -47,16 +47,16 @@ def _flushed(value: Any) -> Any:
     return 0.0 if isinstance(value, float) and 0 < abs(value) < TINY else value
 
 
-def _encode_complex(values: np.ndarray) -> tuple[np.ndarray, ...]:
+def _encode_complex(array: np.ndarray) -> tuple[np.ndarray, ...]:
     # Radios often return complex64.
-    flat = np.asarray(values, '<c16').ravel()
-    return np.array(values.shape, '<u4'), flat.real, flat.imag
+    flat = np.asarray(array, '<c16').ravel()
+    return np.array(array.shape, '<u4'), flat.real, flat.imag
 
 
 def _decode_real(items: Sequence[np.ndarray]) -> np.ndarray:
-    shape, values = items
+    shape, array = items
     # A copy, because the received numbers may be unaligned in memory, which slows computations.
-    return values.astype(float).reshape(_shape(values, shape))
+    return array.astype(float).reshape(_shape(array, shape))
 
 
 def _decode_complex(items: Sequence[np.ndarray]) -> np.ndarray:
@@ -68,11 +68,11 @@ def _decode_complex(items: Sequence[np.ndarray]) -> np.ndarray:
     return result.reshape(sizes)
 
 
-def _shape(values: np.ndarray, shape: np.ndarray) -> list[int]:
+def _shape(array: np.ndarray, shape: np.ndarray) -> list[int]:
     sizes: list[int] = shape.tolist()
-    if len(values) != math.prod(sizes) or not len(values):
+    if len(array) != math.prod(sizes) or not len(array):
         raise ValueError(
-            f'{len(values)} values, expected shape {sizes} with at least one value')
+            f'{len(array)} values, expected shape {sizes} with at least one value')
     return sizes
 
 
@@ -81,7 +81,7 @@ def _numbers(*shape: int) -> Type:
         check_floats(items)
         return np.array(items).reshape(shape)
     return Type(('d',) * math.prod(shape),
-                lambda values: list(map(_flushed, values.ravel().tolist())), decode)
+                lambda array: list(map(_flushed, array.ravel().tolist())), decode)
 
 
 # Types that are one item on the wire.
@@ -97,10 +97,10 @@ TYPES = {
     'double[9]': _numbers(3, 3),
     'double[36]': _numbers(6, 6),
     'sequence<uint32>': Type(
-        ('*I',), lambda values: (values.astype('<u4'),), lambda items: items[0].astype(int)),
+        ('*I',), lambda array: (array.astype('<u4'),), lambda items: items[0].astype(int)),
     'rhs_isac_msgs/RealArray': Type(
-        ('*I', '*d'), lambda values: (
-            np.array(values.shape, '<u4'), np.asarray(values, '<f8').ravel()), _decode_real),
+        ('*I', '*d'), lambda array: (
+            np.array(array.shape, '<u4'), np.asarray(array, '<f8').ravel()), _decode_real),
     'rhs_isac_msgs/ComplexArray': Type(('*I', '*d', '*d'), _encode_complex, _decode_complex),
 }
 
@@ -233,26 +233,26 @@ class Codec:
         except (struct.error, ValueError) as error:
             raise MessageError(f'{self._kind.__name__}: invalid CDR data of {len(data)} bytes: '
                                f'{error}') from None
-        values: dict[str, Any] = {}
+        fields: dict[str, Any] = {}
         if self._keeps_stamp:
             # A larger number could put the seconds out of range when the stamp is forwarded.
             if items[1] >= _NANOSECONDS:
                 raise MessageError(f'{self._kind.__name__}.header: stamp with {items[1]} ns, '
                                    f'expected less than {_NANOSECONDS}')
-            values['stamp_ns'] = _NANOSECONDS * items[0] + items[1]
+            fields['stamp_ns'] = _NANOSECONDS * items[0] + items[1]
         for name, first, last, encode, decode in self._fields:
             try:
                 if decode is None:
-                    values[name] = value = items[first]
+                    fields[name] = value = items[first]
                     if isinstance(value, float):
                         check_floats((value,))
                     continue
-                values[name] = decode(items[first] if encode is None else items[first:last])
+                fields[name] = decode(items[first] if encode is None else items[first:last])
             except ValueError as error:
                 raise MessageError(f'{self._kind.__name__}.{name}: {error}') from None
         # Unlike the constructor, this does not store each field of a frozen dataclass separately.
         message = object.__new__(self._kind)
-        vars(message).update(values)
+        vars(message).update(fields)
         return message
 
     def _items(self, data: bytes) -> list[Any]:

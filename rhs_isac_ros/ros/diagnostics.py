@@ -18,7 +18,7 @@ _PERIOD_S, _TOLERANCE_S = 1.0, 0.05
 def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
     """Convert a report to an array of one status, OK or WARN; `name` is the node's full name."""
     level = DiagnosticStatus.WARN if report.fault else DiagnosticStatus.OK
-    values = [KeyValue(key=key, value=value) for key, value in report.values.items()]
+    values = [KeyValue(key=key, value=value) for key, value in report.details.items()]
     status = DiagnosticStatus(
         level=level, name=name.lstrip('/'), message=report.summary,
         hardware_id=f'{socket.gethostname()}:{name}', values=values)

@@ -149,7 +149,7 @@ def create_publisher(
 
     Parameters ``qos_overrides.*`` change the quality of service of an `overridable` topic.
     """
-    # A copy: rclpy writes the overrides into the profile, which other endpoints share.
+    # A copy: rclpy writes the overrides into the profile, which other endpoints use, too.
     own = copy.copy(profile)
     publisher = create_or_refuse(node, f'publisher of {name}', lambda: node.create_publisher(
         kind, name, own, qos_overriding_options=_overriding(overridable),

@@ -71,8 +71,8 @@ def use_discovery_profile() -> None:
     Fast DDS reads the profile when the first node is created. A file that is already set in the
     environment takes precedence; an empty name selects the defaults of Fast DDS.
     """
-    share = get_package_share_directory('rhs_isac_ros')
-    if not os.environ.setdefault(_PROFILES, f'{share}/config/discovery.xml'):
+    folder = get_package_share_directory('rhs_isac_ros')
+    if not os.environ.setdefault(_PROFILES, f'{folder}/config/discovery.xml'):
         # Fast DDS reports an error for an empty name.
         del os.environ[_PROFILES]
 

@@ -18,9 +18,9 @@ def vector(message: Any) -> np.ndarray:
     return np.array([message.x, message.y, message.z])
 
 
-def to_ros(kind: Any, values: np.ndarray) -> Any:
+def to_ros(kind: Any, numbers: np.ndarray) -> Any:
     """Return a point, vector or quaternion of ROS with the given x, y, z and (if any) w."""
-    return kind(**dict(zip('xyzw', values.tolist(), strict=False)))
+    return kind(**dict(zip('xyzw', numbers.tolist(), strict=False)))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -52,7 +52,7 @@ class Parameter(Field):
     dynamic: bool = False
     is_frame: bool = False  #: Whether the value is the name of a frame.
 
-    # ROS does not accept 1 in place of 1.0.
+    # ROS does not accept 1 instead of 1.0.
     WORDS = {**Field.WORDS, float: 'a number with a decimal point',
              list: 'a list of numbers, each with a decimal point'}
 

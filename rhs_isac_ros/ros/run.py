@@ -1,6 +1,6 @@
 """The life of a node: command line, init, spin, shutdown; and the errors at its start.
 
-`starting` turns each error at the start into a `StartError` of one line. A command prints it and
+`starting` makes each error at the start a `StartError` of one line. A command prints it and
 ends with exit code 2.
 """
 
@@ -112,7 +112,7 @@ def init(args: Sequence[str]) -> None:
 def _enclave(args: Sequence[str]) -> list[str]:
     """Return arguments that select an enclave of DDS security, if none is given.
 
-    Nodes and ``replay`` have their full names as enclaves; all other tools share ``operator``.
+    Nodes and ``replay`` have their full names as enclaves; all other tools have ``operator``.
     """
     if not is_secure() or '--enclave' in args:
         return []

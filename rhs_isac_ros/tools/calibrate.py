@@ -60,7 +60,7 @@ _CYCLES = 200
 _OUTPUT, _SITE_OUTPUT = Path('calibration.npz'), Path('site_calibrated.yaml')
 _TIMEOUT_S = 600.0
 # Maximum number of pilots whose errors before and after the calibration are compared, and number
-# of groups of places that are left out in turn.
+# of groups of places that are left out one by one.
 _N_COMPARED, _N_FOLDS = 200, 5
 # Function that returns the scenario and the surface that an estimator assumes, from pilots.
 Assumption: TypeAlias = Callable[[list[Pilots]], tuple[Scenario, SurfaceEstimate | None]]
@@ -288,7 +288,7 @@ def _print_errors(scenario: Scenario, pilots: Sequence[Pilots], *assumptions: As
 
 def _folds(scenario: Scenario, pilots: Sequence[Pilots]
            ) -> Iterator[tuple[list[Pilots], list[Pilots]]]:
-    """Leave groups of places out in turn; yield the pilots at other places, and those left out.
+    """Leave groups of places out one by one; yield the pilots at other places, and those left out.
 
     At most about `_N_COMPARED` pilots are left out in total.
     """

@@ -1,4 +1,4 @@
-"""Code that the commands share: their entry point, nodes, recordings and tables."""
+"""What all commands use: their entry point, nodes, recordings and tables."""
 
 import argparse
 import contextlib

@@ -104,11 +104,11 @@ def start_network(
         surfaces: Collection[str] = (), **given: Any) -> None:
     """Start each node of a network, or of a site with `surfaces`, in a separate process.
 
-    If `together`, the users share a node. Users walk at random, by default at the maximum speed of
-    the scenario, which in a site is that of the first surface. Each parameter in `given` applies
-    to all nodes that have it; None selects its default. A scenario other than Table I must also be
-    given as ``scenario_file``, and a site as ``site_file``. With ``first_cycle=1``, the seed
-    determines multipath and noise.
+    If `together`, the users are in one node. Users walk at random, by default at the maximum speed
+    of the scenario, which in a site is that of the first surface. Each parameter in `given`
+    applies to all nodes that have it; None selects its default. A scenario other than Table I must
+    also be given as ``scenario_file``, and a site as ``site_file``. With ``first_cycle=1``, the
+    seed determines multipath and noise.
     """
     for namespace, role in [(space, role) for space, roles in networks(surfaces)
                             for role in roles]:
@@ -415,7 +415,7 @@ def _run(demonstration: _Demonstration, options: argparse.Namespace) -> int:
     log, code = CycleLog(), 0
     together = options.users > MAX_USER_NODES
     if together:
-        print(f'the {options.users} users share one process', file=sys.stderr)
+        print(f'the {options.users} users run in one process', file=sys.stderr)
     with (tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs,
           contextlib.ExitStack() as stack):
         # The processes run until the cycles have been observed.

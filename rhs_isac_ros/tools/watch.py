@@ -111,7 +111,7 @@ def _nodes(overview: Overview, now_s: float) -> 'RenderableType':
             state = Text(f'silent for {now_s - status.received_s:.0f} s', style='red')
         # `Text` prevents rich from interpreting received strings as markup.
         table.add_row(
-            Text(_printable(name)), Text(_printable(report.values.get('phase', ''))), state,
+            Text(_printable(name)), Text(_printable(report.details.get('phase', ''))), state,
             Text(_counts(given_up)), Text(_counts(status.counts('dropped'))))
     return table
 

@@ -17,15 +17,15 @@ def state(outcome, cycle_id=1):
 def test_an_idle_role_reports_its_phase_only():
     report = RoleStatistics().report('waiting', {})
     assert (report.fault, report.summary) == (False, 'no fault')
-    assert report.values == {'phase': 'waiting'}
-    assert RoleStatistics().report('', {}).values == {}
+    assert report.details == {'phase': 'waiting'}
+    assert RoleStatistics().report('', {}).details == {}
 
 
 def test_counters_are_sorted_into_sections():
     counters = {'wrong_cycle': 3, 'rhs_silent': 2, 'unanswered': 7, 'not_granted': 1,
                 'retry_band': 4, 'asked_again': 5, 'no_beacon': 6}
-    values = RoleStatistics().report('', counters).values
-    assert values == {'dropped.wrong_cycle': '3', 'cycles.rhs_silent': '2',
+    details = RoleStatistics().report('', counters).details
+    assert details == {'dropped.wrong_cycle': '3', 'cycles.rhs_silent': '2',
                       'beacons.unanswered': '7', 'cycles.not_granted': '1',
                       'retries.retry_band': '4', 'retries.asked_again': '5',
                       'beacons.no_beacon': '6'}
@@ -35,17 +35,17 @@ def test_settings_in_use_and_pending_are_reported(codebooks):
     statistics = RoleStatistics()
     settings = {'parameter.policy': 'first', 'pending.policy': 'random'}
 
-    def values_with(in_use):
+    def details_with(in_use):
         report = statistics.report('', {}, status={'codebook_id': in_use, **settings})
         assert not report.fault
-        return {name: value for name, value in report.values.items() if 'handling' not in name}
+        return {name: value for name, value in report.details.items() if 'handling' not in name}
     first, second, _ = (codebook.id for codebook in codebooks)
-    assert values_with('') == settings
+    assert details_with('') == settings
     statistics.record(CodebookOffered(codebooks[0]), [], 0.0)
-    assert values_with('') == values_with(first) == {'codebook_id': first, **settings}
+    assert details_with('') == details_with(first) == {'codebook_id': first, **settings}
     statistics.record(CodebookOffered(codebooks[1]), [], 0.0)
-    assert values_with(first) == {'codebook_id': first, 'pending.codebook_id': second, **settings}
-    assert values_with(second) == {'codebook_id': second, **settings}
+    assert details_with(first) == {'codebook_id': first, 'pending.codebook_id': second, **settings}
+    assert details_with(second) == {'codebook_id': second, **settings}
 
 
 def test_messages_and_served_cycles_are_counted(codebooks):
@@ -56,11 +56,11 @@ def test_messages_and_served_cycles_are_counted(codebooks):
         statistics.record(Timeout(), [Send(beacon), LogMessage('x')], 0.0)
         statistics.record(Timeout(), [state('', cycle_id)], 0.0)
         statistics.record(Timeout(), [state(outcome, cycle_id)], 0.0)
-    values = statistics.report('', {'rhs_silent': 1}).values
-    assert values['codebook_id'] == codebooks[1].id
-    assert (values['cycles.served'], values['cycles.rhs_silent']) == ('2', '1')
-    assert (values['sent.Beacon'], values['sent.ProtocolState']) == ('3', '6')
-    assert {values[f'cycle_ms.p{percent}'] for percent in (50, 95, 99)} == {'500.000'}
+    details = statistics.report('', {'rhs_silent': 1}).details
+    assert details['codebook_id'] == codebooks[1].id
+    assert (details['cycles.served'], details['cycles.rhs_silent']) == ('2', '1')
+    assert (details['sent.Beacon'], details['sent.ProtocolState']) == ('3', '6')
+    assert {details[f'cycle_ms.p{percent}'] for percent in (50, 95, 99)} == {'500.000'}
 
 
 def test_latencies_are_percentiles_of_the_latest_durations(example):
@@ -69,11 +69,11 @@ def test_latencies_are_percentiles_of_the_latest_durations(example):
     for time_s in times_s:
         estimate = example(m.PositionEstimate, latency_s=2 * time_s)
         statistics.record(Timeout(), [Send(estimate)], time_s)
-    values = statistics.report('', {}).values
+    details = statistics.report('', {}).details
     for percent in (50, 95, 99):
         expected = 1e3 * np.percentile(times_s[-512:], percent)
-        assert float(values[f'handling_ms.p{percent}']) == pytest.approx(expected, abs=1e-3)
-        assert float(values[f'estimate_ms.p{percent}']) == pytest.approx(2 * expected, abs=1e-3)
+        assert float(details[f'handling_ms.p{percent}']) == pytest.approx(expected, abs=1e-3)
+        assert float(details[f'estimate_ms.p{percent}']) == pytest.approx(2 * expected, abs=1e-3)
 
 
 MISSING = ('channel', 'bs')
@@ -107,4 +107,4 @@ def test_faults_are_summarised(reports):
         report = statistics.report(phase, counters, status=status)
         assert report.fault == bool(expected)
         assert report.summary == (expected or phase or 'no fault')
-        assert report.values.items() >= status.items()
+        assert report.details.items() >= status.items()

@@ -23,7 +23,7 @@ class Running:
         self.process, self.watch = process, watch
         self.diagnostics = {}
         subscribe_reports(watch.node, lambda name, report: self.diagnostics.update(
-            {name.removeprefix(f'{NAMESPACE}/'): report.values}))
+            {name.removeprefix(f'{NAMESPACE}/'): report.details}))
 
     def set(self, node, **values):
         """Set parameters together and return the result."""

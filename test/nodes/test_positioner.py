@@ -81,9 +81,9 @@ def test_the_diagnostics_contain_the_progress_of_a_table(bench, node, codebooks,
 
     monkeypatch.setattr(EstimatorKind, 'create', half)
     node.dispatch(CodebookOffered(codebooks[0]))
-    bench.until(lambda: node.report().values.get('table.progress') == '50 %', 'the progress')
+    bench.until(lambda: node.report().details.get('table.progress') == '50 %', 'the progress')
     released.set()
-    bench.until(lambda: 'table.progress' not in node.report().values, 'the end')
+    bench.until(lambda: 'table.progress' not in node.report().details, 'the end')
 
 
 def test_signals_are_answered_while_another_estimator_is_built(

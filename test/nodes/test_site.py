@@ -354,7 +354,7 @@ def test_the_others_continue_without_nodes_of_one_surface(running, roles):
 def test_a_surface_that_has_moved_is_named_and_its_pose_is_found(
         running, built_scripts, tmp_path):
     reports = []
-    subscribe_reports(running.fused.node, lambda name, report: reports.append(report.values))
+    subscribe_reports(running.fused.node, lambda name, report: reports.append(report.details))
     running.until(lambda: reports and 'agreement.front.side' in reports[-1], 'the references')
     assert 'warning.poses' not in reports[-1]
     assert running.side.set_parameters('channel', {'surface_shift_m': 0.3}).successful

@@ -61,7 +61,7 @@ def after(registry, steps):
     ('round_robin', [(1, 2), (1, 2), 1, 2, (2, 1)], [1, 2, 1]),
     # The first to answer.
     ('first', [(3, 1, 2), (2, 3), (2, 1)], [3, 2, 2]),
-    # A new policy keeps the turns.
+    # A new policy keeps the order.
     ('round_robin', [(1, 2, 3), (1, 2, 3), 'first', (2, 1, 3), 'round_robin', (1, 2, 3)],
      [1, 2, 2, 3])])
 def test_the_policy_selects_among_the_users_that_answered(make, policy, steps, served):
@@ -109,7 +109,7 @@ def test_random_is_uniform_and_reproducible(make):
     assert [cycle(other, 1, 2, 3) for _ in range(20)] != served[:20]
 
 
-def served_in_turn(registry, present, n):
+def served_in_order(registry, present, n):
     """Return the users served in cycles in which the invited ones of `present` answer."""
     served = []
     for _ in range(n):
@@ -155,8 +155,8 @@ def test_of_many_users_few_are_invited(make, policy):
 def test_no_user_waits_longer_than_a_round(make, present):
     registry = make()
     n = len(present)
-    served_in_turn(registry, present, 1)
-    served = served_in_turn(registry, present, 3 * n)
+    served_in_order(registry, present, 1)
+    served = served_in_order(registry, present, 3 * n)
     for user in present:
         turns = [turn for turn, other in enumerate(served) if other == user]
         assert max(np.diff([-1, *turns, 3 * n])) <= n
@@ -168,7 +168,7 @@ def test_a_user_that_is_always_late_does_not_delay_the_users_of_other_ranges(mak
         registry.register(user)
     served = []
     for _ in range(3 * len(others)):
-        served += served_in_turn(registry, others, 1)
+        served += served_in_order(registry, others, 1)
         # Its acks arrive after the grant.
         registry.register(late)
     for user in others:

@@ -110,7 +110,7 @@ def test_a_role_runs_without_what_was_refused(bench, refused, capfd, role):
         f'{name} not found in allow rule' for name in refused}
     report = node.report()
     assert report.fault
-    assert {*texts.values()} <= {*report.values.values()}
+    assert {*texts.values()} <= {*report.details.values()}
     assert capfd.readouterr().err.count('was refused') == len(texts)
 
 

@@ -184,7 +184,7 @@ def test_a_simulation_without_a_clock_is_waited_for(bench, monkeypatch, capfd):
 def test_nodes_in_different_times_report_each_other(bench, add_channel, announce, capfd):
     node = add_channel()
     announce('optimizer', values={'use_sim_time': True})
-    bench.until(lambda: 'conflict.clock' in node.report().values, 'the report')
+    bench.until(lambda: 'conflict.clock' in node.report().details, 'the report')
     assert node.report().fault
     assert '/optimizer: use_sim_time true, expected' in node.report().summary
     bench.until(lambda: '/channel: use_sim_time false, expected' in capfd.readouterr().err,
@@ -201,7 +201,7 @@ def test_endpoints_with_incompatible_qos_are_named_once(bench, capfd):
     reasons = {'feed_signals': 'Volatile publisher and transient local subscription',
                'pilot': 'Best effort publisher and reliable subscription'}
     keys = {f'conflict.qos.{topic}.observer' for topic in reasons}
-    bench.until(lambda: keys <= node.report().values.keys(), 'the report')
+    bench.until(lambda: keys <= node.report().details.keys(), 'the report')
     assert node.report().fault
     log = capfd.readouterr().err
     for topic, reason in reasons.items():
@@ -209,7 +209,7 @@ def test_endpoints_with_incompatible_qos_are_named_once(bench, capfd):
         assert text in node.report().summary
         assert log.count(text) == log.count(reason) == 1
     bench.remove(observer)
-    bench.until(lambda: not keys & node.report().values.keys(), 'its end')
+    bench.until(lambda: not keys & node.report().details.keys(), 'its end')
 
 
 def test_compatible_observers_are_no_conflict(bench):

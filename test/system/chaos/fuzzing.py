@@ -101,7 +101,7 @@ class _Counters:
             report, before = self._observer.reports.get(node), self._before.get(node, {})
             found[node] = {
                 key: int(value) - before.get(key, 0)
-                for key, value in (report.values if report else {}).items()
+                for key, value in (report.details if report else {}).items()
                 if key.startswith(('received.', 'dropped.'))}
         return found
 

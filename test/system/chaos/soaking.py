@@ -94,6 +94,6 @@ def soak(
 
 def _counts(observer: NetworkObserver, node: str, prefix: str) -> dict[str, int]:
     """Return the counters of a node whose keys begin with a prefix, by the rest of the key."""
-    values = observer.reports[node].values if node in observer.reports else {}
-    return {key.removeprefix(prefix): int(value) for key, value in values.items()
+    details = observer.reports[node].details if node in observer.reports else {}
+    return {key.removeprefix(prefix): int(value) for key, value in details.items()
             if key.startswith(prefix)}
