@@ -58,7 +58,7 @@ setup(
             'matplotlib', 'joblib', 'dask', 'distributed', 'tqdm', 'scikit-learn',
             'pymoo', 'mcap', 'sigmf', 'rich', 'rerun-sdk==0.22.1', 'pyarrow==25.0.0'],
         'docs': ['sphinx', 'furo', 'myst-nb'],
-        'test': ['pytest', 'hypothesis', 'rosbags'],
+        'test': ['pytest', 'hypothesis', 'filterpy', 'rosbags'],
     },
     zip_safe=False,
     entry_points={
