@@ -31,7 +31,9 @@ def example_message(
                  'missing_probability': 1e-3, 'outside_probability': 0.25,
                  'blocked_probability': 0.0,
                  'surface_quaternion': np.array([0.6, 0.0, 0.0, 0.8]),
-                 'surface_uncertainty': 1e-4 * np.eye(6)} | given
+                 'surface_uncertainty': 1e-4 * np.eye(6), 'sheet_log_weights': np.zeros(1),
+                 'sheet_means': np.array([[8.0, -0.25, 0.0]]),
+                 'sheet_covariances': 1e-4 * np.eye(3)[None]} | given
     fields = dataclasses.fields(kind)
     for field in fields:
         meta = field.metadata

@@ -15,8 +15,7 @@ received = site.sample(users, rng)
 for number, user in enumerate(users):
     errors_m = []
     for names in (['front'], list(site.surfaces)):
-        posterior = estimator.estimate({name: received[name][number] for name in names})
-        mean, covariance = posterior.mixture.moments()
-        errors_m.append(np.linalg.norm(mean - user))
+        found = estimator.estimate({name: received[name][number] for name in names})
+        errors_m.append(np.linalg.norm(found.mean - user))
     print(f'{user.round(2)} m: error {errors_m[0]:.2f} m with one surface, {errors_m[1]:.2f} m '
-          f'with all, standard deviations {np.sqrt(np.diag(covariance)).round(2)} m')
+          f'with all, standard deviations {np.sqrt(np.diag(found.covariance)).round(2)} m')

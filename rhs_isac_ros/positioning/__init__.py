@@ -14,16 +14,17 @@ only to a fraction of a beam. In Cartesian coordinates, the modes are curved.
 The modules, in reading order:
 
 * `estimate`: the interface; `estimators`: `bayes` and `ml`, from signals to positions
+* `mixture`: Gaussians in the frame of the site; `sheets`: Gaussians in range and direction cosines
+  around a surface, also restricted to the region of interest
 * `lattice`: lengths over which signals change, and the grid; `segments`: points of each shot
-* `region`: Gaussians restricted to the region of interest
 * `likelihood`: the likelihood of positions and nuisance parameters
 * `templates`, `peaks`, `grid`: starts of the search; `search`: ascent from the starts to the
   modes; `failures`: modes if elements have failed
 * `posterior`: from modes to samples; `draws`: samples without modes; `alternatives`: users outside
   or blocked; `diagnosis`: tests of the fit between signals and model
-* `mixture`: posteriors in the frame of the site; `prior`: their update with signals; `fusion`:
-  several surfaces; `agreement`: surfaces whose pose is wrong; `alignment`: the pose of a surface
-  from common users; `site`: the surfaces of a site in a file
+* `prior`: the update of a mixture with signals; `fusion`: several surfaces; `agreement`: surfaces
+  whose pose is wrong; `alignment`: the pose of a surface from common users; `site`: the surfaces
+  of a site in a file
 * `tracking`: moving users; `neural`: the paper's network; `store`: tables in files
 """
 
@@ -34,19 +35,23 @@ from typing import Any, cast
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import KnownSurface
-from rhs_isac_ros.positioning.estimate import Estimate, Estimator, SignalError, estimate_each
+from rhs_isac_ros.positioning.estimate import (
+    Estimate,
+    Estimator,
+    Sighting,
+    SignalError,
+    estimate_each,
+)
 from rhs_isac_ros.positioning.estimators import (
     BayesEstimator,
     MlEstimator,
     SearchEstimator,
-    WeightedModes,
-    weighted_modes,
 )
-from rhs_isac_ros.positioning.fusion import Fused, Sighting, fuse
+from rhs_isac_ros.positioning.fusion import fuse
 from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.positioning.neural import ModelError, Network, NeuralEstimator, train
 from rhs_isac_ros.positioning.site import Site, SiteError, SiteEstimator
-from rhs_isac_ros.positioning.tracking import Motion, Tracker, TrackEstimate
+from rhs_isac_ros.positioning.tracking import Motion, Tracker
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.system import System
 
@@ -54,11 +59,10 @@ ESTIMATORS: Mapping[str, Callable[..., Estimator]] = {
     kind.name: kind for kind in (BayesEstimator, MlEstimator, NeuralEstimator)}
 
 __all__ = [
-    'ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'Fused', 'EstimatorKind',
-    'Mixture', 'MlEstimator', 'ModelError', 'Motion', 'Network', 'NeuralEstimator',
-    'SearchEstimator', 'Sighting', 'SignalError', 'Site', 'SiteError', 'SiteEstimator',
-    'TrackEstimate', 'Tracker', 'WeightedModes', 'estimate_each', 'fuse', 'make_estimator',
-    'train', 'weighted_modes',
+    'ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'EstimatorKind', 'Mixture',
+    'MlEstimator', 'ModelError', 'Motion', 'Network', 'NeuralEstimator', 'SearchEstimator',
+    'Sighting', 'SignalError', 'Site', 'SiteError', 'SiteEstimator', 'Tracker', 'estimate_each',
+    'fuse', 'make_estimator', 'train',
 ]
 
 

@@ -1,9 +1,9 @@
 """Detection of surfaces whose pose is wrong, from the signals of ordinary users.
 
-The measure of a cycle is `Fused.log_agreement` of two surfaces. Its distribution has heavy tails:
-a few cycles in which a wrong mode won would dominate a mean. So each value is replaced by its rank
-among the values for right poses. The mean rank of many cycles is then 1/2, with a known standard
-deviation, and it is smaller if a pose is wrong.
+The measure of a cycle is `Estimate.log_agreement` of two surfaces. Its distribution has heavy
+tails: a few cycles in which a wrong mode won would dominate a mean. So each value is replaced by
+its rank among the values for right poses. The mean rank of many cycles is then 1/2, with a known
+standard deviation, and it is smaller if a pose is wrong.
 
 The agreement also depends on the position of the user. If a few users move slowly, all positions
 of a window are in one part of the region. Each value is then compared with the references nearby.
@@ -16,7 +16,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rhs_isac_ros.positioning.fusion import Fuser, Sighting
+from rhs_isac_ros.positioning.estimate import Sighting
+from rhs_isac_ros.positioning.fusion import Fuser
 
 # Number of latest cycles that count.
 WINDOW = 50
@@ -36,7 +37,7 @@ def pair_agreements(sightings: Mapping[str, Sighting], fuser: Fuser) -> dict[Pai
     Takes the sightings by the name of their surface. `fuser` multiplies them, unless it already
     has.
     """
-    return {(one, other): fuser.fuse([sightings[one], sightings[other]]).log_agreement
+    return {(one, other): float(fuser.fuse([sightings[one], sightings[other]]).log_agreement)
             for one, other in itertools.combinations(sorted(sightings), 2)}
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximum, symmetric
-from rhs_isac_ros.positioning.fusion import Sighting
+from rhs_isac_ros.positioning.estimate import Sighting
 from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.positioning.segments import Segments, select
 from rhs_isac_ros.positioning.templates import standard_normal
@@ -157,25 +157,10 @@ def _moments(pairs: '_Pairs', pose: Pose, found: Sequence[tuple['_Score', Pose]]
     return moments(weights, errors)
 
 
-def _thickened(sighting: Sighting) -> Mixture:
-    """Return the probable candidates, normalised, in the frame of the surface.
-
-    A component is a sheet that bends around the surface. At an offset d across the line of sight,
-    it is nearer by d^2 / (2 r), whose mean and variance are added to the Gaussian.
-    """
-    pose, mixture = sighting.pose, sighting.mixture.normalised()
-    mixture = select(mixture, mixture.log_weights >= _LIMITS.log_weight)
-    means = pose.to_surface(mixture.means)
-    covariances = pose.covariances_to_surface(mixture.covariances)
-    range_m = np.linalg.norm(means, axis=1)
-    sight = means / range_m[:, None]
-    along = sight[:, :, None] * sight[:, None, :]
-    across = (np.eye(3) - along) @ covariances @ (np.eye(3) - along)
-    nearer = np.trace(across, axis1=1, axis2=2) / (2 * range_m)
-    variance = np.einsum('cpq,cpq->c', across, across) / (2 * range_m**2)
-    return mixture._replace(
-        means=means - nearer[:, None] * sight,
-        covariances=covariances + variance[:, None, None] * along)
+def _candidates(sighting: Sighting) -> Mixture:
+    """Return the probable candidates, normalised, in the frame of the surface."""
+    mixture = sighting.likelihood.to_mixture(Pose()).normalised()
+    return select(mixture, mixture.log_weights >= _LIMITS.log_weight)
 
 
 def _inverses(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -228,7 +213,7 @@ class _Pairs(NamedTuple):
         """Pair all candidates of every user."""
         columns = []
         for one, two in zip(reference, other, strict=True):
-            here, there = _thickened(one), _thickened(two)
+            here, there = _candidates(one), _candidates(two)
             first, second = np.divmod(
                 np.arange(len(here.means) * len(there.means)), len(there.means))
             columns.append((

@@ -23,7 +23,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.gaussian import FALSE_ALARM, energy_limit, share_of_level
+from rhs_isac_ros.model.gaussian import (
+    BLOCKED_STD_DB,
+    FALSE_ALARM,
+    energy_limit,
+    log_evidence_of_level,
+    share_of_level,
+)
 from rhs_isac_ros.positioning.alternatives import ALTERNATIVES, probabilities_of
 from rhs_isac_ros.positioning.estimate import Estimate
 
@@ -107,6 +113,14 @@ class FitTest:
 
 def _excess(subject: str, value: float, limit: float) -> str:
     return '' if value <= limit else f'{subject}: {value:.3g}, expected at most {limit:.3g}'
+
+
+def misfit_log_ratio(residual: float, n: int) -> float:
+    """Return how likely n measurements with a residual energy fit no position: a log-likelihood.
+
+    It is relative to the best position. The residual then has an unknown level.
+    """
+    return float(log_evidence_of_level(np.array([residual]), n, BLOCKED_STD_DB)[0]) + residual
 
 
 class InnovationTest:

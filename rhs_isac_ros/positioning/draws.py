@@ -12,6 +12,7 @@ not depend on its own draws. Later rounds have larger weights (Owen and Zhou, Th
 for adaptive importance sampling, ACM Trans. on Modeling and Computer Simulation, 2020).
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,9 @@ from rhs_isac_ros.model.gaussian import moments
 from rhs_isac_ros.positioning.estimate import Fit, regular
 from rhs_isac_ros.positioning.grid import TemplateTable, Windows
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution, carrier_wavenumbers
+from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.positioning.segments import concatenate, select
+from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.positioning.templates import Query
 
 
@@ -43,6 +46,11 @@ class Sampling(NamedTuple):
     # Smallest number of range steps per wavelength. Narrow peaks get one per two standard
     # deviations.
     steps: int = 8
+    # How often groups of rays are divided, if they have at least a number of rays; and smallest
+    # weight of a ray in a group, relative to the largest one.
+    levels: int = 6
+    divided: int = 16
+    least: float = 1e-6
     # Number of range steps to evaluate at a time.
     block: int = 1 << 20
 
@@ -139,7 +147,8 @@ class DrawnPosterior:
         return Fit(
             mean, regular(covariance * (1 + variance)),
             float(log_total) - np.log(total_share) - energy - self._log_region,
-            energy - best, query.signals[0].size + float(weights @ rays.average) - best, 0.0)
+            energy - best, query.signals[0].size + float(weights @ rays.average) - best, 0.0,
+            functools.partial(_described, rays, weights, 1 + variance, self._bounds))
 
     def _probabilities(self, query: Query, shot: int) -> np.ndarray:
         """Approximate each cell's share of the posterior, as if carrier phases were random."""
@@ -205,6 +214,46 @@ class DrawnPosterior:
         directions = np.where(np.abs(directions) < _TINY, _TINY, directions)
         ends = np.sort(self._bounds[:, None] / directions, axis=0)
         return ends[0].max(axis=1), ends[1].min(axis=1)
+
+
+def _described(rays: _Rays, weights: np.ndarray, widening: float, bounds: np.ndarray
+               ) -> tuple[Mixture, Sheets]:
+    """Return the posterior as a mixture, and the likelihood, of groups of rays."""
+    chosen = weights > weights.max() * SAMPLING.least
+    rays, weights = select(rays, chosen), weights[chosen]
+    places = rays.range_m[:, None] * rays.direction
+    shares = _groups(weights, places)
+    log_shares, shares = np.log(shares.sum(axis=1)), shares / shares.sum(axis=1, keepdims=True)
+    along = np.zeros((len(weights), 3))
+    along[:, 0] = 1.0
+
+    def of_each(points: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        means = shares @ points
+        outer = points[:, :, None] * points[:, None] + (
+            rays.variance_m2[:, None, None] * axis[:, :, None] * axis[:, None])
+        squares = (shares @ outer.reshape(-1, 9)).reshape(-1, 3, 3)
+        return means, squares - means[:, :, None] * means[:, None]
+
+    means, covariances = of_each(places, rays.direction)
+    return (Mixture._make((log_shares, means, regular(covariances))).normalised().scaled(widening),
+            Sheets.of_density(log_shares, *of_each(
+                np.column_stack([rays.range_m, rays.direction[:, 1:]]), along), bounds))
+
+
+def _groups(weights: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return the weights of places [P, 3] in each of G groups, float64 [G, P].
+
+    Each group is divided again and again at its mean, along the axis in which it is widest.
+    """
+    group, row = np.zeros(len(weights), int), np.arange(len(weights))
+    for _ in range(SAMPLING.levels):
+        total, *sums = (np.bincount(group, weights * values) for values in (1.0, *places.T))
+        means = np.stack(sums, axis=1) / np.maximum(total, np.finfo(float).tiny)[:, None]
+        offsets = places - means[group]
+        squares = np.stack([np.bincount(group, weights * one**2) for one in offsets.T])
+        beyond = offsets[row, np.argmax(squares, axis=0)[group]] > 0
+        group = 2 * group + (beyond & (np.bincount(group) >= SAMPLING.divided)[group])
+    return weights * np.equal.outer(np.unique(group), group)
 
 
 def _boresight(directions: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -10,13 +10,19 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.arrays import numbers, position_problem
 from rhs_isac_ros.model.gaussian import symmetric
+from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.sheets import Sheets
+from rhs_isac_ros.support.fields import finite
 
 # Limit far above any received amplitude [sqrt(W)]. The square of a whitened amplitude is still
 # finite in single precision.
 _MAX_MAGNITUDE = 1e3
 # Standard deviation that every coordinate of a position has, so that covariances have inverses.
 _MIN_STD_M = 1e-5
-_EstimateT = TypeVar('_EstimateT', bound='Estimate')
+# Probability that modes do not contain the position of a user in sight.
+MISS_PROBABILITY = 1e-3
+# Frames of an estimate.
+SURFACE, SITE = 'surface', 'site'
 
 
 class SignalError(ValueError):
@@ -24,10 +30,56 @@ class SignalError(ValueError):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class Sighting:
+    """What the signals of one surface say about a position, for a user in the region.
+
+    Raises ValueError if `missing` is not between 0 and 1.
+    """
+
+    pose: Pose
+    #: Likelihood as a density with moments in the frame of the site, D = 3, as if the pose were
+    #: exact. With `sheets`, the moments are those in the region. Without, its Gaussians touch the
+    #: sheets at their maxima.
+    mixture: Mixture
+    #: Probability that the mixture does not contain the position of the user.
+    missing: float = MISS_PROBABILITY
+    sheets: Sheets | None = None  #: The likelihood around the surface, without limits.
+    #: Logarithms of likelihoods relative to a user in the region and in sight, whatever the prior
+    #: probabilities; NaN if unknown: user outside of the region, no direct path, and signals that
+    #: fit no position.
+    outside_log_ratio: float = np.nan
+    blocked_log_ratio: float = np.nan
+    misfit_log_ratio: float = np.nan
+
+    def __post_init__(self) -> None:
+        """Check the probability."""
+        if not 0 < finite('missing', self.missing) < 1:
+            raise ValueError(f'missing: {self.missing}, expected a probability between 0 and 1')
+
+    @property
+    def likelihood(self) -> Sheets:
+        """The sheets; raises ValueError if those of the mixture are behind the surface."""
+        return self.sheets or Sheets.tangent(self.mixture, self.pose)
+
+    @classmethod
+    def of(cls, estimate: 'Estimate', pose: Pose | None = None) -> 'Sighting | None':
+        """Return the likelihood for the signals of one shot; None without a position.
+
+        `estimate` is the result of `posterior`. By default, the pose is that of its scenario.
+        """
+        found = estimate.sighting
+        if found is None or estimate.reason:
+            return None
+        return found if pose in (None, found.pose) else dataclasses.replace(
+            found, pose=pose, mixture=found.mixture.moved(found.pose, pose))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Estimate:
     """A position with its uncertainty, or the reason why there is none; or N of these.
 
-    Mean and covariance always apply to a user in the region and in sight.
+    Estimators, tracks, the fusion and sites return estimates. Mean and covariance always apply to
+    a user in the region and in sight. ``estimate[n]`` is the n-th of N estimates.
     """
 
     mean: np.ndarray  #: Position, float64 [3] or [N, 3] [m]; NaN if there is none.
@@ -45,32 +97,92 @@ class Estimate:
     #: Probability that there is no direct path, float64 [] or [N]; NaN if the estimator assumes a
     #: direct path, or if the signals are weaker than noise.
     blocked_probability: float | np.ndarray = np.nan
+    #: Logarithm of the density of the signals of several surfaces for one user, relative to that
+    #: for a different user at each surface, float64 [] or [N]; NaN for one surface.
+    log_agreement: float | np.ndarray = np.nan
+    #: Velocity, float64 [..., 3] [m/s], and its covariance, [..., 3, 3]; NaN without a track.
+    velocity: np.ndarray = dataclasses.field(default_factory=lambda: np.full(3, np.nan))
+    velocity_covariance: np.ndarray = dataclasses.field(
+        default_factory=lambda: np.full((3, 3), np.nan))
+    #: Number of phases of the track in the estimate, int [] or [N]; 0 without a track.
+    n_phases: int | np.ndarray = 0
+    #: Whether the position is a prediction for a blocked user, bool [] or [N].
+    is_predicted: bool | np.ndarray = False
+    #: Whether a mode beside the prior explains the signals better than all modes near it.
+    is_elsewhere: bool | np.ndarray = False
+    #: The `mixture`, or a function that returns it. This and the next two fields are tuples of N
+    #: for N estimates.
+    density: Mixture | Callable[[], Mixture] | None = None
+    #: Posterior without regard to the limits of the region, from which a track continues.
+    unbounded: Mixture | None = None
+    #: Function that returns the `sighting`.
+    see: Callable[[], Sighting] | None = None
+    frame: str = SURFACE  #: ``surface`` or ``site``: the frame of the mean and the velocity.
+
+    @property
+    def mixture(self) -> Mixture | None:
+        """Posterior with the mean and the covariance, normalised, in the frame of the site.
+
+        None without a position, and unless `posterior`, a track, `fuse` or a site returned the
+        estimate. D = 6 with velocities. It is computed when it is first read.
+        """
+        if isinstance(self.reason, tuple):
+            found: Any = tuple(self[n].mixture for n in range(len(self.reason)))
+            return found
+        return self.density() if callable(self.density) else self.density
+
+    @property
+    def sighting(self) -> Sighting | None:
+        """What the signals alone say; None unless this is a result of `posterior` with modes."""
+        return self.see() if callable(self.see) else None
+
+    @property
+    def estimate(self) -> 'Estimate':
+        """The estimate itself, for programs that expect it as a part of a posterior."""
+        return self
 
     @classmethod
-    def without_fix(cls, reason: str, **statistics: float) -> 'Estimate':
+    def without_fix(cls, reason: str, **statistics: Any) -> 'Estimate':
         """Return an estimate of one shot that has a reason in place of a position."""
         return cls(np.full(3, np.nan), np.full((3, 3), np.nan), reason, **statistics)
 
     @classmethod
-    def of_each(cls, estimates: Sequence['Estimate']) -> 'Estimate':
+    def of_each(cls, estimates: Sequence['Estimate'], frame: str = SURFACE) -> 'Estimate':
         """Combine the estimates of N shots."""
-        of = {field.name: [getattr(one, field.name) for one in estimates]
-              for field in dataclasses.fields(Estimate)}
-        mean, covariance, reason = of.pop('mean'), of.pop('covariance'), of.pop('reason')
-        return cls(
-            np.reshape(mean, (-1, 3)), np.reshape(covariance, (-1, 3, 3)), tuple(reason),
-            **{name: np.array(values, float) for name, values in of.items()})
+        shapes = {name: (3, 3)[:2 - (name in ('mean', 'velocity'))] for name in (
+            'mean', 'covariance', 'velocity', 'velocity_covariance')}
+        found: dict[str, Any] = {}
+        for field in dataclasses.fields(cls):
+            values = [getattr(one, field.name) for one in estimates]
+            if field.name in _OBJECTS:
+                found[field.name] = tuple(values)
+            elif field.name != 'frame':
+                found[field.name] = np.reshape(
+                    np.array(values), (len(values), *shapes.get(field.name, ())))
+        return cls(**found, frame=estimates[0].frame if estimates else frame)
+
+    def __getitem__(self, n: int) -> 'Estimate':
+        """Return one of several estimates."""
+        return type(self)(**{
+            field.name: getattr(self, field.name)[n] for field in dataclasses.fields(self)
+            if field.name != 'frame'}, frame=self.frame)
 
     @property
     def fix(self) -> np.ndarray:
         """Whether there is a position, bool [] or [N]."""
         return np.isfinite(self.mean).all(axis=-1)
 
-    def to_site(self: _EstimateT, pose: Pose) -> _EstimateT:
+    def to_site(self, pose: Pose) -> 'Estimate':
         """Convert from the frame of a surface with the given pose to that of the site."""
         return dataclasses.replace(
             self, mean=pose.to_site(self.mean),
-            covariance=pose.covariances_to_site(self.covariance))
+            covariance=pose.covariances_to_site(self.covariance),
+            velocity=pose.vectors_to_site(self.velocity),
+            velocity_covariance=pose.covariances_to_site(self.velocity_covariance), frame=SITE)
+
+
+# Fields of an estimate that are no numbers.
+_OBJECTS = ('reason', 'density', 'unbounded', 'see')
 
 
 class Fit(NamedTuple):
@@ -82,6 +194,8 @@ class Fit(NamedTuple):
     residual: float  # Energy of the whitened residual at the best position.
     expected: float  # Expected residual of signals that match the model.
     gain: float  # Gain of the signals at the best position [nepers].
+    # Returns the posterior as a mixture in the frame of the surface, and the likelihood.
+    describe: Callable[[], tuple[Mixture, Sheets]]
 
 
 class Estimator(Protocol):
@@ -101,9 +215,9 @@ class Estimator(Protocol):
 
 
 def regular(covariances: np.ndarray) -> np.ndarray:
-    """Return symmetric covariances of positions [..., 3, 3] [m^2] that have an inverse."""
+    """Return symmetric covariances of positions [..., D, D] [m^2] that have an inverse."""
     # In a region without extent along an axis, the variance along it is 0.
-    return symmetric(covariances) + _MIN_STD_M**2 * np.eye(3)
+    return symmetric(covariances) + _MIN_STD_M**2 * np.eye(covariances.shape[-1])
 
 
 def estimate_each(
@@ -116,9 +230,7 @@ def estimate_each(
     value is not a finite number, or a magnitude exceeds 1000.
     """
     found = list(map(_possible, locate(checked_received(codebook, received))))
-    if np.ndim(received) == 2:
-        return found[0]
-    return Estimate.of_each(found)
+    return found[0] if np.ndim(received) == 2 else Estimate.of_each(found)
 
 
 def _possible(estimate: Estimate) -> Estimate:

@@ -6,26 +6,29 @@ import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
-from rhs_isac_ros.model.gaussian import moments, share_of_level
+from rhs_isac_ros.model.gaussian import share_of_level
 from rhs_isac_ros.model.geometry import to_positions
 from rhs_isac_ros.positioning.alternatives import Alternative, Blocked, Outside, rejection
-from rhs_isac_ros.positioning.diagnosis import FitTest
+from rhs_isac_ros.positioning.diagnosis import FitTest, misfit_log_ratio
 from rhs_isac_ros.positioning.draws import DrawnPosterior
 from rhs_isac_ros.positioning.estimate import (
+    MISS_PROBABILITY,
     Estimate,
     Fit,
+    Sighting,
     checked_received,
     estimate_each,
     regular,
 )
 from rhs_isac_ros.positioning.failures import refinement_of
 from rhs_isac_ros.positioning.grid import TemplateTable
-from rhs_isac_ros.positioning.lattice import Grid, Resolution, lay_grid
+from rhs_isac_ros.positioning.lattice import Grid, lay_grid
 from rhs_isac_ros.positioning.likelihood import (
     Alignment,
     Likelihood,
@@ -34,8 +37,7 @@ from rhs_isac_ros.positioning.likelihood import (
 from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.positioning.posterior import (
     BandPhases,
-    Posterior,
-    WeightedSamples,
+    Samples,
     draw_broad_samples,
     draw_samples,
 )
@@ -43,9 +45,7 @@ from rhs_isac_ros.positioning.prior import (
     MIN_EXTENT_M,
     PRIOR_MARGIN,
     WRONG,
-    bend,
     cells_of,
-    flatten,
     inside,
     is_doubtful,
     multiply,
@@ -53,6 +53,7 @@ from rhs_isac_ros.positioning.prior import (
 )
 from rhs_isac_ros.positioning.search import GRID_MARGIN, Modes, modes_from
 from rhs_isac_ros.positioning.segments import concatenate, select
+from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.positioning.templates import N_NORMAL, standard_normal, tabulate
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
@@ -169,7 +170,7 @@ class SearchEstimator(abc.ABC):
         """Compute the table of the region, unless it exists; any thread may call this."""
         _ = self._region
 
-    def _scopes(self, bent: Mixture) -> Iterator[Scope]:
+    def _scopes(self, bent: Sheets) -> Iterator[Scope]:
         """Yield the part of the grid that a prior in (r [m], u, v) covers, and then the region.
 
         The part is left out if the table of the region exists.
@@ -190,12 +191,13 @@ class SearchEstimator(abc.ABC):
 
     @one_blas_thread
     def posterior(self, received: np.ndarray, prior: Mixture | None = None, *,
-                  wrong: float = WRONG, share: float = 1.0) -> Posterior:
-        """Compute the posterior for the signals of one shot, complex128 [N_B, N_SB F].
+                  wrong: float = WRONG, share: float = 1.0) -> Estimate:
+        """Estimate positions, and keep the posterior as a mixture; signals as in `estimate`.
 
-        The probabilities of users outside or blocked, and the reason why there is no position, are
-        those without the prior. Users outside are considered only if the whole region is searched.
-        Raises `SignalError` if the signals are unusable.
+        Without a prior, the position is that of `estimate`. The probabilities of users outside or
+        blocked, and the reason why there is no position, are those without the prior. Users
+        outside are considered only if the whole region is searched. Raises `SignalError` if the
+        signals are unusable.
 
         Parameters
         ----------
@@ -208,70 +210,87 @@ class SearchEstimator(abc.ABC):
         share
             Exponent of the likelihood with a mixture as prior; see `independent_share`.
         """
-        batch = checked_received(self._likelihood.codebook, received)
-        signals = self._likelihood.signals(batch)
-        if prior is not None:
-            return self._update(signals, prior, wrong, share)
-        ((estimate, modes),) = self._locate_block(self._region, signals, draws=True)
-        if modes is None and not estimate.reason:
-            # The position is an average over draws, as in `estimate`; a search yields modes.
-            ((_, modes),) = self._locate_block(self._region, signals, draws=False)
-        return Posterior(estimate, modes, signals, modes and flatten(
-            uniform(modes, self._bounds).normalised(), self.scenario.pose))
+        signals = self._likelihood.signals(checked_received(self._likelihood.codebook, received))
+        if prior is None:
+            found = [one.posterior() for block in blocks(len(signals.received), _LIMITS.block)
+                     for one in self._locate_block(self._region, select(signals, block))]
+        else:
+            before = self.in_front(prior, wrong)
+            found = [self._update(select(signals, [n]), before, share)
+                     for n in range(len(signals.received))]
+        return found[0] if np.ndim(received) == 2 else Estimate.of_each(found)
 
-    def _update(self, signals: Signals, prior: Mixture, wrong: float, share: float) -> Posterior:
-        """Compute the posterior with a mixture as prior; see `posterior`."""
-        pose, extent = self.scenario.pose, self._bounds[1] - self._bounds[0]
-        region = (pose.to_site(self._bounds.mean(axis=0)), pose.covariances_to_site(
-            np.diag(np.maximum(extent, MIN_EXTENT_M)**2)))
-        # The component for the whole region comes last.
-        before = bend(prior.or_within(*region, wrong), pose)
+    def in_front(self, prior: Mixture, wrong: float) -> Sheets:
+        """Return a density of the site around the surface, with the probability that it is wrong.
+
+        A component for the whole region comes last.
+        """
+        pose, extent = self.scenario.pose, np.ptp(self._bounds, axis=0)
+        return Sheets.from_mixture(prior.or_within(
+            pose.to_site(self._bounds.mean(axis=0)),
+            pose.covariances_to_site(np.diag(np.maximum(extent, MIN_EXTENT_M)**2)), wrong), pose)
+
+    def _update(self, signals: Signals, before: Sheets, share: float) -> Estimate:
+        """Compute the posterior of one shot for a prior, whose last component is everywhere."""
         for scope in self._scopes(select(before, slice(-1))):
-            ((estimate, modes),) = self._locate_block(scope, signals, draws=False)
-            if modes is None:
+            (found,) = self._locate_block(scope, signals, draws=False)
+            if found.modes is None or found.estimate.reason:
                 continue
             products = multiply(
-                before, modes, share, self._exact_likelihood, signals, self._bounds)
+                before, found.modes, share, self._exact_likelihood, signals, self._bounds)
             if not is_doubtful(products.energy / self._level, self._n_measurements):
                 break
-        if modes is None:
-            return Posterior(estimate, None, signals)
-        found = products.bent
+        if found.modes is None or found.estimate.reason:
+            return found.estimate
+        estimate, density = found.estimate, products.bent
         blocked, outside = np.nan_to_num(
             [float(estimate.blocked_probability), float(estimate.outside_probability)])
         if blocked:
             # Signals without a direct path contain no information. The odds are relative to a user
             # anywhere in the region.
             odds = share * np.log(blocked / max(1 - blocked - outside, 1e-12))
-            everywhere = uniform(modes, self._bounds, share).log_mass
-            found = concatenate(found, before.weighted(everywhere + odds))
-        found, mean, covariance = inside(
-            found.reduce(), self._bounds, self.normal[:_LIMITS.narrow])
-        return Posterior(dataclasses.replace(estimate, mean=mean, covariance=covariance), modes,
-                         signals, flatten(found, pose), products.is_last)
+            everywhere = uniform(found.modes.sheets(share), self._bounds).log_mass
+            density = concatenate(density, before.weighted(everywhere + odds))
+        return self.restricted(density.reduce(), dataclasses.replace(
+            estimate, see=found.see(), is_elsewhere=products.is_last))
+
+    def begin(self, estimate: Estimate) -> Mixture:
+        """Return the posterior without a prior, from which a track begins."""
+        assert estimate.sighting is not None and estimate.sighting.sheets is not None
+        density = uniform(estimate.sighting.sheets, self._bounds).normalised()
+        return density.to_mixture(self.scenario.pose)
+
+    def restricted(self, density: Sheets, estimate: Estimate) -> Estimate:
+        """Return an estimate with the position and velocity of a density, in the region."""
+        density, mixture = inside(
+            density, self._bounds, self.normal[:_LIMITS.narrow], self.scenario.pose)
+        mean, covariance = mixture.position().moments()
+        pose = self.scenario.pose
+        return dataclasses.replace(
+            estimate, mean=pose.to_surface(mean),
+            covariance=pose.covariances_to_surface(covariance), density=mixture,
+            unbounded=density.to_mixture(pose))
 
     @abc.abstractmethod
-    def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
+    def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
         """Return positions, [N, 3], and covariances, [N, 3, 3], of N shots."""
 
     def _locate(self, batch: np.ndarray) -> Iterator[Estimate]:
         signals = self._likelihood.signals(batch)
         parts = map_blocks(
-            lambda block: self._locate_block(self._region, select(signals, block), draws=True),
+            lambda block: [one.estimate for one in self._locate_block(
+                self._region, select(signals, block))],
             blocks(len(batch), _LIMITS.block))
-        return (estimate for estimate, _ in itertools.chain.from_iterable(parts))
+        return itertools.chain.from_iterable(parts)
 
-    def _locate_block(self, scope: Scope, signals: Signals, draws: bool
-                      ) -> list[tuple[Estimate, Modes | None]]:
-        """Return the estimate and the modes of each of several shots.
+    def _locate_block(self, scope: Scope, signals: Signals, draws: bool = True) -> list['_Found']:
+        """Locate each of several shots.
 
-        With `draws`, positions are drawn if the search for modes would be too long. The modes are
-        None after draws and without a position.
+        With `draws`, positions are drawn if the search for modes would be too long.
         """
         energies = np.sum(np.abs(signals.received)**2, axis=(1, 2)) / self.scenario.noise_power_w
         reasons = list(map(self._test.min_energy_test, energies.tolist()))
-        found: list[tuple[Estimate, Modes | None]] = [
-            (Estimate.without_fix(reason), None) for reason in reasons]
+        found = [_Found(self, Estimate.without_fix(reason)) for reason in reasons]
         usable = [row for row, reason in enumerate(reasons) if not reason]
         if usable:
             signals = select(signals, usable)
@@ -280,8 +299,8 @@ class SearchEstimator(abc.ABC):
             fits = self._fits(scope, signals, aligned, whitened, draws)
             for row, (fit, modes), one, values in zip(
                     usable, fits, whitened, aligned, strict=True):
-                estimate = self._judge(scope.alternatives, fit, one, values)
-                found[row] = estimate, None if estimate.reason else modes
+                estimate, log_ratios = self._judge(scope.alternatives, fit, one, values)
+                found[row] = _Found(self, estimate, fit, modes, log_ratios)
         return found
 
     def _fits(self, scope: Scope, signals: Signals, aligned: np.ndarray, whitened: np.ndarray,
@@ -306,13 +325,13 @@ class SearchEstimator(abc.ABC):
         likelihood = self._likelihood
         modes, conditionals = self._refinement.refine(modes, signals, scope.table)
         if likelihood.nuisance.is_coarse:
-            drawn = concatenate(*(
-                draw_broad_samples(likelihood, of_shot, self._phases, select(signals, [shot]),
-                                   modes.of_shot(shot), self._mode_normal)
-                for shot, of_shot in conditionals.items()))
+            drawn = (draw_broad_samples(
+                likelihood, of_shot, self._phases, select(signals, [shot]), modes.of_shot(shot),
+                self._mode_normal) for shot, of_shot in conditionals.items())
+            positions, log_weights = map(np.concatenate, zip(*drawn, strict=True))
+            samples = Samples.of(positions, log_weights, modes.shots)
         else:
-            drawn = draw_samples(modes, self._mode_normal, self._bounds)
-        samples = WeightedSamples.of(drawn, modes)
+            samples = draw_samples(modes, self._mode_normal, self._bounds)
         means, covariances = self._moments(modes, samples)
         # If the model holds, twice the residual energy, averaged over the posterior, has the mean
         # of a chi-square variable. At the best of several modes, it is smaller than the average.
@@ -320,19 +339,24 @@ class SearchEstimator(abc.ABC):
         residuals = samples.of_shot.first(modes.residual)
         expected = self._mean_residual - (samples.average(modes.residual) - residuals)
         gains = samples.of_shot.first(modes.values) @ likelihood.nuisance.gain
-        for shot, *fit in zip(
+        for n, (shot, *fit) in enumerate(zip(
                 conditionals, means, covariances, samples.log_evidence.tolist(),
-                residuals.tolist(), expected.tolist(), gains.tolist(), strict=True):
-            yield shot, (Fit(*fit), modes.of_shot(shot))
+                residuals.tolist(), expected.tolist(), gains.tolist(), strict=True)):
+            of_shot = modes.of_shot(shot)
+            # Broad modes are not Gaussian, so their sheets have the moments of the samples.
+            describe = functools.partial(
+                samples.described, n, None if likelihood.nuisance.is_coarse else of_shot,
+                self._bounds)
+            yield shot, (Fit._make((*fit, describe)), of_shot)
 
     def _judge(self, alternatives: Sequence[Alternative], fit: Fit, whitened: np.ndarray,
-               aligned: np.ndarray) -> Estimate:
-        """Return the position of one shot, or the reason why there is none."""
-        log_weights = np.array([fit.log_evidence, *(
-            one.log_odds + one.log_evidence_of(
-                whitened, aligned, fit.residual, self._likelihood.nuisance)
-            for one in alternatives)])
-        probabilities, _ = mixture_weights(log_weights)
+               aligned: np.ndarray) -> tuple[Estimate, dict[str, float]]:
+        """Return the position of one shot, or the reason why there is none; and `log_ratios`."""
+        log_ratios = {one.name: one.log_evidence_of(
+            whitened, aligned, fit.residual, self._likelihood.nuisance) - fit.log_evidence
+            for one in alternatives}
+        probabilities, _ = mixture_weights(np.array([0.0, *(
+            one.log_odds + log_ratios[one.name] for one in alternatives)]))
         weights = self._likelihood.weights_at(np.array([fit.gain]))[0]
         reason = self._reason(alternatives, whitened * np.exp(-fit.gain) * weights,
                               fit.residual, probabilities)
@@ -340,20 +364,21 @@ class SearchEstimator(abc.ABC):
         # The residual is the reason if the texts are equal.
         is_evidence = (reason == self._test.residual_test(fit.residual) if reason
                        else probabilities[0] >= 1 - _LIMITS.doubt)
-        statistics = {
+        statistics: dict[str, Any] = {
             'residual': fit.residual, 'expected_residual': fit.expected if is_evidence else np.nan,
             **{f'{one.name}_probability': float(share) for one, share in zip(
                 alternatives, probabilities[1:], strict=True)}}
         if reason:
-            return Estimate.without_fix(reason, **statistics)
-        return Estimate(fit.mean, self._covariance(fit), reason, **statistics)
+            return Estimate.without_fix(reason, **statistics), log_ratios
+        return Estimate(fit.mean, self._scale(fit) * fit.covariance, reason, **statistics
+                        ), log_ratios
 
-    def _covariance(self, fit: Fit) -> np.ndarray:
-        """Return the covariance, scaled to the multipath level that the residual indicates."""
+    def _scale(self, fit: Fit) -> float:
+        """Return the factor of the covariance for the multipath level that the residual shows."""
         relative = max(fit.residual, 1e-9) / (self._level * max(fit.expected, 0.5))
         # The scaled covariance does not exceed the prior's, unless the original one does.
         largest = max(self._prior_m2 / float(fit.covariance.trace()), 1.0)
-        return min(relative**self._level_share, largest) * fit.covariance
+        return float(min(relative**self._level_share, largest))
 
     def _reason(self, alternatives: Sequence[Alternative], whitened: np.ndarray, residual: float,
                 probabilities: np.ndarray) -> str:
@@ -376,7 +401,7 @@ class BayesEstimator(SearchEstimator):
 
     name, uses_tracks = 'bayes', True
 
-    def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
+    def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
         mean, covariance = samples.moments()
         return mean, regular(covariance)
 
@@ -386,35 +411,46 @@ class MlEstimator(SearchEstimator):
 
     name, averages = 'ml', False
 
-    def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
+    def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
         mean, covariance = samples.moments()
         best = to_positions(samples.of_shot.first(modes.points))
         offsets = best - mean
         return best, regular(covariance + offsets[:, :, None] * offsets[:, None])
 
 
-class WeightedModes(NamedTuple):
-    """The posterior as a mixture of M components, the most probable first."""
+class _Found(NamedTuple):
+    """The estimate of one shot, and how it was found if the signals are stronger than noise."""
 
-    probabilities: np.ndarray  #: Float64 [M]; their sum is 1.
-    positions: np.ndarray  #: Means of the components, float64 [M, 3] [m].
-    covariances: np.ndarray  #: Float64 [M, 3, 3] [m^2].
+    estimator: SearchEstimator
+    estimate: Estimate
+    fit: Fit | None = None
+    modes: Modes | None = None  # None after draws.
+    #: Logarithms of the likelihoods of alternatives, by name, relative to a user in sight.
+    log_ratios: Mapping[str, float] = {}
 
+    def posterior(self) -> Estimate:
+        """Return the estimate with its mixture and its sighting."""
+        if self.fit is None:
+            return self.estimate
+        see = self.see()
+        density = functools.cache(lambda: see().mixture.normalised())
+        return dataclasses.replace(
+            self.estimate, see=see, density=None if self.estimate.reason else density)
 
-@one_blas_thread
-def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> WeightedModes | None:
-    """Compute the mixture of modes for signals of one shot, [N_B, N_SB F] or [N_B, N_SB, F].
+    def see(self) -> Callable[[], Sighting]:
+        """Return the function that describes the signals alone."""
+        return functools.cache(self._sighting)
 
-    The mixture has the mean and covariance that `BayesEstimator` estimates, up to sampling errors,
-    unless the latter averages over draws, bands have unknown phases, or multipath levels vary.
-    Returns None without a position. Raises `SignalError` if the signals cannot be used.
-    """
-    modes = estimator.posterior(received.reshape(len(received), -1)).modes
-    if modes is None:
-        return None
-    samples = WeightedSamples.of(draw_samples(
-        modes, estimator._mode_normal, Resolution.of(estimator.scenario).bounds_m), modes)
-    shares = samples.weights.sum(axis=1)
-    order = np.argsort(-shares, kind='stable')[:np.count_nonzero(shares)]
-    weights = samples.weights[order] / shares[order, None]
-    return WeightedModes(shares[order], *moments(weights, samples.positions[order]))
+    def _sighting(self) -> Sighting:
+        estimator, estimate, fit = self.estimator, self.estimate, self.fit
+        assert fit is not None
+        mixture, sheets = fit.describe()
+        size = np.ptp(estimator._bounds, axis=0)
+        log_evidence = fit.log_evidence + float(np.log(size[size > 0]).sum())
+        blocked = float(np.nan_to_num(estimate.blocked_probability))
+        pose = estimator.scenario.pose
+        return Sighting(
+            pose, mixture.scaled(estimator._scale(fit)).moved(Pose(), pose).weighted(log_evidence),
+            float(np.clip(blocked + (1 - blocked) * MISS_PROBABILITY, 0.0, 1 - 1e-12)), sheets,
+            misfit_log_ratio=misfit_log_ratio(fit.residual, estimator._n_measurements),
+            **{f'{name}_log_ratio': value for name, value in self.log_ratios.items()})

@@ -25,8 +25,8 @@ from rhs_isac_ros.positioning.lattice import (
 )
 from rhs_isac_ros.positioning.likelihood import NuisancePrior
 from rhs_isac_ros.positioning.peaks import Candidates, PeakFinder, Peaks, RangeWindows
-from rhs_isac_ros.positioning.region import move_inside
 from rhs_isac_ros.positioning.segments import Segments, concatenate, select
+from rhs_isac_ros.positioning.sheets import move_inside
 from rhs_isac_ros.positioning.templates import Cells, Filters, Query, turns_at
 
 # Computes the posterior of one shot of a query from drawn positions, or returns None if a search

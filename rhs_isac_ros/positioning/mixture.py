@@ -4,12 +4,13 @@ A mixture represents the posterior of one cycle, from one or several surfaces. I
 Cartesian coordinates. Where a component is a curved sheet around a surface, `fusion` bends it.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import log_sum, mixture_weights
-from rhs_isac_ros.model.gaussian import likelihood_loss, moments, symmetric
+from rhs_isac_ros.model.arrays import log_sum, mixture_weights, numbers
+from rhs_isac_ros.model.gaussian import moments, symmetric
+from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.segments import concatenate, select
 
 # Number of components of a posterior of one phase.
@@ -18,17 +19,61 @@ MAX_COMPONENTS = 48
 _MERGE_DISTANCE = 1.0
 # Components whose log-weight is below the heaviest by more than this are discarded.
 _WEIGHT_MARGIN = 18.0
+# Largest difference from a symmetric matrix, relative to the largest element.
+_ASYMMETRY = 1e-6
+_MixtureT = TypeVar('_MixtureT', bound='Mixture')
 
 
-class Mixture(NamedTuple):
+class _Arrays(NamedTuple):
+    """The fields of `Mixture`, whose constructor checks them."""
+
+    log_weights: np.ndarray
+    means: np.ndarray
+    covariances: np.ndarray
+
+
+class Mixture(_Arrays):
     """A mixture of C Gaussians over D = 3 coordinates of a position, or 6 with the velocity.
 
     Lengths are in metres, velocities in metres per second. Every method returns a new mixture.
+
+    Parameters
+    ----------
+    log_weights
+        Float64 [C]; the sum of the weights is the mass of the mixture.
+    means, covariances
+        Float64 [C, D] and [C, D, D].
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or have no rows, a number is not finite, or a covariance is not
+        symmetric with positive eigenvalues. A log-weight may be -inf.
     """
 
-    log_weights: np.ndarray  #: Float64 [C]; the sum of the weights is the mass of the mixture.
-    means: np.ndarray  #: Float64 [C, D].
-    covariances: np.ndarray  #: Float64 [C, D, D].
+    __slots__ = ()
+
+    def __new__(cls: type[_MixtureT], log_weights: np.ndarray, means: np.ndarray,
+                covariances: np.ndarray) -> _MixtureT:
+        """Check the arrays. `_make`, which all methods use, does not."""
+        weights = numbers('log_weights', log_weights, finite=False)
+        centres, spreads = numbers('means', means), numbers('covariances', covariances)
+        if weights.ndim != 1 or not weights.size or not (weights < np.inf).all():
+            raise ValueError(f'log_weights: shape {weights.shape} with a maximum of '
+                             f'{weights.max(initial=-np.inf):g}, expected [C] below infinity')
+        n = len(weights)
+        if centres.ndim != 2 or len(centres) != n or centres.shape[1] not in (3, 6):
+            raise ValueError(f'means: shape {centres.shape}, expected [{n}, 3] or [{n}, 6]')
+        if spreads.shape != (*centres.shape, centres.shape[1]):
+            raise ValueError(f'covariances: shape {spreads.shape}, expected '
+                             f'{(*centres.shape, centres.shape[1])}')
+        asymmetry = np.abs(spreads - np.swapaxes(spreads, 1, 2)).max()
+        smallest = np.linalg.eigvalsh(spreads).min()
+        if not (asymmetry <= _ASYMMETRY * np.abs(spreads).max() and smallest > 0):
+            raise ValueError(
+                f'covariances: eigenvalue {smallest:g}, asymmetry {asymmetry:g}, expected '
+                'symmetric matrices with positive eigenvalues')
+        return super().__new__(cls, weights, centres, spreads)
 
     @property
     def log_mass(self) -> float:
@@ -45,27 +90,39 @@ class Mixture(NamedTuple):
         """Logarithms of the densities of the components at their means, float64 [C]."""
         return self.log_weights - log_volume(self.covariances)
 
-    def normalised(self) -> 'Mixture':
+    def normalised(self: _MixtureT) -> _MixtureT:
         """Return the mixture with a mass of 1."""
         return self.weighted(-self.log_mass)
 
-    def weighted(self, log_factor: float | np.ndarray) -> 'Mixture':
+    def weighted(self: _MixtureT, log_factor: float | np.ndarray) -> _MixtureT:
         """Return the mixture with its weights multiplied by a factor, given as its logarithm."""
         return self._replace(log_weights=self.log_weights + log_factor)
 
-    def powered(self, exponent: float) -> 'Mixture':
+    def powered(self: _MixtureT, exponent: float) -> _MixtureT:
         """Return the mixture with the density of each component raised to a power."""
         powered = self._replace(covariances=self.covariances / exponent)
         return powered.weighted(exponent * self.log_peaks - powered.log_peaks)
 
-    def widened(self, covariance: np.ndarray) -> 'Mixture':
+    def widened(self: _MixtureT, covariance: np.ndarray) -> _MixtureT:
         """Return the mixture after independent errors, [D, D] or [C, D, D]; the mass stays."""
         return self._replace(covariances=self.covariances + covariance)
 
-    def position(self) -> 'Mixture':
+    def position(self: _MixtureT) -> _MixtureT:
         """Return the mixture of the position alone, D = 3."""
         return self._replace(
             means=self.means[:, :3], covariances=self.covariances[:, :3, :3])
+
+    def scaled(self: _MixtureT, factor: float) -> _MixtureT:
+        """Return the mixture with its covariance multiplied by a factor, around its mean."""
+        mean = self.probabilities @ self.means
+        return self._replace(means=mean + factor**0.5 * (self.means - mean),
+                             covariances=factor * self.covariances)
+
+    def moved(self, before: Pose, after: Pose) -> 'Mixture':
+        """Return the position as if a surface with one pose had another pose."""
+        turn = after.rotation @ before.rotation.T
+        return self._replace(means=after.to_site(before.to_surface(self.means)),
+                             covariances=turn @ self.covariances @ turn.T)
 
     def or_within(self, centre_m: np.ndarray, covariance: np.ndarray, probability: float
                   ) -> 'Mixture':
@@ -85,7 +142,8 @@ class Mixture(NamedTuple):
         # The peak of a Gaussian is lower than a uniform density of the same extent.
         log_weight = np.log(probability) + 1.5 * np.log(2 * np.pi)
         rest = self.weighted(np.log1p(-probability) - self.log_mass)
-        return concatenate(rest, Mixture(np.array([log_weight]), mean[None], joint[None]))
+        return concatenate(rest, self._replace(
+            log_weights=np.array([log_weight]), means=mean[None], covariances=joint[None]))
 
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean, float64 [D], and the covariance, float64 [D, D]."""
@@ -110,8 +168,8 @@ class Mixture(NamedTuple):
         normal = rng.standard_normal((n, self.means.shape[1], 1))
         return self.means[chosen] + np.matmul(roots, normal)[..., 0]
 
-    def reduce(self, max_components: int = MAX_COMPONENTS, distance: float = _MERGE_DISTANCE
-               ) -> 'Mixture':
+    def reduce(self: _MixtureT, max_components: int = MAX_COMPONENTS,
+               distance: float = _MERGE_DISTANCE) -> _MixtureT:
         """Merge components close to a heavier one; discard light ones and any beyond the maximum.
 
         A component is close to another one if its squared Mahalanobis distance from it, with the
@@ -140,21 +198,40 @@ class Mixture(NamedTuple):
         The other mixture may have fewer coordinates, which are the first ones of this mixture; it
         then is a likelihood of these. The mass is the integral of the product.
         """
-        n, size = len(self.means), other.means.shape[1]
-        first, second = np.divmod(np.arange(n * len(other.means)), len(other.means))
-        pairs = select(self, first)
-        offsets = other.means[second] - pairs.means[:, :size]
-        precision = np.linalg.inv(
-            pairs.covariances[:, :size, :size] + other.covariances[second])
-        gain = np.matmul(pairs.covariances[:, :, :size], precision)
-        log_weights = pairs.log_weights + other.log_weights[second] + (
-            np.linalg.slogdet(precision)[1] - size * np.log(2 * np.pi)) / 2
-        return Mixture(
-            log_weights - likelihood_loss(offsets, precision),
-            pairs.means + np.matmul(gain, offsets[..., None])[..., 0],
-            symmetric(pairs.covariances - np.matmul(gain, pairs.covariances[:, :size])))
+        first, second = np.divmod(
+            np.arange(len(self.means) * len(other.means)), len(other.means))
+        return select(self, first).updated(select(other, second))
 
-    def _merged(self, group: np.ndarray) -> 'Mixture':
+    def heaviest_pairs(self, other: 'Mixture', number: int, margin: float = np.inf
+                       ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the components of both mixtures in the heaviest terms of `product`.
+
+        The log-weights of the terms are within `margin` of the heaviest one.
+        """
+        size = other.means.shape[1]
+        log_weights, _ = overlap(
+            other.means[:, None] - self.means[:, :size],
+            self.covariances[:, :size, :size] + other.covariances[:, None])
+        log_weights += other.log_weights[:, None] + self.log_weights
+        order = np.argsort(-log_weights, axis=None, kind='stable')[:number]
+        kept = log_weights.ravel()[order] >= log_weights.max() - margin
+        second, first = np.unravel_index(order[kept], log_weights.shape)
+        return first, second
+
+    def updated(self: _MixtureT, other: 'Mixture') -> _MixtureT:
+        """Multiply each component by the one in the same row of `other`; see `product`."""
+        size = other.means.shape[1]
+        offsets = other.means - self.means[:, :size]
+        log_density, precision = overlap(
+            offsets, self.covariances[:, :size, :size] + other.covariances)
+        gain = np.matmul(self.covariances[:, :, :size], precision)
+        return self._replace(
+            log_weights=self.log_weights + other.log_weights + log_density,
+            means=self.means + np.matmul(gain, offsets[..., None])[..., 0],
+            covariances=symmetric(
+                self.covariances - np.matmul(gain, self.covariances[:, :size])))
+
+    def _merged(self: _MixtureT, group: np.ndarray) -> _MixtureT:
         """Merge the components of each group; discard group -1."""
         members = np.equal.outer(np.arange(group.max() + 1), group)
         shares, log_weights = mixture_weights(np.where(members, self.log_weights, -np.inf))
@@ -163,7 +240,15 @@ class Mixture(NamedTuple):
         spread = self.covariances + offsets[:, :, None] * offsets[:, None, :]
         size = means.shape[1]
         covariances = (shares @ spread.reshape(len(group), -1)).reshape(-1, size, size)
-        return Mixture(log_weights, means, covariances)
+        return self._replace(log_weights=log_weights, means=means, covariances=covariances)
+
+
+def overlap(offsets: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the log of Gaussian densities at offsets [..., D], and inverses of covariances."""
+    precision = np.linalg.inv(covariances)
+    log_scale = np.linalg.slogdet(2 * np.pi * covariances)[1] / 2
+    squares = np.einsum('...p,...pq,...q->...', offsets, precision, offsets)
+    return -squares / 2 - log_scale, precision
 
 
 def log_volume(covariances: np.ndarray) -> np.ndarray:

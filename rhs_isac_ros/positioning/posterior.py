@@ -14,15 +14,16 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model.arrays import mixture_weights
+from rhs_isac_ros.model.gaussian import moments
 from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD
-from rhs_isac_ros.positioning.estimate import Estimate
+from rhs_isac_ros.positioning.estimate import regular
 from rhs_isac_ros.positioning.lattice import carrier_wavenumbers
 from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
 from rhs_isac_ros.positioning.mixture import Mixture
-from rhs_isac_ros.positioning.region import Restricted
 from rhs_isac_ros.positioning.search import Modes, marginal_at
 from rhs_isac_ros.positioning.segments import Segments, select
+from rhs_isac_ros.positioning.sheets import Inside, Sheets
 
 
 class _Sampling(NamedTuple):
@@ -48,57 +49,27 @@ class _Sampling(NamedTuple):
 _SAMPLING = _Sampling()
 
 
-class Posterior(NamedTuple):
-    """The posterior of one shot, for a uniform prior on the region of interest or a mixture."""
-
-    estimate: Estimate  # Without a prior, that of `Estimator.estimate`.
-    modes: Modes | None  # Of the likelihood; None without a position.
-    signals: Signals  # Signals of the shot, N = 1.
-    mixture: Mixture | None = None  # Normalised, in the frame of the site; None without one.
-    # Whether a mode beside the prior is a better explanation than all modes near the prior.
-    is_elsewhere: bool = False
-
-
 class Samples(NamedTuple):
-    """Samples of M modes inside the region, S samples per mode."""
+    """The samples of the posteriors of N shots in the region, S samples for each of M modes."""
 
     positions: np.ndarray  # Float64 [M, S, 3] [m].
-    log_weights: np.ndarray  # Posterior relative to the density of the samples, float64 [M, S].
-
-
-def draw_samples(modes: Modes, normal: np.ndarray, bounds: np.ndarray) -> Samples:
-    """Represent the modes by samples, for a uniform prior between the bounds [2, 3] of the region.
-
-    `normal`, float64 [S, 3], contains points that represent a standard Gaussian.
-    """
-    gaussians = Restricted.of(modes.points, modes.gradient, modes.curvature, bounds)
-    positions, log_ratio = gaussians.sample(normal)
-    log_weights = modes.log_likelihood[:, None] + gaussians.logarithm(positions) + log_ratio
-    return Samples(positions, log_weights)
-
-
-class WeightedSamples(NamedTuple):
-    """The samples of the posteriors of N shots, with weights whose sum is one for each shot."""
-
-    positions: np.ndarray  # Float64 [M, S, 3] [m].
-    weights: np.ndarray  # Float64 [M, S].
+    weights: np.ndarray  # Float64 [M, S]; their sum is 1 for each shot.
     of_shot: Segments  # The modes of each shot.
-    log_totals: np.ndarray  # Logarithms of the weights' sums before normalisation, float64 [N].
+    log_evidence: np.ndarray  # Logarithms of the likelihood averaged over the region, [N].
 
     @classmethod
-    def of(cls, samples: Samples, modes: Modes) -> 'WeightedSamples':
-        """Normalise the weights of each shot."""
-        of_shot = Segments.of_keys(modes.shots)
-        highest = of_shot.max(samples.log_weights.max(axis=1))
-        weights = np.exp(samples.log_weights - of_shot.repeat(highest)[:, None])
+    def of(cls, positions: np.ndarray, log_weights: np.ndarray, shots: np.ndarray) -> 'Samples':
+        """Normalise the weights of each shot; the density is relative to a uniform prior.
+
+        Takes log-weights [M, S], and the shots of the modes, int [M].
+        """
+        of_shot = Segments.of_keys(shots)
+        highest = of_shot.max(log_weights.max(axis=1))
+        weights = np.exp(log_weights - of_shot.repeat(highest)[:, None])
         totals = of_shot.sum(weights.sum(axis=1))
         weights /= of_shot.repeat(totals)[:, None]
-        return cls(samples.positions, weights, of_shot, highest + np.log(totals))
-
-    @property
-    def log_evidence(self) -> np.ndarray:
-        """Logarithms of the likelihood averaged over the region, float64 [N]."""
-        return self.log_totals - np.log(self.weights.shape[1])
+        return cls(positions, weights, of_shot,
+                   highest + np.log(totals) - np.log(log_weights.shape[1]))
 
     def average(self, values: np.ndarray) -> np.ndarray:
         """Average values of the modes, float64 [M], over each posterior, [N]."""
@@ -116,19 +87,53 @@ class WeightedSamples(NamedTuple):
         squares, shift = np.matmul(weighted, offsets), weighted.sum(axis=2)
         shares = np.maximum(self.weights.sum(axis=1), np.finfo(float).tiny)
         within = squares - shift[:, :, None] * shift[:, None] / shares[:, None, None]
-        n_effective = of_shot.sum(np.einsum('ms,ms->m', self.weights, self.weights))
-        return mean, of_shot.sum(squares) + n_effective[:, None, None] * of_shot.sum(within)
+        return mean, of_shot.sum(squares) + self._few[:, None, None] * of_shot.sum(within)
+
+    @property
+    def _few(self) -> np.ndarray:
+        """Relative increase of covariances because there are few samples, [N]."""
+        return self.of_shot.sum(np.einsum('ms,ms->m', self.weights, self.weights))
+
+    def described(self, n: int, modes: Modes | None, bounds: np.ndarray
+                  ) -> tuple[Mixture, Sheets]:
+        """Return the posterior of the n-th shot as a mixture, and the likelihood.
+
+        The mixture has the moments of the samples. Without `modes`, those of the shot, so has the
+        likelihood, in (r, u, v).
+        """
+        rows = slice(self.of_shot.starts[n], self.of_shot.ends[n])
+        shares = self.weights[rows].sum(axis=1)
+        chosen = np.argsort(-shares, kind='stable')[:np.count_nonzero(shares)]
+        log_shares, positions = np.log(shares[chosen]), self.positions[rows][chosen]
+        weights = self.weights[rows][chosen] / shares[chosen, None]
+        means, covariances = moments(weights, positions)
+        mixture = Mixture._make((
+            log_shares, means, regular(covariances * (1 + self._few[n]))))
+        return mixture, modes.sheets() if modes else Sheets.of_density(
+            log_shares, *moments(weights, to_polar(positions)), bounds)
+
+
+def draw_samples(modes: Modes, normal: np.ndarray, bounds: np.ndarray) -> Samples:
+    """Represent the modes by samples, for a uniform prior between the bounds [2, 3] of the region.
+
+    `normal`, float64 [S, 3], contains points that represent a standard Gaussian.
+    """
+    gaussians = Inside.of(modes.points, modes.gradient, modes.curvature, bounds,
+                          log_values=modes.log_likelihood)
+    positions, log_ratio = gaussians.sample(normal)
+    return Samples.of(positions, gaussians.logarithm(positions) + log_ratio, modes.shots)
 
 
 def draw_broad_samples(
         likelihood: Likelihood, conditionals: Sequence[Conditional], phases: 'BandPhases',
-        signals: Signals, modes: Modes, normal: np.ndarray) -> Samples:
+        signals: Signals, modes: Modes, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Represent the posterior of one shot by weighted samples of its widened modes.
 
-    `conditionals` contains the likelihood for each state of the surface.
+    `conditionals` contains the likelihood for each state of the surface. Returns the positions,
+    float64 [M, S, 3] [m], and the logarithms of their weights, [M, S].
     """
     bounds, widening = likelihood.resolution.bounds_m, _SAMPLING.spread**2
-    positions, log_weights = Restricted.of(
+    positions, log_weights = Inside.of(
         modes.points, modes.gradient / widening, modes.curvature / widening, bounds
     ).sample(normal)
     for state in np.unique(modes.state):
@@ -148,7 +153,7 @@ def draw_broad_samples(
             positions[rows] = np.clip(
                 to_positions(points), *bounds).reshape(len(rows), -1, 3)
         log_weights[rows] += evidence.reshape(len(rows), -1)
-    return Samples(positions, log_weights)
+    return positions, log_weights
 
 
 def _log_share(points: np.ndarray, modes: Modes) -> np.ndarray:

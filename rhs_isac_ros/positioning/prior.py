@@ -15,21 +15,16 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model.arrays import mixture_weights
-from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximum, symmetric
-from rhs_isac_ros.model.geometry import (
-    jacobian,
-    polar_derivative,
-    to_polar,
-    to_positions,
-)
+from rhs_isac_ros.model.gaussian import likelihood_loss, moments
+from rhs_isac_ros.model.geometry import jacobian, to_polar
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.estimate import regular
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Grid, Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
-from rhs_isac_ros.positioning.mixture import Mixture, log_volume
-from rhs_isac_ros.positioning.region import Restricted, move_inside
+from rhs_isac_ros.positioning.mixture import Mixture, overlap
 from rhs_isac_ros.positioning.search import EXACT_MARGIN, Modes
 from rhs_isac_ros.positioning.segments import concatenate, select
+from rhs_isac_ros.positioning.sheets import Sheets, move_inside
 
 # Probability that a prior does not hold.
 WRONG = 0.1
@@ -53,10 +48,6 @@ class _Limits(NamedTuple):
     # largest one, do not contribute to moments.
     weight: float = -9.0
     density: float = 0.01
-    # Smallest x of a position [m], and smallest cosine of its angle from boresight in curvatures;
-    # no user is behind the surface.
-    x_m: float = 1e-3
-    cosine: float = 0.05
     # Share of true priors that are doubted.
     doubt: float = 0.02
 
@@ -70,57 +61,7 @@ PRIOR_MARGIN = _LIMITS.reach**2 / 2
 _FLOOR = -(EXACT_MARGIN + PRIOR_MARGIN)
 
 
-def bend(mixture: Mixture, pose: Pose) -> Mixture:
-    """Convert a mixture of the site to (r [m], u, v) around a surface; other coordinates stay."""
-    positions = pose.to_surface(mixture.means[:, :3])
-    positions[:, 0] = np.maximum(positions[:, 0], _LIMITS.x_m)
-    points = to_polar(positions)
-    bent = _converted(mixture, points, polar_derivative(points) @ pose.rotation.T)
-    # The second derivative of the range is the projection across the line of sight over the range.
-    sight = positions / points[:, :1]
-    across = np.eye(3) - sight[:, :, None] * sight[:, None, :]
-    longer_m, variance_m2 = _moments_of_square(
-        across / points[:, :1, None],
-        pose.covariances_to_surface(mixture.covariances[:, :3, :3]))
-    bent.means[:, 0] += longer_m
-    bent.covariances[:, 0, 0] += variance_m2
-    return bent
-
-
-def flatten(bent: Mixture, pose: Pose) -> Mixture:
-    """Convert a mixture from (r [m], u, v) back to the coordinates of the site."""
-    points, cosines = bent.means[:, :3], bent.means[:, 1:3]
-    mixture = _converted(
-        bent, pose.to_site(to_positions(points)), pose.rotation @ jacobian(points))
-    # Of the position, only x = r (1 - u^2 - v^2)^(1/2) is curved in u and v.
-    w = np.sqrt(np.maximum(1 - np.sum(cosines**2, axis=1), _LIMITS.cosine**2))[:, None, None]
-    bending = -points[:, :1, None] * (
-        np.eye(2) / w + cosines[:, :, None] * cosines[:, None, :] / w**3)
-    shift_m, variance_m2 = _moments_of_square(bending, bent.covariances[:, 1:3, 1:3])
-    outward = pose.rotation[:, 0]
-    mixture.means[:, :3] += shift_m[:, None] * outward
-    mixture.covariances[:, :3, :3] += variance_m2[:, None, None] * np.outer(outward, outward)
-    return mixture
-
-
-def _converted(mixture: Mixture, points: np.ndarray, derivative: np.ndarray) -> Mixture:
-    """Replace the first three coordinates, which have the given derivative, [C, 3, 3]."""
-    means, covariances = mixture.means.copy(), mixture.covariances.copy()
-    means[:, :3] = points
-    covariances[:, :3] = derivative @ covariances[:, :3]
-    covariances[:, :, :3] = covariances[:, :, :3] @ np.swapaxes(derivative, 1, 2)
-    return mixture._replace(means=means, covariances=covariances)
-
-
-def _moments_of_square(matrices: np.ndarray, covariances: np.ndarray
-                       ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and variance, [C], of d^T H d / 2 for Gaussian d of covariance [C, n, n]."""
-    product = matrices @ covariances
-    return (np.trace(product, axis1=1, axis2=2) / 2,
-            np.einsum('cpq,cqp->c', product, product) / 2)
-
-
-def cells_of(bent: Mixture, grid: Grid, resolution: Resolution) -> np.ndarray:
+def cells_of(bent: Sheets, grid: Grid, resolution: Resolution) -> np.ndarray:
     """Mark the cells in which a prior in (r [m], u, v) requires a search, bool [C]."""
     half = np.column_stack([
         grid.widths_m[grid.range_bin] / 2,
@@ -136,50 +77,47 @@ def cells_of(bent: Mixture, grid: Grid, resolution: Resolution) -> np.ndarray:
 class Products(NamedTuple):
     """Products of T pairs of a component of the prior and a mode, and components without a mode.
 
-    The mixture is not normalised: its mass is the average of the likelihood over the prior.
+    The density is not normalised: its mass is the average of the likelihood over the prior.
     """
 
-    bent: Mixture  #: In (r [m], u, v); the products come first.
+    bent: Sheets  #: The products come first.
     #: Energy of the residual at the heaviest product inside the region, plus half of the squared
     #: Mahalanobis distance from its component.
     energy: float
     is_last: bool  #: Whether the heaviest product is that of the last component.
 
 
-def multiply(bent: Mixture, modes: Modes, share: float, likelihood: Likelihood | None,
+def multiply(bent: Sheets, modes: Modes, share: float, likelihood: Likelihood | None,
              signals: Signals, bounds_m: np.ndarray) -> Products:
-    """Multiply a prior in (r [m], u, v) by the likelihood of the signals of one phase, N = 1.
+    """Multiply a prior by the likelihood of the signals of one phase, N = 1.
 
     `likelihood`, if given, is evaluated at the heaviest products. Each component is also kept
     without an update, for an unlikely mode that the search may have missed; it is assumed to be as
     wide as the best mode. `share`, from 0 to 1, is an exponent of the likelihood: below 1 if
     successive multipath is similar.
     """
-    spread = np.linalg.inv(modes.curvature) / share
-    offsets = modes.centres[:, None] - bent.means[:, :3]
-    log_weights, precision = _evidence(offsets, bent.covariances[:, :3, :3], spread[:, None])
-    log_weights += share * modes.log_likelihood[:, None] + bent.log_weights
-    mode, component = np.unravel_index(
-        np.argsort(-log_weights, axis=None, kind='stable')[:_LIMITS.products], log_weights.shape)
-    chosen = select(bent, component)._replace(log_weights=log_weights[mode, component])
-    found = _shifted(chosen, precision[mode, component], offsets[mode, component])
+    sheets = modes.sheets(share)
+    component, mode = bent.heaviest_pairs(sheets, _LIMITS.products)
+    chosen = select(bent, component)
+    found = chosen.updated(select(sheets, mode))
     if likelihood is not None:
         # The heaviest products come first.
         n = _LIMITS.exact
-        exact = _exact(
-            select(bent, component[:n]), found.means[:n, :3], share, likelihood, signals)
+        before = select(chosen, slice(n))
+        exact = before.updated(
+            _expanded(found.means[:n, :3], share, likelihood, signals))
         found = concatenate(exact, select(found, slice(n, None)))
     # The best mode comes first.
-    floor, _ = _evidence(np.zeros(3), bent.covariances[:, :3, :3], spread[0])
-    floor += share * (modes.log_likelihood[0] + _FLOOR)
+    missed, _ = overlap(np.zeros(3), bent.covariances[:, :3, :3] + sheets.covariances[0])
+    missed += sheets.log_weights[0] + share * _FLOOR
     best = int(np.argmax(found.log_weights))
     energy = _energy(found.means[best, :3], select(bent, component[[best]]),
                      select(modes, mode[[best]]), bounds_m)
-    return Products(concatenate(found, bent.weighted(floor)), energy,
+    return Products(concatenate(found, bent.weighted(missed)), energy,
                     bool(component[best] == len(bent.log_weights) - 1))
 
 
-def _energy(point: np.ndarray, component: Mixture, mode: Modes, bounds_m: np.ndarray) -> float:
+def _energy(point: np.ndarray, component: Sheets, mode: Modes, bounds_m: np.ndarray) -> float:
     """Return `Products.energy` for the product of a component and a mode at a point [3]."""
     precision = np.linalg.inv(component.covariances[:, :3, :3])
     point = move_inside(point[None], precision + mode.curvature, bounds_m)
@@ -188,40 +126,12 @@ def _energy(point: np.ndarray, component: Mixture, mode: Modes, bounds_m: np.nda
     return float(losses[0])
 
 
-def _exact(bent: Mixture, points: np.ndarray, share: float, likelihood: Likelihood,
-           signals: Signals) -> Mixture:
-    """Update each component with the likelihood expanded at its own point (r, u, v), [C, 3]."""
+def _expanded(points: np.ndarray, share: float, likelihood: Likelihood, signals: Signals
+              ) -> Sheets:
+    """Expand the likelihood at points (r, u, v), [C, 3]; each has one sheet."""
     value, gradient, curvature, _ = likelihood.local(
         points, np.zeros((len(points), 0)), signals)
-    step = step_to_maximum(curvature, gradient)
-    offsets = points + step - bent.means[:, :3]
-    log_weights, precision = _evidence(
-        offsets, bent.covariances[:, :3, :3], np.linalg.inv(curvature) / share)
-    log_weights += share * (value + np.sum(gradient * step, axis=1) / 2)
-    return _shifted(bent.weighted(log_weights), precision, offsets)
-
-
-def _evidence(
-        offsets: np.ndarray, predicted: np.ndarray, spread: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Integrate the product of a Gaussian density and a Gaussian with the maximum 1.
-
-    Takes the differences of the means, float64 [..., 3], and both covariances. Returns the
-    logarithm, float64 [...], and the precision of the offset, float64 [..., 3, 3].
-    """
-    total = predicted + spread
-    precision = np.linalg.inv(total)
-    distance = np.einsum('...p,...pq,...q->...', offsets, precision, offsets)
-    log_value = (np.linalg.slogdet(spread)[1] - np.linalg.slogdet(total)[1] - distance) / 2
-    return log_value, precision
-
-
-def _shifted(mixture: Mixture, precision: np.ndarray, offsets: np.ndarray) -> Mixture:
-    """Apply the Kalman update with innovations [C, 3] and their precision [C, 3, 3]."""
-    gain = np.matmul(mixture.covariances[:, :, :3], precision)
-    means = mixture.means + np.matmul(gain, offsets[..., None])[..., 0]
-    covariances = mixture.covariances - np.matmul(gain, mixture.covariances[:, :3])
-    return mixture._replace(means=means, covariances=symmetric(covariances))
+    return Sheets.expanded(points, gradient, curvature, value, share)
 
 
 def is_doubtful(energy: float, n: int) -> bool:
@@ -231,44 +141,43 @@ def is_doubtful(energy: float, n: int) -> bool:
     return energy > float(gammainccinv(n, _LIMITS.doubt))
 
 
-def uniform(modes: Modes, bounds_m: np.ndarray, share: float = 1.0) -> Mixture:
-    """Multiply the likelihood by a uniform prior on the region with bounds [2, 3] [m].
+def uniform(sheets: Sheets, bounds_m: np.ndarray) -> Sheets:
+    """Multiply a likelihood by a uniform prior on the region with bounds [2, 3] [m].
 
-    Returns a mixture in (r [m], u, v) that is not normalised, D = 3.
+    Sheets with a maximum outside of the region begin at their best point inside.
     """
-    covariances = np.linalg.inv(modes.curvature) / share
     extent_m = np.maximum(np.ptp(bounds_m, axis=0), MIN_EXTENT_M)
-    log_mass = (np.log(np.linalg.det(jacobian(modes.points))) + log_volume(covariances)
-                - np.log(extent_m).sum())
-    return Mixture(share * modes.log_likelihood + log_mass, modes.points, covariances)
+    precision = np.linalg.inv(sheets.covariances)
+    points = move_inside(sheets.means, precision, bounds_m)
+    loss = likelihood_loss(points - sheets.means, precision)
+    return sheets._replace(means=points).weighted(-loss - np.log(extent_m).sum()).as_density()
 
 
-def inside(bent: Mixture, bounds_m: np.ndarray, normal: np.ndarray
-           ) -> tuple[Mixture, np.ndarray, np.ndarray]:
-    """Restrict a mixture in (r [m], u, v) to the region with bounds [2, 3] [m].
+def inside(density: Sheets, bounds_m: np.ndarray, normal: np.ndarray, pose: Pose
+           ) -> tuple[Sheets, Mixture]:
+    """Restrict a density to the region with bounds [2, 3] [m] in the frame of the surface.
 
-    Returns the normalised mixture without components outside of the region, and the mean [3] [m]
-    and covariance of the position inside. `normal`, float64 [S, 3], contains points that represent
-    a standard Gaussian.
+    Returns the normalised density without components outside of the region, and the mixture of
+    those inside, normalised, in the frame of the site. `normal`, float64 [S, 3], contains points
+    that represent a standard Gaussian.
     """
-    heavy = bent.log_weights >= bent.log_mass + _LIMITS.weight
-    bent, light = select(bent, heavy), select(bent, ~heavy)
-    precision = np.linalg.inv(bent.covariances[:, :3, :3])
-    points = to_polar(np.clip(to_positions(bent.means[:, :3]), *bounds_m))
-    offsets = bent.means[:, :3] - points
-    gaussians = Restricted.of(
-        points, np.matmul(precision, offsets[..., None])[..., 0], precision, bounds_m)
+    heavy = density.log_weights >= density.log_mass + _LIMITS.weight
+    density, light = select(density, heavy), select(density, ~heavy)
+    gaussians = density.inside(bounds_m)
     peaks = gaussians.logarithm(gaussians.nearest()[:, None])[:, 0]
-    reaches = peaks - likelihood_loss(offsets, precision) >= np.log(_LIMITS.density)
+    reaches = peaks - density.position().log_peaks >= np.log(_LIMITS.density)
     chosen = reaches if reaches.any() else np.ones(len(reaches), bool)
-    bent, gaussians = select(bent, chosen), select(gaussians, chosen)
+    density, gaussians = select(density, chosen), gaussians.rows(chosen)
     positions, log_ratio = gaussians.sample(normal)
+    points = to_polar(positions)
     # The density of a position is that of (r, u, v) divided by the volume element.
-    log_weights = bent.log_weights[:, None] + gaussians.logarithm(positions) + log_ratio
-    log_density = np.linalg.slogdet(precision)[1] / 2 - likelihood_loss(offsets, precision)
-    log_weights += log_density[chosen, None]
-    flat = positions.reshape(-1, 3)
-    log_weights -= np.log(np.linalg.det(jacobian(to_polar(flat)))).reshape(log_weights.shape)
-    weights, _ = mixture_weights(log_weights.ravel())
-    mean, covariance = moments(weights, flat)
-    return concatenate(bent, light).normalised(), mean, regular(covariance)
+    volume = np.log(np.linalg.det(jacobian(points.reshape(-1, 3)))).reshape(log_ratio.shape)
+    weights, log_weights = mixture_weights(gaussians.logarithm(positions) + log_ratio - volume)
+    among = np.linalg.inv(density.covariances[:, :3, :3])
+    gain = np.swapaxes(density.covariances[:, 3:, :3] @ among, 1, 2)
+    rates = density.means[:, None, 3:] + np.matmul(points - density.means[:, None, :3], gain)
+    means, covariances = moments(weights, np.concatenate([pose.to_site(positions), rates], axis=2))
+    covariances[:, 3:, 3:] += density.covariances[:, 3:, 3:] - np.matmul(
+        density.covariances[:, 3:, :3], gain)
+    mixture = Mixture._make((log_weights, means, regular(covariances))).normalised()
+    return concatenate(density, light).normalised(), mixture

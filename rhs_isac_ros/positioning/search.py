@@ -20,8 +20,8 @@ from rhs_isac_ros.positioning.likelihood import (
     Local,
     Signals,
 )
-from rhs_isac_ros.positioning.region import Restricted
 from rhs_isac_ros.positioning.segments import Segments, select
+from rhs_isac_ros.positioning.sheets import Inside, Sheets
 
 # Negative logarithms of the share of the posterior that discarded modes may have: on the grid,
 # which is accurate to one Gauss-Newton step, and after exact steps.
@@ -73,6 +73,11 @@ class Modes(NamedTuple):
     def order(self) -> np.ndarray:
         """Indices of the modes of each shot, the most likely first, int [M]."""
         return np.lexsort((-self.log_likelihood - self.points @ _PREFERENCE, self.shots))
+
+    def sheets(self, share: float = 1.0) -> Sheets:
+        """Return the likelihood without the limits of the region; `share` is an exponent."""
+        return Sheets.expanded(
+            self.points, self.gradient, self.curvature, self.log_likelihood, share)
 
     def starts(self) -> Starts:
         """Return the points, to start another search from them."""
@@ -244,7 +249,7 @@ def _inside(points: np.ndarray, marginal: Marginal, step: np.ndarray, likelihood
     (outside,) = np.nonzero(((ends < bounds[0]) | (ends > bounds[1])).any(axis=1))
     if len(outside):
         starts = points[outside]
-        best = Restricted.of(
+        best = Inside.of(
             starts, marginal.gradient[outside], marginal.information[outside], bounds).nearest()
         limited = starts + np.clip(to_polar(best) - starts, -limits, limits)
         step[outside] = to_polar(np.clip(to_positions(limited), *bounds)) - starts

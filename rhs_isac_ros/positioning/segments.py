@@ -12,13 +12,13 @@ _Rows = TypeVar('_Rows', bound=tuple[np.ndarray, ...])
 def select(rows: _Rows, chosen: Any) -> _Rows:
     """Select rows of a named tuple of arrays by their indices or by a mask."""
     kind: Any = type(rows)
-    return kind(*(field[chosen] for field in rows))
+    return kind._make(field[chosen] for field in rows)
 
 
 def concatenate(*parts: _Rows) -> _Rows:
     """Concatenate the fields of named tuples of arrays."""
     kind: Any = type(parts[0])
-    return kind(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+    return kind._make(map(np.concatenate, zip(*parts, strict=True)))
 
 
 class Segments(NamedTuple):

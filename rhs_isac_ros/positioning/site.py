@@ -4,7 +4,7 @@ import dataclasses
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,9 @@ import yaml
 from rhs_isac_ros.bounds import site_crlb
 from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.positioning.agreement import Pair, pair_agreements
+from rhs_isac_ros.positioning.estimate import SITE, Estimate, Sighting, SignalError
 from rhs_isac_ros.positioning.estimators import BayesEstimator
-from rhs_isac_ros.positioning.fusion import Fused, Fuser, Sighting, fuse
+from rhs_isac_ros.positioning.fusion import Fuser, fuse
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import mapping_of, read_yaml
 from rhs_isac_ros.system import System, SystemFiles
@@ -116,10 +117,21 @@ class SiteEstimator:
 
         `received` contains signals, complex128 [N_B, N_SB F], of some or all surfaces.
         """
-        found = ((name, Sighting.of(self._estimators[name].posterior(signals),
-                                    self._site.surfaces[name].pose))
-                 for name, signals in received.items())
-        return {name: one for name, one in found if one is not None}
+        ((_, found),) = self._each({name: signals[None] for name, signals in received.items()})
+        return found
+
+    def _each(self, received: Mapping[str, np.ndarray]
+              ) -> Iterator[tuple[dict[str, Estimate], dict[str, Sighting]]]:
+        """Yield the posteriors of the surfaces for each shot, and their sightings, by name."""
+        found = {name: self._estimators[name].posterior(signals)
+                 for name, signals in received.items()}
+        lengths = {name: len(one.mean) for name, one in found.items()}
+        if len(set(lengths.values())) > 1:
+            raise SignalError(f'received: {lengths} shots, expected equal numbers')
+        for n in range(max(lengths.values(), default=0)):
+            posteriors = {name: one[n] for name, one in found.items()}
+            yield posteriors, {name: sighting for name, one in posteriors.items()
+                               if (sighting := Sighting.of(one))}
 
     def draw_agreements(self, n: int, rng: np.random.Generator
                         ) -> tuple[list[dict[Pair, float]], np.ndarray]:
@@ -128,23 +140,34 @@ class SiteEstimator:
         Users without a position are left out.
         """
         low, high = self._site.bounds_m
-        received = self._site.sample(rng.uniform(low, high, size=(n, 3)), rng)
         agreements, places = [], []
-        for cycle in range(n):
-            sightings = self.sightings(
-                {name: of_surface[cycle] for name, of_surface in received.items()})
+        for _, sightings in self._each(
+                self._site.sample(rng.uniform(low, high, size=(n, 3)), rng)):
             if sightings:
                 fuser = Fuser(self._site.bounds_m)
                 agreements.append(pair_agreements(sightings, fuser))
                 # In the order of the pairs, so that products are reused.
-                fused = fuser.fuse([one for _, one in sorted(sightings.items())])
-                places.append(fused.mixture.moments()[0])
+                places.append(fuser.fuse([one for _, one in sorted(sightings.items())]).mean)
         return agreements, np.array(places).reshape(-1, 3)
 
-    def estimate(self, received: Mapping[str, np.ndarray]) -> Fused | None:
-        """Return the posterior in the frame of the site; None if no surface has a position."""
-        sightings = self.sightings(received)
-        return fuse(list(sightings.values()), self._site.bounds_m) if sightings else None
+    def estimate(self, received: Mapping[str, np.ndarray]) -> Estimate:
+        """Return the position with its mixture, in the frame of the site; see `sightings`.
+
+        For several shots, complex128 [N, N_B, N_SB F] by name, there are N positions. Raises
+        `SignalError` if signals are unusable, or if the numbers of shots differ.
+        """
+        single = {name for name, signals in received.items() if np.ndim(signals) == 2}
+        found = [self._fused(*one) for one in self._each({
+            name: np.asarray(signals)[None] if name in single else signals
+            for name, signals in received.items()})]
+        return found[0] if single else Estimate.of_each(found, SITE)
+
+    def _fused(self, posteriors: Mapping[str, Estimate], sightings: Mapping[str, Sighting]
+               ) -> Estimate:
+        if sightings:
+            return fuse(list(sightings.values()), self._site.bounds_m)
+        return Estimate.without_fix('; '.join(
+            f'{name}: {one.reason}' for name, one in posteriors.items()), frame=SITE)
 
 
 def site_text(path: str | Path, poses: Mapping[str, Pose], folder: Path) -> str:

@@ -12,14 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model import Pose, Scenario
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import time_correlation
 from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT, LIMIT
-from rhs_isac_ros.positioning.estimate import Estimate
+from rhs_isac_ros.positioning.estimate import SITE, Estimate, SignalError
 from rhs_isac_ros.positioning.estimators import SearchEstimator
 from rhs_isac_ros.positioning.mixture import Mixture
-from rhs_isac_ros.positioning.posterior import Posterior
-from rhs_isac_ros.positioning.prior import bend, flatten, inside
 from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.support.fields import finite, to_number
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -43,6 +41,8 @@ class Limits(NamedTuple):
     # exponent of the likelihood; with a small one, modes overlap, and the likelihood is no longer
     # their sum.
     least_share: float = 0.25
+    # Probability that the user is anywhere in the region although a prediction is far outside.
+    elsewhere: float = 1e-12
     # Maximum number of components of a track of mixtures, each of which meets all of a phase.
     max_components: int = 24
 
@@ -82,8 +82,8 @@ class Motion:
         covariances = np.zeros((n, 6, 6))
         covariances[:, :3, :3] = mixture.covariances
         covariances[:, 3:, 3:] = self.velocity_variance * np.eye(3)
-        return Mixture(
-            mixture.log_weights, np.hstack([mixture.means, np.zeros((n, 3))]), covariances)
+        return Mixture._make((
+            mixture.log_weights, np.hstack([mixture.means, np.zeros((n, 3))]), covariances))
 
     def predict(self, mixture: Mixture, elapsed_s: float) -> Mixture:
         """Return the mixture after a time of at least 0 [s].
@@ -132,33 +132,15 @@ def _moved(mixture: Mixture, reach_s: float, decay: float, noise: np.ndarray) ->
     `noise`, [2, 2], is the covariance of position and velocity that each axis gains.
     """
     transition = _for_each_axis(np.array([[1.0, reach_s], [0.0, decay]]))
-    return Mixture(
+    return Mixture._make((
         mixture.log_weights, mixture.means @ transition.T,
-        transition @ mixture.covariances @ transition.T + _for_each_axis(noise))
+        transition @ mixture.covariances @ transition.T + _for_each_axis(noise)))
 
 
 def _for_each_axis(matrix: np.ndarray) -> np.ndarray:
     """Expand a matrix of position and velocity, [2, 2], to all axes, [6, 6]."""
     # `np.kron` returns the same, but takes ten times as long.
     return (matrix[:, None, :, None] * np.eye(3)[:, None]).reshape(6, 6)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class TrackEstimate(Estimate):
-    """A position and velocity with their uncertainty, or the reason why there is none."""
-
-    #: Velocity, float64 [3] [m/s], and its covariance, [3, 3]; NaN without a position.
-    velocity: np.ndarray = dataclasses.field(default_factory=lambda: np.full(3, np.nan))
-    velocity_covariance: np.ndarray = dataclasses.field(
-        default_factory=lambda: np.full((3, 3), np.nan))
-    n_phases: int = 0  #: Number of phases in the estimate; 0 without a position.
-    is_predicted: bool = False  #: Whether the position is a prediction for a blocked user.
-
-    def to_site(self, pose: Pose) -> 'TrackEstimate':
-        """Convert from the frame of a surface with the given pose to that of the site."""
-        return dataclasses.replace(
-            super().to_site(pose), velocity=pose.vectors_to_site(self.velocity),
-            velocity_covariance=pose.covariances_to_site(self.velocity_covariance))
 
 
 class MixtureTracker:
@@ -176,7 +158,7 @@ class MixtureTracker:
         self._time_s, self._n_phases = -np.inf, 0
 
     @one_blas_thread
-    def update(self, time_s: float, likelihood: Mixture, missing: float) -> TrackEstimate | None:
+    def update(self, time_s: float, likelihood: Mixture, missing: float) -> Estimate | None:
         """Return position and velocity after a phase; None if the phase is late.
 
         `missing`, above 0 and below 1, is the probability that the likelihood does not contain the
@@ -203,11 +185,12 @@ class MixtureTracker:
         self._n_phases += 1
         return self._described(self._mixture)
 
-    def _described(self, mixture: Mixture) -> TrackEstimate:
+    def _described(self, mixture: Mixture) -> Estimate:
         mean, covariance = mixture.moments()
-        return TrackEstimate(
+        return Estimate(
             mean[:3], covariance[:3, :3], velocity=mean[3:],
-            velocity_covariance=covariance[3:, 3:], n_phases=self._n_phases)
+            velocity_covariance=covariance[3:, 3:], n_phases=self._n_phases, density=mixture,
+            frame=SITE)
 
 
 class Tracker:
@@ -224,22 +207,25 @@ class Tracker:
 
     def __init__(self, estimator: SearchEstimator, motion: Motion | None = None) -> None:
         self.estimator, self._motion = estimator, motion or Motion()
-        #: Posterior after the latest phase; None before the first one. Its modes are those of the
-        #: likelihood of this phase alone.
-        self.latest: Posterior | None = None
+        #: Posterior after the latest phase; None before the first one. Its sighting is that of the
+        #: signals of this phase alone.
+        self.latest: Estimate | None = None
         self._mixture: Mixture | None = None
         # Time of the mixture, and of the latest phase, which may not have changed it [s].
         self._time_s = self._latest_s = -np.inf
         self._n_phases = 0
 
     @one_blas_thread
-    def update(self, time_s: float, received: np.ndarray) -> TrackEstimate:
+    def update(self, time_s: float, received: np.ndarray) -> Estimate:
         """Estimate position and velocity at the time [s] of a phase from this and earlier phases.
 
         Takes signals, complex128 [N_B, N_SB F]; raises `SignalError` if they are unusable, and
         ValueError if the time is not finite. If the phase is not later than the previous one, its
         position follows from its own signals alone, and the track does not change.
         """
+        if np.ndim(received) != 2:
+            raise SignalError(f'received: shape {np.shape(received)}, expected the signals of one '
+                              'phase, [N_B, N_SB F]')
         time_s = finite('time_s', time_s)
         elapsed_s = time_s - self._time_s
         if self._mixture is None or elapsed_s > MAX_GAP_S or time_s <= self._latest_s:
@@ -247,16 +233,16 @@ class Tracker:
         share = independent_share(self.estimator.scenario, elapsed_s)
         is_new = share >= LIMITS.least_share
         predicted = self._motion.predict(self._mixture, elapsed_s)
-        posterior = self.latest = self.estimator.posterior(
+        found = self.latest = self.estimator.posterior(
             received, predicted if is_new else None, share=share,
             wrong=LIMITS.loss_rate_hz * elapsed_s)
-        found = posterior.estimate
-        if posterior.mixture is None:
+        if not found.fix:
             return self._predicted(time_s, found)
         self._latest_s = time_s
         if not is_new:
             return self._placed(found, predicted)
-        self._mixture, self._time_s = posterior.mixture, time_s
+        assert isinstance(found.unbounded, Mixture)
+        self._mixture, self._time_s = found.unbounded, time_s
         self._n_phases += 1
         return self._described(found, self._mixture)
 
@@ -272,47 +258,47 @@ class Tracker:
         pose = self.estimator.scenario.pose
         # The motion maps moments to moments, so those of one Gaussian are those of the mixture.
         mean, covariance = self._mixture.moments()
-        gaussian = Mixture(np.zeros(1), mean[None], covariance[None])
+        gaussian = Mixture._make((np.zeros(1), mean[None], covariance[None]))
         mean, covariance = self._motion.predict(gaussian, elapsed_s).position().moments()
         return pose.to_surface(mean), pose.covariances_to_surface(covariance)
 
-    def _alone(self, time_s: float, received: np.ndarray) -> TrackEstimate:
+    def _alone(self, time_s: float, received: np.ndarray) -> Estimate:
         """Estimate the position from one phase, which begins a track unless it is late."""
-        posterior = self.latest = self.estimator.posterior(received)
-        if posterior.mixture is None:
-            return self._predicted(time_s, posterior.estimate)
-        mixture = self._motion.start(posterior.mixture)
+        found = self.latest = self.estimator.posterior(received)
+        if not found.fix:
+            return self._predicted(time_s, found)
+        mixture = self._motion.start(self.estimator.begin(found))
         if time_s > self._latest_s:
             self._mixture, self._time_s, self._latest_s = mixture, time_s, time_s
             self._n_phases = 1
-        return self._described(posterior.estimate, mixture, 1)
+        return self._described(found, mixture, 1)
 
-    def _predicted(self, time_s: float, found: Estimate) -> TrackEstimate:
+    def _predicted(self, time_s: float, found: Estimate) -> Estimate:
         """Continue the track of a blocked user by prediction; other users get no position."""
         elapsed_s = time_s - self._time_s
         if (self._mixture is None or not 0 < elapsed_s <= MAX_GAP_S
                 or not found.blocked_probability > BLOCKED_LIMIT
                 or found.outside_probability > LIMIT):
-            return TrackEstimate(**vars(found))
+            return found
         self._latest_s = max(time_s, self._latest_s)
         estimate = self._placed(
-            dataclasses.replace(found, reason=''), self._motion.predict(self._mixture, elapsed_s))
+            dataclasses.replace(found, reason='', see=None),
+            self._motion.predict(self._mixture, elapsed_s))
         return dataclasses.replace(estimate, is_predicted=True)
 
-    def _placed(self, found: Estimate, mixture: Mixture) -> TrackEstimate:
+    def _placed(self, found: Estimate, mixture: Mixture) -> Estimate:
         """Replace the position of an estimate by that of a mixture inside the region."""
-        scenario = self.estimator.scenario
-        bent, mean, covariance = inside(
-            bend(mixture, scenario.pose), scenario.roi_bounds_m, self.estimator.normal)
-        return self._described(dataclasses.replace(found, mean=mean, covariance=covariance),
-                               flatten(bent, scenario.pose))
+        placed = self.estimator.restricted(
+            self.estimator.in_front(mixture, LIMITS.elsewhere), found)
+        assert isinstance(placed.unbounded, Mixture)
+        return self._described(placed, placed.unbounded)
 
     def _described(self, estimate: Estimate, mixture: Mixture, n_phases: int = 0
-                   ) -> TrackEstimate:
+                   ) -> Estimate:
         """Add the velocity of a mixture, in the frame of the surface, to an estimate."""
         pose, (mean, covariance) = self.estimator.scenario.pose, mixture.moments()
-        return TrackEstimate(
-            **vars(estimate), velocity=pose.vectors_to_surface(mean[3:]),
+        return dataclasses.replace(
+            estimate, velocity=pose.vectors_to_surface(mean[3:]),
             velocity_covariance=pose.covariances_to_surface(covariance[3:, 3:]),
             n_phases=n_phases or self._n_phases)
 

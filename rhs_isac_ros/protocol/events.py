@@ -9,7 +9,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.frontend import Sounding
-from rhs_isac_ros.positioning import Estimator, SearchEstimator, TrackEstimate
+from rhs_isac_ros.positioning import Estimate, Estimator, SearchEstimator
 from rhs_isac_ros.positioning.agreement import Pair
 from rhs_isac_ros.protocol.messages import Message
 
@@ -196,7 +196,7 @@ class PublishTrack:
     """
 
     user: int
-    estimate: TrackEstimate
+    estimate: Estimate
     stamp_ns: int = 0
 
 

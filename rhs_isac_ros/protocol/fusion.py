@@ -7,9 +7,11 @@ from collections.abc import Callable, Collection, Mapping
 import numpy as np
 
 from rhs_isac_ros.bounds import site_crlb
+from rhs_isac_ros.positioning import Estimate, Mixture, Sighting
 from rhs_isac_ros.positioning.agreement import PoseTest, pair_agreements
-from rhs_isac_ros.positioning.fusion import Fused, Fuser, Sighting
-from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.fusion import Fuser
+from rhs_isac_ros.positioning.segments import select
+from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.positioning.site import Site
 from rhs_isac_ros.positioning.tracking import MixtureTracker, Motion
 from rhs_isac_ros.protocol import messages as m
@@ -34,22 +36,36 @@ _MAX_MISSED = 3
 _MAX_CLOSED, _MAX_OPEN = 256, 64
 
 
+_LOG_RATIOS = ('outside_log_ratio', 'blocked_log_ratio', 'misfit_log_ratio')
+
+
 def posterior_of(source: object, sighting: Sighting, **fields: float | str) -> m.Posterior:
     """Return the message about a likelihood, with the cycle, user and codebook of a source."""
     mixture, pose = sighting.mixture.normalised(), sighting.pose
+    if len(mixture.means) > m.MAX_COMPONENTS:
+        mixture = mixture.reduce(m.MAX_COMPONENTS)
+    sheets: dict[str, np.ndarray] = {}
+    if sighting.sheets is not None:
+        heaviest = np.argsort(-sighting.sheets.log_weights, kind='stable')[:m.MAX_COMPONENTS]
+        sheets = dict(zip(('sheet_log_weights', 'sheet_means', 'sheet_covariances'),
+                          select(sighting.sheets, heaviest).normalised(), strict=True))
     return m.derive(
         m.Posterior, source, log_weights=mixture.log_weights, means=mixture.means,
         covariances_m2=mixture.covariances, log_evidence=sighting.mixture.log_mass,
         missing_probability=float(np.clip(sighting.missing, _LEAST_MISSING, _MOST_MISSING)),
         surface_position_m=pose.origin, surface_quaternion=pose.unit_quaternion,
-        surface_uncertainty=pose.covariance, **fields)
+        surface_uncertainty=pose.covariance, **sheets,
+        **{name: getattr(sighting, name) for name in _LOG_RATIOS}, **fields)
 
 
 def sighting_of(message: m.Posterior) -> Sighting:
     """Return the likelihood in a message."""
     mixture = Mixture(message.log_weights, message.means, message.covariances_m2)
+    sheets = Sheets(message.sheet_log_weights, message.sheet_means, message.sheet_covariances
+                    ) if len(message.sheet_log_weights) else None
     return Sighting(message.surface_pose, mixture.weighted(message.log_evidence),
-                    message.missing_probability)
+                    message.missing_probability, sheets,
+                    **{name: getattr(message, name) for name in _LOG_RATIOS})
 
 
 @dataclasses.dataclass
@@ -196,7 +212,7 @@ class Fusion(Role):
             return
         self._publish(fix, sightings, fused, self._stopwatch() - begin)
         if self._test:
-            self._test.add(agreements, fused.mixture.moments()[0])
+            self._test.add(agreements, fused.mean)
             self._examine(self._test.suspects())
 
     def _trusted(self, name: str, sighting: Sighting) -> Sighting:
@@ -205,11 +221,11 @@ class Fusion(Role):
             return sighting
         return dataclasses.replace(sighting, missing=max(sighting.missing, _SUSPECT_MISSING))
 
-    def _publish(self, fix: _Fix, sightings: Mapping[str, Sighting], fused: Fused,
+    def _publish(self, fix: _Fix, sightings: Mapping[str, Sighting], fused: Estimate,
                  latency_s: float) -> None:
         answers = fix.posteriors
         source = next(iter(answers.values()))
-        mean, covariance = fused.mixture.moments()
+        assert fused.mixture is not None
         common: dict[str, float | str] = {
             'stamp_ns': source.stamp_ns,
             'codebook_id': '',  # of no single surface
@@ -218,12 +234,13 @@ class Fusion(Role):
             'blocked_probability': math.prod(
                 one.blocked_probability for one in answers.values())}
         self._answer(fix, m.derive(
-            m.PositionEstimate, source, position=mean, covariance_m2=covariance,
-            crlb_m2=self._bound_m2(answers, mean), estimator=f'fusion of {", ".join(answers)}',
-            latency_s=latency_s, **common))
+            m.PositionEstimate, source, position=fused.mean, covariance_m2=fused.covariance,
+            crlb_m2=self._bound_m2(answers, fused.mean),
+            estimator=f'fusion of {", ".join(answers)}', latency_s=latency_s, **common))
         # The agreement is relative to a different user at each surface.
-        volume = (len(answers) - 1) * float(np.log(np.ptp(self._bounds_m, axis=0)).sum())
-        log_evidence = fused.log_agreement - volume + sum(
+        size = np.ptp(self._bounds_m, axis=0)
+        volume = (len(answers) - 1) * float(np.log(size[size > 0]).sum())
+        log_evidence = float(fused.log_agreement) - volume + sum(
             one.log_evidence for one in answers.values())
         missing = math.prod(one.missing for one in sightings.values())
         self.send(posterior_of(source, Sighting(
@@ -235,9 +252,7 @@ class Fusion(Role):
         surfaces = {name: self._surfaces[name] for name in answers}
         if any(answers[name].codebook_id != one.codebook.id for name, one in surfaces.items()):
             return math.nan
-        # A thin region is widened, perhaps to positions behind a surface.
-        place = np.clip(position, *self._bounds_m)[None]
-        return float(site_crlb(surfaces.values(), place)[0])
+        return float(site_crlb(surfaces.values(), np.clip(position, *self._bounds_m)[None])[0])
 
     def _track(self, source: m.Posterior, mixture: Mixture, missing: float) -> None:
         """Update the track of a user and publish it, unless the cycle is late."""

@@ -21,14 +21,17 @@ class MessageError(ValueError):
 
 def array(
         dims: str, kind: type = float, low: float = -math.inf, high: float = math.inf,
-        nan_allowed: bool = False, in_front: bool = False) -> Any:
+        nan_allowed: bool = False, in_front: bool = False, empty: bool = False) -> Any:
     """Declare an array field; `low` and `high` are inclusive limits of magnitudes if complex.
 
     `dims` lists the dimensions, separated by spaces: numbers, or symbols of `Scenario.sizes` or
     `Message.own_sizes`. If `nan_allowed` is set, NaN stands for an unknown value. With `in_front`,
-    the entries are positions in front of the surface, in the frame of the site.
+    the entries are positions in front of the surface, in the frame of the site. With `empty`, the
+    default is an array whose first dimension is 0.
     """
     return dataclasses.field(
+        default_factory=functools.partial(np.zeros, (0, *map(int, dims.split()[1:])))
+        if empty else dataclasses.MISSING,
         metadata={'check': _array_problem, 'dims': tuple(dims.split()),
                   'declared': Field(kind, low=low, high=high), 'nan_allowed': nan_allowed,
                   'in_front': in_front})
@@ -51,9 +54,10 @@ def size(symbol: str) -> Any:
     return dataclasses.field(metadata={'check': _size_problem, 'equals': symbol})
 
 
-def optional_float() -> Any:
+def optional_float(default: Any = dataclasses.MISSING) -> Any:
     """Declare a number field in which NaN stands for an unknown value."""
-    return dataclasses.field(metadata={'check': _number_problem, 'nan_allowed': True})
+    return dataclasses.field(
+        default=default, metadata={'check': _number_problem, 'nan_allowed': True})
 
 
 def check(message: 'Message', scenario: Scenario) -> None:
@@ -347,7 +351,7 @@ class PositionEstimate(Message):
 
 
 # Maximum number of components of a mixture in a message.
-_MAX_COMPONENTS = 256
+MAX_COMPONENTS = 256
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -368,19 +372,30 @@ class Posterior(Message):
     surface_position_m: np.ndarray = array('3', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M)
     surface_quaternion: np.ndarray = array('4', low=-1, high=1)
     surface_uncertainty: np.ndarray = array('6 6', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M)
+    #: The likelihood around the surface, in range [m] and direction cosines; of no length if the
+    #: Gaussians in the frame of the site touch it at their means.
+    sheet_log_weights: np.ndarray = array('SHEETS', empty=True)
+    sheet_means: np.ndarray = array('SHEETS 3', empty=True)
+    sheet_covariances: np.ndarray = array('SHEETS 3 3', empty=True)
+    #: Log-likelihoods relative to a user in the region and in sight; NaN if unknown.
+    outside_log_ratio: float = optional_float(math.nan)
+    blocked_log_ratio: float = optional_float(math.nan)
+    misfit_log_ratio: float = optional_float(math.nan)
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return the number of Gaussians, COMPONENTS."""
-        return {'COMPONENTS': len(self.log_weights)}
+        """Return the numbers of Gaussians, COMPONENTS and SHEETS."""
+        return {'COMPONENTS': len(self.log_weights), 'SHEETS': len(self.sheet_log_weights)}
 
     def own_problem(self) -> str:
         """Describe a mixture without a density, a pose that is none, or means behind it."""
-        if len(self.log_weights) > _MAX_COMPONENTS:
-            return (f'log_weights: {len(self.log_weights)} components, expected at most '
-                    f'{_MAX_COMPONENTS}')
-        smallest = np.linalg.eigvalsh(self.covariances_m2).min()
-        if not smallest > 0:
-            return f'covariances_m2: eigenvalue {smallest:g}, expected positive eigenvalues'
+        for log_weights, covariances in (('log_weights', 'covariances_m2'),
+                                         ('sheet_log_weights', 'sheet_covariances')):
+            n, matrices = len(getattr(self, log_weights)), getattr(self, covariances)
+            if n > MAX_COMPONENTS:
+                return f'{log_weights}: {n} components, expected at most {MAX_COMPONENTS}'
+            smallest = np.linalg.eigvalsh(matrices).min(initial=np.inf)
+            if not smallest > 0:
+                return f'{covariances}: eigenvalue {smallest:g}, expected positive eigenvalues'
         try:
             pose = self.surface_pose
         except ValueError as error:

@@ -19,14 +19,12 @@ from rhs_isac_ros.positioning import (
     Estimator,
     Motion,
     SearchEstimator,
+    Sighting,
     SignalError,
     Tracker,
-    TrackEstimate,
 )
 from rhs_isac_ros.positioning.alternatives import describe_doubts, probabilities_of
 from rhs_isac_ros.positioning.diagnosis import WINDOW, InnovationTest, diagnose
-from rhs_isac_ros.positioning.fusion import Sighting
-from rhs_isac_ros.positioning.posterior import Posterior
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
@@ -73,7 +71,7 @@ class Tracks:
     def __init__(self) -> None:
         self._tracks: NewestDict[int, _Track] = NewestDict(MAX_USERS)
         #: Posterior of the latest signals if they belong to a track.
-        self.posterior: Posterior | None = None
+        self.posterior: Estimate | None = None
 
     def clear(self) -> None:
         """End all tracks."""
@@ -84,9 +82,9 @@ class Tracks:
             now_s: float) -> Estimate:
         """Estimate the position of a user from signals that were measured at `now_s` [s].
 
-        If the signals begin or continue a track, the result is a `TrackEstimate`, and `posterior`
-        is that of these signals alone. A new track assumes the typical speed `speed_mps`. Raises
-        SignalError if the signals are unusable.
+        If the signals begin or continue a track, the result has a number of phases, and
+        `posterior` is that of the latest signals. A new track assumes the typical speed
+        `speed_mps`. Raises SignalError if the signals are unusable.
         """
         signals, self.posterior = received.stacked, None
         # The oldest track comes first.
@@ -365,7 +363,7 @@ class Positioner(Role):
         job, system, estimator = self._estimators.take(received.codebook_id)
         begin = self._stopwatch()
         try:
-            estimate, posterior = self._estimate(received, job.settings, estimator, now_s)
+            estimate = self._estimate(received, job.settings, estimator, now_s)
         except SignalError as error:
             self._no_fix(received, str(error))
             return
@@ -382,7 +380,9 @@ class Positioner(Role):
                 crlb_m2=float(system.crlb(estimate.mean[None])[0]), estimator=estimator.name,
                 latency_s=latency_s, **probabilities, **self._proposal(received.user, estimate)))
             self._publish_track(received, of_site)
-            self._publish_posterior(received, posterior, probabilities)
+            if self._is_observed() and (sighting := Sighting.of(estimate)):
+                self.send(posterior_of(
+                    received, sighting, stamp_ns=received.stamp_ns, **probabilities))
         else:
             self._no_fix(received, f'position: {problem}' if problem else str(estimate.reason))
         text, begins = self._residuals.add(received.user, estimate)
@@ -391,35 +391,25 @@ class Positioner(Role):
 
     def _estimate(
             self, received: m.ReceivedSignals, settings: PositionerSettings, estimator: Estimator,
-            now_s: float) -> tuple[Estimate, Posterior | None]:
-        """Estimate a position; return also its posterior if it is observed and has modes."""
+            now_s: float) -> Estimate:
+        """Estimate a position; if posteriors are observed, the result has a sighting."""
         if settings.prior == TRACK:
             return self._tracks.locate(
-                received, estimator, settings.track_speed_mps, received.time_s(now_s)
-            ), self._tracks.posterior
+                received, estimator, settings.track_speed_mps, received.time_s(now_s))
         self._tracks.clear()
-        signals = received.stacked
-        if not (self._is_observed() and isinstance(estimator, SearchEstimator)):
-            return estimator.estimate(signals), None
-        posterior = estimator.posterior(signals)
-        return posterior.estimate, posterior
+        if self._is_observed() and isinstance(estimator, SearchEstimator):
+            return estimator.posterior(received.stacked)
+        return estimator.estimate(received.stacked)
 
     def _proposal(self, user: int, estimate: Estimate) -> dict[str, Any]:
         """Return the fields of an estimate that propose a codebook for the user's next cycle."""
-        if not (self._library.by_id and isinstance(estimate, TrackEstimate)):
+        if not (self._library.by_id and estimate.n_phases):
             return {}
         return proposal(self._library, self._tracks.predict(user))
 
-    def _publish_posterior(self, received: m.ReceivedSignals, posterior: Posterior | None,
-                           probabilities: Mapping[str, float]) -> None:
-        if posterior and self._is_observed() and (
-                sighting := Sighting.of(posterior, self._scenario.pose)):
-            self.send(posterior_of(
-                received, sighting, stamp_ns=received.stamp_ns, **probabilities))
-
     def _publish_track(self, received: m.ReceivedSignals, estimate: Estimate) -> None:
         user, loss = received.user, None
-        if isinstance(estimate, TrackEstimate):
+        if estimate.n_phases:
             self.act(events.PublishTrack(user, estimate, received.stamp_ns))
             loss = _Loss.BLOCKED if estimate.is_predicted else None
         self._log_change(received, loss, f'the track of user {user} predicts its position: '

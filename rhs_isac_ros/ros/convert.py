@@ -14,7 +14,7 @@ from std_msgs.msg import Header
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.positioning import TrackEstimate
+from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol.events import PublishTrack
 from rhs_isac_ros.protocol.messages import Message, MessageError, PositionEstimate
 from rhs_isac_ros.protocol.presences import Presence
@@ -113,7 +113,7 @@ def pose(estimate: PositionEstimate, stamp: Time, frame: Frame) -> PoseWithCovar
 
 
 def odometry(
-        user: int, estimate: TrackEstimate, stamp: Time, frame: Frame) -> Odometry:
+        user: int, estimate: Estimate, stamp: Time, frame: Frame) -> Odometry:
     """Return a track as odometry, with unknown orientation and angular velocity.
 
     The child frame, in which the velocity is given, has the same axes as `frame`.

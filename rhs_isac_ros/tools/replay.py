@@ -415,11 +415,11 @@ class SiteRecording(Recording):
                 if signals is None:
                     continue
                 posterior = find(name, signals.codebook_id).posterior(signals.stacked)
-                if sighting := Sighting.of(posterior, scenario.pose):
-                    again[name][key] = posterior.estimate.to_site(scenario.pose).mean
+                if sighting := Sighting.of(posterior):
+                    again[name][key] = posterior.to_site(scenario.pose).mean
                     sightings.append(sighting)
             if sightings:
-                again[''][key] = fuse(sightings, self._networks.bounds_m).mixture.moments()[0]
+                again[''][key] = fuse(sightings, self._networks.bounds_m).mean
         return again
 
     def _estimator(self, folder: Path | None, name: str, codebook_id: str) -> BayesEstimator:

@@ -123,7 +123,7 @@ def locate(world: World, positions: np.ndarray, centres: np.ndarray,
         received = model_of(world.scenario, codebook).sample(position[None], rng)[0]
         begin = time.process_time()
         estimator = estimator_of(world.scenario, codebook)
-        estimates.append(estimator.posterior(received, around(centre) if knows else None).estimate)
+        estimates.append(estimator.posterior(received, around(centre) if knows else None))
         times_s.append(time.process_time() - begin)
     return frame.Fixes.of(Estimate.of_each(estimates), positions), float(np.median(times_s))
 

@@ -37,7 +37,7 @@ from rhs_isac_ros.model.surface import AppliedBeams, radiation_matrix
 from rhs_isac_ros.positioning.grid import TemplateTable
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood, NuisancePrior, Signals
-from rhs_isac_ros.positioning.posterior import WeightedSamples, draw_samples
+from rhs_isac_ros.positioning.posterior import draw_samples
 from rhs_isac_ros.positioning.search import find_modes
 from rhs_isac_ros.positioning.templates import tabulate
 
@@ -173,7 +173,7 @@ def posterior_means(receiver: ArrayReceiver, received: np.ndarray) -> np.ndarray
         modes = find_modes(
             likelihood, grid, Signals(signals, signals), np.zeros((len(signals), 0)))
         samples = draw_samples(modes, grid.normal, receiver.scenario.roi_bounds_m)
-        means.append(WeightedSamples.of(samples, modes).moments()[0])
+        means.append(samples.moments()[0])
     return np.concatenate(means)
 
 

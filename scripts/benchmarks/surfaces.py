@@ -39,7 +39,6 @@ from rhs_isac_ros.positioning import BayesEstimator, Estimate, Sighting, fuse
 from rhs_isac_ros.positioning.agreement import WINDOW, PoseTest, pair_agreements
 from rhs_isac_ros.positioning.alignment import estimate_pose
 from rhs_isac_ros.positioning.fusion import Fuser
-from rhs_isac_ros.positioning.posterior import Posterior
 from rhs_isac_ros.system import System
 
 EXACT, DECLARED = (0.0, 0.0), (0.02, 0.2)
@@ -68,7 +67,7 @@ class World(NamedTuple):
     estimator: BayesEstimator
     positions: np.ndarray  # Float64 [N, 3] [m], in the frame of the site.
 
-    def posteriors(self, poses: list[Pose], rng: np.random.Generator) -> list[Posterior]:
+    def posteriors(self, poses: list[Pose], rng: np.random.Generator) -> list[Estimate]:
         """Return the posteriors of one surface, which has another pose for each position."""
         places = np.array([pose.to_surface(place) for pose, place in zip(
             poses, self.positions, strict=True)])
@@ -136,7 +135,7 @@ def make_world(scenario: Scenario, codebook: Codebook, positions: np.ndarray) ->
                  BayesEstimator(System(scenario, codebook)), positions)
 
 
-def sightings_of(found: list[list[Posterior]], poses: list[Pose], position: int
+def sightings_of(found: list[list[Estimate]], poses: list[Pose], position: int
                  ) -> list[Sighting]:
     """Return the sightings of the surfaces with a position."""
     both = (Sighting.of(posteriors[position], pose)
@@ -144,15 +143,15 @@ def sightings_of(found: list[list[Posterior]], poses: list[Pose], position: int
     return [one for one in both if one is not None]
 
 
-def compare(world: World, found: list[list[Posterior]], poses: list[Pose]) -> dict:
+def compare(world: World, found: list[list[Estimate]], poses: list[Pose]) -> dict:
     """Fuse the posteriors of all positions, and return the figures."""
     n = len(world.positions)
     means, covariances, times_s = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n)
     for number in range(n):
         sightings = sightings_of(found, poses, number)
         begin = time.process_time()
-        means[number], covariances[number] = fuse(
-            sightings, world.scenario.roi_bounds_m).mixture.moments()
+        fused = fuse(sightings, world.scenario.roi_bounds_m)
+        means[number], covariances[number] = fused.mean, fused.covariance
         times_s[number] = time.process_time() - begin
     fixes = frame.Fixes.of(Estimate(means, covariances), world.positions)
     mse = fixes.squared.mean()
@@ -164,7 +163,7 @@ def compare(world: World, found: list[list[Posterior]], poses: list[Pose]) -> di
             'time_ms': 1e3 * np.median(times_s)}
 
 
-def wrong_poses(found: dict[str, list[Posterior]], scenario: Scenario,
+def wrong_poses(found: dict[str, list[Estimate]], scenario: Scenario,
                 rng: np.random.Generator) -> dict:
     """Measure how often wrong poses of the side surface are noticed, and named, in a window."""
     n = min(WRONG_POSITIONS, len(found['front']) // 2)
@@ -201,7 +200,7 @@ def wrong_poses(found: dict[str, list[Posterior]], scenario: Scenario,
     return results
 
 
-def estimated_poses(found: dict[str, list[Posterior]], scenario: Scenario,
+def estimated_poses(found: dict[str, list[Estimate]], scenario: Scenario,
                     rng: np.random.Generator) -> dict:
     """Estimate the pose of the side surface from groups of positions; measure the errors."""
     truth, errors, squares = POSES['side'], [], []

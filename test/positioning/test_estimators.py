@@ -11,7 +11,7 @@ from scipy.stats import qmc
 from rhs_isac_ros.bounds.fisher import fisher_information
 from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError, simulate_received
 from rhs_isac_ros.model.multipath import multipath_covariance
-from rhs_isac_ros.positioning import Tracker, make_estimator, weighted_modes
+from rhs_isac_ros.positioning import Tracker, make_estimator
 from rhs_isac_ros.system import System
 
 # Little scattering and three bands, which leave a single mode.
@@ -259,34 +259,35 @@ def phases(shipped):
 
 def test_the_mixture_has_the_moments_of_the_estimate(table1_estimator, phases):
     for received in phases:
-        modes = weighted_modes(table1_estimator, received)
-        estimate = table1_estimator.estimate(received)
-        assert modes.probabilities.sum() == pytest.approx(1)
-        assert (np.diff(modes.probabilities) <= 0).all()
-        mean = modes.probabilities @ modes.positions
-        assert mean == pytest.approx(estimate.mean, abs=1e-9)
-        offsets = modes.positions - mean
-        covariance = np.einsum(
-            'm,mab->ab', modes.probabilities,
-            modes.covariances + offsets[:, :, None] * offsets[:, None, :])
-        # The estimate adds the uncertainty of the mean of the samples.
-        added = estimate.covariance - covariance
-        assert np.linalg.eigvalsh(added).min() > -1e-9
-        assert np.trace(added) < 0.1 * np.trace(covariance)
+        estimate, found = table1_estimator.estimate(received), table1_estimator.posterior(received)
+        assert (np.diff(found.mixture.log_weights) <= 0).all()
+        assert found.mixture.log_mass == pytest.approx(0, abs=1e-12)
+        mean, covariance = found.mixture.moments()
+        for one in (estimate, found):
+            np.testing.assert_allclose(mean, one.mean, atol=1e-9)
+            np.testing.assert_allclose(covariance, one.covariance, atol=1e-9)
 
 
 def test_the_modes_are_the_range_ambiguities_of_the_bands(table1_estimator, phases):
     """Two bands 0.5 GHz apart repeat every 0.6 m; single bands every 0.1 m."""
     gaps = []
     for received in phases:
-        modes = weighted_modes(table1_estimator, received)
-        ranges = np.sort(np.linalg.norm(modes.positions[modes.probabilities > 0.05], axis=1))
+        modes = table1_estimator.posterior(received).mixture
+        ranges = np.sort(np.linalg.norm(modes.means[modes.probabilities > 0.05], axis=1))
         gaps += np.diff(ranges).tolist()
     assert np.median([gap for gap in gaps if gap > 0.3]) == pytest.approx(0.6, abs=0.06)
 
 
-def test_signals_without_a_position_have_no_modes(table1_estimator, phases):
-    assert weighted_modes(table1_estimator, np.zeros_like(phases[0])) is None
+def test_posteriors_of_several_shots_are_those_of_each(table1_estimator, phases):
+    received = np.concatenate([phases[:3], np.zeros_like(phases[:1])])
+    found = table1_estimator.posterior(received)
+    assert found.fix.tolist() == [True, True, True, False]
+    for n, one in enumerate(received):
+        alone = table1_estimator.posterior(one)
+        np.testing.assert_allclose(found[n].mean, alone.mean, atol=1e-6)
+        if alone.fix:
+            np.testing.assert_allclose(found[n].mixture.moments()[1], alone.covariance, atol=1e-6)
+    assert found[3].mixture is None
 
 
 def test_a_region_far_shorter_than_the_wavelength_has_a_mode_for_all_signals(random_beams):

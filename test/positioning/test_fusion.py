@@ -8,8 +8,8 @@ import pytest
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
 from rhs_isac_ros.model.geometry import polar_derivative, to_polar
-from rhs_isac_ros.positioning import make_estimator, weighted_modes
-from rhs_isac_ros.positioning.fusion import MAX_MODES, Fuser, Sighting, fuse
+from rhs_isac_ros.positioning import Sighting, make_estimator
+from rhs_isac_ros.positioning.fusion import Fuser, fuse
 from rhs_isac_ros.positioning.mixture import Mixture
 
 BOUNDS = np.array([[5.0, -5.0, -1.0], [15.0, 5.0, 1.0]])
@@ -186,22 +186,10 @@ def test_one_surface_has_the_moments_of_its_modes(world):
     scenario, _, estimator = world
     positions = scenario.sample_positions(20, np.random.default_rng(2))
     for signals in drawn(world, SIDE, positions, 3):
-        fused = fuse([Sighting.of(estimator.posterior(signals), SIDE)], BOUNDS)
-        modes = weighted_modes(estimator, signals)
-        mean, covariance = Mixture(
-            np.log(modes.probabilities), modes.positions, modes.covariances).moments()
-        assert_moments(fused, SIDE.to_site(mean), SIDE.covariances_to_site(covariance),
+        alone = estimator.posterior(signals)
+        fused = fuse([Sighting.of(alone, SIDE)], BOUNDS)
+        assert_moments(fused, SIDE.to_site(alone.mean), SIDE.covariances_to_site(alone.covariance),
                        tolerance=0.12)
-
-
-def test_the_number_of_modes_is_limited(world):
-    scenario, _, estimator = world
-    (signals,) = drawn(world, FRONT, scenario.sample_positions(1, np.random.default_rng(5)), 6)
-    posterior = estimator.posterior(signals)
-    many = posterior.modes._replace(
-        **{name: np.repeat(field, MAX_MODES + 1, axis=0)
-           for name, field in posterior.modes._asdict().items()})
-    assert len(Sighting.of(posterior._replace(modes=many), FRONT).mixture.means) == MAX_MODES
 
 
 def test_products_of_the_same_sightings_are_computed_once():

@@ -10,7 +10,7 @@ import yaml
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Pose, Scenario
-from rhs_isac_ros.positioning import Site, SiteError, SiteEstimator
+from rhs_isac_ros.positioning import SignalError, Site, SiteError, SiteEstimator
 from rhs_isac_ros.positioning.agreement import PoseTest
 from rhs_isac_ros.positioning.site import site_text
 from rhs_isac_ros.system import System
@@ -57,8 +57,21 @@ def test_a_surface_without_a_signal_is_left_out(estimator, cycles):
     mixtures = [estimator.estimate(received).mixture for received in (
         {**cycle, 'side': silent}, {'front': cycle['front']})]
     np.testing.assert_array_equal(mixtures[0].means, mixtures[1].means)
-    assert estimator.estimate({'side': silent}) is None
-    assert estimator.estimate({}) is None
+    none = estimator.estimate({'side': silent})
+    assert not none.fix
+    assert none.reason.startswith('side: energy of the signals')
+
+
+def test_several_shots_are_located_at_once(estimator, cycles):
+    shots = [*cycles[1][:2], {name: np.zeros_like(one) for name, one in cycles[1][0].items()}]
+    received = {name: np.stack([shot[name] for shot in shots]) for name in ('front', 'side')}
+    found = estimator.estimate(received)
+    assert found.fix.tolist() == [True, True, False]
+    for n in range(2):
+        np.testing.assert_allclose(found[n].mean, estimator.estimate(shots[n]).mean, atol=1e-6)
+        np.testing.assert_array_equal(found[n].mixture.moments()[0], found.mean[n])
+    with pytest.raises(SignalError, match="'side': 1} shots, expected equal numbers"):
+        estimator.estimate({**received, 'side': received['side'][:1]})
 
 
 def test_the_example_is_two_surfaces_at_a_right_angle():

@@ -108,7 +108,8 @@ def test_an_array_with_a_value_that_is_not_finite_is_named(error_of, kind, field
 
 @fields_of(lambda field: field.type is float and 'dims' not in field.metadata)
 def test_a_number_must_be_finite_unless_it_may_be_unknown(error_of, kind, field):
-    unknown = {'crlb_m2', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent'}
+    unknown = {'crlb_m2', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent',
+               'outside_log_ratio', 'blocked_log_ratio', 'misfit_log_ratio'}
     for bad in (math.nan, math.inf):
         assert error_of(kind, **{field.name: bad}) == (
             '' if field.name in unknown else f'{field.name}: {bad}, expected a finite number')

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model import Scenario, simulate_received
-from rhs_isac_ros.positioning import Estimate, TrackEstimate, make_estimator
+from rhs_isac_ros.positioning import Estimate, make_estimator
 from rhs_isac_ros.positioning.diagnosis import MIN_RESIDUALS, MIN_RETURN, WINDOW
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import ResidualWatch
@@ -101,9 +101,9 @@ def texts(net):
 
 def test_a_prediction_through_a_blockage_is_logged_once_with_its_probability(net):
     net.run_cycles(1)
-    net.result = TrackEstimate(
+    net.result = Estimate(
         PLACE, np.eye(3), blocked_probability=0.97, velocity=np.zeros(3),
-        velocity_covariance=np.eye(3), is_predicted=True)
+        velocity_covariance=np.eye(3), n_phases=1, is_predicted=True)
     net.run_cycles(3)
     assert net['positioner'].status()['probability.blocked'] == '0.970'
     net.result = estimate(1.0)

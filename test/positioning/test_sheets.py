@@ -8,7 +8,7 @@ from scipy.stats import qmc
 
 from rhs_isac_ros.model.gaussian import likelihood_loss
 from rhs_isac_ros.model.geometry import to_polar, to_positions
-from rhs_isac_ros.positioning.region import Restricted, move_inside
+from rhs_isac_ros.positioning.sheets import Inside, move_inside
 from rhs_isac_ros.positioning.templates import standard_normal
 
 CENTRE, SIZE = np.array([10.0, 4.5, -2.5]), np.array([8.0, 6.0, 2.0])
@@ -43,7 +43,7 @@ def restricted(centre, bounds):
     """The Gaussian around a centre, expanded at its most likely point inside."""
     point = to_polar(np.clip(to_positions(centre), *bounds))
     for _ in range(4):
-        gaussian = Restricted.of(
+        gaussian = Inside.of(
             point[None], (CURVATURE @ (centre - point))[None], CURVATURE[None], bounds)
         point = to_polar(gaussian.nearest()[0])
     return gaussian
@@ -94,7 +94,7 @@ def test_a_grazing_direction_determines_the_range_along_the_wall():
     """A corridor along the surface: x is far shorter than y, and directions are near the rim."""
     bounds = np.array([[0.05, 15.0, -1.0], [1.5, 25.0, 1.0]])
     point = to_polar(np.array([0.4, 20.0, 0.3]))
-    positions, log_weights = Restricted.of(
+    positions, log_weights = Inside.of(
         point[None], np.zeros((1, 3)), CURVATURE[None], bounds).sample(NORMAL)
     weights = np.exp(log_weights[0] + log_density(positions[0], point))
     expected = np.exp(log_density(grid(bounds), point)).mean()
@@ -109,7 +109,7 @@ def test_a_gaussian_without_direction_reaches_both_sides_of_a_line(extents, side
     bounds = bounds_of(extents, np.array([10.0, 1.0, 0.2]))
     inside = np.array([10.0, 1.0, 0.7 * side])
     point, curvature = to_polar(inside), np.diag([1e6, 3e2, 1e-2])
-    positions, log_weights = Restricted.of(
+    positions, log_weights = Inside.of(
         point[None], np.zeros((1, 3)), curvature[None], bounds).sample(NORMAL)
     reference = grid(bounds)
     expected = np.exp(-likelihood_loss(to_polar(reference) - point, curvature[None]))
@@ -124,7 +124,7 @@ def test_a_range_without_error_leaves_unknown_directions_unknown():
     """Strong signals at two elements along z tell nothing about y."""
     bounds = np.array([[0.2, -1.4, 0.3], [1.1, -1.1, 0.7]])
     point, curvature = to_polar(bounds.mean(axis=0)), np.diag([1e24, 1e-3, 1e15])
-    positions, log_weights = Restricted.of(
+    positions, log_weights = Inside.of(
         point[None], np.zeros((1, 3)), curvature[None], bounds).sample(NORMAL)
     assert np.isfinite(log_weights).all()
     assert np.ptp(positions[0, :, 1]) == pytest.approx(0.3, rel=0.05)
@@ -134,7 +134,7 @@ def test_a_distant_gaussian_is_sampled_on_the_border():
     bounds = bounds_of((1, 1, 1))
     centre = to_polar(np.array([10.0, 4.0, 9.0]))
     point = to_polar(np.array([10.0, 4.0, -1.5]))
-    positions, log_weights = Restricted.of(
+    positions, log_weights = Inside.of(
         point[None], (CURVATURE @ (centre - point))[None], CURVATURE[None], bounds).sample(NORMAL)
     assert np.isfinite(log_weights).all()
     assert (positions[0, :, 2] > -1.8).mean() > 0.8
@@ -146,5 +146,5 @@ def test_axes_that_are_equally_wide_are_chosen_in_their_order_whatever_the_round
     centre = to_polar(np.array([[10.0, 0.0, 0.0]]))
     for rounding in (-1e-13, 0.0, 1e-13):
         curvature = np.diag([1e4, 3e2 * (1 + rounding), 3e2])[None]
-        order = Restricted.of(centre, np.zeros((1, 3)), curvature, bounds).order
+        order = Inside.of(centre, np.zeros((1, 3)), curvature, bounds).order
         assert order.tolist() == [[1, 2, 0]]

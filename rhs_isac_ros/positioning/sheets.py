@@ -10,14 +10,17 @@ is known best, the surface of constant likelihood is nearly a sphere, which the 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import untied
-from rhs_isac_ros.model.gaussian import step_to_maximum
-from rhs_isac_ros.model.geometry import polar_derivative, to_polar, to_positions
+from rhs_isac_ros.model.arrays import mixture_weights, untied
+from rhs_isac_ros.model.gaussian import likelihood_loss, step_to_maximum, symmetric
+from rhs_isac_ros.model.geometry import jacobian, polar_derivative, to_polar, to_positions
+from rhs_isac_ros.model.pose import Pose
+from rhs_isac_ros.positioning.mixture import Mixture, log_volume
 from rhs_isac_ros.positioning.segments import select
+from rhs_isac_ros.positioning.templates import standard_normal
 
 
 class _Limits(NamedTuple):
@@ -42,6 +45,13 @@ class _Limits(NamedTuple):
     # decrease of the log-likelihood up to which the far side counts.
     separate: float = 1.0
     far_side: float = 8.0
+    # Smallest cosine of the angle from boresight in curvatures.
+    cosine: float = 0.05
+    # Densities of samples: smallest standard deviation [m], largest share of a uniform prior in
+    # the information along an axis, and number of samples of a mass.
+    std_m: float = 1e-5
+    share: float = 0.9
+    samples: int = 64
 
 
 _LIMITS = _Limits()
@@ -51,14 +61,158 @@ _LIMITS = _Limits()
 _Choice = Callable[[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
-class Restricted(NamedTuple):
-    """M Gaussians ``exp(g^T d - d^T C d / 2)`` of offsets d from points inside the region."""
+class Sheets(Mixture):
+    """C Gaussians over (r [m], u, v) around a surface; further coordinates are those of the site.
 
+    A mode of the likelihood is a fraction of a wavelength thick and up to metres wide, so it bends
+    around its surface. As a likelihood, sheets are functions of the position with the maxima
+    `log_peaks`; as a posterior, they are a density of r, u, v and the further coordinates.
+    """
+
+    @classmethod
+    def expanded(cls, points: np.ndarray, gradient: np.ndarray, curvature: np.ndarray,
+                 log_values: np.ndarray, share: float = 1.0) -> 'Sheets':
+        """Return likelihoods with given values, gradients and curvatures at points [C, 3].
+
+        `share` is an exponent of the likelihood.
+        """
+        step = step_to_maximum(curvature, gradient)
+        covariances = symmetric(np.linalg.inv(curvature)) / share
+        log_peaks = share * (log_values + np.sum(gradient * step, axis=1) / 2)
+        return cls._make((log_peaks + log_volume(covariances), points + step, covariances))
+
+    @classmethod
+    def of_density(cls, log_weights: np.ndarray, means: np.ndarray, covariances: np.ndarray,
+                   bounds: np.ndarray) -> 'Sheets':
+        """Return the likelihood whose product with a uniform prior in a region is a density.
+
+        The density consists of Gaussians in (r, u, v) with moments inside the region; what the
+        prior contributes to them is removed.
+        """
+        size, by_point = np.ptp(bounds, axis=0), jacobian(means)
+        prior = np.where(size > 0, 12 / np.maximum(size, _LIMITS.std_m)**2, 0.0)
+        derivative = polar_derivative(means)
+        smallest = derivative @ np.swapaxes(derivative, 1, 2) * _LIMITS.std_m**2
+        roots = np.linalg.cholesky(symmetric(covariances) + smallest)
+        whitened = by_point @ roots
+        shares, axes = np.linalg.eigh(
+            np.swapaxes(whitened, 1, 2) @ (prior[:, None] * whitened))
+        wider = 1 / (1 - np.minimum(shares, _LIMITS.share))[:, None]
+        by_axis = roots @ axes
+        spread = (wider * by_axis) @ np.swapaxes(by_axis, 1, 2)
+        sheets = cls._make((np.zeros(len(means)), means, symmetric(spread)))
+        gaussians = sheets.inside(bounds)
+        positions, log_ratio = gaussians.sample(standard_normal(_LIMITS.samples))
+        _, log_mass = mixture_weights(gaussians.logarithm(positions) + log_ratio)
+        return sheets.weighted(log_weights - log_mass)
+
+    @classmethod
+    def from_mixture(cls, mixture: Mixture, pose: Pose) -> 'Sheets':
+        """Convert a density in the site to second order; what is behind the surface is left out.
+
+        Raises ValueError if everything is behind.
+        """
+        positions = pose.to_surface(mixture.means[:, :3])
+        mixture = select(mixture, _in_front(positions))
+        points = to_polar(positions[positions[:, 0] > 0])
+        sheets = cls._converted(mixture, points, polar_derivative(points) @ pose.rotation.T)
+        # The second derivative of the range is the projection across the line of sight over the
+        # range.
+        sight = jacobian(points)[:, :, 0]
+        across = (np.eye(3) - sight[:, :, None] * sight[:, None]) / points[:, :1, None]
+        longer_m, variance_m2 = _moments_of_square(
+            across, pose.covariances_to_surface(mixture.covariances[:, :3, :3]))
+        sheets.means[:, 0] += longer_m
+        sheets.covariances[:, 0, 0] += variance_m2
+        return sheets
+
+    @classmethod
+    def tangent(cls, mixture: Mixture, pose: Pose) -> 'Sheets':
+        """Bend a likelihood whose Gaussians touch their sheets at the maxima, and keep these.
+
+        Raises ValueError if a maximum is behind the surface.
+        """
+        positions = pose.to_surface(mixture.means)
+        if not _in_front(positions).all():
+            raise _behind(positions)
+        points = to_polar(positions)
+        sheets = cls._converted(mixture, points, polar_derivative(points) @ pose.rotation.T)
+        return sheets.weighted(mixture.log_peaks - sheets.log_peaks)
+
+    def to_mixture(self, pose: Pose) -> Mixture:
+        """Convert a density to the coordinates of the site, to second order."""
+        points, cosines = self.means[:, :3], self.means[:, 1:3]
+        mixture = Mixture._make(self._converted(
+            self, pose.to_site(to_positions(points)), pose.rotation @ jacobian(points)))
+        # Of the position, only x = r (1 - u^2 - v^2)^(1/2) is curved in u and v.
+        w = np.sqrt(np.maximum(1 - np.sum(cosines**2, axis=1), _LIMITS.cosine**2))[:, None, None]
+        bending = -points[:, :1, None] * (
+            np.eye(2) / w + cosines[:, :, None] * cosines[:, None, :] / w**3)
+        shift_m, variance_m2 = _moments_of_square(bending, self.covariances[:, 1:3, 1:3])
+        outward = pose.rotation[:, 0]
+        mixture.means[:, :3] += shift_m[:, None] * outward
+        mixture.covariances[:, :3, :3] += variance_m2[:, None, None] * np.outer(outward, outward)
+        return mixture
+
+    @classmethod
+    def _converted(cls, mixture: Mixture, points: np.ndarray, derivative: np.ndarray) -> 'Sheets':
+        """Replace the first three coordinates, which have the given derivative, [C, 3, 3]."""
+        means, covariances = mixture.means.copy(), mixture.covariances.copy()
+        means[:, :3] = points
+        covariances[:, :3] = derivative @ covariances[:, :3]
+        covariances[:, :, :3] = covariances[:, :, :3] @ np.swapaxes(derivative, 1, 2)
+        return cls._make((mixture.log_weights, means, covariances))
+
+    def as_density(self) -> 'Sheets':
+        """Return the density of r, u and v for a uniform prior on the positions."""
+        return self.weighted(np.log(np.linalg.det(jacobian(self.means))))
+
+    def inside(self, bounds: np.ndarray, pose: Pose | None = None) -> 'Inside':
+        """Restrict the first three coordinates to a region; see `Inside`."""
+        precision = np.linalg.inv(self.covariances[:, :3, :3])
+        positions = to_positions(self.means[:, :3])
+        points = _polar(np.clip(
+            positions if pose is None else pose.to_site(positions), *bounds), pose)
+        offsets = self.means[:, :3] - points
+        log_values = self.position().log_peaks - likelihood_loss(offsets, precision)
+        return Inside.of(points, np.matmul(precision, offsets[..., None])[..., 0], precision,
+                         bounds, pose, log_values)
+
+
+def _in_front(positions: np.ndarray) -> np.ndarray:
+    """Mark positions [C, 3] in front of the surface; raise ValueError if there is none."""
+    front: np.ndarray = positions[:, 0] > 0
+    if not front.any():
+        raise _behind(positions)
+    return front
+
+
+def _behind(positions: np.ndarray) -> ValueError:
+    return ValueError(f'mixture: means at x = {positions[:, 0].min():g} m in the frame of the '
+                      'surface, expected positive x')
+
+
+def _moments_of_square(matrices: np.ndarray, covariances: np.ndarray
+                       ) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and variance, [C], of d^T H d / 2 for Gaussian d of covariance [C, n, n]."""
+    product = matrices @ covariances
+    return (np.trace(product, axis1=1, axis2=2) / 2,
+            np.einsum('cpq,cqp->c', product, product) / 2)
+
+
+class Inside(NamedTuple):
+    """M Gaussians ``exp(a + g^T d - d^T C d / 2)`` of offsets d in (r, u, v), in a region.
+
+    Positions and the region are in the frame of the surface or, with its pose, of the site.
+    """
+
+    pose: Pose | None
+    log_values: np.ndarray  # a, float64 [M].
     points: np.ndarray  # (r [m], u, v), float64 [M, 3].
     gradient: np.ndarray  # g, float64 [M, 3].
     curvature: np.ndarray  # C, float64 [M, 3, 3].
     order: np.ndarray  # Axes in the order of their choice, int [M, 3].
-    low_m: np.ndarray  # Limits of the axes in this order, float64 [M, 3].
+    low_m: np.ndarray  # Limits of the axes from the surface, in this order, float64 [M, 3].
     high_m: np.ndarray
     centre_m: np.ndarray  # Unrestricted maximum, in this order, float64 [M, 3].
     precision: np.ndarray  # Inverse of the covariance, in this order, float64 [M, 3, 3] [1/m^2].
@@ -68,9 +222,18 @@ class Restricted(NamedTuple):
 
     @classmethod
     def of(cls, points: np.ndarray, gradient: np.ndarray, curvature: np.ndarray,
-           bounds: np.ndarray) -> 'Restricted':
-        """Restrict Gaussians with gradient [M, 3] and curvature [M, 3, 3] to bounds [2, 3] [m]."""
+           bounds: np.ndarray, pose: Pose | None = None, log_values: np.ndarray | None = None
+           ) -> 'Inside':
+        """Restrict Gaussians to the region between the bounds [2, 3] [m].
+
+        Takes the first four fields; `log_values` are 0 by default.
+        """
+        if log_values is None:
+            log_values = np.zeros(len(points))
         positions, derivative = to_positions(points), polar_derivative(points)
+        if pose is not None:
+            positions, derivative = pose.vectors_to_site(positions), derivative @ pose.rotation.T
+            bounds = bounds - pose.origin
         transposed = np.swapaxes(derivative, 1, 2)
         extent = bounds[1] - bounds[0]
         # Metres per unit of r, u and v.
@@ -89,21 +252,21 @@ class Restricted(NamedTuple):
         rows = np.arange(len(points))[:, None]
         low, high = bounds
         return cls._in_order(
-            points, gradient, curvature, order, low[order], high[order], centre[rows, order],
+            (pose, log_values, points, gradient, curvature), order, low[order], high[order],
+            centre[rows, order],
             precision[rows[..., None], order[:, :, None], order[:, None]],
             derivative[:, 0][rows, order])
 
     @classmethod
     def _in_order(
-            cls, points: np.ndarray, gradient: np.ndarray, curvature: np.ndarray,
-            order: np.ndarray, low: np.ndarray, high: np.ndarray, centre: np.ndarray,
-            precision: np.ndarray, direction: np.ndarray) -> 'Restricted':
+            cls, gaussians: tuple[Any, ...], order: np.ndarray, low: np.ndarray, high: np.ndarray,
+            centre: np.ndarray, precision: np.ndarray, direction: np.ndarray) -> 'Inside':
         # With the axes reversed, the Cholesky factor contains the conditional distributions.
         root = np.linalg.cholesky(precision[:, ::-1, ::-1])[:, ::-1, ::-1]
         std = 1 / np.diagonal(root, axis1=1, axis2=2)
         coupling = np.swapaxes(root, 1, 2) * std[:, :, None]
-        return cls(points, gradient, curvature, order, low, high, centre, precision, std,
-                   coupling, direction)
+        return cls._make((*gaussians, order, low, high, centre, precision, std, coupling,
+                          direction))
 
     def nearest(self) -> np.ndarray:
         """Return the most likely position of each Gaussian in the region, float64 [M, 3] [m]."""
@@ -116,18 +279,26 @@ class Restricted(NamedTuple):
         (ends,) = np.nonzero((last == self.low_m[:, 2]) | (last == self.high_m[:, 2]))
         if len(ends):
             # The other axes may compensate for a limit of the last one.
-            fixed = select(self, ends)._at_end(last[ends])
+            fixed = self.rows(ends)._at_end(last[ends])
             positions[ends] = fixed._positions(clipped, 1)[..., 0].T
-        return positions
+        return self._placed(positions)
 
-    def _at_end(self, last_m: np.ndarray) -> 'Restricted':
+    def rows(self, chosen: np.ndarray) -> 'Inside':
+        """Return the Gaussians with these indices or in a mask."""
+        return self._replace(**{name: field[chosen] for name, field in self._asdict().items()
+                               if name != 'pose'})
+
+    def _placed(self, positions: np.ndarray) -> np.ndarray:
+        return positions if self.pose is None else positions + self.pose.origin
+
+    def _at_end(self, last_m: np.ndarray) -> 'Inside':
         """Give the last axis a single value, [M] [m], and choose it first."""
         turn = [2, 0, 1]
         low, high = self.low_m[:, turn], self.high_m[:, turn]
         low[:, 0] = high[:, 0] = last_m
         return self._in_order(
-            self.points, self.gradient, self.curvature, self.order[:, turn], low, high,
-            self.centre_m[:, turn], self.precision[:, turn][:, :, turn], self.direction[:, turn])
+            self[:5], self.order[:, turn], low, high, self.centre_m[:, turn],
+            self.precision[:, turn][:, :, turn], self.direction[:, turn])
 
     def sample(self, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Draw samples in the region, which represent `normal`, points of a Gaussian [S, 3].
@@ -153,7 +324,7 @@ class Restricted(NamedTuple):
             share = (high_m - low_m)[two_sided] / (self.high_m - self.low_m)[two_sided, 2:]
             log_ratio[two_sided] = np.log(2 * share)
         positions = self._positions(truncated, len(normal), sides)
-        return np.moveaxis(positions, 0, 2), log_ratio
+        return self._placed(np.moveaxis(positions, 0, 2)), log_ratio
 
     def _is_two_sided(self) -> np.ndarray:
         """Mark Gaussians with samples on either side of the last axis' zero, bool [M].
@@ -169,9 +340,11 @@ class Restricted(NamedTuple):
         rows = np.flatnonzero(found)
         if len(rows):
             far_side = to_positions(self.points[rows])
+            if self.pose is not None:
+                far_side = self.pose.vectors_to_site(far_side)
             far_side[np.arange(len(rows)), axis[rows]] *= -1
-            likelihood = select(self, rows).logarithm(far_side[:, None])[:, 0]
-            found[rows] = likelihood > -_LIMITS.far_side
+            likelihood = self.rows(rows).logarithm(self._placed(far_side)[:, None])[:, 0]
+            found[rows] = likelihood - self.log_values[rows] > -_LIMITS.far_side
         return found
 
     def _side_limits(self, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -186,10 +359,13 @@ class Restricted(NamedTuple):
 
     def logarithm(self, positions: np.ndarray) -> np.ndarray:
         """Evaluate the logarithms of the Gaussians at positions [M, S, 3] [m], float64 [M, S]."""
+        if self.pose is not None:
+            positions = self.pose.to_surface(positions)
         # Contiguous coordinates make these operations several times as fast.
         range_m = np.sqrt(np.sum(np.moveaxis(positions, 2, 0)**2, axis=0))
         offsets = [range_m, positions[..., 1] / range_m, positions[..., 2] / range_m]
-        total = np.zeros_like(range_m)
+        total = np.empty_like(range_m)
+        total[:] = self.log_values[:, None]
         for first in range(3):
             offsets[first] -= self.points[:, first, None]
             slope = self.gradient[:, first, None] - self.curvature[:, first, first, None] / 2 * (
@@ -197,7 +373,8 @@ class Restricted(NamedTuple):
             for second in range(first):
                 slope -= self.curvature[:, first, second, None] * offsets[second]
             total += slope * offsets[first]
-        return total
+        # No user behind the surface is in sight.
+        return total if self.pose is None else np.where(positions[..., 0] > 0, total, -np.inf)
 
     def _positions(self, choose: _Choice, n: int, sides: np.ndarray | None = None) -> np.ndarray:
         """Choose n positions for each Gaussian, axis by axis, float64 [3, M, n] [m].
@@ -244,17 +421,23 @@ class Restricted(NamedTuple):
         return mean + by_range / total * (on_sphere - mean), 1 / np.sqrt(total)
 
 
-def move_inside(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+def move_inside(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,
+                pose: Pose | None = None) -> np.ndarray:
     """Return the most likely points inside the region for Gaussians around points [M, 3]."""
-    moved = points.copy()
-    positions = to_positions(points)
+    positions = to_positions(points) if pose is None else pose.to_site(to_positions(points))
     (outside,) = np.nonzero(((positions < bounds[0]) | (positions > bounds[1])).any(axis=1))
+    moved = points.copy()
     if len(outside):
-        start = to_polar(np.clip(positions[outside], *bounds))
+        start = _polar(np.clip(positions[outside], *bounds), pose)
         curvature = curvature[outside]
         gradient = np.matmul(curvature, (points[outside] - start)[..., None])[..., 0]
-        moved[outside] = to_polar(Restricted.of(start, gradient, curvature, bounds).nearest())
+        moved[outside] = _polar(
+            Inside.of(start, gradient, curvature, bounds, pose).nearest(), pose)
     return moved
+
+
+def _polar(positions: np.ndarray, pose: Pose | None) -> np.ndarray:
+    return to_polar(positions if pose is None else pose.to_surface(positions))
 
 
 def _truncated(normal: np.ndarray, low: np.ndarray, high: np.ndarray
