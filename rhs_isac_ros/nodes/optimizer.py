@@ -119,9 +119,10 @@ class OptimizerNode(RoleNode[Holder]):
         try:
             self._codebook.check(self.scenario)
         except CodebookError as error:
+            scenario = self.values.scenario_file or self.values.system_file or 'Table I'
             raise CodebookError(
                 f'codebook_file: {str(file or default_codebook_file())!r} does not fit '
-                f'scenario_file {self.values.scenario_file or "Table I"!r}: {error}; set '
+                f'scenario_file {scenario!r}: {error}; set '
                 'codebook_file (codebook:= of a launch) to a codebook of this scenario') from None
         # In a file of an earlier version, the provenance differs and the id may be missing.
         super().set_parameters_atomically(ros_parameters(self._codebook.to_parameters()))

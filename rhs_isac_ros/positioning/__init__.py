@@ -30,7 +30,7 @@ The modules, in reading order:
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
@@ -100,13 +100,13 @@ class EstimatorKind:
     """
 
     def __init__(self, name: str) -> None:
-        self.name, made, self._is_plugin = name, ESTIMATORS.get(name), name not in ESTIMATORS
-        if self._is_plugin:
-            if name not in (installed := plugins.names(plugins.ESTIMATORS)):
-                raise ValueError(
-                    f'estimator: {name!r}, expected one of {sorted({*ESTIMATORS, *installed})}')
-            made = plugins.load(plugins.ESTIMATORS, name)
-        parameters = inspect.signature(cast('Callable[..., Estimator]', made)).parameters
+        self.name, self._is_plugin = name, name not in ESTIMATORS
+        if self._is_plugin and name not in (installed := plugins.names(plugins.ESTIMATORS)):
+            raise ValueError(
+                f'estimator: {name!r}, expected one of {sorted({*ESTIMATORS, *installed})}')
+        made: Any = (plugins.load(plugins.ESTIMATORS, name) if self._is_plugin
+                     else ESTIMATORS[name])
+        parameters = inspect.signature(made).parameters
         #: Names of the options; a plug-in with ``**options`` takes any others as well.
         self.options = {*parameters} - {'system', 'scenario', 'codebook'}
         self.takes_any = any(one.kind is one.VAR_KEYWORD for one in parameters.values())

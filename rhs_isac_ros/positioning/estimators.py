@@ -157,11 +157,11 @@ class SearchEstimator(abc.ABC):
     @functools.cached_property
     def _region(self) -> Scope:
         """The whole region."""
-        scenario, arrays = self.scenario, self._load(outside=self._rejects_outside)
-        scope = Scope.of(self._likelihood, arrays, lay_grid(scenario))
+        scenario = self.scenario
+        scope = Scope.of(self._likelihood, self._load(), lay_grid(scenario))
         if self._rejects_outside:
-            scope = scope._replace(
-                alternatives=[Outside(scenario, arrays), *scope.alternatives])
+            outside = Outside(scenario, self._load(outside=True))
+            scope = scope._replace(alternatives=[outside, *scope.alternatives])
         if self.averages and self._exact_likelihood:
             scope = scope._replace(drawn=DrawnPosterior(scenario, scope.table))
         return scope

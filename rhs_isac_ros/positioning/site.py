@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from rhs_isac_ros.bounds import site_crlb
 from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.positioning.agreement import Pair, pair_agreements
 from rhs_isac_ros.positioning.estimate import SITE, Estimate, Sighting, SignalError
@@ -95,10 +94,6 @@ class Site:
         """
         return {name: one.sample(one.pose.to_surface(positions), rng)
                 for name, one in self.surfaces.items()}
-
-    def crlb(self, positions: np.ndarray) -> np.ndarray:
-        """Compute the Cramer-Rao bound at positions [N, 3] [m]; see `site_crlb`."""
-        return site_crlb(self.surfaces.values(), positions)
 
 
 class SiteEstimator:

@@ -1,7 +1,6 @@
 """Tables on disk: computed once for a system, then mapped into memory."""
 
 import contextlib
-import functools
 import hashlib
 import os
 import tokenize
@@ -42,37 +41,24 @@ def load_table(system: System, folder: Path | None = None,
                ) -> Mapping[str, np.ndarray]:
     """Load the table of a system from a folder, or compute it and store it there.
 
-    The result contains the arrays of `tabulate` and, if `outside`, those of `tabulate_outside`,
-    which have a file of their own. If they come from a folder, they are read-only and mapped into
-    memory. Without a folder, or with a `RuntimeWarning` if the folder cannot be written, the table
-    is kept only in memory. During the computation, `progress` is called with the completed share.
+    The result contains the arrays of `tabulate` or, if `outside`, those of `tabulate_outside`. If
+    they come from a folder, they are read-only and mapped into memory. Without a folder, or with a
+    `RuntimeWarning` if the folder cannot be written, the table is kept only in memory. During the
+    computation, `progress` is called with the completed share.
     """
-    parts = {'': templates.tabulate} | (
-        {'-outside': alternatives.tabulate_outside} if outside else {})
-    table: dict[str, np.ndarray] = {}
-    for number, (suffix, tabulate) in enumerate(parts.items()):
-        def report(share: float, number: int = number) -> None:
-            if progress:
-                progress((number + share) / len(parts))
-        table |= _load(functools.partial(tabulate, system, report), table_key(system), suffix,
-                       folder)
-    return table
-
-
-def _load(compute: Callable[[], dict[str, np.ndarray]], key: str, suffix: str,
-          folder: Path | None) -> Mapping[str, np.ndarray]:
-    """Load a part of a table, whose file has a name with a suffix, or compute and store it."""
+    tabulate = alternatives.tabulate_outside if outside else templates.tabulate
     if folder is None:
-        return compute()
-    path = folder / f'{_PREFIX}{key}{suffix}.npy'
+        return tabulate(system, progress)
+    key = table_key(system)
+    path = folder / f'{_PREFIX}{key}{"-outside" if outside else ""}.npy'
     table = _read(path, key)
     if table is not None:
         return table
-    table = compute()
+    table = tabulate(system, progress)
     try:
         _write(path, key, table)
     except OSError as error:
-        warnings.warn(f'the table cannot be stored: {error}', RuntimeWarning, stacklevel=3)
+        warnings.warn(f'the table cannot be stored: {error}', RuntimeWarning, stacklevel=2)
     return _read(path, key) or table
 
 

@@ -119,9 +119,9 @@ def test_estimators_are_compared(tmp_path, monkeypatch, capsys):
         'roi_center_m: [2.0, 0.0, 0.0]\nroi_size_m: [1.0, 1.0, 1.0]\n')
     scenario = Scenario.from_yaml(tmp_path / 'my.yaml')
     random_codebook(scenario, np.random.default_rng(0)).save(tmp_path / 'codebook.yaml')
+    (tmp_path / 'system.yaml').write_text('scenario: my.yaml\ncodebook: codebook.yaml\n')
     script = EXAMPLES / 'compare_estimators.py'
-    monkeypatch.setattr(sys, 'argv', [
-        str(script), str(tmp_path / 'my.yaml'), str(tmp_path / 'codebook.yaml'), 'ml'])
+    monkeypatch.setattr(sys, 'argv', [str(script), str(tmp_path / 'system.yaml'), 'ml'])
     # Fifty positions suffice to run the script.
     exec(script.read_text(encoding='utf-8').replace('1000', '50'), {})
     name, error, unit = capsys.readouterr().out.split()

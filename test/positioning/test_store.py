@@ -72,9 +72,9 @@ def test_a_table_is_computed_once_and_then_mapped(tmp_path, system, computed):
 def test_the_table_of_users_outside_is_computed_when_it_is_used(tmp_path, system, computed):
     load_table(system, tmp_path)
     for _ in range(2):
-        both = load_table(system, tmp_path, outside=True)
+        outside = load_table(system, tmp_path, outside=True)
     assert computed == [system.codebook.id]
-    assert_same(both, system, templates.tabulate(system) | tabulate_outside(system))
+    assert_same(outside, system, tabulate_outside(system))
     assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -173,6 +173,6 @@ def test_a_user_without_a_home_directory_has_no_default_folder(monkeypatch):
 def test_the_progress_of_a_table_is_reported_up_to_the_end(system, tmp_path):
     shares = []
     for _ in range(2):
-        load_table(system, tmp_path, shares.append, outside=True)
-    # Templates inside and outside of the region; a stored table takes no time.
-    assert shares == [0.5, 1.0]
+        load_table(system, tmp_path, shares.append)
+    # A stored table takes no time.
+    assert shares == [1.0]
