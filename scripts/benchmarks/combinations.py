@@ -198,7 +198,7 @@ class OneSurface:
             self._tracker.estimator = look.estimator
             found = with_prior(self._tracker.update, prior)(time_s, look.signals)
         else:
-            found = look.estimator.posterior(look.signals, prior).estimate
+            found = look.estimator.posterior(look.signals, prior)
         return found.to_site(self._surface.scenario.pose)
 
 
@@ -223,11 +223,11 @@ class SeveralSurfaces:
             return Estimate.without_fix('no surface has a position')
         if prior:
             sightings.append(Sighting(Pose(), prior))
-        mixture = fuse(sightings, self._bounds_m).mixture
+        fused = fuse(sightings, self._bounds_m)
         if not self._tracker:
-            return Estimate(*mixture.moments())
+            return fused
         missing = float(np.prod([one.missing for one in sightings]))
-        tracked = self._tracker.update(time_s, mixture, missing)
+        tracked = self._tracker.update(time_s, fused.mixture, missing)
         return tracked or Estimate.without_fix('late')
 
 
