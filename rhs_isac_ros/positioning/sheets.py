@@ -41,6 +41,11 @@ class _Limits(NamedTuple):
     distant: float = 5.0
     # Width of an interval below which the density in it is constant.
     constant: float = 1e-4
+    # Share of the whole precision of an axis that counts like that of the range in its order.
+    least: float = 1e-6
+    # Standard deviation across the line of sight, relative to the diagonal of the region, above
+    # which a plane does not approximate the sphere.
+    wide: float = 0.5
     # Distance between both sides of the last axis on the sphere from which they are separate, and
     # decrease of the log-likelihood up to which the far side counts.
     separate: float = 1.0
@@ -247,9 +252,16 @@ class Inside(NamedTuple):
             12 * _LIMITS.floor / np.maximum(extent, _LIMITS.extent * extent.max())**2)
         centre = positions + step_to_maximum(
             precision, np.matmul(transposed, gradient[..., None])[..., 0])
-        freedom = extent * np.sqrt(np.diagonal(precision, axis1=1, axis2=2))
-        order = np.argsort(untied(freedom), axis=1, kind='stable')
+        known = np.diagonal(precision, axis1=1, axis2=2)
+        order = np.argsort(untied(extent * np.sqrt(known)), axis=1, kind='stable')
         rows = np.arange(len(points))[:, None]
+        wide = _is_wide(points, curvature, extent)
+        if wide.any():
+            # The last axis follows the sphere, even if directions determine another better.
+            by_range = curvature[:, :1, 0] * derivative[:, 0]**2 + _LIMITS.least * known
+            last = np.argmax(untied(extent * np.sqrt(by_range)), axis=1)
+            kept = order != last[:, None]
+            order[wide] = np.column_stack([order[kept].reshape(-1, 2), last])[wide]
         low, high = bounds
         return cls._in_order(
             (pose, log_values, points, gradient, curvature), order, low[order], high[order],
@@ -418,7 +430,44 @@ class Inside(NamedTuple):
         on_sphere = np.copysign(np.sqrt(rest_m2), last)
         if sides is not None:
             on_sphere = np.where(sides < 0, -on_sphere, on_sphere)
-        return mean + by_range / total * (on_sphere - mean), 1 / np.sqrt(total)
+        mean, std = mean + by_range / total * (on_sphere - mean), 1 / np.sqrt(total)
+        wide = _is_wide(self.points, self.curvature, self.high_m - self.low_m)
+        if wide.any():
+            mean[wide], std[wide] = self.rows(wide)._along(chosen[:, wide], mean[wide])
+        return mean, std
+
+    def _along(self, chosen: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and standard deviation of the last axis near values of it, [M, n].
+
+        They follow from the derivatives of range and directions at these values.
+        """
+        rotation = np.eye(3) if self.pose is None else self.pose.rotation
+        positions, rows = np.empty((3, *last.shape)), np.arange(len(last))
+        for axis, values in enumerate((*chosen[:2], last)):
+            positions[self.order[:, axis], rows] = values
+        sight, along = np.einsum('ba,bmn->amn', rotation, positions), rotation[self.order[:, 2]].T
+        range_m = np.sqrt(np.sum(sight**2, axis=0))
+        sight /= range_m
+        slope = np.einsum('am,amn->mn', along, sight)
+        slopes = np.stack([slope, *((along[1:, :, None] - sight[1:] * slope) / range_m)])
+        offsets = np.stack([range_m, *sight[1:]]) - self.points.T[..., None]
+        through = np.einsum('mij,jmn->imn', self.curvature, slopes)
+        information = np.maximum(np.sum(slopes * through, axis=0), np.finfo(float).tiny)
+        gradient = np.einsum('mi,imn->mn', self.gradient, slopes) - np.sum(
+            through * offsets, axis=0)
+        return last + gradient / information, 1 / np.sqrt(information)
+
+
+def _is_wide(points: np.ndarray, curvature: np.ndarray, extent: np.ndarray) -> np.ndarray:
+    """Mark Gaussians, one of whose directions is hardly determined within the region, bool [M].
+
+    This is so for a board with a single row or column of elements. The region then contains a
+    large part of the sphere, which no plane approximates.
+    """
+    least = np.diagonal(curvature, axis1=1, axis2=2)[:, 1:].min(axis=1)
+    limit_m2 = _LIMITS.wide**2 * np.sum(np.atleast_2d(extent)**2, axis=1)
+    wide: np.ndarray = points[:, 0]**2 > limit_m2 * least
+    return wide
 
 
 def move_inside(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,

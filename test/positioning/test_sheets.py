@@ -148,3 +148,19 @@ def test_axes_that_are_equally_wide_are_chosen_in_their_order_whatever_the_round
         curvature = np.diag([1e4, 3e2 * (1 + rounding), 3e2])[None]
         order = Inside.of(centre, np.zeros((1, 3)), curvature, bounds).order
         assert order.tolist() == [[1, 2, 0]]
+
+
+@pytest.mark.parametrize('cosine', [-0.32, 0.0, 0.1])
+def test_samples_follow_the_sphere_where_a_direction_is_unknown(cosine):
+    """A row of elements does not see the height, so any height in the region is as likely."""
+    bounds = np.array([[2.5, -1.5, -1.0], [5.5, 1.5, 1.0]])
+    point = np.array([[2.83, -0.29, cosine]])
+    gaussian = Inside.of(
+        point, np.zeros((1, 3)), np.diag(np.array([1.5e-4, 3e-4, 2.0])**-2)[None], bounds)
+    positions, log_ratio = gaussian.sample(standard_normal(128))
+    logarithm = gaussian.logarithm(positions) + log_ratio
+    weights = np.exp(logarithm - logarithm.max())
+    assert np.sum(weights)**2 / np.sum(weights**2) > 0.9 * 128
+    heights = positions[0, :, 2]
+    assert np.average(heights, weights=weights[0]) == pytest.approx(0, abs=0.1)
+    assert np.average(heights**2, weights=weights[0]) == pytest.approx(1 / 3, rel=0.1)
