@@ -111,14 +111,18 @@ class Pose:
         return self.rotation.T @ covariances @ self.rotation
 
     def spread(self, positions: np.ndarray) -> np.ndarray:
-        """Return the covariances that the pose adds to positions, float64 [N, 3, 3] [m^2].
+        """Return the covariances that the pose adds to positions, float64 [..., 3, 3] [m^2].
 
-        The positions, float64 [N, 3] [m], and the covariances are in the frame of the site.
+        The positions, float64 [..., 3] [m], and the covariances are in the frame of the site.
         """
-        by_error = np.concatenate(
-            [np.broadcast_to(np.eye(3), (len(positions), 3, 3)),
-             -_cross_matrices(positions - self.origin)], axis=2)
-        return by_error @ self.covariance @ np.swapaxes(by_error, 1, 2)
+        turns = -_cross_matrices(positions - self.origin)
+        by_error = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=-1)
+        return by_error @ self.covariance @ np.swapaxes(by_error, -1, -2)
+
+    def spread_of_vectors(self, vectors: np.ndarray) -> np.ndarray:
+        """Return the covariances that the pose adds to vectors [..., 3], such as velocities."""
+        turns = _cross_matrices(vectors)
+        return turns @ self.covariance[3:, 3:] @ np.swapaxes(turns, -1, -2)
 
     def displaced(self, error: ArrayLike) -> 'Pose':
         """Return the pose after an error: a shift [m] and a rotation vector [rad], [6]."""
@@ -168,8 +172,8 @@ def quaternion_product(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
-    """Return the matrices [N, 3, 3] whose products with a vector are cross products."""
-    return np.cross(vectors[:, None], np.eye(3)).swapaxes(1, 2)
+    """Return the matrices [..., 3, 3] whose products with a vector are cross products."""
+    return np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
 
 
 def _check_covariance(name: str, matrix: np.ndarray) -> None:

@@ -173,12 +173,23 @@ class Estimate:
         return np.isfinite(self.mean).all(axis=-1)
 
     def to_site(self, pose: Pose) -> 'Estimate':
-        """Convert from the frame of a surface with the given pose to that of the site."""
+        """Convert from the frame of a surface to that of the site, with the errors of its pose.
+
+        The errors also widen the `mixture`.
+        """
+        if isinstance(self.reason, tuple):
+            return self.of_each([self[n].to_site(pose) for n in range(len(self.reason))], SITE)
+        mean, velocity = pose.to_site(self.mean), pose.vectors_to_site(self.velocity)
+        spread = pose.spread(mean)
+
+        def widened() -> Mixture:
+            assert self.mixture is not None
+            return self.mixture.shared(spread)
         return dataclasses.replace(
-            self, mean=pose.to_site(self.mean),
-            covariance=pose.covariances_to_site(self.covariance),
-            velocity=pose.vectors_to_site(self.velocity),
-            velocity_covariance=pose.covariances_to_site(self.velocity_covariance), frame=SITE)
+            self, mean=mean, covariance=pose.covariances_to_site(self.covariance) + spread,
+            velocity=velocity, velocity_covariance=pose.covariances_to_site(
+                self.velocity_covariance) + pose.spread_of_vectors(velocity),
+            density=self.density and widened, frame=SITE)
 
 
 # Fields of an estimate that are no numbers.

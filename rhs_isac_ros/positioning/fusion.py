@@ -60,6 +60,8 @@ class _Limits(NamedTuple):
     effective: float = 0.4
     tempered: float = 0.15
     rounds: int = 8
+    # Largest share of a variance that is the same in all phases.
+    constant: float = 0.98
     # Logarithm of a likelihood of 0, and smallest standard deviation of samples [m].
     never: float = -1e9
     least_m: float = 1e-6
@@ -107,9 +109,10 @@ class Fuser:
 
     def _locate(self, sightings: tuple[Sighting, ...]) -> Estimate:
         factors = [self._factor(one) for one in sightings]
-        mixture = self._product(sightings).inside(factors, self._bounds_m)
-        log_agreement = mixture.log_mass
-        mixture = mixture.reduce(_LIMITS.products[1]).normalised()
+        products = self._product(sightings).inside(factors, self._bounds_m)
+        log_agreement, constant = products.moments.log_mass, products.constant(factors)
+        mixture = products.moments.widened(-constant).reduce(_LIMITS.products[1]).normalised()
+        mixture = mixture.shared(np.tensordot(products.moments.probabilities, constant, axes=1))
         return Estimate(*mixture.moments(), log_agreement=log_agreement, density=mixture,
                         frame=SITE)
 
@@ -249,8 +252,8 @@ class _Products(NamedTuple):
                 terms = list(zip(factors, self.rows[mine].T, strict=True))
                 yield mine, [terms.pop(number), *terms]
 
-    def inside(self, factors: Sequence[_Factor], bounds_m: np.ndarray) -> Mixture:
-        """Return averages over the region and moments of the products in it."""
+    def inside(self, factors: Sequence[_Factor], bounds_m: np.ndarray) -> '_Products':
+        """Return the products with averages over the region and moments in it."""
         found = self.select(~self.are_constant(factors))
         n = min(max(_LIMITS.samples // len(found.rows), 16), _LIMITS.of_product)
         normal = standard_normal(1 << (n.bit_length() - 1))
@@ -270,7 +273,24 @@ class _Products(NamedTuple):
                 again = mine[rows]
                 positions[again], logs[again] = _annealed(
                     [(one, which[rows]) for one, which in terms], bounds_m, normal)
-        return _moments(positions, logs)
+        return _Products(found.rows[_has_mass(logs)], _moments(positions, logs))
+
+    def constant(self, factors: Sequence[_Factor]) -> np.ndarray:
+        """Return the parts of the covariances that errors of poses cause, float64 [T, 3, 3] [m^2].
+
+        If a pose moves a sheet, the product moves by its own covariance times the information of
+        the sheet.
+        """
+        means, covariances = self.moments.means, self.moments.covariances
+        pulls = np.zeros_like(covariances)
+        for one, rows in zip(factors, self.rows.T, strict=True):
+            _, curvature = one.expanded(rows, means)
+            pulls += curvature @ one.pose.spread(means) @ curvature
+        # Where a product is no Gaussian, its covariance may exceed the inverse of the information.
+        roots = np.linalg.cholesky(covariances)
+        shares, axes = np.linalg.eigh(np.swapaxes(roots, 1, 2) @ pulls @ roots)
+        moves = roots @ axes * np.sqrt(np.clip(shares, 0.0, _LIMITS.constant))[:, None]
+        return moves @ np.swapaxes(moves, 1, 2)
 
 
 def _logarithm(terms: _Terms, positions: np.ndarray) -> np.ndarray:

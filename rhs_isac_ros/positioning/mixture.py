@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import log_sum, mixture_weights, numbers
+from rhs_isac_ros.model.arrays import log_sum, mixture_weights, numbers, read_only
 from rhs_isac_ros.model.gaussian import moments, symmetric
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.segments import concatenate, select
@@ -51,7 +51,9 @@ class Mixture(_Arrays):
         symmetric with positive eigenvalues. A log-weight may be -inf.
     """
 
-    __slots__ = ()
+    #: Part of the covariances of positions that errors cause that are nearly the same in all
+    #: phases, such as those of poses, float64 [3, 3] [m^2]; see `shared`.
+    constant_covariance: np.ndarray = read_only(np.zeros((3, 3)))
 
     def __new__(cls: type[_MixtureT], log_weights: np.ndarray, means: np.ndarray,
                 covariances: np.ndarray) -> _MixtureT:
@@ -106,6 +108,22 @@ class Mixture(_Arrays):
     def widened(self: _MixtureT, covariance: np.ndarray) -> _MixtureT:
         """Return the mixture after independent errors, [D, D] or [C, D, D]; the mass stays."""
         return self._replace(covariances=self.covariances + covariance)
+
+    def shared(self: _MixtureT, covariance: np.ndarray) -> _MixtureT:
+        """Return the mixture after errors of the position, [3, 3], that other phases share.
+
+        The result has this `constant_covariance`, which is lost in all further steps.
+        """
+        wider = np.zeros((self.means.shape[1],) * 2)
+        wider[:3, :3] = covariance
+        found = self.widened(wider)
+        found.constant_covariance = covariance
+        return found
+
+    @property
+    def fresh(self: _MixtureT) -> _MixtureT:
+        """The mixture without the errors that other phases share."""
+        return self.shared(-self.constant_covariance)
 
     def position(self: _MixtureT) -> _MixtureT:
         """Return the mixture of the position alone, D = 3."""

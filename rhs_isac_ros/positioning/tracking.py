@@ -161,31 +161,35 @@ class MixtureTracker:
     def update(self, time_s: float, likelihood: Mixture, missing: float) -> Estimate | None:
         """Return position and velocity after a phase; None if the phase is late.
 
+        The track is that of a position with the errors that are the same in all phases. Their
+        covariance, `Mixture.constant_covariance`, is part of the result but not of the track.
         `missing`, above 0 and below 1, is the probability that the likelihood does not contain the
         position. If a phase is late by more than `MAX_GAP_S`, the clock has been reset, and a new
         track begins. Raises ValueError if the time is not finite.
         """
         elapsed_s = finite('time_s', time_s) - self._time_s
+        constant = likelihood.constant_covariance
         if self._mixture is None or abs(elapsed_s) > MAX_GAP_S:
             self._mixture, self._time_s, self._n_phases = (
-                self._motion.start(likelihood), time_s, 1)
-            return self._described(self._mixture)
+                self._motion.start(likelihood.fresh), time_s, 1)
+            return self._described(self._mixture, constant)
         if elapsed_s <= 0:
             return None
         predicted = self._motion.predict(self._mixture, elapsed_s)
         share = independent_share(self._scenario, elapsed_s)
         if share < LIMITS.least_share:
-            return self._described(predicted)
+            return self._described(predicted, constant)
         predicted = predicted.or_within(
             self._centre_m, np.diag(self._size_m**2), LIMITS.loss_rate_hz * elapsed_s)
-        seen = predicted.product(likelihood.powered(share)).weighted(np.log1p(-missing))
+        seen = predicted.product(likelihood.fresh.powered(share)).weighted(np.log1p(-missing))
         unseen = predicted.weighted(np.log(missing) - np.log(self._size_m).sum())
         self._mixture = concatenate(seen, unseen).normalised().reduce(LIMITS.max_components)
         self._time_s = time_s
         self._n_phases += 1
-        return self._described(self._mixture)
+        return self._described(self._mixture, constant)
 
-    def _described(self, mixture: Mixture) -> Estimate:
+    def _described(self, mixture: Mixture, constant: np.ndarray) -> Estimate:
+        mixture = mixture.shared(constant)
         mean, covariance = mixture.moments()
         return Estimate(
             mean[:3], covariance[:3, :3], velocity=mean[3:],

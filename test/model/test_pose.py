@@ -104,6 +104,12 @@ def test_the_spread_is_the_covariance_of_displaced_positions():
                                slopes @ root @ root.T @ np.swapaxes(slopes, 1, 2), rtol=1e-6)
 
 
+def test_the_errors_of_a_pose_turn_velocities():
+    turned = Pose(uncertainty=np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 1e-4]))
+    np.testing.assert_allclose(turned.spread_of_vectors(np.array([2.0, 0.0, 0.0])),
+                               np.diag([0.0, 4e-4, 0.0]), atol=1e-12)
+
+
 def test_a_displaced_surface_turns_about_itself():
     error = np.array([0.1, 0.2, -0.3, 0.0, 0.0, np.pi / 2])
     moved = TILTED.displaced(error)

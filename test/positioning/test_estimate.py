@@ -1,9 +1,12 @@
-"""Checks of received signals."""
+"""Estimates in the frame of the site, and checks of received signals."""
+
+import dataclasses
 
 import numpy as np
 import pytest
 
-from rhs_isac_ros.positioning import SignalError
+from rhs_isac_ros.model import Pose
+from rhs_isac_ros.positioning import Mixture, SignalError
 from rhs_isac_ros.positioning.estimate import Estimate, checked_received, estimate_each
 
 
@@ -22,6 +25,19 @@ def test_the_error_for_another_shape_names_field_shape_and_expectation(small, sh
         checked_received(small.codebook, np.zeros(shape))
     message = str(caught.value)
     assert message.startswith(f'received: shape {shape}, expected [N_B, N_SB F] = (1, 6)')
+
+
+def test_a_position_in_the_site_contains_the_errors_of_the_pose():
+    mixture = Mixture(np.zeros(2), [[9.0, 1.0, 0.0], [11.0, 1.0, 0.0]], [np.eye(3)] * 2)
+    found = Estimate(*mixture.moments(), density=mixture)
+    pose = Pose((1.0, 2.0, 0.0), (0.0, 0.0, 1.0, 1.0), (0.1, 1.0))
+    exact = dataclasses.replace(pose, uncertainty=(0.0, 0.0))
+    batch = Estimate.of_each([found, Estimate.without_fix('none')])
+    for placed in found.to_site(pose), batch.to_site(pose)[0]:
+        np.testing.assert_allclose(
+            placed.covariance, found.to_site(exact).covariance + pose.spread(placed.mean))
+        np.testing.assert_allclose(placed.mixture.moments()[1] - found.covariance,
+                                   pose.spread(placed.mean))
 
 
 def test_a_position_behind_the_surface_is_no_fix(small):

@@ -123,6 +123,25 @@ def test_an_uncertain_pose_widens_the_posterior_by_its_covariance():
     np.testing.assert_allclose(found.mixture.moments()[1] - alone, 0.09 * np.eye(3), atol=0.01)
 
 
+def test_the_constant_part_of_a_covariance_is_that_of_displaced_poses():
+    """To first order in the errors of both poses: the slopes are differences."""
+    one, other = (dataclasses.replace(pose, uncertainty=(0.02, 0.2)) for pose in (FRONT, SIDE))
+    seen = [sheets(pose, PLACE, std=STD / 100) for pose in (one, other)]
+
+    def displaced(sighting, error):
+        pose = sighting.pose.displaced(error)
+        return dataclasses.replace(
+            sighting, pose=pose, mixture=sighting.mixture.moved(sighting.pose, pose))
+
+    def mean(errors):
+        return fuse(list(map(displaced, seen, np.split(errors, 2))), BOUNDS).mean
+    slopes = np.stack([(mean(step) - mean(-step)) / 2e-3 for step in 1e-3 * np.eye(12)], axis=1)
+    constant = fuse(seen, BOUNDS).mixture.constant_covariance
+    np.testing.assert_allclose(
+        constant, slopes[:, :6] @ one.covariance @ slopes[:, :6].T
+        + slopes[:, 6:] @ other.covariance @ slopes[:, 6:].T, atol=0.1 * constant.max())
+
+
 def test_widening_keeps_the_weights_of_the_modes():
     # The modes are so far apart that they do not overlap. One is much narrower.
     front = sheets(FRONT, [PLACE, PLACE + [4.0, 0.0, 0.0]], np.log([0.3, 0.7]))

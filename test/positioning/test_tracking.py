@@ -416,6 +416,26 @@ def test_the_covariances_of_tracks_of_mixtures_match_their_errors():
     assert 1.5 < np.mean(squares) < 4.0
 
 
+def test_an_error_that_all_phases_share_is_counted_once():
+    """The result is that of conditioning on all phases together, for a user without turns."""
+    motion, std_m, shared_m, times_s = Motion(1.0, 1e9, 1e9), 0.1, 0.2, np.arange(8) / 4
+    tracker = MixtureTracker(Scenario(), Scenario().roi_bounds_m, motion)
+    seen = START + 0.1 * np.random.default_rng(8).standard_normal((len(times_s), 3))
+    for time_s, place in zip(times_s, seen, strict=True):
+        found = tracker.update(
+            time_s, likelihood(place).shared(shared_m**2 * np.eye(3)), MISSING)
+    # Along one axis: the position at the end, which may be anywhere, and the velocity.
+    slopes = np.column_stack([np.ones(len(times_s)), times_s - times_s[-1]])
+    errors = std_m**2 * np.eye(len(times_s)) + shared_m**2
+    information = slopes.T @ np.linalg.solve(errors, slopes) + np.diag(
+        [0.0, 1 / motion.velocity_variance])
+    joint = np.linalg.inv(information)
+    expected = joint @ slopes.T @ np.linalg.solve(errors, seen)
+    np.testing.assert_allclose(found.mean, expected[0], atol=0.003)
+    np.testing.assert_allclose(found.covariance, joint[0, 0] * np.eye(3), atol=0.001)
+    np.testing.assert_allclose(found.velocity_covariance, joint[1, 1] * np.eye(3), atol=0.001)
+
+
 def test_late_phases_do_not_change_a_track_of_mixtures(mixture_tracker):
     mixture_tracker.update(1.0, likelihood(START), MISSING)
     assert mixture_tracker.update(1.0, likelihood(PLACE[0]), MISSING) is None

@@ -78,7 +78,8 @@ def test_the_codebook_of_the_signals_selects_the_estimator(
         assert (estimate.cycle_id, estimate.user, estimate.codebook_id, estimate.estimator,
                 estimate.latency_s) == (5, 2, codebook.id, f'fixed {codebook.id}', 1.0)
         assert (estimate.position == PLACE).all()
-        assert (estimate.covariance_m2 == np.eye(3)).all()
+        np.testing.assert_allclose(
+            estimate.covariance_m2, np.eye(3) + scenario.pose.spread(PLACE), rtol=1e-12)
         assert estimate.crlb_m2 == pytest.approx(crlb(scenario, codebook, PLACE[None])[0])
 
 
