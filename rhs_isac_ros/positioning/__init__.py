@@ -25,7 +25,8 @@ The modules, in reading order:
 * `prior`: the update of a mixture with signals; `fusion`: several surfaces; `agreement`: surfaces
   whose pose is wrong; `alignment`: the pose of a surface from common users; `site`: the surfaces
   of a site in a file
-* `tracking`: moving users; `neural`: the paper's network; `store`: tables in files
+* `tracking`: moving users; `constant`: errors that are the same in all phases of a track
+* `neural`: the paper's network; `store`: tables in files
 """
 
 import inspect

@@ -13,8 +13,9 @@ import numpy as np
 from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.gaussian import share_of_level
-from rhs_isac_ros.model.geometry import to_positions
+from rhs_isac_ros.model.geometry import jacobian, to_positions
 from rhs_isac_ros.positioning.alternatives import Alternative, Blocked, Outside, rejection
+from rhs_isac_ros.positioning.constant import constant_shares
 from rhs_isac_ros.positioning.diagnosis import FitTest, misfit_log_ratio
 from rhs_isac_ros.positioning.draws import DrawnPosterior
 from rhs_isac_ros.positioning.estimate import (
@@ -191,7 +192,8 @@ class SearchEstimator(abc.ABC):
 
     @one_blas_thread
     def posterior(self, received: np.ndarray, prior: Mixture | None = None, *,
-                  wrong: float = WRONG, share: float = 1.0) -> Estimate:
+                  wrong: float = WRONG, share: float = 1.0, n_before: float = 0.0
+                  ) -> Estimate:
         """Estimate positions, and keep the posterior as a mixture; signals as in `estimate`.
 
         Without a prior, the position is that of `estimate`. The probabilities of users outside or
@@ -209,6 +211,9 @@ class SearchEstimator(abc.ABC):
             Probability that the prior does not hold, and the user is anywhere in the region.
         share
             Exponent of the likelihood with a mixture as prior; see `independent_share`.
+        n_before
+            Number of phases in the prior. If it is not 0, the prior is that of a position with the
+            errors that are the same in all phases; see `constant`.
         """
         signals = self._likelihood.signals(checked_received(self._likelihood.codebook, received))
         if prior is None:
@@ -216,7 +221,7 @@ class SearchEstimator(abc.ABC):
                      for one in self._locate_block(self._region, select(signals, block))]
         else:
             before = self.in_front(prior, wrong)
-            found = [self._update(select(signals, [n]), before, share)
+            found = [self._update(select(signals, [n]), before, share, n_before)
                      for n in range(len(signals.received))]
         return found[0] if np.ndim(received) == 2 else Estimate.of_each(found)
 
@@ -230,14 +235,17 @@ class SearchEstimator(abc.ABC):
             pose.to_site(self._bounds.mean(axis=0)),
             pose.covariances_to_site(np.diag(np.maximum(extent, MIN_EXTENT_M)**2)), wrong), pose)
 
-    def _update(self, signals: Signals, before: Sheets, share: float) -> Estimate:
+    def _update(self, signals: Signals, before: Sheets, share: float, n_before: float
+                ) -> Estimate:
         """Compute the posterior of one shot for a prior, whose last component is everywhere."""
+        constant = self.constant_shares if n_before else np.zeros(3)
         for scope in self._scopes(select(before, slice(-1))):
             (found,) = self._locate_block(scope, signals, draws=False)
             if found.modes is None or found.estimate.reason:
                 continue
             products = multiply(
-                before, found.modes, share, self._exact_likelihood, signals, self._bounds)
+                before, found.modes, share, self._exact_likelihood, signals, self._bounds,
+                constant, n_before)
             if not is_doubtful(products.energy / self._level, self._n_measurements):
                 break
         if found.modes is None or found.estimate.reason:
@@ -252,24 +260,42 @@ class SearchEstimator(abc.ABC):
             everywhere = uniform(found.modes.sheets(share), self._bounds).log_mass
             density = concatenate(density, before.weighted(everywhere + odds))
         return self.restricted(density.reduce(), dataclasses.replace(
-            estimate, see=found.see(), is_elsewhere=products.is_last))
+            estimate, see=found.see(), is_elsewhere=products.is_last),
+            self._constant(products.best, constant))
+
+    def _constant(self, sheet: Sheets, shares: np.ndarray) -> np.ndarray:
+        """Return the covariance of errors of elements in the site, float64 [3, 3] [m^2]."""
+        by_point = self.scenario.pose.rotation @ jacobian(sheet.means)[0] * np.sqrt(shares)
+        return by_point @ sheet.covariances[0] @ by_point.T
 
     def begin(self, estimate: Estimate) -> Mixture:
         """Return the posterior without a prior, from which a track begins."""
         assert estimate.sighting is not None and estimate.sighting.sheets is not None
-        density = uniform(estimate.sighting.sheets, self._bounds).normalised()
-        return density.to_mixture(self.scenario.pose)
+        sheets = estimate.sighting.sheets
+        best = select(sheets, [int(np.argmax(sheets.log_peaks))])
+        density = uniform(sheets.narrowed(self.constant_shares), self._bounds).normalised()
+        return density.to_mixture(self.scenario.pose).shared(
+            self._constant(best, self.constant_shares))
 
-    def restricted(self, density: Sheets, estimate: Estimate) -> Estimate:
-        """Return an estimate with the position and velocity of a density, in the region."""
+    @functools.cached_property
+    def constant_shares(self) -> np.ndarray:
+        """Shares of variances that are the same in all phases; see the function of this name."""
+        return constant_shares(self._likelihood.model)
+
+    def restricted(self, density: Sheets, estimate: Estimate, constant: np.ndarray) -> Estimate:
+        """Return an estimate with the position and velocity of a density, in the region.
+
+        `constant`, [3, 3] [m^2], is the covariance of further errors, which all phases share.
+        """
         density, mixture = inside(
             density, self._bounds, self.normal[:_LIMITS.narrow], self.scenario.pose)
+        mixture = mixture.shared(constant)
         mean, covariance = mixture.position().moments()
         pose = self.scenario.pose
         return dataclasses.replace(
             estimate, mean=pose.to_surface(mean),
             covariance=pose.covariances_to_surface(covariance), density=mixture,
-            unbounded=density.to_mixture(pose))
+            unbounded=density.to_mixture(pose).shared(constant))
 
     @abc.abstractmethod
     def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:

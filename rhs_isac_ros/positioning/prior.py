@@ -85,18 +85,21 @@ class Products(NamedTuple):
     #: Mahalanobis distance from its component.
     energy: float
     is_last: bool  #: Whether the heaviest product is that of the last component.
+    best: Sheets  #: The mode of the heaviest product, with all errors.
 
 
 def multiply(bent: Sheets, modes: Modes, share: float, likelihood: Likelihood | None,
-             signals: Signals, bounds_m: np.ndarray) -> Products:
+             signals: Signals, bounds_m: np.ndarray, constant: np.ndarray,
+             n_before: float = 0.0) -> Products:
     """Multiply a prior by the likelihood of the signals of one phase, N = 1.
 
     `likelihood`, if given, is evaluated at the heaviest products. Each component is also kept
     without an update, for an unlikely mode that the search may have missed; it is assumed to be as
     wide as the best mode. `share`, from 0 to 1, is an exponent of the likelihood: below 1 if
-    successive multipath is similar.
+    successive multipath is similar. `constant` and `n_before` are those of `Sheets.narrowed`.
     """
-    sheets = modes.sheets(share)
+    whole = modes.sheets(share)
+    sheets = whole.narrowed(constant, n_before)
     component, mode = bent.heaviest_pairs(sheets, _LIMITS.products)
     chosen = select(bent, component)
     found = chosen.updated(select(sheets, mode))
@@ -105,7 +108,8 @@ def multiply(bent: Sheets, modes: Modes, share: float, likelihood: Likelihood | 
         n = _LIMITS.exact
         before = select(chosen, slice(n))
         exact = before.updated(
-            _expanded(found.means[:n, :3], share, likelihood, signals))
+            _expanded(found.means[:n, :3], share, likelihood, signals).narrowed(
+                constant, n_before))
         found = concatenate(exact, select(found, slice(n, None)))
     # The best mode comes first.
     missed, _ = overlap(np.zeros(3), bent.covariances[:, :3, :3] + sheets.covariances[0])
@@ -114,7 +118,8 @@ def multiply(bent: Sheets, modes: Modes, share: float, likelihood: Likelihood | 
     energy = _energy(found.means[best, :3], select(bent, component[[best]]),
                      select(modes, mode[[best]]), bounds_m)
     return Products(concatenate(found, bent.weighted(missed)), energy,
-                    bool(component[best] == len(bent.log_weights) - 1))
+                    bool(component[best] == len(bent.log_weights) - 1),
+                    select(whole, mode[[best]]))
 
 
 def _energy(point: np.ndarray, component: Sheets, mode: Modes, bounds_m: np.ndarray) -> float:

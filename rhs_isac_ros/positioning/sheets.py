@@ -168,6 +168,18 @@ class Sheets(Mixture):
         covariances[:, :, :3] = covariances[:, :, :3] @ np.swapaxes(derivative, 1, 2)
         return cls._make((mixture.log_weights, means, covariances))
 
+    def narrowed(self, constant: np.ndarray, n_before: float = 0.0) -> 'Sheets':
+        """Return likelihoods of a position with the errors that are the same in all phases.
+
+        `constant`, float64 [3], contains their shares of the variances of r, u and v. The evidence
+        of a phase counts less, the more phases `n_before` there were, because these had the same
+        errors.
+        """
+        roots = np.sqrt(1 - constant)
+        sheets = self._replace(covariances=roots[:, None] * self.covariances * roots)
+        return sheets.weighted(
+            self.log_peaks / (1 + n_before * constant[0]) - sheets.log_peaks)
+
     def as_density(self) -> 'Sheets':
         """Return the density of r, u and v for a uniform prior on the positions."""
         return self.weighted(np.log(np.linalg.det(jacobian(self.means))))

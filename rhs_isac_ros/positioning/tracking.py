@@ -43,6 +43,8 @@ class Limits(NamedTuple):
     least_share: float = 0.25
     # Probability that the user is anywhere in the region although a prediction is far outside.
     elsewhere: float = 1e-12
+    # Distance over which errors of elements change, so that they favour other modes [m].
+    shared_m: float = 1.0
     # Maximum number of components of a track of mixtures, each of which meets all of a phase.
     max_components: int = 24
 
@@ -218,6 +220,9 @@ class Tracker:
         # Time of the mixture, and of the latest phase, which may not have changed it [s].
         self._time_s = self._latest_s = -np.inf
         self._n_phases = 0
+        # Covariance of errors that are the same in all phases, in the site. They are part of the
+        # position whose track the mixture is.
+        self._constant = np.zeros((3, 3))
 
     @one_blas_thread
     def update(self, time_s: float, received: np.ndarray) -> Estimate:
@@ -236,17 +241,24 @@ class Tracker:
             return self._alone(time_s, received)
         share = independent_share(self.estimator.scenario, elapsed_s)
         is_new = share >= LIMITS.least_share
-        predicted = self._motion.predict(self._mixture, elapsed_s)
+        # The evidence of phases with the same errors grows more slowly than their number.
+        distance = elapsed_s * self._motion.speed_mps / LIMITS.shared_m
+        n_before = min(self._n_phases, 1 / np.expm1(max(distance, 1e-6)))
+        shared = float(self.estimator.constant_shares[0])
+        predicted = self._motion.predict(self._mixture._replace(
+            log_weights=self._mixture.log_weights * (
+                1 - shared * min(n_before, 1.0) / (1 + n_before * shared))), elapsed_s)
         found = self.latest = self.estimator.posterior(
             received, predicted if is_new else None, share=share,
-            wrong=LIMITS.loss_rate_hz * elapsed_s)
+            wrong=LIMITS.loss_rate_hz * elapsed_s, n_before=n_before)
         if not found.fix:
             return self._predicted(time_s, found)
         self._latest_s = time_s
         if not is_new:
             return self._placed(found, predicted)
         assert isinstance(found.unbounded, Mixture)
-        self._mixture, self._time_s = found.unbounded, time_s
+        self._mixture, self._time_s = found.unbounded.fresh, time_s
+        self._constant = found.unbounded.constant_covariance
         self._n_phases += 1
         return self._described(found, self._mixture)
 
@@ -263,7 +275,8 @@ class Tracker:
         # The motion maps moments to moments, so those of one Gaussian are those of the mixture.
         mean, covariance = self._mixture.moments()
         gaussian = Mixture._make((np.zeros(1), mean[None], covariance[None]))
-        mean, covariance = self._motion.predict(gaussian, elapsed_s).position().moments()
+        predicted = self._motion.predict(gaussian, elapsed_s).shared(self._constant)
+        mean, covariance = predicted.position().moments()
         return pose.to_surface(mean), pose.covariances_to_surface(covariance)
 
     def _alone(self, time_s: float, received: np.ndarray) -> Estimate:
@@ -271,10 +284,11 @@ class Tracker:
         found = self.latest = self.estimator.posterior(received)
         if not found.fix:
             return self._predicted(time_s, found)
-        mixture = self._motion.start(self.estimator.begin(found))
+        begin = self.estimator.begin(found)
+        mixture = self._motion.start(begin.fresh)
         if time_s > self._latest_s:
             self._mixture, self._time_s, self._latest_s = mixture, time_s, time_s
-            self._n_phases = 1
+            self._n_phases, self._constant = 1, begin.constant_covariance
         return self._described(found, mixture, 1)
 
     def _predicted(self, time_s: float, found: Estimate) -> Estimate:
@@ -293,7 +307,7 @@ class Tracker:
     def _placed(self, found: Estimate, mixture: Mixture) -> Estimate:
         """Replace the position of an estimate by that of a mixture inside the region."""
         placed = self.estimator.restricted(
-            self.estimator.in_front(mixture, LIMITS.elsewhere), found)
+            self.estimator.in_front(mixture, LIMITS.elsewhere), found, self._constant)
         assert isinstance(placed.unbounded, Mixture)
         return self._described(placed, placed.unbounded)
 

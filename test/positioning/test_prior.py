@@ -108,7 +108,7 @@ def test_a_share_is_an_exponent_of_the_likelihood(share):
     curvature = np.diag(1 / np.array([0.1, 0.02, 0.03])**2)
     modes = Modes(np.zeros(1, int), point[None], np.zeros((1, 3)), curvature[None], np.zeros(1),
                   np.zeros((1, 0)), np.zeros(1), np.zeros(1, int))
-    found = multiply(before, modes, share, None, None, Scenario().roi_bounds_m).bent
+    found = multiply(before, modes, share, None, None, Scenario().roi_bounds_m, np.zeros(3)).bent
     precision = np.linalg.inv(before.covariances[0])
     covariance = np.linalg.inv(precision + share * curvature)
     np.testing.assert_allclose(found.covariances[0], covariance, atol=1e-12)
