@@ -38,6 +38,7 @@ from scipy.special import chdtri
 
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.library import EMPTY, Library
+from rhs_isac_ros.experiments.resampling import share_percent
 from rhs_isac_ros.frontend import Air, EmulatedRadio, Radio, WaveformRadio
 from rhs_isac_ros.model import Pose, Scenario, ScenarioError
 from rhs_isac_ros.model.mobility import RandomWalk
@@ -259,16 +260,18 @@ class Results(NamedTuple):
         squared = np.sum(errors**2, axis=1)
         traces = np.trace(covariances, axis1=1, axis2=2)
 
-        def share(flags: np.ndarray, chosen: np.ndarray) -> frame.Interval | None:
-            return frame.mean_interval(100.0 * flags[chosen], self.users[chosen])
+        def share(flags: np.ndarray, users: np.ndarray) -> frame.Interval | None:
+            # The cycles of a user are not independent.
+            n_users = len(np.unique(users))
+            return share_percent(float(flags.mean()) * n_users, n_users) if n_users else None
         ratio = frame.mean_interval(squared / traces.mean(), users) if len(users) else None
         return {
-            'in_region': frame.mean_interval(
-                100.0 * (squares <= chdtri(dimensions, 0.05)), users),
+            'in_region': share(squares <= chdtri(dimensions, 0.05), users),
             'nees': frame.mean_interval(squares, users),
             'dimensions': float(dimensions.mean()) if len(users) else None,
-            'mse_ratio': ratio, 'fix': share(fix, self.expected),
-            'wrong_fix': share(fix, ~self.expected), 'mse_m2': frame.mean_interval(squared, users),
+            'mse_ratio': ratio, 'fix': share(fix[self.expected], self.users[self.expected]),
+            'wrong_fix': share(fix[~self.expected], self.users[~self.expected]),
+            'mse_m2': frame.mean_interval(squared, users),
             'n': len(fix)}
 
 
