@@ -184,8 +184,9 @@ def _of_site(
     """
     found, parts = {}, {}
     for name, roles in networks(site.surfaces if site else ()):
-        surface = NodeSurface(site.surfaces[name or site.leader].scenario, site, base, name
-                      ) if site else _ALONE
+        surface = NodeSurface(
+            site.surfaces[name or site.leader].scenario, site=site, base=base, name=name
+        ) if site else _ALONE
         parts[name] = permissions(users, robots, is_simulated, surface, roles)
         found |= {(f'{base}/{name}'.rstrip('/'), node): allowed
                   for node, allowed in parts[name].items() if node != 'network'}

@@ -83,7 +83,7 @@ class SiteNetwork(Network):
     def _place(self, name):
         surface = '' if name == 'fusion' else name.rpartition('/')[0] or self.site.leader
         one = self.site.surfaces[surface or self.site.leader]
-        return NodeSurface(one.scenario, self.site, '', surface)
+        return NodeSurface(one.scenario, site=self.site, name=surface)
 
     def _codebook_of(self, name):
         return self.site.surfaces[self._place(name).name].codebook
