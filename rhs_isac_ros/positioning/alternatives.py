@@ -7,6 +7,7 @@ alternatives together, which is the decision with the least error, and if the pr
 alternative, compared with such a user alone, is within the limit of the alternative.
 """
 
+import copy
 import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple, TypeAlias
@@ -103,6 +104,10 @@ class Blocked:
             blocked += math.log(gain_db * NEPERS_PER_DB / prior.gain_unit)
         return blocked - (in_sight + residual) + prior.log_evidence_of_aligned(aligned)
 
+    def given(self, wrong: float) -> 'Blocked':
+        """Return the alternative; whether a user is in sight does not depend on a prior."""
+        return self
+
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether a plausible level explains signals up to this residual energy."""
         energy = float(np.sum(np.abs(whitened)**2))
@@ -164,7 +169,8 @@ class Outside:
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
         # Logarithm of the prior odds relative to a user inside and in sight.
-        self.log_odds = _log_odds(scenario.outside_probability)
+        self._probability = scenario.outside_probability
+        self.log_odds = _log_odds(self._probability)
         self._filters, self._index = arrays['outer_filters'], arrays['outer_index']
         ranges = _ranges(scenario)[:, None]
         self._scale = (2 / ranges).astype(np.float32)
@@ -173,6 +179,13 @@ class Outside:
         with np.errstate(divide='ignore'):
             log_prior = np.log(arrays['outer_weights'])
         self._offset = (log_prior - self._energy).astype(np.float32)
+
+    def given(self, wrong: float) -> 'Outside':
+        """Return the alternative for a prior of the position that is wrong with a probability."""
+        # If the prior holds, the user is inside.
+        changed = copy.copy(self)
+        changed.log_odds = _log_odds(wrong * self._probability)
+        return changed
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
                         prior: NuisancePrior) -> float:
@@ -268,8 +281,8 @@ def rejection(alternative: Alternative, probability: float, inside: float) -> st
 
 
 def _log_odds(probability: float) -> float:
-    """Return the logarithm of the odds of a probability above 0; the odds are at most 1e12."""
-    return math.log(probability / max(1 - probability, _MIN_PROBABILITY))
+    """Return the logarithm of the odds of a probability; the odds are within 1e-12 and 1e12."""
+    return math.log(max(probability, _MIN_PROBABILITY) / max(1 - probability, _MIN_PROBABILITY))
 
 
 def _log_bessel(argument: np.ndarray) -> np.ndarray:

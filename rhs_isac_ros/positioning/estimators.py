@@ -171,10 +171,11 @@ class SearchEstimator(abc.ABC):
         """Compute the table of the region, unless it exists; any thread may call this."""
         _ = self._region
 
-    def _scopes(self, bent: Sheets) -> Iterator[Scope]:
+    def _scopes(self, bent: Sheets, wrong: float) -> Iterator[Scope]:
         """Yield the part of the grid that a prior in (r [m], u, v) covers, and then the region.
 
-        The part is left out if the table of the region exists.
+        A user is outside only if the prior is wrong. The part is left out if the table of the
+        region exists.
         """
         likelihood, grid = self._likelihood, lay_grid(self.scenario)
         chosen = cells_of(bent, grid, likelihood.resolution)
@@ -183,7 +184,8 @@ class SearchEstimator(abc.ABC):
             part = grid.within(chosen)
             scope = Scope.of(likelihood, tabulate(likelihood.model, grid=part), part)
             yield scope._replace(favoured=np.ones(1, bool))
-        yield self._region._replace(favoured=chosen)
+        yield self._region._replace(
+            alternatives=[one.given(wrong) for one in self._region.alternatives], favoured=chosen)
 
     @one_blas_thread
     def estimate(self, received: np.ndarray) -> Estimate:
@@ -197,9 +199,9 @@ class SearchEstimator(abc.ABC):
         """Estimate positions, and keep the posterior as a mixture; signals as in `estimate`.
 
         Without a prior, the position is that of `estimate`. The probabilities of users outside or
-        blocked, and the reason why there is no position, are those without the prior. Users
-        outside are considered only if the whole region is searched. Raises `SignalError` if the
-        signals are unusable.
+        blocked, and the reason why there is no position, are those without the prior, except that
+        a user is outside only if the prior is wrong. Users outside are considered only if the
+        whole region is searched. Raises `SignalError` if the signals are unusable.
 
         Parameters
         ----------
@@ -221,7 +223,7 @@ class SearchEstimator(abc.ABC):
                      for one in self._locate_block(self._region, select(signals, block))]
         else:
             before = self.in_front(prior, wrong)
-            found = [self._update(select(signals, [n]), before, share, n_before)
+            found = [self._update(select(signals, [n]), before, wrong, share, n_before)
                      for n in range(len(signals.received))]
         return found[0] if np.ndim(received) == 2 else Estimate.of_each(found)
 
@@ -235,11 +237,11 @@ class SearchEstimator(abc.ABC):
             pose.to_site(self._bounds.mean(axis=0)),
             pose.covariances_to_site(np.diag(np.maximum(extent, MIN_EXTENT_M)**2)), wrong), pose)
 
-    def _update(self, signals: Signals, before: Sheets, share: float, n_before: float
-                ) -> Estimate:
+    def _update(self, signals: Signals, before: Sheets, wrong: float, share: float,
+                n_before: float) -> Estimate:
         """Compute the posterior of one shot for a prior, whose last component is everywhere."""
         constant = self.constant_shares if n_before else np.zeros(3)
-        for scope in self._scopes(select(before, slice(-1))):
+        for scope in self._scopes(select(before, slice(-1)), wrong):
             (found,) = self._locate_block(scope, signals, draws=False)
             if found.modes is None or found.estimate.reason:
                 continue
@@ -415,7 +417,8 @@ class SearchEstimator(abc.ABC):
             float(np.sum(np.abs(whitened)**2)), residual)
         in_sight, *others = probabilities.tolist()
         for probability, one in sorted(
-                zip(others, alternatives, strict=True), key=lambda pair: -pair[0]):
+                zip(others, alternatives, strict=True),
+                key=lambda pair: -pair[0] / pair[1].limit):
             reason = rejection(one, probability, in_sight)
             if reason and (not unexplained or one.explain(whitened, self._test.max_residual)):
                 return reason

@@ -12,7 +12,7 @@ from rhs_isac_ros.model.geometry import to_positions
 from rhs_isac_ros.model.hall import CONDITIONS, MultipathEstimate
 from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.model.los import draw_blocked
-from rhs_isac_ros.positioning import Tracker, alternatives, make_estimator
+from rhs_isac_ros.positioning import Mixture, Tracker, alternatives, make_estimator
 from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT, LIMIT, Outside, tabulate_outside
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.system import System
@@ -324,3 +324,17 @@ def test_a_track_continues_through_a_blockage(shipped):
     # Without signals in sight, the track ends.
     late = tracker.update(20.0, received[9])
     assert late.reason.startswith('blocked') and not late.fix
+
+
+def test_a_blocked_user_near_the_prior_is_not_outside(shipped):
+    """Signals without a direct path may also be those of a distant user, but not of this one."""
+    scenario = Scenario(blocked_probability=0.05)
+    rng = np.random.default_rng(3)
+    positions = scenario.sample_positions(12, rng)
+    received = MeasurementModel(
+        dataclasses.replace(scenario, blocked_probability=1.0), shipped).sample(positions, rng)
+    estimator = make_estimator('bayes', scenario, shipped, reject_outside=True)
+    reasons = [str(estimator.posterior(one, Mixture(
+        np.zeros(1), position[None], 0.09 * np.eye(3)[None])).reason)
+        for one, position in zip(received, positions, strict=True)]
+    assert np.mean([one.startswith('blocked') for one in reasons]) > 0.8
