@@ -176,29 +176,26 @@ class Recorder:
             queue.depth = endpoints.OBSERVATION.depth
             endpoints.subscribe(node, kind, name, functools.partial(
                 self._write, channel, name, on_message), queue, raw=True)
-        endpoints.steady_timer(node, _FLUSH_S, self._flush)
-
-    def _flush(self) -> None:
-        self._attempt(self._writer.flush)
+        endpoints.steady_timer(
+            node, _FLUSH_S, functools.partial(self._attempt, self._writer.flush))
 
     def _write(
             self, channel: int, name: str, on_message: Callable[[str], None], message: bytes,
             info: Mapping[str, int]) -> None:
-        if self._attempt(lambda: self._writer.add_message(
-                channel_id=channel, log_time=info['received_timestamp'],
-                publish_time=info['source_timestamp'], data=message)):
-            self.count += 1
+        self._attempt(lambda: self._writer.add_message(
+            channel_id=channel, log_time=info['received_timestamp'],
+            publish_time=info['source_timestamp'], data=message))
+        self.count += not self.failure
         on_message(name)
 
-    def _attempt(self, write: Callable[[], object]) -> bool:
-        """Write unless the file is closed or an attempt has failed; return whether none has."""
+    def _attempt(self, write: Callable[[], object]) -> None:
+        """Write unless the file is closed or an attempt has failed."""
         try:
             if not (self.failure or self._stream.closed):
                 write()
         except OSError as error:
             self.failure = (f'{self._partial}: cannot be written: {error.strerror}; the recording '
                             f'ends after {self.count} messages')
-        return not self.failure
 
     def close(self) -> None:
         """Complete the file and rename it; after a failure, the incomplete file remains."""

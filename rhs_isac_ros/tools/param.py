@@ -150,31 +150,26 @@ def _set(session: Session, options: argparse.Namespace, contents: dict[str, Any]
 
 def _parameter(name: str, content: str | list[str], declared: Parameter.Type) -> Parameter:
     """Return a parameter of the declared type or, if the text does not fit, of that in YAML."""
-    converters: dict[str, Callable[[str], Any]] = {'STRING': str, 'DOUBLE': _float}
-    convert = converters.get(declared.name.removesuffix('_ARRAY'), _value)
+    kind = declared.name.removesuffix('_ARRAY')
     with contextlib.suppress(TypeError, ValueError):
-        value = list(map(convert, content)) if isinstance(content, list) else convert(content)
-        # Python has no difference between the truth values and the numbers 0 and 1.
-        if isinstance(value, bool) <= (declared is Parameter.Type.BOOL):
-            return Parameter(name, declared, value)
-    return Parameter(name, value=(
-        list(map(_value, content)) if isinstance(content, list) else _value(content)))
+        return Parameter(name, declared, _value(content, kind) if isinstance(
+            content, str) else [_value(text, kind) for text in content])
+    return Parameter(name, value=_value(content) if isinstance(content, str) else [
+        _value(text) for text in content])
 
 
-def _value(text: str) -> Any:
-    """Return the number or truth value of a text in YAML, or else the text itself."""
+def _value(text: str, kind: str = '') -> Any:
+    """Return a text as number or truth value if it is one in YAML, or as a value of a kind."""
+    value: Any = text
     # An impossible date is a ValueError.
     with contextlib.suppress(yaml.YAMLError, ValueError):
-        if isinstance(value := yaml.safe_load(text), bool | int | float):
-            return value
-    return text
-
-
-def _float(text: str) -> float:
-    value = _value(text)
-    if isinstance(value, bool):
+        value = yaml.safe_load(text)
+    if kind == 'STRING' or not isinstance(value, bool | int | float):
+        value = text
+    # Python does not tell the truth values from the numbers 0 and 1.
+    if kind and isinstance(value, bool) and kind != 'BOOL':
         raise ValueError(text)
-    return float(value)
+    return float(value) if kind == 'DOUBLE' else value
 
 
 def _reason(result: SetParametersResult) -> str:
