@@ -33,6 +33,8 @@ _EXTENSION = {'name': 'rhs_isac', 'version': '1.0.0', 'optional': True}
 # A collection ends with the cycle in which it reaches this number of frames: a process that is
 # killed loses the frames since then.
 _N_FRAMES = 512
+# Part of the report.
+SAMPLES_FAILED = 'samples cannot be written'
 _DATATYPES = {'<c8': 'cf32_le', '<c16': 'cf64_le'}
 # Integers would have lost the unit.
 _READABLE = (*_DATATYPES.values(), 'cf32_be', 'cf64_be')
@@ -123,8 +125,8 @@ class SampleRecorder:
             self._collection = _Collection()
         except OSError as error:
             self._collection = None
-            self._report(f'{self._folder}: samples cannot be written: {error.strerror}; the '
-                         'recording has ended')
+            self._report(f'{self._folder}: {SAMPLES_FAILED}: {error.strerror}; the recording has '
+                         'ended')
 
     def _write(self, found: _Collection) -> None:
         import sigmf

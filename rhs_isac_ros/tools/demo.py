@@ -32,6 +32,7 @@ from rhs_isac_ros.frontend import (
     make_surface,
 )
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
+from rhs_isac_ros.frontend.sigmf_recording import SAMPLES_FAILED
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog, CycleRecord
 from rhs_isac_ros.positioning.site import Site, SiteError
@@ -434,6 +435,12 @@ def _run(demonstration: _Demonstration, options: argparse.Namespace) -> int:
             on_end_signals(signal.default_int_handler)
             with contextlib.suppress(KeyboardInterrupt):
                 code = _report(log, demonstration, options, problem)
+        # The node `channel` writes the last samples when it ends.
+        if options.samples and 'channel' in processes.names:
+            for line in processes.log('channel').splitlines():
+                if SAMPLES_FAILED in line:
+                    print_error(line.partition('[channel]: ')[2], 'demo')
+                    code = 1
     return code
 
 

@@ -68,6 +68,24 @@ def test_a_recording_that_fails_has_an_exit_code(tmp_path, monkeypatch, capsys, 
     assert 'run.mcap.part: cannot be written: File exists' in capsys.readouterr().err
 
 
+def test_samples_that_cannot_be_written_have_an_exit_code(tmp_path, monkeypatch, capsys):
+    """The process of the node ends as it would otherwise, and the network goes on."""
+    error = 'samples: samples cannot be written: No space left on device; the recording has ended'
+
+    def start(processes, *_, **__):
+        processes._commands['channel'] = []
+        (processes._logs / 'channel.log').write_text(
+            f'[INFO] [1.0] [channel]: serving\n[ERROR] [2.0] [channel]: {error}\n')
+        signal.raise_signal(signal.SIGINT)
+    monkeypatch.setattr(demo, 'start_network', start)
+    monkeypatch.setattr(demo, 'private_domain', dict)
+    monkeypatch.chdir(tmp_path)
+    lab = [f'--{name}={SITE.parent}/{file}' for name, file in (
+        ('config', 'lab.yaml'), ('codebook', 'codebook_lab.yaml'))]
+    assert main([*lab, '--radio', 'waveform', '--samples', 'samples']) == 1
+    assert capsys.readouterr().err == f'demo: error: {error}\n'
+
+
 class Started(dict):
     """The parameters of processes, by namespace and name."""
 
