@@ -80,9 +80,8 @@ _BATCH = 64
 # Period of publishing signals again that have no answer, because an estimator may still wait for
 # the codebook; maximum time to wait for an answer after another one is missing [s].
 _REPEAT_S, _SHORT_S = 2.0, 0.5
-# A recorded pause that is longer than the first number, and a clock that was set back by more than
-# the second, are shortened to the third [s].
-_MAX_GAP_S, _MAX_BACK_S, _GAP_S = 10.0, 1.0, 1.0
+# A recorded pause that is longer than the first number is shortened to the second [s].
+_MAX_GAP_S, _GAP_S = 10.0, 1.0
 # Maximum time between two looks at the clock [s].
 _MAX_WAIT_S = 1.0
 # Topics that can be published again. The codebook is set as parameters; recorded diagnostics and
@@ -226,8 +225,8 @@ def _without_gaps(
         messages: Iterable[tuple[str, bytes, float]]) -> Iterator[tuple[str, bytes, float]]:
     """Replace recorded times by times since the first message that is no codebook [s].
 
-    Long pauses and steps of the recorded clock are shortened, and printed. A codebook before the
-    first other message is due at once.
+    Long pauses are shortened, and printed. A codebook before the first other message is due at
+    once.
     """
     last_s, due_s = math.nan, 0.0
     for name, content, time_s in messages:
@@ -237,9 +236,8 @@ def _without_gaps(
             yield name, content, 0.0
             continue
         step_s, last_s = time_s - last_s, time_s
-        if step_s > _MAX_GAP_S or step_s < -_MAX_BACK_S:
-            what = 'a pause of' if step_s > 0 else 'a clock that was set back by'
-            print(f'replay: {what} {abs(step_s):.0f} s in the recording is shortened to '
+        if step_s > _MAX_GAP_S:
+            print(f'replay: a pause of {step_s:.0f} s in the recording is shortened to '
                   f'{_GAP_S:.0f} s', file=sys.stderr)
             step_s = _GAP_S
         due_s += step_s

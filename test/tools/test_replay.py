@@ -309,11 +309,7 @@ def test_signals_that_nobody_answers_are_counted(many, bench):
 @pytest.mark.parametrize(('times_s', 'due_s', 'lines'), [
     ([5, 6, 8.5], [0, 1, 3.5], []),
     ([5, 3605, 3606], [0, 1, 2], ['a pause of 3600 s']),
-    ([3600, 0, 1], [0, 1, 2], ['a clock that was set back by 3600 s']),
-    ([0, 100, 101, 201, 1], [0, 1, 2, 3, 4], [
-        'a pause of 100 s', 'a pause of 100 s', 'a clock that was set back by 200 s']),
-    # Messages in almost the right order.
-    ([0, 2, 1.5, 3], [0, 2, 1.5, 3], [])])
+    ([0, 100, 101, 201], [0, 1, 2, 3], ['a pause of 100 s', 'a pause of 100 s'])])
 def test_gaps_of_a_recording_are_shortened_and_printed(times_s, due_s, lines, capsys):
     messages = [('codebook', b'', -1e6), *(('ack', b'', time_s) for time_s in times_s)]
     found = list(replay._without_gaps(messages))
