@@ -34,7 +34,6 @@ from rclpy.qos import (
     qos_check_compatible,
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from rhs_isac_ros.model import Scenario
@@ -170,12 +169,12 @@ def publish_if_subscribed(publishers: Iterable[Publisher], make: Callable[[], An
 
 def subscribe(
         node: Node, kind: type, name: str, callback: Callable[..., None], profile: QoSProfile,
-        raw: bool = False, overridable: bool = False) -> Subscription | None:
+        raw: bool = False, overridable: bool = False) -> None:
     """Subscribe to a topic of a ROS type; a `raw` callback receives bytes (CDR) and their times.
 
     The times are those of rclpy's `MessageInfo`. The node logs that it drops a message without a
     valid serialization. Parameters ``qos_overrides.*`` change the quality of service of an
-    `overridable` topic. Returns None if the subscription is refused.
+    `overridable` topic.
     """
     def receive(*taken: Any) -> None:
         # The EventsExecutor of rclpy 7.1 passes both as one argument.
@@ -195,7 +194,7 @@ def subscribe(
     own = copy.copy(profile)
     # A subscription of rclpy that is not raw drops an invalid message without a word, and leaves
     # the error to the next call that fails.
-    return create_or_refuse(node, f'subscription to {name}', lambda: node.create_subscription(
+    create_or_refuse(node, f'subscription to {name}', lambda: node.create_subscription(
         kind, name, receive, own, raw=True,
         qos_overriding_options=_overriding(overridable),
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False)))

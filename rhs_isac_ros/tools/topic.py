@@ -23,7 +23,7 @@ from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 from rhs_isac_ros.protocol.messages import MessageError
 from rhs_isac_ros.protocol.role import NewestDict
 from rhs_isac_ros.ros.convert import deserialize
-from rhs_isac_ros.ros.endpoints import OBSERVATION, log_dropped, steady_timer, subscribe
+from rhs_isac_ros.ros.endpoints import OBSERVATION, log_dropped, steady_timer
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run_verb
 
@@ -105,7 +105,7 @@ def echo(session: Session, options: argparse.Namespace) -> None:
     printed = 0
     # Of the publishers that appear one after the other, each needs a subscription that suits it; a
     # message may arrive at several.
-    subscriptions: dict[tuple[ReliabilityPolicy, DurabilityPolicy], Subscription | None] = {}
+    subscriptions: dict[tuple[ReliabilityPolicy, DurabilityPolicy], Subscription] = {}
     known: NewestDict[tuple[int, int], None] = NewestDict(_MAX_KNOWN)
 
     def show(content: bytes, info: Mapping[str, int]) -> None:
@@ -134,14 +134,15 @@ def echo(session: Session, options: argparse.Namespace) -> None:
             offered = publisher.qos_profile
             policies = offered.reliability, offered.durability
             if policies not in subscriptions:
-                subscriptions[policies] = subscribe(session.node, kind, name, show, QoSProfile(
-                    depth=OBSERVATION.depth, reliability=policies[0], durability=policies[1]),
+                subscriptions[policies] = session.node.create_subscription(
+                    kind, name, show, QoSProfile(  # type: ignore[arg-type]
+                        depth=OBSERVATION.depth, reliability=policies[0], durability=policies[1]),
                     raw=True)
         return bool(options.once and printed)
     try:
         session.spin_until(done, options.timeout)
     finally:
-        for subscription in filter(None, subscriptions.values()):
+        for subscription in subscriptions.values():
             session.node.destroy_subscription(subscription)
 
 
@@ -152,9 +153,9 @@ def show_rate(session: Session, options: argparse.Namespace) -> None:
     times_ns: collections.deque[int] = collections.deque(maxlen=_MAX_TIMES)
     reported_ns = 0
     # Raw messages, because deserialization of long messages takes time.
-    subscribe(session.node, kind, name,
-              lambda _, info: times_ns.append(info['received_timestamp']),
-              qos_profile_sensor_data, raw=True)
+    session.node.create_subscription(
+        kind, name, lambda _, info: times_ns.append(  # type: ignore[arg-type, misc]
+            info['received_timestamp']), qos_profile_sensor_data, raw=True)
 
     def report() -> None:
         nonlocal reported_ns

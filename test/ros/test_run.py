@@ -16,6 +16,7 @@ from rclpy.utilities import try_shutdown
 from std_msgs.msg import Empty
 
 from rhs_isac_ros.ros import run
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.run import StartError
 from rhs_isac_ros.tools import param, topic
 
@@ -172,14 +173,14 @@ def test_a_tool_that_is_refused_a_topic_or_a_service_ends_with_one_line(
         raise rclpy_implementation.RCLError('Failed to create: not allowed\nat a line')
     node = SimpleNamespace(
         create_subscription=refuse, create_client=refuse,
-        get_publishers_info_by_topic=lambda name: [],
+        get_publishers_info_by_topic=lambda name: [SimpleNamespace(qos_profile=EXCHANGE)],
         get_topic_names_and_types=lambda: [('/ack', ['rhs_isac_msgs/msg/Ack'])],
         get_node_names_and_namespaces=lambda: [('bs', '/')] if clock_s >= 8.0 else [])
     clock_s = 0.0
 
     def spin_until(condition, timeout_s=8.0):
         nonlocal clock_s
-        clock_s += timeout_s
+        clock_s += timeout_s or 0.0
         return condition()
     session = SimpleNamespace(node=node, full_name='/{}'.format, spin_until=spin_until)
     monkeypatch.setattr(
