@@ -16,8 +16,8 @@ MODULES = {'.'.join(('rhs_isac_ros', *path.relative_to(ROOT).with_suffix('').par
 REFUSED = (
     'rclpy', 'launch', 'launch_ros', 'tf2_ros', 'rosidl_runtime_py', 'dask', 'distributed',
     'joblib', 'lz4', 'matplotlib', 'mcap', 'pymoo', 'rerun', 'rich', 'rosbags', 'sklearn', 'tqdm')
-# Names that a class of the positioning still shares with another one.
-PENDING = {'Posterior', 'Scope'}
+# A name that a class of the positioning and one of the model still have in common.
+PENDING = {'Scope'}
 CODE = '''
 import importlib, sys
 
