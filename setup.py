@@ -56,7 +56,7 @@ setup(
         'view': ['rerun-sdk==0.22.1', 'pyarrow==25.0.0'],
         'all': [
             'matplotlib', 'joblib', 'dask', 'distributed', 'tqdm', 'scikit-learn',
-            'pymoo', 'mcap', 'sigmf', 'rich', 'rerun-sdk==0.22.1', 'pyarrow==25.0.0'],
+            'pymoo', 'mcap>=1.6', 'sigmf', 'rich', 'rerun-sdk==0.22.1', 'pyarrow==25.0.0'],
         'docs': ['sphinx', 'furo', 'myst-nb'],
         'test': ['pytest', 'hypothesis', 'filterpy', 'rosbags'],
     },
