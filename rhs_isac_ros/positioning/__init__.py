@@ -17,7 +17,8 @@ The modules, in reading order:
 * `mixture`: Gaussians in the frame of the site; `sheets`: Gaussians in range and direction cosines
   around a surface, also restricted to the region of interest
 * `lattice`: lengths over which signals change, and the grid; `segments`: points of each shot
-* `likelihood`: the likelihood of positions and nuisance parameters
+* `likelihood`: the likelihood of positions and nuisance parameters; `nuisance`: the prior of the
+  parameters; `dispersed`: errors of elements; `offsets`: carrier and timing from signals alone
 * `templates`, `peaks`, `grid`: starts of the search; `search`: ascent from the starts to the
   modes; `failures`: modes if elements have failed
 * `posterior`: from modes to samples; `draws`: samples without modes; `alternatives`: users outside

@@ -20,7 +20,7 @@ from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
 from rhs_isac_ros.model.geometry import element_positions, to_positions
 from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers
-from rhs_isac_ros.positioning.likelihood import NuisancePrior
+from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.segments import Segments
 from rhs_isac_ros.support.threads import map_blocks
 

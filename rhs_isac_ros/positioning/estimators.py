@@ -30,12 +30,9 @@ from rhs_isac_ros.positioning.estimate import (
 from rhs_isac_ros.positioning.failures import refinement_of
 from rhs_isac_ros.positioning.grid import TemplateTable
 from rhs_isac_ros.positioning.lattice import Grid, lay_grid
-from rhs_isac_ros.positioning.likelihood import (
-    Alignment,
-    Likelihood,
-    Signals,
-)
+from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
 from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.offsets import Alignment
 from rhs_isac_ros.positioning.posterior import (
     BandPhases,
     Samples,

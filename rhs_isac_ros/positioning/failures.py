@@ -37,10 +37,10 @@ from rhs_isac_ros.positioning.likelihood import (
     Factors,
     Likelihood,
     Local,
-    NuisancePrior,
     Signals,
     assemble,
 )
+from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.search import Modes, OneState, Refinement, ascend, predict
 from rhs_isac_ros.positioning.segments import concatenate, select
 

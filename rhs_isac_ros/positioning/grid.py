@@ -23,7 +23,7 @@ from rhs_isac_ros.positioning.lattice import (
     lay_grid,
     subband_wavenumbers,
 )
-from rhs_isac_ros.positioning.likelihood import NuisancePrior
+from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.peaks import Candidates, PeakFinder, Peaks, RangeWindows
 from rhs_isac_ros.positioning.segments import Segments, concatenate, select
 from rhs_isac_ros.positioning.sheets import move_inside

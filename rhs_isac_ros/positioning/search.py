@@ -12,14 +12,9 @@ import numpy as np
 
 from rhs_isac_ros.model.gaussian import Marginal, likelihood_loss, marginalise, step_to_maximum
 from rhs_isac_ros.model.geometry import to_polar, to_positions
+from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable, heaviest, separate
-from rhs_isac_ros.positioning.likelihood import (
-    Conditional,
-    DispersedLikelihood,
-    Likelihood,
-    Local,
-    Signals,
-)
+from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Local, Signals
 from rhs_isac_ros.positioning.segments import Segments, select
 from rhs_isac_ros.positioning.sheets import Inside, Sheets
 

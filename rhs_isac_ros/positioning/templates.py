@@ -23,7 +23,7 @@ from rhs_isac_ros.positioning.lattice import (
     lay_grid,
     whiten,
 )
-from rhs_isac_ros.positioning.likelihood import NuisancePrior
+from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.segments import Segments
 from rhs_isac_ros.support.threads import map_blocks
 

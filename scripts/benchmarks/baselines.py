@@ -36,7 +36,8 @@ from rhs_isac_ros.model.multipath import (
 from rhs_isac_ros.model.surface import AppliedBeams, radiation_matrix
 from rhs_isac_ros.positioning.grid import TemplateTable
 from rhs_isac_ros.positioning.lattice import Resolution
-from rhs_isac_ros.positioning.likelihood import Likelihood, NuisancePrior, Signals
+from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
+from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.posterior import draw_samples
 from rhs_isac_ros.positioning.search import find_modes
 from rhs_isac_ros.positioning.templates import tabulate

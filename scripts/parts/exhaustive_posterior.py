@@ -12,14 +12,11 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import to_polar
+from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.estimate import Estimate, checked_received
-from rhs_isac_ros.positioning.likelihood import (
-    Alignment,
-    Conditional,
-    DispersedLikelihood,
-    Likelihood,
-)
+from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood
 from rhs_isac_ros.positioning.neural import stack_parts
+from rhs_isac_ros.positioning.offsets import Alignment
 from rhs_isac_ros.positioning.posterior import BandPhases
 from rhs_isac_ros.positioning.search import marginal_at
 from rhs_isac_ros.positioning.segments import select

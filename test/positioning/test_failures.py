@@ -10,6 +10,7 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
 from rhs_isac_ros.model.geometry import jacobian, to_polar, to_positions
 from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.failures import (
     LIMITS,
     FailureModel,
@@ -19,7 +20,7 @@ from rhs_isac_ros.positioning.failures import (
     can_enumerate,
     first_places,
 )
-from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
+from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.system import System
 
 SCENARIO = Scenario(

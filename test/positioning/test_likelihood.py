@@ -10,8 +10,10 @@ from scipy.stats import binom
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.model.impairments import nuisance_of
+from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.failures import FailureModel
-from rhs_isac_ros.positioning.likelihood import Alignment, DispersedLikelihood, Likelihood
+from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.positioning.offsets import Alignment
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.templates import tabulate
 from rhs_isac_ros.system import System

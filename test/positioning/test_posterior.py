@@ -9,7 +9,8 @@ from scipy.stats import multivariate_normal, norm, qmc
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import estimators, make_estimator
-from rhs_isac_ros.positioning.likelihood import DispersedLikelihood, Likelihood
+from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
+from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.posterior import _SAMPLING, BandPhases, _log_density, _log_share
 from rhs_isac_ros.positioning.search import Modes
 from rhs_isac_ros.system import System

@@ -9,8 +9,10 @@ from rhs_isac_ros.bounds.fisher import fisher_information
 from rhs_isac_ros.codebook import Codebook, random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.geometry import element_positions, jacobian, to_polar, to_positions
+from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
-from rhs_isac_ros.positioning.likelihood import Alignment, DispersedLikelihood, Likelihood
+from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.positioning.offsets import Alignment
 from rhs_isac_ros.positioning.search import ascend, find_modes, marginal_at
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.templates import tabulate

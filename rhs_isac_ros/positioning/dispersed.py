@@ -1,0 +1,122 @@
+"""The likelihood with the covariance of element errors at each position."""
+
+import dataclasses
+
+import numpy as np
+
+from rhs_isac_ros.model import MeasurementModel
+from rhs_isac_ros.model.arrays import mixture_weights
+from rhs_isac_ros.model.gaussian import (
+    covariance_root,
+)
+from rhs_isac_ros.model.geometry import jacobian, to_positions
+from rhs_isac_ros.positioning.likelihood import (
+    Columns,
+    Factors,
+    Likelihood,
+    Local,
+    Signals,
+    assemble,
+)
+
+# Numbers of failures to average over: smallest probability of each, and how many at most.
+_MIN_PROBABILITY = 1e-5
+_MAX_COUNTS = 12
+# Share of the whitened energy up to which errors of an estimated surface need no covariance for
+# each position.
+_MIN_ERROR_SHARE = 0.05
+
+
+class DispersedLikelihood:
+    """The likelihood with the covariance of element errors at each position.
+
+    Errors of the direct path are stronger for near users. A surface has a whole number k of failed
+    elements, and the covariance of their errors is k / E[k] times the average. The likelihood is
+    averaged over k. Its value omits the same constant as that of `Likelihood`.
+    """
+
+    def __init__(self, likelihood: Likelihood) -> None:
+        self._base, scenario = likelihood, likelihood.scenario
+        # The number of failures of an estimated surface is known.
+        share = scenario.failed_element_share if likelihood.surface is None else 0.0
+        intact = dataclasses.replace(scenario, failed_element_share=0.0)
+        self._average = MeasurementModel(
+            dataclasses.replace(scenario, failed_element_share=share), likelihood.codebook,
+            likelihood.surface).prepare()
+        self._intact = MeasurementModel(intact, likelihood.codebook, likelihood.surface)
+        self._scales, log_weights = _failure_counts(scenario.n_elements, share)
+        self._offsets = log_weights + likelihood.log_det
+        self._latest: tuple[np.ndarray, list[Factors]] | None = None
+        average, least = self._average.covariance(), self._intact.covariance()
+        roots = covariance_root(
+            scenario, least + self._scales[:, None, None, None] * (average - least))
+        self._information = [likelihood.nuisance.information_of(*both)
+                             for both in zip(roots, np.linalg.inv(roots), strict=True)]
+
+    @classmethod
+    def of(cls, likelihood: Likelihood) -> 'DispersedLikelihood | None':
+        """Return this likelihood, or None if element errors are known or accurately estimated."""
+        model = likelihood.model
+        if model.elements.is_exact:
+            return None
+        if model.surface is not None:
+            errors = model.elements.error_covariance(model.scenario, model.beams)
+            energy = np.einsum('irs,ist,irt->', model.whitener, errors, model.whitener.conj(),
+                               optimize=True).real
+            if energy <= _MIN_ERROR_SHARE * np.prod(model.shape):
+                return None
+        return cls(likelihood)
+
+    def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
+        """Evaluate the likelihood at points; see `Conditional.local`."""
+        prior, states = self._base.nuisance, []
+        mean, slopes = self._average.mean_and_jacobian(to_positions(points), jacobian(points))
+        columns = prior.columns(values, signals.received, mean, slopes)
+        for factors, offset, information in zip(
+                self._factors_at(points), self._offsets, self._information, strict=True):
+            white = Columns.of(factors.whiten(columns), len(prior))
+            local = assemble(prior, values, white, information, factors.noise)
+            states.append(local._replace(value=local.value + offset - factors.log_det))
+        return _average_of(states)
+
+    def _factors_at(self, points: np.ndarray) -> list[Factors]:
+        """Return factors of the covariance at points for each number of failures."""
+        # Numerical integration evaluates many parameters at the same points. Another thread may
+        # replace `_latest` at any time.
+        latest = self._latest
+        if latest is None or points is not latest[0]:
+            positions = to_positions(points)
+            intact = self._intact.covariance_at(positions)
+            excess = (self._average.covariance_at(positions) - intact if any(self._scales)
+                      else np.zeros(1))
+            self._latest = latest = points, [
+                Factors.of(self._base.nuisance, intact + scale * excess)
+                for scale in self._scales]
+        return latest[1]
+
+
+def _average_of(states: list[Local]) -> Local:
+    """Average the likelihoods of states; take the residual from the most probable state."""
+    value = np.stack([one.value for one in states])
+    weights, log_total = mixture_weights(value, axis=0)
+    residual = np.stack([one.residual for one in states])
+    return Local(
+        log_total,
+        np.einsum('km,kmp->mp', weights, np.stack([one.gradient for one in states])),
+        np.einsum('km,kmpq->mpq', weights, np.stack([one.information for one in states])),
+        np.take_along_axis(residual, value.argmax(axis=0)[None], axis=0)[0])
+
+
+def _failure_counts(n_elements: int, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return numbers of failures divided by the mean, and the logs of their probabilities."""
+    if share == 0:
+        return np.zeros(1), np.zeros(1)
+    from scipy.stats import binom
+
+    counts = np.arange(n_elements + 1)
+    probability = binom.pmf(counts, n_elements, share)
+    likely = counts[probability > _MIN_PROBABILITY]
+    if len(likely) > _MAX_COUNTS:
+        likely = np.unique(np.linspace(likely[0], likely[-1], _MAX_COUNTS).round().astype(int))
+    weights = probability[likely] / probability[likely].sum()
+    return likely / (n_elements * share), np.log(weights)

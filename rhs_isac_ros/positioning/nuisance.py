@@ -1,0 +1,238 @@
+"""The prior of the nuisance parameters, and what the search maximises over them on the grid."""
+
+import functools
+
+import numpy as np
+
+from rhs_isac_ros.model import MeasurementModel
+from rhs_isac_ros.model.arrays import adjoint
+from rhs_isac_ros.model.impairments import (
+    UNIFORM_STD_RAD,
+    Exponents,
+    nuisance_of,
+)
+from rhs_isac_ros.model.scenario import ScenarioError
+from rhs_isac_ros.positioning.lattice import Resolution
+
+# Standard deviation of a Gaussian whose density at its centre equals that of a uniform phase.
+UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
+# Standard deviation from which the search treats the phases of the bands as uniform. Their joint
+# density then has many peaks along the range, too narrow for Gaussians. Its information is added
+# to the samples of the posterior afterwards.
+COARSE_STD_RAD = 0.75
+# Largest logarithm of the power of noise relative to signals, which keeps it finite.
+_MAX_EXPONENT = 300.0
+
+
+class NuisancePrior(Exponents):
+    """Prior and effect of the nuisance parameters, in units in which they are standard normal.
+
+    A uniform phase has a flat prior and the unit `UNIFORM_EQUIVALENT`. If the relative phases of
+    bands vary by `COARSE_STD_RAD` or more, uniform phases of all bands replace the parameters that
+    rotate whole bands; the range then follows from delays, amplitudes and wavefronts only.
+    """
+
+    phase_covariance: np.ndarray  #: Of the declared phases of the bands, float64 [N_B, N_B].
+    relative_phase_std_rad: float  #: Largest standard deviation relative to their mean.
+    is_coarse: bool  #: Whether every band is given a uniform phase, by the last parameters.
+    needs_search: np.ndarray  #: As in `Nuisance`, bool [Q].
+    phases: np.ndarray  #: Phase of each band per unit [rad], float64 [N_B, Q].
+    #: Information of the prior, as in `Nuisance`, but 0 for a uniform phase, float64 [Q].
+    precision: np.ndarray
+    gains: np.ndarray  #: Of the bands per unit of each parameter [nepers], float64 [N_B, Q].
+    has_gain: bool  #: Whether any of them is not negligible.
+    #: Half of the change of a parameter that does not change the signals, float64 [Q].
+    half_period: np.ndarray
+    information: np.ndarray  #: Contribution of the model's covariance, float64 [Q, Q].
+
+    def __init__(self, model: MeasurementModel) -> None:
+        self.scenario, declared = model.scenario, nuisance_of(model.scenario)
+        self.phase_covariance = declared.phases @ declared.phases.T
+        self.relative_phase_std_rad = _relative_std(self.phase_covariance)
+        self.is_coarse = self.relative_phase_std_rad >= COARSE_STD_RAD
+        kept = ~(declared.phases.any(axis=0) & self.is_coarse)
+        _, n_bands, n_rows = declared.scaled_patterns.shape
+        turns = UNIFORM_EQUIVALENT * np.eye(n_bands)[:n_bands * self.is_coarse]
+        patterns = np.concatenate([
+            declared.scaled_patterns[kept], 1j * turns[:, :, None] * np.ones(n_rows)])
+        phases = np.hstack([declared.phases[:, kept], turns.T])
+        self.needs_search, self.moves_multipath = (
+            np.append(flags[kept], np.zeros(len(turns), bool))
+            for flags in (declared.needs_search, declared.moves_multipath))
+        largest = np.abs(phases).max(axis=0, initial=0.0)
+        uniform = largest > UNIFORM_STD_RAD
+        scale = np.where(uniform, UNIFORM_EQUIVALENT / np.where(uniform, largest, 1.0), 1.0)
+        self.scaled_patterns, self.phases = patterns * scale[:, None, None], phases * scale
+        precision, period = (np.append(values[kept], np.zeros(len(turns)))
+                             for values in (declared.precision, declared.period))
+        if (self.scenario.timing_std_s == np.inf and self.scenario.n_subbands % 2 == 0
+                and not np.isinf(self.phase_std_rad).all()):
+            raise ScenarioError(
+                'timing_std_s: unknown, expected an unknown phase_std_rad or band_phase_std_rad '
+                'as well: half a period of the timing turns all phases by half a turn')
+        self.precision, self.half_period = np.where(uniform, 0.0, precision), period / 2
+        self.gains, self.has_gain = self.scaled_patterns.real.mean(axis=2).T, declared.has_gain
+        self._operators = self._multiplying(model.root, model.whitener)
+        self.information = self.information_of(model.root, model.whitener)
+
+    @functools.cached_property
+    def gain(self) -> np.ndarray:
+        """Gain of all signals per unit [nepers], float64 [Q]."""
+        return self.scaled_patterns.real.mean(axis=(1, 2))
+
+    @functools.cached_property
+    def gain_unit(self) -> float:
+        """Gain [nepers] per unit of its density; the standard deviation unless it is unknown."""
+        return float(np.linalg.norm(self.gain))
+
+    @functools.cached_property
+    def gain_std(self) -> float:
+        """Standard deviation of the gain of all signals [nepers]; 0 if it is negligible.
+
+        It is far above `gain_unit` if the gain has no prior.
+        """
+        return self.has_gain * float(np.sqrt(self.gain @ self._gain_variance))
+
+    @functools.cached_property
+    def _gain_variance(self) -> np.ndarray:
+        """Covariance of the parameters with the gain of all signals [nepers], float64 [Q]."""
+        return self.gain / np.where(self.gain == 0, 1.0, self.precision)
+
+    @functools.cached_property
+    def volume(self) -> np.ndarray:
+        """Change of the logarithm of the signals' volume per unit, float64 [Q]."""
+        return 2 * self.scaled_patterns.real.sum(axis=(1, 2))
+
+    @functools.cached_property
+    def phase_std_rad(self) -> np.ndarray:
+        """Standard deviation of the phase of each band, infinite if it is uniform, [N_B]."""
+        std = np.sqrt(np.diagonal(self.phase_covariance))
+        return np.where(self.is_coarse | (std > UNIFORM_STD_RAD), np.inf, std)
+
+    @functools.cached_property
+    def floor(self) -> np.ndarray:
+        """Curvature in (r, u, v) that is added to every log-likelihood, float64 [3]."""
+        return Resolution.of(self.scenario).curvature_floor
+
+    def information_of(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
+        """Compute the Fisher information of a covariance about the parameters, [Q, Q]."""
+        # The multipath reveals gains and offsets of carrier and timing, but no phase.
+        operators = self._multiplying(root, whitener)
+        both = operators + adjoint(operators)
+        return np.einsum('aimn,binm->ab', both, both, optimize=True).real
+
+    def direct_information(self, spread: np.ndarray) -> np.ndarray:
+        """Compute the information of whitened means with second moments `spread`, [Q, Q]."""
+        return 2 * np.einsum('aimn,ino,bimo->ab', self._operators, spread, self._operators.conj(),
+                             optimize=True).real
+
+    def _multiplying(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
+        """Compute W P W^-1, which applies P to whitened signals, [Q, N_B, N_SB F, N_SB F]."""
+        return np.matmul(whitener * self.scaled_patterns[:, :, None], root)
+
+    def columns(self, values: np.ndarray, received: np.ndarray, mean: np.ndarray,
+                slopes: np.ndarray, *linear: np.ndarray) -> np.ndarray:
+        """Stack the fields of `Columns`, before whitening, complex128 [M, C, N_B, N_SB F].
+
+        `slopes` are the derivatives of the mean with respect to the point.
+        """
+        divided = self.divide(received, values)
+        return np.concatenate([
+            (divided - mean)[:, None], slopes, self.derivatives(divided, mean), *linear,
+            self.scaled_patterns * divided[:, None]], axis=1)
+
+    def slopes(self, whitened: np.ndarray) -> np.ndarray:
+        """Multiply whitened signals [M, N_B, N_SB F] by W P W^-1; return [M, Q, N_B N_SB F]."""
+        slopes = np.einsum('qimn,kin->kqim', self._operators, whitened, optimize=True)
+        return slopes.reshape(*slopes.shape[:2], -1)
+
+    def log_prior(self, values: np.ndarray) -> np.ndarray:
+        """Return the logarithm of the prior times the change of volume, float64 [M]."""
+        return -(values**2 @ self.precision / 2 + values @ self.volume)
+
+    def log_evidence_of_aligned(self, aligned: np.ndarray) -> float:
+        """Return the log of Laplace's integral over the parameters that `Alignment` estimates."""
+        (moves,) = np.nonzero(self.moves_multipath)
+        curvature = self.information[np.ix_(moves, moves)] + np.diag(self.precision[moves])
+        return float(-self.precision @ aligned**2 - np.linalg.slogdet(curvature)[1]) / 2
+
+    def amplitude(self, outputs: np.ndarray) -> np.ndarray:
+        """Add up the bands' matched-filter outputs, [N_B, ...], rotated as in `_in_phase`."""
+        if not self.relative_phase_std_rad:
+            return _in_phase(outputs.sum(axis=0), float(self.phase_std_rad[0]))
+        parts = [_in_phase(output, float(std))
+                 for output, std in zip(outputs, self.phase_std_rad, strict=True)]
+        return np.sum(parts, axis=0)
+
+    def maximised_over_gain(self, amplitude: np.ndarray, energy: float, n_measurements: int
+                            ) -> tuple[np.ndarray, np.ndarray]:
+        """Maximise the log-likelihood, without the template's energy, over the gain.
+
+        If signals y are multiplied by h, the log-likelihood for an amplitude A, an array of any
+        shape, is ``-h^2 |y|^2 + 2 h A + 2 n log h`` plus the log-prior of the gain, which is
+        ``-log h``; n is `n_measurements`. Returns its maximum and the gain [nepers]; if the gain
+        is known, 2 A and a single 0.
+        """
+        if not self.gain_std:
+            return 2 * amplitude, np.zeros(1)
+        precision = self.gain_std**-2
+        # The maximum without the prior, and its curvature, lead to a start for two Newton steps.
+        positive = np.maximum(amplitude, 0)
+        factor = (positive + np.sqrt(positive**2 + 4 * n_measurements * energy)) / (2 * energy)
+        curvature = 2 * positive * factor + 4 * n_measurements
+        gain = -np.log(factor) * curvature / (curvature + precision)
+        for _ in range(2):
+            factor = np.exp(-gain)
+            slope = (2 * factor * (factor * energy - amplitude) - 2 * n_measurements
+                     - precision * gain)
+            curvature = 2 * factor * (2 * factor * energy - amplitude) + precision
+            gain += slope / np.maximum(curvature, precision)
+        factor = np.exp(-gain)
+        return (factor * (2 * amplitude - factor * energy) - 2 * n_measurements * gain
+                - precision * gain**2 / 2, gain)
+
+    def start(self, outputs: np.ndarray, gain: np.ndarray) -> np.ndarray:
+        """Return initial parameters [M, Q] for filter outputs [N_B, M] and gains [M] [nepers]."""
+        angles = np.angle(outputs)
+        if not self.relative_phase_std_rad:
+            angles = np.broadcast_to(np.angle(outputs.sum(axis=0)), angles.shape)
+        # Phases without a prior follow the angles; the others share the rest by their variance.
+        variance = np.where(self.precision > 0, 1.0, 1e6)
+        spread = self.phases * variance
+        values: np.ndarray = (spread.T @ np.linalg.pinv(spread @ self.phases.T) @ angles).T
+        if self.gain_std:
+            values += np.outer(gain, self._gain_variance / self.gain_std**2)
+        return values
+
+    def noise_weights(self, gains: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return factors of whitened measurements, and the shares of noise in them, [M, n] each.
+
+        `gains` are those of the bands, [M, N_B] [nepers], and `noise` is the share of noise in
+        each measurement at a gain of 0, [n] or [M, n].
+        """
+        power = np.exp(np.minimum(-2 * gains, _MAX_EXPONENT))
+        power = np.repeat(power, noise.shape[-1] // gains.shape[1], axis=1)
+        total = 1 + noise * (power - 1)
+        return 1 / np.sqrt(total), noise * power / total
+
+
+def _relative_std(phase_covariance: np.ndarray) -> float:
+    """Return the largest standard deviation of the bands' phases relative to their mean [rad]."""
+    n_bands = len(phase_covariance)
+    centre = np.eye(n_bands) - (1 / n_bands if n_bands > 1 else 0.0)
+    relative = np.linalg.eigvalsh(centre @ phase_covariance @ centre)[-1]
+    # If all bands share one phase, only rounding errors remain.
+    is_shared = relative <= 1e-9 * np.trace(phase_covariance)
+    return 0.0 if is_shared else float(np.sqrt(relative))
+
+
+def _in_phase(outputs: np.ndarray, std: float) -> np.ndarray:
+    """Return the real parts after the most likely rotation, less half its cost in the prior."""
+    if std == 0:
+        return outputs.real
+    magnitude: np.ndarray = np.abs(outputs)
+    if not np.isfinite(std):
+        return magnitude
+    angle = np.angle(outputs)
+    phase = angle * magnitude / (magnitude + 1 / (2 * std**2))
+    return magnitude * np.cos(angle - phase) - phase**2 / (4 * std**2)

@@ -1,0 +1,106 @@
+"""Offsets of carrier and timing, estimated from the signals before the position is known."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.model.arrays import blocks
+from rhs_isac_ros.model.gaussian import (
+    step_to_maximum,
+)
+from rhs_isac_ros.positioning.likelihood import Likelihood
+
+
+class _Search(NamedTuple):
+    """Estimation of parameters from the signals alone, and the margin for its errors."""
+
+    # Grid on which parameters with several maxima are compared.
+    reach: float = 4.0  # In standard deviations.
+    points: tuple[int, ...] = (513, 49, 13, 5)  # Per parameter, for 1, 2, 3 and more parameters.
+    points_per_turn: int = 6  # Of the phase between two measurements, if these are more.
+    block: int = 1 << 20  # Number of complex numbers at a time.
+    refinements: int = 4  # Of the best point.
+    # Errors of the estimates, in standard deviations, whose effect the margin covers, and largest
+    # margin. Nearby users have stronger signals than the average, on which the effect depends.
+    deviation: float = 6.0
+    margin: float = 200.0
+
+
+_SEARCH = _Search()
+# Smallest eigenvalue of a sum of signals, as a share of its trace.
+_MIN_SPREAD = 1e-12
+
+
+class Alignment:
+    """Estimates of the parameters that move the multipath, from the signals alone.
+
+    Offsets of carrier and timing move the multipath out of the nulls of its covariance, so they
+    must be known before the search. `spread`, from `tabulate`, contains the second moments of the
+    whitened means over the region, and accounts for the unknown position. `margin` is the loss of
+    log-likelihood that errors of the estimates may cause at the true position.
+    """
+
+    def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:
+        self._prior = likelihood.nuisance
+        # Strong signals must not make the sum singular up to rounding errors.
+        least = np.maximum(_MIN_SPREAD * np.trace(spread, axis1=1, axis2=2).real, 1.0)
+        roots = np.linalg.cholesky(spread + least[:, None, None] * np.eye(spread.shape[1]))
+        self._whitener = np.linalg.solve(roots, likelihood.model.whitener)
+        moves = np.ix_(*2 * [self._prior.moves_multipath])
+        known = self._prior.information_of(likelihood.model.root @ roots, self._whitener)
+        precision = (known + np.diag(self._prior.precision))[moves]
+        loss = np.trace(np.linalg.solve(
+            precision, self._prior.direct_information(spread)[moves])) / 2
+        self.margin = min(_SEARCH.deviation**2 * float(loss), _SEARCH.margin)
+
+    def values_of_each(self, received: np.ndarray) -> np.ndarray:
+        """Estimate the parameters [N, Q] that move the multipath; all others are 0."""
+        if not self._prior.moves_multipath.any():
+            return np.zeros((len(received), len(self._prior)))
+        return np.stack([self._values(one) for one in received])
+
+    def _values(self, received: np.ndarray) -> np.ndarray:
+        prior, moves = self._prior, self._prior.moves_multipath
+        values = np.zeros(len(prior))
+        if prior.needs_search.any():
+            values = self._best_on_grid(received)
+        for _ in range(_SEARCH.refinements):
+            divided = prior.divide(received, values)
+            residual = self._whitened(divided[None]).reshape(-1)
+            slopes = self._whitened(prior.scaled_patterns[moves] * divided)
+            slopes = slopes.reshape(len(slopes), -1)
+            # With an unknown gain, the energy is normalised.
+            scale = residual.size / np.sum(np.abs(residual)**2) if prior.gain_std else 1.0
+            curvature = 2 * scale * (slopes.conj() @ slopes.T).real
+            curvature += np.diag(prior.precision[moves])
+            gradient = 2 * scale * (slopes.conj() @ residual).real
+            gradient -= prior.precision[moves] * values[moves]
+            values[moves] += step_to_maximum(curvature, gradient)
+        return values
+
+    def _best_on_grid(self, received: np.ndarray) -> np.ndarray:
+        """Return the best grid values of parameters whose likelihood has several maxima."""
+        prior = self._prior
+        (searched,) = np.nonzero(prior.needs_search)
+        n_grid = _SEARCH.points[min(len(searched), len(_SEARCH.points)) - 1]
+        # Beyond half a period, the signals repeat.
+        reach = np.minimum(_SEARCH.reach, prior.half_period[searched])
+        turns = reach * np.ptp(prior.scaled_patterns[searched].imag, axis=(1, 2))
+        counts = np.maximum(n_grid, np.ceil(_SEARCH.points_per_turn * turns / np.pi)).astype(int)
+        lines = [np.linspace(-most, most, n)
+                 for most, n in zip(reach, counts.tolist(), strict=True)]
+        grid = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1)
+        candidates = np.zeros((grid[..., 0].size, len(prior)))
+        candidates[:, searched] = grid.reshape(len(candidates), -1)
+        parts = blocks(len(candidates), max(_SEARCH.block // received.size, 1))
+        cost = np.concatenate([np.sum(np.abs(
+            self._whitened(prior.divide(received, candidates[part])))**2, axis=(1, 2))
+            for part in parts])
+        if prior.gain_std:
+            cost = received.size * np.log(cost)
+        cost += candidates**2 @ prior.precision / 2
+        return candidates[np.argmin(cost)]
+
+    def _whitened(self, signals: np.ndarray) -> np.ndarray:
+        return np.moveaxis(
+            np.matmul(np.moveaxis(signals, 1, 0), np.swapaxes(self._whitener, 1, 2)), 0, 1)
