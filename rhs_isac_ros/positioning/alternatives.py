@@ -86,7 +86,7 @@ class Blocked:
     name, reason, limit = 'blocked', 'blocked', BLOCKED_LIMIT
 
     def __init__(self, scenario: Scenario) -> None:
-        self.log_odds = _log_odds(scenario.blocked_probability)
+        self.log_odds = log_odds_of(scenario.blocked_probability)
         self._median_db, self._std_db = scenario.multipath_level_db
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
@@ -170,7 +170,7 @@ class Outside:
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
         # Logarithm of the prior odds relative to a user inside and in sight.
         self._probability = scenario.outside_probability
-        self.log_odds = _log_odds(self._probability)
+        self.log_odds = log_odds_of(self._probability)
         self._filters, self._index = arrays['outer_filters'], arrays['outer_index']
         ranges = _ranges(scenario)[:, None]
         self._scale = (2 / ranges).astype(np.float32)
@@ -184,7 +184,7 @@ class Outside:
         """Return the alternative for a prior of the position that is wrong with a probability."""
         # If the prior holds, the user is inside.
         changed = copy.copy(self)
-        changed.log_odds = _log_odds(wrong * self._probability)
+        changed.log_odds = log_odds_of(wrong * self._probability)
         return changed
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
@@ -264,7 +264,8 @@ def describe_doubts(estimate: object) -> str:
         estimate).items() if value >= _MIN_DOUBT)
 
 
-def rejection(alternative: Alternative, probability: float, inside: float) -> str:
+def rejection(alternative: Alternative | type[Alternative], probability: float, inside: float
+              ) -> str:
     """Return why an alternative rules out a fix, or '' if it does not.
 
     `probability` and `inside` are the probabilities of the alternative and of a user in the region
@@ -280,7 +281,7 @@ def rejection(alternative: Alternative, probability: float, inside: float) -> st
     return ''
 
 
-def _log_odds(probability: float) -> float:
+def log_odds_of(probability: float) -> float:
     """Return the logarithm of the odds of a probability; the odds are within 1e-12 and 1e12."""
     return math.log(max(probability, _MIN_PROBABILITY) / max(1 - probability, _MIN_PROBABILITY))
 

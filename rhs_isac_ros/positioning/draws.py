@@ -235,9 +235,14 @@ def _described(rays: _Rays, weights: np.ndarray, widening: float, bounds: np.nda
         return means, squares - means[:, :, None] * means[:, None]
 
     means, covariances = of_each(places, rays.direction)
+    points, bent = of_each(np.column_stack([rays.range_m, rays.direction[:, 1:]]), along)
+    # A few rays have moments in fewer dimensions than the posterior around them. All groups
+    # together show how wide it is.
+    variance = float(np.exp(log_shares) @ np.trace(bent[:, 1:, 1:], axis1=1, axis2=2)) / 2
+    few = np.sum(shares**2, axis=1)**2
+    bent[:, 1:, 1:] += (few * variance / np.exp(log_shares).sum())[:, None, None] * np.eye(2)
     return (Mixture._make((log_shares, means, regular(covariances))).normalised().scaled(widening),
-            Sheets.of_density(log_shares, *of_each(
-                np.column_stack([rays.range_m, rays.direction[:, 1:]]), along), bounds))
+            Sheets.of_density(log_shares, points, bent, bounds))
 
 
 def _groups(weights: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -63,14 +63,16 @@ class Sighting:
 
     @classmethod
     def of(cls, estimate: 'Estimate', pose: Pose | None = None) -> 'Sighting | None':
-        """Return the likelihood for the signals of one shot; None without a position.
+        """Return the likelihood for the signals of one shot, or None.
 
-        `estimate` is the result of `posterior`. By default, the pose is that of its scenario.
+        None without a position, unless the reason is a user outside of the region, which is
+        evidence, too. `estimate` is the result of `posterior`. By default, the pose is that of its
+        scenario.
         """
         found = estimate.sighting
-        if found is None or estimate.reason:
-            return None
-        return found if pose in (None, found.pose) else dataclasses.replace(
+        if found is None or pose in (None, found.pose):
+            return found
+        return dataclasses.replace(
             found, pose=pose, mixture=found.mixture.moved(found.pose, pose))
 
 
@@ -133,7 +135,7 @@ class Estimate:
 
     @property
     def sighting(self) -> Sighting | None:
-        """What the signals alone say; None unless this is a result of `posterior` with modes."""
+        """What the signals alone say; None unless this is a result of `posterior`; see `of`."""
         return self.see() if callable(self.see) else None
 
     @property

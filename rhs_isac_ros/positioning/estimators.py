@@ -456,12 +456,13 @@ class _Found(NamedTuple):
 
     def posterior(self) -> Estimate:
         """Return the estimate with its mixture and its sighting."""
-        if self.fit is None:
+        reason = self.estimate.reason
+        if self.fit is None or (reason and not str(reason).startswith(Outside.reason)):
             return self.estimate
         see = self.see()
         density = functools.cache(lambda: see().mixture.normalised())
         return dataclasses.replace(
-            self.estimate, see=see, density=None if self.estimate.reason else density)
+            self.estimate, see=see, density=None if reason else density)
 
     def see(self) -> Callable[[], Sighting]:
         """Return the function that describes the signals alone."""

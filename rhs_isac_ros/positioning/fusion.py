@@ -14,18 +14,23 @@ To each likelihood, a constant is added: the user may be blocked from the surfac
 have missed a mode, or the surface may be elsewhere. A surface that disagrees with the others thus
 makes the posterior broader. All masses are averages over the region, in as many dimensions as the
 region has.
+
+All surfaces together decide whether a user is outside of the region. The product for a user inside
+is compared with the product of what each surface says about a user outside. A surface may see the
+user beyond its own region, or in the part of it that is outside of the region of the site.
 """
 
 import functools
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import mixture_weights, untied
+from rhs_isac_ros.model.arrays import log_sum, mixture_weights, untied
 from rhs_isac_ros.model.gaussian import moments, step_to_maximum, symmetric
 from rhs_isac_ros.model.geometry import jacobian, polar_derivative, to_polar, to_positions
 from rhs_isac_ros.model.pose import Pose
+from rhs_isac_ros.positioning.alternatives import Outside, log_odds_of, rejection
 from rhs_isac_ros.positioning.estimate import SITE, Estimate, Sighting, regular
 from rhs_isac_ros.positioning.mixture import Mixture, log_volume
 from rhs_isac_ros.positioning.segments import select
@@ -64,6 +69,8 @@ class _Limits(NamedTuple):
     constant: float = 0.98
     # Logarithm of a likelihood of 0, and smallest standard deviation of samples [m].
     never: float = -1e9
+    # Largest logarithm of a share that is due to the tails of sheets alone.
+    tail: float = -9.0
     least_m: float = 1e-6
 
 
@@ -72,13 +79,16 @@ _LIMITS = _Limits()
 _POWERS = 0.5**np.arange(24)
 
 
-def fuse(sightings: Sequence[Sighting], bounds_m: np.ndarray) -> Estimate:
+def fuse(sightings: Sequence[Sighting], bounds_m: np.ndarray, outside_probability: float = 0.0
+         ) -> Estimate:
     """Multiply the likelihoods of the surfaces, for a user between the bounds of the region.
 
-    The bounds, float64 [2, 3] [m], and the result are in the frame of the site. Raises ValueError
-    without sightings, or if one has no density in the region.
+    The bounds, float64 [2, 3] [m], and the result are in the frame of the site. The prior
+    probability of a user outside of the region is from 0 to less than 1. If that of all sightings
+    exceeds `alternatives.LIMIT`, the result is a reason; with 0, users are inside. Raises
+    ValueError without sightings, or if one has no density in the region.
     """
-    return Fuser(bounds_m).fuse(sightings)
+    return Fuser(bounds_m, outside_probability).fuse(sightings)
 
 
 class Fuser:
@@ -87,9 +97,9 @@ class Fuser:
     The products of sightings that begin in the same way share their first factors.
     """
 
-    def __init__(self, bounds_m: np.ndarray) -> None:
-        """Take the bounds of the region in the frame of the site, float64 [2, 3] [m]."""
-        self._bounds_m = bounds_m
+    def __init__(self, bounds_m: np.ndarray, outside_probability: float = 0.0) -> None:
+        """Take the bounds of the region and the prior probability; see the function `fuse`."""
+        self._bounds_m, self._outside_probability = bounds_m, outside_probability
         self._factor = functools.cache(lambda one: _Factor.of(one, bounds_m))
         self._product = functools.cache(self._multiply)
         self._fused = functools.cache(self._locate)
@@ -110,17 +120,43 @@ class Fuser:
     def _locate(self, sightings: tuple[Sighting, ...]) -> Estimate:
         factors = [self._factor(one) for one in sightings]
         products = self._product(sightings).inside(factors, self._bounds_m)
-        log_agreement, constant = products.moments.log_mass, products.constant(factors)
+        constant = products.constant(factors)
+        log_agreement = products.moments.log_mass
+        common: dict[str, Any] = {'log_agreement': log_agreement, 'frame': SITE}
+        log_ratios = np.array([one.outside_log_ratio for one in sightings])
+        if self._outside_probability and not np.isnan(log_ratios).all():
+            log_missing = np.log([one.missing for one in sightings])
+            beyond = np.maximum(-np.expm1([one.log_share for one in factors]), 1e-9)
+            # Beyond the region of the surface, or in the part of it outside of that of the site.
+            log_outside = np.logaddexp(log_missing, np.log1p(-np.exp(log_missing)) + np.logaddexp(
+                np.nan_to_num(log_ratios), np.log(beyond))).sum()
+            # A user inside, too, may be seen by no surface.
+            log_inside = np.logaddexp(log_agreement, log_missing.sum())
+            probability = float(np.exp(-np.logaddexp(
+                0.0, log_inside - log_outside - log_odds_of(self._outside_probability))))
+            common['outside_probability'] = probability
+            if reason := rejection(Outside, probability, 1 - probability):
+                return Estimate.without_fix(reason, **common)
         mixture = products.moments.widened(-constant).reduce(_LIMITS.products[1]).normalised()
         mixture = mixture.shared(np.tensordot(products.moments.probabilities, constant, axes=1))
-        return Estimate(*mixture.moments(), log_agreement=log_agreement, density=mixture,
-                        frame=SITE)
+        return Estimate(*mixture.moments(), density=mixture, **common)
+
+
+def _log_share_of(mixture: Mixture, bounds_m: np.ndarray) -> float:
+    """Return the logarithm of the probability of a region, or minus infinity."""
+    free = np.ptp(bounds_m, axis=0) > 0
+    positions = mixture.means[:, None] + np.matmul(
+        standard_normal(_LIMITS.of_sheet),
+        np.swapaxes(np.linalg.cholesky(mixture.covariances), 1, 2))
+    within = ((positions >= bounds_m[0]) & (positions <= bounds_m[1]))[..., free].all(axis=-1)
+    with np.errstate(divide='ignore'):
+        return float(np.log(mixture.probabilities @ within.mean(axis=1)))
 
 
 class _Factor(NamedTuple):
     """The likelihood of one surface: C sheets and, as the last row, a constant.
 
-    Its average over the region is 1.
+    Its average over the region of the surface, which contains that of the site, is 1.
     """
 
     pose: Pose
@@ -128,6 +164,7 @@ class _Factor(NamedTuple):
     curvature: np.ndarray  # Float64 [C + 1, 3, 3].
     log_peaks: np.ndarray  # Float64 [C + 1].
     moments: Mixture  # Averages and moments inside the region, in the frame of the site.
+    log_share: float  # Logarithm of the surface's probability of the region of the site.
 
     @classmethod
     def of(cls, sighting: Sighting, bounds_m: np.ndarray) -> '_Factor':
@@ -141,8 +178,12 @@ class _Factor(NamedTuple):
         positions, log_ratio = gaussians.sample(standard_normal(_LIMITS.of_sheet))
         logs = gaussians.logarithm(positions) + log_ratio
         sheets, inside = select(sheets, _has_mass(logs)), _moments(positions, logs)
-        log_total = inside.log_mass - np.log1p(-sighting.missing)
         centre, size = bounds_m.mean(axis=0), np.ptp(bounds_m, axis=0)
+        tail = inside.log_mass + np.log(size[size > 0]).sum() - log_sum(
+            sheets.as_density().log_weights)
+        log_share = float(np.logaddexp(
+            _log_share_of(sighting.mixture, bounds_m), min(tail, _LIMITS.tail)))
+        log_total = inside.log_mass - np.log1p(-sighting.missing) - log_share
         return cls(
             pose, np.append(sheets.means, sheets.means[:1], axis=0),
             np.append(np.linalg.inv(sheets.covariances), np.zeros((1, 3, 3)), axis=0),
@@ -150,7 +191,8 @@ class _Factor(NamedTuple):
             Mixture._make((
                 np.append(inside.log_weights - log_total, np.log(sighting.missing)),
                 np.append(inside.means, centre[None], axis=0),
-                np.append(inside.covariances, regular(np.diag(size**2 / 12))[None], axis=0))))
+                np.append(inside.covariances, regular(np.diag(size**2 / 12))[None], axis=0))),
+            log_share)
 
     def logarithm(self, rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
         """Evaluate rows [T] at positions [T, S, 3] [m], float64 [T, S]."""
@@ -354,7 +396,10 @@ def _annealed(terms: _Terms, bounds_m: np.ndarray, normal: np.ndarray
         points = to_polar(pose.to_surface(positions))
         means, covariances = moments(weights, points)
         derivative = polar_derivative(means) @ pose.rotation.T
-        covariances += derivative @ least @ np.swapaxes(derivative, 1, 2)
+        # Few samples have moments in fewer dimensions than the product.
+        few = np.sum(weights**2, axis=1)[:, None, None]**2
+        covariances += few * sheets.covariances + derivative @ least @ np.swapaxes(
+            derivative, 1, 2)
         sheets = Sheets._make((
             np.zeros(len(rows)), means, symmetric(_LIMITS.spread**2 * covariances)))
     return best[1], best[2]

@@ -83,6 +83,11 @@ class Site:
                         for name, value in content['surfaces'].items()}, bounds_m)
 
     @property
+    def outside_probability(self) -> float:
+        """Prior probability of a user outside of the region, that of the leader."""
+        return self.surfaces[self.leader].scenario.outside_probability
+
+    @property
     def leader(self) -> str:
         """Name of the surface whose base station leads: the first one."""
         return next(iter(self.surfaces))
@@ -99,7 +104,7 @@ class Site:
 class SiteEstimator:
     """The position of a user of a site, from the signals of one cycle.
 
-    As in a running site, a surface for which the user is outside of the region has no position.
+    All surfaces together decide whether the user is outside of the region.
     """
 
     def __init__(self, site: Site, table_folder: Path | None = None) -> None:
@@ -108,7 +113,7 @@ class SiteEstimator:
                             for name, one in site.surfaces.items()}
 
     def sightings(self, received: Mapping[str, np.ndarray]) -> dict[str, Sighting]:
-        """Return the likelihoods of the surfaces that have a position, by name.
+        """Return the likelihoods of the surfaces, by name; see `Sighting.of`.
 
         `received` contains signals, complex128 [N_B, N_SB F], of some or all surfaces.
         """
@@ -138,11 +143,12 @@ class SiteEstimator:
         agreements, places = [], []
         for _, sightings in self._each(
                 self._site.sample(rng.uniform(low, high, size=(n, 3)), rng)):
-            if sightings:
-                fuser = Fuser(self._site.bounds_m)
+            fuser = Fuser(self._site.bounds_m, self._site.outside_probability)
+            # In the order of the pairs, so that products are reused.
+            if sightings and (fused := fuser.fuse(
+                    [one for _, one in sorted(sightings.items())])).fix:
                 agreements.append(pair_agreements(sightings, fuser))
-                # In the order of the pairs, so that products are reused.
-                places.append(fuser.fuse([one for _, one in sorted(sightings.items())]).mean)
+                places.append(fused.mean)
         return agreements, np.array(places).reshape(-1, 3)
 
     def estimate(self, received: Mapping[str, np.ndarray]) -> Estimate:
@@ -160,7 +166,8 @@ class SiteEstimator:
     def _fused(self, posteriors: Mapping[str, Estimate], sightings: Mapping[str, Sighting]
                ) -> Estimate:
         if sightings:
-            return fuse(list(sightings.values()), self._site.bounds_m)
+            return fuse(list(sightings.values()), self._site.bounds_m,
+                        self._site.outside_probability)
         return Estimate.without_fix('; '.join(
             f'{name}: {one.reason}' for name, one in posteriors.items()), frame=SITE)
 

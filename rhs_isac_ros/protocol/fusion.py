@@ -9,6 +9,7 @@ import numpy as np
 from rhs_isac_ros.bounds import site_crlb
 from rhs_isac_ros.positioning import Estimate, Mixture, Sighting
 from rhs_isac_ros.positioning.agreement import PoseTest, pair_agreements
+from rhs_isac_ros.positioning.alternatives import LIMIT, Outside
 from rhs_isac_ros.positioning.fusion import Fuser
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.sheets import Sheets
@@ -77,7 +78,7 @@ class _Fix:
 
     @property
     def posteriors(self) -> dict[str, m.Posterior]:
-        """The answers that contain a position."""
+        """The answers with evidence about the position."""
         return {name: answer for name, answer in sorted(self.answers.items())
                 if isinstance(answer, m.Posterior)}
 
@@ -98,6 +99,7 @@ class Fusion(Role):
                  settings: FusionSettings | None = None) -> None:
         super().__init__()
         self._bounds_m, self._stopwatch = site.bounds_m, stopwatch
+        self._outside_probability = site.outside_probability
         self._surfaces, self._scenario = site.surfaces, site.surfaces[site.leader].scenario
         for one in site.surfaces.values():
             one.prepare()
@@ -153,7 +155,8 @@ class Fusion(Role):
 
     def _is_ready(self, fix: _Fix) -> bool:
         return self.now_s >= fix.due_s or all(
-            name in fix.answers or self._is_silent(name) for name in self._missed)
+            (name in fix.answers and not _is_followed(fix.answers[name]))
+            or self._is_silent(name) for name in self._missed)
 
     def _receive(self, message: m.Posterior | m.NoFix) -> None:
         name, key = self._names.get(message.scenario_id), (message.cycle_id, message.user)
@@ -165,7 +168,8 @@ class Fusion(Role):
         self._missed[name] = 0
         fix = self._open.get(key)
         if key in self._closed:
-            self._answer_again(name, *self._closed[key])
+            if not _is_followed(message):
+                self._answer_again(name, *self._closed[key])
         elif fix is None:
             wait_s = self._settings.in_use.wait_s
             if any(cycle_id < message.cycle_id for cycle_id, _ in self._open):
@@ -174,8 +178,10 @@ class Fusion(Role):
                          key='wait_s')
             self.count(Outcome.OVERFLOW, self._open.put(
                 key, _Fix(self.now_s + wait_s, {name: message})))
-        elif name in fix.answers:
-            self.count(Outcome.DUPLICATE)
+        elif isinstance(before := fix.answers.get(name), m.Posterior) or type(before) is type(
+                message):
+            # A posterior that is no position comes with its reason, in any order.
+            self.count(Outcome.DUPLICATE, not _is_followed(message))
         else:
             fix.answers[name] = message
 
@@ -202,7 +208,7 @@ class Fusion(Role):
         begin = self._stopwatch()
         sightings = {name: sighting_of(one) for name, one in fix.posteriors.items()}
         # Anything may be published on the topic, such as a mixture inside the surface.
-        fuser = Fuser(self._bounds_m)
+        fuser = Fuser(self._bounds_m, self._outside_probability)
         try:
             fused = fuser.fuse([self._trusted(name, one) for name, one in sightings.items()])
             agreements = pair_agreements(sightings, fuser) if self._test else {}
@@ -210,9 +216,16 @@ class Fusion(Role):
             self.counters['malformed'] += 1
             self.log(f'cycle {key[0]} of user {key[1]}: {error}', warning=True, key='malformed')
             return
-        self._publish(fix, sightings, fused, self._stopwatch() - begin)
-        if self._test:
-            self._test.add(agreements, fused.mean)
+        if fused.reason:
+            self._no_fix(fix, str(fused.reason))
+        else:
+            self._publish(fix, sightings, fused, self._stopwatch() - begin)
+        # Surfaces that disagree about users whom each of them sees inside have wrong poses.
+        if self._test and all(
+                one.outside_probability <= LIMIT for one in fix.posteriors.values()):
+            place = fused.mean if fused.fix else next(iter(
+                sightings.values())).mixture.moments()[0]
+            self._test.add(agreements, place)
             self._examine(self._test.suspects())
 
     def _trusted(self, name: str, sighting: Sighting) -> Sighting:
@@ -229,8 +242,8 @@ class Fusion(Role):
         common: dict[str, float | str] = {
             'stamp_ns': source.stamp_ns,
             'codebook_id': '',  # of no single surface
-            'outside_probability': max(one.outside_probability for one in answers.values()),
             # From all surfaces.
+            'outside_probability': float(np.nan_to_num(fused.outside_probability)),
             'blocked_probability': math.prod(
                 one.blocked_probability for one in answers.values())}
         self._answer(fix, m.derive(
@@ -265,10 +278,10 @@ class Fusion(Role):
         if estimate:
             self.act(PublishTrack(source.user, estimate, source.stamp_ns))
 
-    def _no_fix(self, fix: _Fix) -> None:
+    def _no_fix(self, fix: _Fix, reason: str = '') -> None:
         source = next(iter(fix.answers.values()))
         self.count(Outcome.NO_FIX)
-        reason = '; '.join(f'{name}: {answer.reason}' for name, answer in sorted(
+        reason = reason or '; '.join(f'{name}: {answer.reason}' for name, answer in sorted(
             fix.answers.items()) if isinstance(answer, m.NoFix))
         self._answer(fix, m.derive(m.NoFix, source, stamp_ns=source.stamp_ns, codebook_id='',
                                    reason=reason))
@@ -280,6 +293,11 @@ class Fusion(Role):
             self.log_state(
                 'poses', _wrong_poses(suspects) if suspects else 'the surfaces agree again',
                 bool(suspects))
+
+
+def _is_followed(answer: m.Posterior | m.NoFix) -> bool:
+    """Return whether the posterior of a user outside follows an answer, or preceded it."""
+    return isinstance(answer, m.NoFix) and answer.reason.startswith(Outside.reason)
 
 
 def _silent(name: str) -> str:

@@ -370,9 +370,9 @@ class Positioner(Role):
         latency_s = self._stopwatch() - begin
         # A plug-in may return any position.
         problem = position_problem(np.asarray(estimate.mean)) if estimate.fix else ''
+        probabilities = {f'{name}_probability': value
+                         for name, value in probabilities_of(estimate).items()}
         if estimate.fix and not problem:
-            probabilities = {f'{name}_probability': value
-                             for name, value in probabilities_of(estimate).items()}
             of_site = estimate.to_site(self._scenario.pose)
             self.send(m.derive(
                 m.PositionEstimate, received, stamp_ns=received.stamp_ns,
@@ -380,11 +380,11 @@ class Positioner(Role):
                 crlb_m2=float(system.crlb(estimate.mean[None])[0]), estimator=estimator.name,
                 latency_s=latency_s, **probabilities, **self._proposal(received.user, estimate)))
             self._publish_track(received, of_site)
-            if self._is_observed() and (sighting := Sighting.of(estimate)):
-                self.send(posterior_of(
-                    received, sighting, stamp_ns=received.stamp_ns, **probabilities))
         else:
             self._no_fix(received, f'position: {problem}' if problem else str(estimate.reason))
+        if self._is_observed() and not problem and (sighting := Sighting.of(estimate)):
+            self.send(posterior_of(
+                received, sighting, stamp_ns=received.stamp_ns, **probabilities))
         text, begins = self._residuals.add(received.user, estimate)
         if text:
             self.log_state('residuals', text, begins)

@@ -405,6 +405,7 @@ class SiteRecording(Recording):
         """Locate the users again from the recorded signals; return the positions by name."""
         find = functools.cache(functools.partial(self._estimator, table_folder))
         again: dict[str, _Positions] = {name: {} for name in self.logs}
+        leader = next(iter(self._networks.surfaces.values()))
         for key in self.truths:
             sightings = []
             # In the order of the node `fusion`.
@@ -414,10 +415,12 @@ class SiteRecording(Recording):
                     continue
                 posterior = find(name, signals.codebook_id).posterior(signals.stacked)
                 if sighting := Sighting.of(posterior):
-                    again[name][key] = posterior.to_site(scenario.pose).mean
                     sightings.append(sighting)
-            if sightings:
-                again[''][key] = fuse(sightings, self._networks.bounds_m).mean
+                if posterior.fix:
+                    again[name][key] = posterior.to_site(scenario.pose).mean
+            if sightings and (fused := fuse(
+                    sightings, self._networks.bounds_m, leader.outside_probability)).fix:
+                again[''][key] = fused.mean
         return again
 
     def _estimator(self, folder: Path | None, name: str, codebook_id: str) -> BayesEstimator:

@@ -223,3 +223,34 @@ def test_products_of_the_same_sightings_are_computed_once():
         assert np.array_equal(found.mixture.means, expected.mixture.means)
     # The surface is the same, but may be elsewhere with a higher probability.
     assert fuser.fuse([one, dataclasses.replace(two, missing=0.5)]) is not pair
+
+
+def outside_probability(*log_ratios, poses=(FRONT, SIDE), place=PLACE, **fields):
+    """Return that of surfaces that agree on a place in the region of the site."""
+    return fuse([dataclasses.replace(sheets(pose, place), outside_log_ratio=log_ratio, **fields)
+                 for pose, log_ratio in zip(poses, log_ratios, strict=False)],
+                BOUNDS, 0.5).outside_probability
+
+
+def test_a_single_surface_decides_by_its_own_evidence():
+    for log_ratio in (-3.0, 0.0, 3.0):
+        assert outside_probability(log_ratio) == pytest.approx(
+            1 / (1 + np.exp(-log_ratio)), abs=0.02)
+
+
+def test_surfaces_that_agree_are_evidence_for_a_user_inside():
+    agreement = float(fuse([sheets(FRONT, PLACE), sheets(SIDE, PLACE)], BOUNDS).log_agreement)
+    assert agreement > 3
+    assert outside_probability(agreement / 2, agreement / 2) == pytest.approx(0.5, abs=0.02)
+    assert outside_probability(0.0, 0.0) < 0.05
+    # A surface that is blocked has no evidence.
+    assert outside_probability(20.0, 0.0, missing=1 - 1e-11) == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_surface_that_sees_the_user_beyond_the_region_of_the_site_is_evidence():
+    beyond = PLACE + [0.0, 6.0, 0.0]
+    assert outside_probability(-20.0, place=beyond) > 0.99
+
+
+def test_users_are_inside_if_no_surface_knows_about_users_outside():
+    assert np.isnan(outside_probability(np.nan, np.nan))

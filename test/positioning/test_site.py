@@ -74,6 +74,18 @@ def test_several_shots_are_located_at_once(estimator, cycles):
         estimator.estimate({**received, 'side': received['side'][:1]})
 
 
+def test_users_outside_have_no_position_and_users_inside_have_one(estimator, cycles):
+    assert sum(not estimator.estimate(one).fix for one in cycles[1]) == 0
+    rng = np.random.default_rng(6)
+    positions = rng.uniform(BOUNDS[0] - [3, 3, 1], BOUNDS[1] + [5, 5, 1], size=(120, 3))
+    distances = np.linalg.norm(positions - np.clip(positions, *BOUNDS), axis=1)
+    received = SITE.sample(positions[distances > 0.5][:30], rng)
+    found = estimator.estimate(received)
+    assert found.fix.sum() <= 1
+    assert all(reason.startswith('position outside of the region')
+               for reason, fix in zip(found.reason, found.fix, strict=True) if not fix)
+
+
 def test_the_example_is_two_surfaces_at_a_right_angle():
     site = Site.from_yaml(CONFIG / 'site.yaml')
     assert list(site.surfaces) == ['front', 'side']

@@ -43,16 +43,16 @@ def fusion(site):
 @pytest.fixture(scope='module')
 def answer(site):
     """Function that returns the posterior of a surface, 0.1 m thick and 2 m wide at a place."""
-    def make(name, cycle_id=1, place=PLACE, user=2, **fields):
+    def make(name, cycle_id=1, place=PLACE, user=2, outside_log_ratio=-5.0, **fields):
         pose = POSES[name]
         covariance = pose.covariances_to_site(np.diag([0.01, 4.0, 0.04])[None])
-        sighting = Sighting(pose, Mixture(np.array([-3.0]), place[None], covariance))
+        sighting = Sighting(pose, Mixture(np.array([-3.0]), place[None], covariance),
+                            outside_log_ratio=outside_log_ratio)
         source = m.ReceivedSignals(
             cycle_id=cycle_id, user=user, user_instance=7,
             codebook_id=site.surfaces[name].codebook.id, signals=None)
         return posterior_of(source, sighting, **{
-            'scenario_id': site.surfaces[name].scenario.id, 'stamp_ns': 9,
-            'outside_probability': 0.1} | fields)
+            'scenario_id': site.surfaces[name].scenario.id, 'stamp_ns': 9} | fields)
     return make
 
 
@@ -94,11 +94,34 @@ def test_a_cycle_with_all_surfaces_is_fused_at_once(fusion, site, answer):
     assert np.array_equal(estimate.position, mean)
     assert np.array_equal(estimate.covariance_m2, covariance)
     assert (estimate.cycle_id, estimate.user, estimate.user_instance, estimate.stamp_ns,
-            estimate.estimator, estimate.latency_s, estimate.outside_probability) == (
-        1, 2, 7, 9, 'fusion of front, side', 1, 0.1)
+            estimate.estimator, estimate.latency_s) == (1, 2, 7, 9, 'fusion of front, side', 1)
+    assert 0 < estimate.outside_probability < 1e-3
     assert np.linalg.norm(mean - PLACE) < 0.1
     for message in (estimate, posterior):
         m.check(message, site.surfaces['front'].scenario)
+
+
+@pytest.mark.parametrize('order', [(0, 1, 2), (1, 0, 2), (2, 1, 0)])
+@pytest.mark.parametrize(('log_ratio', 'kind'), [(3.0, m.PositionEstimate), (30.0, m.NoFix)])
+def test_all_surfaces_decide_whether_a_user_is_outside(
+        fusion, answer, no_fix, order, log_ratio, kind):
+    # The front surface finds the user outside, and sends its reason and its posterior.
+    reason = dataclasses.replace(
+        no_fix('front'), reason='position outside of the region: probability 0.95')
+    events = [reason, answer('front', outside_log_ratio=log_ratio), answer('side')]
+    found = [message for messages in at_once(fusion, [events[number] for number in order])
+             for message in messages if not isinstance(message, m.Posterior)]
+    assert [type(message) for message in found] == [kind]
+    if kind is m.NoFix:
+        assert found[0].reason.startswith('position outside of the region: probability 1')
+
+
+def test_a_reason_without_its_posterior_is_an_answer_when_the_cycle_is_due(
+        fusion, answer, no_fix):
+    at_once(fusion, [answer('side'), dataclasses.replace(
+        no_fix('front'), reason='position outside of the region')])
+    (estimate, _) = sent(fusion.handle(Timeout(), WAIT_S))
+    assert estimate.estimator == 'fusion of side'
 
 
 def test_the_bound_is_that_of_the_surfaces_with_a_position(fusion, site, answer, no_fix):
