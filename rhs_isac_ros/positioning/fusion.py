@@ -71,6 +71,8 @@ class _Limits(NamedTuple):
     never: float = -1e9
     # Largest logarithm of a share that is due to the tails of sheets alone.
     tail: float = -9.0
+    # Smallest logarithm of a share, relative to that of the constant.
+    least: float = -10.0
     least_m: float = 1e-6
 
 
@@ -181,8 +183,10 @@ class _Factor(NamedTuple):
         centre, size = bounds_m.mean(axis=0), np.ptp(bounds_m, axis=0)
         tail = inside.log_mass + np.log(size[size > 0]).sum() - log_sum(
             sheets.as_density().log_weights)
-        log_share = float(np.logaddexp(
-            _log_share_of(sighting.mixture, bounds_m), min(tail, _LIMITS.tail)))
+        # A product with the sheets remains if all of them are far from the region.
+        log_share = max(float(np.logaddexp(
+            _log_share_of(sighting.mixture, bounds_m), min(tail, _LIMITS.tail))),
+            float(np.log(sighting.missing)) + _LIMITS.least)
         log_total = inside.log_mass - np.log1p(-sighting.missing) - log_share
         return cls(
             pose, np.append(sheets.means, sheets.means[:1], axis=0),

@@ -250,6 +250,7 @@ def test_surfaces_that_agree_are_evidence_for_a_user_inside():
 def test_a_surface_that_sees_the_user_beyond_the_region_of_the_site_is_evidence():
     beyond = PLACE + [0.0, 6.0, 0.0]
     assert outside_probability(-20.0, place=beyond) > 0.99
+    assert outside_probability(-20.0, -20.0, place=beyond) > 0.99
 
 
 def test_users_are_inside_if_no_surface_knows_about_users_outside():
