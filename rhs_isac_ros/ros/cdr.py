@@ -63,6 +63,8 @@ def _decode_complex(items: Sequence[np.ndarray]) -> np.ndarray:
     shape, real, imag = items
     sizes = _shape(real, shape)
     _shape(imag, shape)
+    if not len(real):
+        raise ValueError(f'shape {sizes}, expected at least one value')
     result = np.empty(len(real), complex)
     result.real, result.imag = real, imag
     return result.reshape(sizes)
@@ -70,9 +72,8 @@ def _decode_complex(items: Sequence[np.ndarray]) -> np.ndarray:
 
 def _shape(array: np.ndarray, shape: np.ndarray) -> list[int]:
     sizes: list[int] = shape.tolist()
-    if len(array) != math.prod(sizes) or not len(array):
-        raise ValueError(
-            f'{len(array)} values, expected shape {sizes} with at least one value')
+    if len(array) != math.prod(sizes):
+        raise ValueError(f'{len(array)} values, expected shape {sizes}')
     return sizes
 
 
