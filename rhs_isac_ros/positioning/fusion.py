@@ -69,10 +69,9 @@ class _Limits(NamedTuple):
     constant: float = 0.98
     # Logarithm of a likelihood of 0, and smallest standard deviation of samples [m].
     never: float = -1e9
-    # Largest logarithm of a share that is due to the tails of sheets alone.
+    # Logarithm of the probability of the region for a surface up to which only the tails of its
+    # sheets reach the region.
     tail: float = -9.0
-    # Smallest logarithm of a share, relative to that of the constant.
-    least: float = -10.0
     least_m: float = 1e-6
 
 
@@ -121,6 +120,10 @@ class Fuser:
 
     def _locate(self, sightings: tuple[Sighting, ...]) -> Estimate:
         factors = [self._factor(one) for one in sightings]
+        if self._outside_probability and all(one.log_share <= _LIMITS.tail for one in factors):
+            return Estimate.without_fix(
+                rejection(Outside, 1.0, 0.0), frame=SITE, outside_probability=1.0,
+                log_agreement=float(np.log([one.missing for one in sightings]).sum()))
         products = self._product(sightings).inside(factors, self._bounds_m)
         constant = products.constant(factors)
         log_agreement = products.moments.log_mass
@@ -181,13 +184,13 @@ class _Factor(NamedTuple):
         logs = gaussians.logarithm(positions) + log_ratio
         sheets, inside = select(sheets, _has_mass(logs)), _moments(positions, logs)
         centre, size = bounds_m.mean(axis=0), np.ptp(bounds_m, axis=0)
-        tail = inside.log_mass + np.log(size[size > 0]).sum() - log_sum(
-            sheets.as_density().log_weights)
-        # A product with the sheets remains if all of them are far from the region.
-        log_share = max(float(np.logaddexp(
-            _log_share_of(sighting.mixture, bounds_m), min(tail, _LIMITS.tail))),
-            float(np.log(sighting.missing)) + _LIMITS.least)
-        log_total = inside.log_mass - np.log1p(-sighting.missing) - log_share
+        log_share = _log_share_of(sighting.mixture, bounds_m)
+        if log_share > _LIMITS.tail:
+            log_total = inside.log_mass - log_share
+        else:
+            # Samples of tails far from all maxima have too little weight.
+            log_total = log_sum(sheets.as_density().log_weights) - np.log(size[size > 0]).sum()
+        log_total -= np.log1p(-sighting.missing)
         return cls(
             pose, np.append(sheets.means, sheets.means[:1], axis=0),
             np.append(np.linalg.inv(sheets.covariances), np.zeros((1, 3, 3)), axis=0),
