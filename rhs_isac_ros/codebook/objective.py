@@ -49,8 +49,7 @@ def nuisance(
     `prior` are unused.
     """
     unknown = dataclasses.replace(scenario, band_phase_std_rad=np.inf)
-    # Without phases, the bound is a small difference of large numbers.
-    return AverageCrlb(unknown, positions, ROW_TOLERANCE / 30, region_prior=True, tick=tick)
+    return AverageCrlb(unknown, positions, ROW_TOLERANCE, region_prior=True, tick=tick)
 
 
 def ambiguity(

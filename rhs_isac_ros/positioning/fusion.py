@@ -6,9 +6,9 @@ product of one sheet of every surface.
 
 The maximum of a product is found by Gauss-Newton steps. Weighted samples around it, in range and
 direction cosines of the surface with the thinnest sheet, yield the moments in the region. Two
-sheets of opposite curvature that touch have a product along a rim. Where few samples carry the
-weight, all of the thinnest sheet is therefore sampled, and the likelihoods of the other surfaces
-are raised to powers that increase to 1 from round to round.
+sheets of opposite curvature that touch have a product along a rim, which may be far from the
+maximum. Samples are therefore as wide as if the other sheets were thicker by what they bend over
+the samples, and there are more of them where few carry the weight.
 
 To each likelihood, a constant is added: the user may be blocked from the surface, the search may
 have missed a mode, or the surface may be elsewhere. A surface that disagrees with the others thus
@@ -33,8 +33,8 @@ from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.alternatives import Outside, log_odds_of, rejection
 from rhs_isac_ros.positioning.estimate import SITE, Estimate, Sighting, regular
 from rhs_isac_ros.positioning.mixture import Mixture, log_volume
-from rhs_isac_ros.positioning.segments import select
-from rhs_isac_ros.positioning.sheets import Inside, Sheets, move_inside
+from rhs_isac_ros.positioning.segments import concatenate, select
+from rhs_isac_ros.positioning.sheets import Inside, move_inside
 from rhs_isac_ros.positioning.templates import standard_normal
 from rhs_isac_ros.support.threads import one_blas_thread
 
@@ -47,37 +47,37 @@ class _Limits(NamedTuple):
     margins: tuple[float, float] = (25.0, 12.0)
     products: tuple[int, int] = (4000, 512)
     steps: int = 3
-    # Numbers of samples of a sheet, of a product, and of all products together; and factor by
-    # which samples are wider than a Gaussian.
+    # Number of samples of a sheet. Numbers of samples of a product, and of all products together,
+    # at first, and where too few of these carry the weight. Factor by which samples are wider than
+    # a Gaussian.
     of_sheet: int = 64
-    of_product: int = 128
-    samples: int = 1 << 13
+    of_product: tuple[int, int] = (128, 1024)
+    samples: tuple[int, int] = (1 << 13, 1 << 15)
     spread: float = 1.2
     # Information of a uniform prior in the region that narrows Gaussians, as a share of it, and
     # smallest extent of the region along an axis, relative to the largest one.
     narrowing: float = 0.25
     extent: float = 1e-3
+    # Passes in which the width of a Gaussian is found, step of its second differences in standard
+    # deviations, and factor by which sheets are thicker, as they bend more in the tails.
+    passes: int = 4
+    step: float = 1.5
+    tails: float = 3.0
     # Share of the samples that have to be effective in products whose weight is within a margin of
-    # the best: a little less than in a Gaussian. Share with which rounds end, share to which
-    # powers of the likelihood are limited, and maximum number of rounds.
-    gaussian: float = 0.75
+    # the best.
+    effective: float = 0.5
     margin: float = 5.0
-    effective: float = 0.4
-    tempered: float = 0.15
-    rounds: int = 8
     # Largest share of a variance that is the same in all phases.
     constant: float = 0.98
-    # Logarithm of a likelihood of 0, and smallest standard deviation of samples [m].
+    # Logarithm of a likelihood of 0.
     never: float = -1e9
-    # Logarithm of the probability of the region for a surface up to which only the tails of its
-    # sheets reach the region.
+    # Largest logarithm of a share that is due to the tails of sheets alone.
     tail: float = -9.0
-    least_m: float = 1e-6
+    # Smallest logarithm of a share, relative to that of the constant.
+    least: float = -10.0
 
 
 _LIMITS = _Limits()
-# Powers of the likelihoods.
-_POWERS = 0.5**np.arange(24)
 
 
 def fuse(sightings: Sequence[Sighting], bounds_m: np.ndarray, outside_probability: float = 0.0
@@ -120,10 +120,6 @@ class Fuser:
 
     def _locate(self, sightings: tuple[Sighting, ...]) -> Estimate:
         factors = [self._factor(one) for one in sightings]
-        if self._outside_probability and all(one.log_share <= _LIMITS.tail for one in factors):
-            return Estimate.without_fix(
-                rejection(Outside, 1.0, 0.0), frame=SITE, outside_probability=1.0,
-                log_agreement=float(np.log([one.missing for one in sightings]).sum()))
         products = self._product(sightings).inside(factors, self._bounds_m)
         constant = products.constant(factors)
         log_agreement = products.moments.log_mass
@@ -166,7 +162,8 @@ class _Factor(NamedTuple):
 
     pose: Pose
     points: np.ndarray  # Maxima, (r [m], u, v), float64 [C + 1, 3].
-    curvature: np.ndarray  # Float64 [C + 1, 3, 3].
+    covariances: np.ndarray  # Float64 [C + 1, 3, 3].
+    curvature: np.ndarray  # Their inverses; 0 for the constant.
     log_peaks: np.ndarray  # Float64 [C + 1].
     moments: Mixture  # Averages and moments inside the region, in the frame of the site.
     log_share: float  # Logarithm of the surface's probability of the region of the site.
@@ -179,27 +176,37 @@ class _Factor(NamedTuple):
         derivative = polar_derivative(to_polar(pose.to_surface(best))) @ pose.rotation.T
         sheets = sheets.widened(symmetric(
             derivative @ pose.spread(best) @ np.swapaxes(derivative, 1, 2)))
-        gaussians = sheets.inside(bounds_m, pose)
-        positions, log_ratio = gaussians.sample(standard_normal(_LIMITS.of_sheet))
-        logs = gaussians.logarithm(positions) + log_ratio
-        sheets, inside = select(sheets, _has_mass(logs)), _moments(positions, logs)
-        centre, size = bounds_m.mean(axis=0), np.ptp(bounds_m, axis=0)
-        log_share = _log_share_of(sighting.mixture, bounds_m)
-        if log_share > _LIMITS.tail:
-            log_total = inside.log_mass - log_share
-        else:
-            # Samples of tails far from all maxima have too little weight.
-            log_total = log_sum(sheets.as_density().log_weights) - np.log(size[size > 0]).sum()
-        log_total -= np.log1p(-sighting.missing)
-        return cls(
+        n, centre, size = len(best), bounds_m.mean(axis=0), np.ptp(bounds_m, axis=0)
+        around = Mixture._make((np.zeros(n + 1), np.append(best, centre[None], axis=0), np.append(
+            np.zeros((n, 3, 3)), regular(np.diag(size**2 / 12))[None], axis=0)))
+        raw = cls(
             pose, np.append(sheets.means, sheets.means[:1], axis=0),
+            np.append(sheets.covariances, np.eye(3)[None], axis=0),
             np.append(np.linalg.inv(sheets.covariances), np.zeros((1, 3, 3)), axis=0),
-            np.append(sheets.log_peaks - log_total, np.log(sighting.missing)),
-            Mixture._make((
-                np.append(inside.log_weights - log_total, np.log(sighting.missing)),
-                np.append(inside.means, centre[None], axis=0),
-                np.append(inside.covariances, regular(np.diag(size**2 / 12))[None], axis=0))),
-            log_share)
+            np.append(sheets.log_peaks, 0.0), around, 0.0)
+        found = _Products.of(raw).select(np.arange(n)).climbed([raw], bounds_m).inside(
+            [raw], bounds_m)
+        tail = found.moments.log_mass + np.log(size[size > 0]).sum() - log_sum(
+            sheets.as_density().log_weights)
+        # Without moments, the region of the surface is not known. If a sheet has its maximum in
+        # that of the site, it is taken to be the same.
+        heights = sheets.inside(bounds_m, pose, best).logarithm(best[:, None])[:, 0]
+        log_share = _log_share_of(sighting.mixture, bounds_m) if sighting.sheets else float(
+            (heights - sheets.log_peaks).max())
+        # A product with the sheets remains if all of them are far from the region.
+        log_share = max(float(np.logaddexp(log_share, min(tail, _LIMITS.tail))),
+                        float(np.log(sighting.missing)) + _LIMITS.least)
+        log_total = found.moments.log_mass - np.log1p(-sighting.missing) - log_share
+        rows = np.append(found.rows[:, 0], n)
+        of_rows = concatenate(found.moments.weighted(-log_total), select(around, [n]).weighted(
+            np.log(sighting.missing)))
+        log_peaks = np.append(raw.log_peaks[:-1] - log_total, np.log(sighting.missing))
+        return cls(pose, raw.points[rows], raw.covariances[rows], raw.curvature[rows],
+                   log_peaks[rows], of_rows, log_share)
+
+    def is_sheet(self, rows: np.ndarray) -> np.ndarray:
+        """Mark the rows [T] that are not the constant, bool [T]."""
+        return rows < len(self.points) - 1
 
     def logarithm(self, rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
         """Evaluate rows [T] at positions [T, S, 3] [m], float64 [T, S]."""
@@ -208,7 +215,7 @@ class _Factor(NamedTuple):
         values = self.log_peaks[rows, None] - np.sum(
             np.matmul(offsets, curvature) * offsets, axis=-1) / 2
         # No user behind the surface is in sight.
-        behind = (local[..., 0] <= 0) & (rows < len(self.points) - 1)[:, None]
+        behind = (local[..., 0] <= 0) & self.is_sheet(rows)[:, None]
         return np.where(behind, -np.inf, values)
 
     def expanded(self, rows: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -304,25 +311,25 @@ class _Products(NamedTuple):
     def inside(self, factors: Sequence[_Factor], bounds_m: np.ndarray) -> '_Products':
         """Return the products with averages over the region and moments in it."""
         found = self.select(~self.are_constant(factors))
-        n = min(max(_LIMITS.samples // len(found.rows), 16), _LIMITS.of_product)
-        normal = standard_normal(1 << (n.bit_length() - 1))
-        shape = len(found.rows), len(normal)
-        positions, logs = np.empty((*shape, 3)), np.empty(shape)
-        parts = list(found._by_reference(factors))
-        for mine, terms in parts:
-            points, gradient, curvature = _expanded(terms, found.moments.means[mine], bounds_m)
-            wide = 1 / _LIMITS.spread**2
-            positions[mine], logs[mine] = _sampled(terms, Inside.of(
-                points, wide * gradient, wide * curvature, bounds_m, terms[0][0].pose), normal)
-        effective, totals = _effective(logs), logs.max(axis=1)
-        poor = (effective < _LIMITS.gaussian) & (totals >= totals.max() - _LIMITS.margin)
-        for mine, terms in parts:
-            rows = np.flatnonzero(poor[mine])
-            if len(rows):
-                again = mine[rows]
-                positions[again], logs[again] = _annealed(
-                    [(one, which[rows]) for one, which in terms], bounds_m, normal)
-        return _Products(found.rows[_has_mass(logs)], _moments(positions, logs))
+        mass = Mixture._make(map(np.empty_like, found.moments))
+        chosen = np.arange(len(found.rows))
+        for number, total in zip(_LIMITS.of_product, _LIMITS.samples, strict=True):
+            n = min(max(total // len(chosen), 16), number)
+            normal, part = standard_normal(1 << (n.bit_length() - 1)), found.select(chosen)
+            poor = np.zeros(len(chosen), bool)
+            for mine, terms in part._by_reference(factors):
+                positions, log_ratio = _proposal(
+                    terms, part.moments.means[mine], bounds_m).sample(normal)
+                logs = log_ratio + _logarithm(terms, positions)
+                poor[mine] = _effective(logs) < _LIMITS.effective
+                for old, new in zip(mass, _moments(positions, logs), strict=True):
+                    old[chosen[mine]] = new
+            heavy = mass.log_weights >= mass.log_weights.max() - _LIMITS.margin
+            chosen = chosen[poor & heavy[chosen]]
+            if not len(chosen):
+                break
+        kept = np.flatnonzero(_has_mass(mass))
+        return _Products(found.rows[kept], select(mass, kept))
 
     def constant(self, factors: Sequence[_Factor]) -> np.ndarray:
         """Return the parts of the covariances that errors of poses cause, float64 [T, 3, 3] [m^2].
@@ -366,50 +373,49 @@ def _expanded(terms: _Terms, positions: np.ndarray, bounds_m: np.ndarray
                 12 * _LIMITS.narrowing / size**2)) @ by_point))
 
 
-def _sampled(terms: _Terms, proposal: Inside, normal: np.ndarray
-             ) -> tuple[np.ndarray, np.ndarray]:
-    """Return samples [T, S, 3] [m], and products relative to their density, [T, S]."""
-    positions, log_ratio = proposal.sample(normal)
-    return positions, _logarithm(terms, positions) + log_ratio
+def _proposal(terms: _Terms, positions: np.ndarray, bounds_m: np.ndarray) -> Inside:
+    """Return Gaussians that are as wide as products around positions [T, 3] [m].
 
-
-def _annealed(terms: _Terms, bounds_m: np.ndarray, normal: np.ndarray
-              ) -> tuple[np.ndarray, np.ndarray]:
-    """Sample the first sheet, and then Gaussians of the samples as the others gain weight."""
-    (first, rows), others = terms[0], terms[1:]
+    In (r, u, v) of the first surface, the sheets of the others are curved. Over the Gaussian, they
+    are thicker by the second differences of their coordinates, and the Gaussian in turn is wider
+    if they are thicker.
+    """
+    (first, rows), *others = terms
     pose, size = first.pose, np.ptp(bounds_m, axis=0)
-    # A Gaussian has an extent along an axis along which the region has none.
-    least = np.diag(np.where(size > 0, _LIMITS.least_m, 1.0)**2)
-    sheets = Sheets._make((
-        first.log_peaks[rows], first.points[rows], np.linalg.inv(first.curvature[rows])))
-    best = np.zeros(len(rows)), np.empty((len(rows), *normal.shape)), np.full(
-        (len(rows), len(normal)), -np.inf)
-    for _ in range(_LIMITS.rounds):
-        positions, log_ratio = sheets.inside(bounds_m, pose).sample(normal)
-        logs = first.logarithm(rows, positions) + log_ratio
-        rest = _logarithm(others, positions) if others else np.zeros_like(logs)
-        effective = _effective(logs + rest)
-        better = effective > best[0]
-        for kept, new in zip(best, (effective, positions, logs + rest), strict=True):
-            kept[better] = new[better]
-        if (best[0] >= _LIMITS.effective).all():
-            break
-        rest = np.where(np.isfinite(rest), rest, _LIMITS.never)
-        # The highest power of the other likelihoods for which enough samples are effective.
-        shares = _effective(logs[:, None] + _POWERS[:, None] * rest[:, None])
-        enough = shares >= np.minimum(_LIMITS.tempered, shares.max(axis=1, keepdims=True))
-        power = _POWERS[np.argmax(enough, axis=1)]
-        weights, _ = mixture_weights(logs + power[:, None] * rest)
+    size = np.maximum(size, _LIMITS.extent * size.max())
+    curvature, gradient = first.curvature[rows], np.zeros((len(rows), 3))
+    points = to_polar(pose.to_surface(positions))
+    for _ in range(_LIMITS.passes if others else 1):
+        # The centre and the width of the Gaussian in the region.
+        by_point = pose.rotation @ jacobian(points)
+        by_site = np.swapaxes(by_point, 1, 2) / size**2 * 12
+        total = symmetric(curvature + by_site @ by_point)
+        pull = gradient + np.matmul(
+            by_site, (bounds_m.mean(axis=0) - positions)[..., None])[..., 0]
+        positions = np.clip(pose.to_site(to_positions(
+            points + step_to_maximum(total, pull))), *bounds_m)
         points = to_polar(pose.to_surface(positions))
-        means, covariances = moments(weights, points)
-        derivative = polar_derivative(means) @ pose.rotation.T
-        # Few samples have moments in fewer dimensions than the product.
-        few = np.sum(weights**2, axis=1)[:, None, None]**2
-        covariances += few * sheets.covariances + derivative @ least @ np.swapaxes(
-            derivative, 1, 2)
-        sheets = Sheets._make((
-            np.zeros(len(rows)), means, symmetric(_LIMITS.spread**2 * covariances)))
-    return best[1], best[2]
+        curvature = first.curvature[rows]
+        gradient = np.matmul(curvature, (first.points[rows] - points)[..., None])[..., 0]
+        axes = np.swapaxes(np.linalg.cholesky(np.linalg.inv(total)), 1, 2)
+        steps = _LIMITS.step * np.concatenate([axes, -axes], axis=1)
+        around = pose.to_site(to_positions(points[:, None] + steps))
+        by_point = pose.rotation @ jacobian(points)
+        for one, which in others:
+            here = to_polar(one.pose.to_surface(positions))
+            second = to_polar(one.pose.to_surface(around)) - here[:, None]
+            second = (second[:, :3] + second[:, 3:]) / _LIMITS.step**2
+            thicker = _LIMITS.tails**2 * (
+                np.sum(second**2, axis=1) / 2 + np.sum(second, axis=1)**2 / 4)
+            information = one.is_sheet(which)[:, None, None] * np.linalg.inv(
+                one.covariances[which] + thicker[:, :, None] * np.eye(3))
+            slope = polar_derivative(here) @ one.pose.rotation.T @ by_point
+            by_slope = np.swapaxes(slope, 1, 2) @ information
+            curvature = curvature + by_slope @ slope
+            gradient = gradient + np.matmul(
+                by_slope, (one.points[which] - here)[..., None])[..., 0]
+    wide = 1 / _LIMITS.spread**2
+    return Inside.of(points, wide * gradient, wide * symmetric(curvature), bounds_m, pose)
 
 
 def _effective(logs: np.ndarray) -> np.ndarray:
@@ -421,17 +427,17 @@ def _effective(logs: np.ndarray) -> np.ndarray:
     return share / logs.shape[-1]
 
 
-def _has_mass(logs: np.ndarray) -> np.ndarray:
-    """Mark products with a finite log-weight [T, S]; raise ValueError if there is none."""
-    chosen: np.ndarray = np.isfinite(logs).any(axis=1)
+def _has_mass(mixture: Mixture) -> np.ndarray:
+    """Mark components with a mass; raise ValueError if there is none."""
+    chosen: np.ndarray = np.isfinite(mixture.log_weights)
     if not chosen.any():
         raise ValueError('sightings: no density in the region, expected one')
     return chosen
 
 
 def _moments(positions: np.ndarray, logs: np.ndarray) -> Mixture:
-    """Return the averages and moments of weighted samples [T, S, 3] [m] of those with a mass."""
-    chosen = _has_mass(logs)
-    weights, log_totals = mixture_weights(logs[chosen])
-    means, covariances = moments(weights, positions[chosen])
+    """Return the averages, and the moments, of samples [T, S, 3] [m] with log-weights [T, S]."""
+    weights, log_totals = mixture_weights(np.maximum(logs, _LIMITS.never))
+    means, covariances = moments(weights, positions)
+    log_totals[np.isneginf(logs).all(axis=1)] = -np.inf
     return Mixture._make((log_totals - np.log(logs.shape[1]), means, regular(covariances)))

@@ -184,12 +184,18 @@ class Sheets(Mixture):
         """Return the density of r, u and v for a uniform prior on the positions."""
         return self.weighted(np.log(np.linalg.det(jacobian(self.means))))
 
-    def inside(self, bounds: np.ndarray, pose: Pose | None = None) -> 'Inside':
-        """Restrict the first three coordinates to a region; see `Inside`."""
+    def inside(self, bounds: np.ndarray, pose: Pose | None = None,
+               around: np.ndarray | None = None) -> 'Inside':
+        """Restrict the first three coordinates to a region; see `Inside`.
+
+        `around`, float64 [C, 3] [m], are positions in the region, by default those next to the
+        maxima.
+        """
         precision = np.linalg.inv(self.covariances[:, :3, :3])
         positions = to_positions(self.means[:, :3])
-        points = _polar(np.clip(
-            positions if pose is None else pose.to_site(positions), *bounds), pose)
+        if around is None:
+            around = positions if pose is None else pose.to_site(positions)
+        points = _polar(np.clip(around, *bounds), pose)
         offsets = self.means[:, :3] - points
         log_values = self.position().log_peaks - likelihood_loss(offsets, precision)
         return Inside.of(points, np.matmul(precision, offsets[..., None])[..., 0], precision,
