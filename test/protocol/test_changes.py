@@ -133,7 +133,8 @@ def test_an_estimator_changes_between_cycles_and_none_is_lost(network, state, ma
     names = list(estimators(net).values())
     assert names[:2] == ['centre'] * 2
     assert names == sorted(names) and names[-1] == 'ml'
-    assert status_of(net, 'positioner', 'parameter.estimator') == {'parameter.estimator': 'ml'}
+    found = status_of(net, 'positioner', 'parameter.estimator')
+    assert found['parameter.estimator'] == 'ml'
     assert not net['positioner'].counters
     net.verify()
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+import functools
 import math
 import re
 import struct
@@ -200,6 +201,18 @@ def test_a_type_of_a_field_without_a_codec_is_named():
 
 REAL = 'Beam.analog'
 COMPLEX = 'FeedSignals.signals'
+
+
+@pytest.mark.parametrize('kind', [kind for kind in KINDS if any(
+    isinstance(field.default_factory, functools.partial) for field in dataclasses.fields(kind))])
+def test_optional_arrays_may_be_empty(kind):
+    message = random_message(kind, np.random.default_rng(0))
+    empty = {field.name: field.default_factory() for field in dataclasses.fields(kind)
+             if isinstance(field.default_factory, functools.partial)}
+    message = dataclasses.replace(message, **empty)
+    found = convert.from_bytes(kind, convert.to_bytes(message, 0, (0, '')))
+    for name, array in empty.items():
+        assert getattr(found, name).shape == array.shape
 
 
 @pytest.mark.parametrize(('where', 'array'), [
