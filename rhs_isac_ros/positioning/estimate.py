@@ -114,7 +114,7 @@ class Estimate:
     is_elsewhere: bool | np.ndarray = False
     #: The `mixture`, or a function that returns it. This and the next two fields are tuples of N
     #: for N estimates.
-    density: Mixture | Callable[[], Mixture] | None = None
+    density: Callable[[], Mixture] | Mixture | None = None
     #: Posterior without regard to the limits of the region, from which a track continues.
     unbounded: Mixture | None = None
     #: Function that returns the `sighting`.
