@@ -26,14 +26,14 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import log_sum, mixture_weights, untied
-from rhs_isac_ros.model.gaussian import moments, step_to_maximum, symmetric
+from rhs_isac_ros.model.arrays import log_sum, mixture_weights
+from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximum, symmetric
 from rhs_isac_ros.model.geometry import jacobian, polar_derivative, to_polar, to_positions
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.alternatives import Outside, log_odds_of, rejection
 from rhs_isac_ros.positioning.estimate import SITE, Estimate, Sighting, regular
 from rhs_isac_ros.positioning.mixture import Mixture, log_volume
-from rhs_isac_ros.positioning.segments import concatenate, select
+from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.sheets import Inside, move_inside
 from rhs_isac_ros.positioning.templates import standard_normal
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -46,7 +46,7 @@ class _Limits(NamedTuple):
     # overlap of their sheets' moments, and after the Gauss-Newton steps.
     margins: tuple[float, float] = (25.0, 12.0)
     products: tuple[int, int] = (4000, 512)
-    steps: int = 3
+    steps: int = 2
     # Number of samples of a sheet. Numbers of samples of a product, and of all products together,
     # at first, and where too few of these carry the weight. Factor by which samples are wider than
     # a Gaussian.
@@ -60,7 +60,7 @@ class _Limits(NamedTuple):
     extent: float = 1e-3
     # Passes in which the width of a Gaussian is found, step of its second differences in standard
     # deviations, and factor by which sheets are thicker, as they bend more in the tails.
-    passes: int = 4
+    passes: int = 3
     step: float = 1.5
     tails: float = 3.0
     # Share of the samples that have to be effective in products whose weight is within a margin of
@@ -71,6 +71,9 @@ class _Limits(NamedTuple):
     constant: float = 0.98
     # Logarithm of a likelihood of 0.
     never: float = -1e9
+    # Logarithm of the largest value of sheets in the region, relative to their maxima, below which
+    # all of them are far from it.
+    far: float = -12.0
     # Largest logarithm of a share that is due to the tails of sheets alone.
     tail: float = -9.0
     # Smallest logarithm of a share, relative to that of the constant.
@@ -172,37 +175,43 @@ class _Factor(NamedTuple):
     def of(cls, sighting: Sighting, bounds_m: np.ndarray) -> '_Factor':
         """Widen sheets by the errors of the pose; this does not change their masses."""
         pose, sheets = sighting.pose, sighting.likelihood
-        best = sheets.inside(bounds_m, pose).nearest()
-        derivative = polar_derivative(to_polar(pose.to_surface(best))) @ pose.rotation.T
+        points = move_inside(sheets.means, np.linalg.inv(sheets.covariances), bounds_m, pose)
+        best = pose.to_site(to_positions(points))
+        derivative = polar_derivative(points) @ pose.rotation.T
         sheets = sheets.widened(symmetric(
             derivative @ pose.spread(best) @ np.swapaxes(derivative, 1, 2)))
-        n, centre, size = len(best), bounds_m.mean(axis=0), np.ptp(bounds_m, axis=0)
-        around = Mixture._make((np.zeros(n + 1), np.append(best, centre[None], axis=0), np.append(
-            np.zeros((n, 3, 3)), regular(np.diag(size**2 / 12))[None], axis=0)))
-        raw = cls(
-            pose, np.append(sheets.means, sheets.means[:1], axis=0),
-            np.append(sheets.covariances, np.eye(3)[None], axis=0),
-            np.append(np.linalg.inv(sheets.covariances), np.zeros((1, 3, 3)), axis=0),
-            np.append(sheets.log_peaks, 0.0), around, 0.0)
-        found = _Products.of(raw).select(np.arange(n)).climbed([raw], bounds_m).inside(
-            [raw], bounds_m)
-        tail = found.moments.log_mass + np.log(size[size > 0]).sum() - log_sum(
+        gaussians = sheets.inside(bounds_m, pose, best)
+        positions, log_ratio = gaussians.sample(standard_normal(_LIMITS.of_sheet))
+        inside = _moments(positions, gaussians.logarithm(positions) + log_ratio)
+        kept = np.flatnonzero(_has_mass(inside))
+        sheets, inside = select(sheets, kept), select(inside, kept)
+        curvature = np.linalg.inv(sheets.covariances)
+        heights = -likelihood_loss(points[kept] - sheets.means, curvature)
+        centre, size = bounds_m.mean(axis=0), np.ptp(bounds_m, axis=0)
+        tail = inside.log_mass + np.log(size[size > 0]).sum() - log_sum(
             sheets.as_density().log_weights)
         # Without moments, the region of the surface is not known. If a sheet has its maximum in
         # that of the site, it is taken to be the same.
-        heights = sheets.inside(bounds_m, pose, best).logarithm(best[:, None])[:, 0]
         log_share = _log_share_of(sighting.mixture, bounds_m) if sighting.sheets else float(
-            (heights - sheets.log_peaks).max())
+            heights.max())
         # A product with the sheets remains if all of them are far from the region.
         log_share = max(float(np.logaddexp(log_share, min(tail, _LIMITS.tail))),
                         float(np.log(sighting.missing)) + _LIMITS.least)
-        log_total = found.moments.log_mass - np.log1p(-sighting.missing) - log_share
-        rows = np.append(found.rows[:, 0], n)
-        of_rows = concatenate(found.moments.weighted(-log_total), select(around, [n]).weighted(
-            np.log(sighting.missing)))
-        log_peaks = np.append(raw.log_peaks[:-1] - log_total, np.log(sighting.missing))
-        return cls(pose, raw.points[rows], raw.covariances[rows], raw.curvature[rows],
-                   log_peaks[rows], of_rows, log_share)
+        log_total = inside.log_mass - np.log1p(-sighting.missing) - log_share
+        log_peaks = sheets.log_peaks - log_total
+        if heights.max() < _LIMITS.far:
+            # Masses of tails are inaccurate, and must not exceed those of other sheets.
+            log_peaks += log_share - heights.max() - log_peaks.max()
+        return cls(
+            pose, np.append(sheets.means, sheets.means[:1], axis=0),
+            np.append(sheets.covariances, np.eye(3)[None], axis=0),
+            np.append(curvature, np.zeros((1, 3, 3)), axis=0),
+            np.append(log_peaks, np.log(sighting.missing)),
+            Mixture._make((
+                np.append(inside.log_weights - log_total, np.log(sighting.missing)),
+                np.append(inside.means, centre[None], axis=0),
+                np.append(inside.covariances, regular(np.diag(size**2 / 12))[None], axis=0))),
+            log_share)
 
     def is_sheet(self, rows: np.ndarray) -> np.ndarray:
         """Mark the rows [T] that are not the constant, bool [T]."""
@@ -279,7 +288,7 @@ class _Products(NamedTuple):
 
     def climbed(self, factors: Sequence[_Factor], bounds_m: np.ndarray) -> '_Products':
         """Move to the maxima in the region by Gauss-Newton steps."""
-        log_weights, places, covariances = map(np.empty_like, self.moments)
+        found, _ = self._single(factors)
         for mine, terms in self._by_reference(factors):
             around = terms[0][0].pose
             place = np.clip(self.moments.means[mine], *bounds_m)
@@ -289,31 +298,51 @@ class _Products(NamedTuple):
                     points + step_to_maximum(curvature, gradient), curvature, bounds_m, around)))
             points, _, curvature = _expanded(terms, place, bounds_m)
             derivative = polar_derivative(points) @ around.rotation.T
-            places[mine] = place
-            covariances[mine] = np.linalg.inv(
-                np.swapaxes(derivative, 1, 2) @ curvature @ derivative)
-            log_weights[mine] = _logarithm(terms, place[:, None])[:, 0]
-        return _Products(self.rows, Mixture._make((
-            log_weights + log_volume(covariances), places, covariances)))
+            covariances = np.linalg.inv(np.swapaxes(derivative, 1, 2) @ curvature @ derivative)
+            found.means[mine], found.covariances[mine] = place, covariances
+            found.log_weights[mine] = (
+                _logarithm(terms, place[:, None])[:, 0] + log_volume(covariances))
+        return _Products(self.rows, found)
 
     def _by_reference(self, factors: Sequence[_Factor]
                       ) -> Iterator[tuple[np.ndarray, _Terms]]:
-        """Yield indices of products, and their rows in the factors, the thinnest sheet first."""
-        knowledge = np.column_stack([one.curvature[rows, 0, 0] for one, rows in zip(
-            factors, self.rows.T, strict=True)])
-        thinnest = np.argmin(untied(-knowledge), axis=1)
-        for number in range(len(factors)):
-            mine = np.flatnonzero(thinnest == number)
+        """Yield indices of products of several sheets, and their rows in the factors.
+
+        That of the surface with the thinnest sheets comes first.
+        """
+        left = np.sum([one.is_sheet(rows) for one, rows in zip(
+            factors, self.rows.T, strict=True)], axis=0) > 1
+        for number in np.argsort([-np.median(one.curvature[:, 0, 0]) for one in factors],
+                                 kind='stable'):
+            mine = np.flatnonzero(left & factors[number].is_sheet(self.rows[:, number]))
+            left[mine] = False
             if len(mine):
                 terms = list(zip(factors, self.rows[mine].T, strict=True))
                 yield mine, [terms.pop(number), *terms]
 
+    def _single(self, factors: Sequence[_Factor]) -> tuple[Mixture, np.ndarray]:
+        """Return the averages and moments of products of at most one sheet, and mark them."""
+        sheets = np.column_stack([
+            one.is_sheet(rows) for one, rows in zip(factors, self.rows.T, strict=True)])
+        n_sheets = np.count_nonzero(sheets, axis=1)
+        single = n_sheets == 1
+        found = Mixture._make(field.copy() for field in self.moments)
+        found.log_weights[n_sheets < 2] = 0.0
+        for number, (one, rows) in enumerate(zip(factors, self.rows.T, strict=True)):
+            found.log_weights[n_sheets < 2] += one.moments.log_weights[rows[n_sheets < 2]]
+            mine = single & sheets[:, number]
+            found.means[mine] = one.moments.means[rows[mine]]
+            found.covariances[mine] = one.moments.covariances[rows[mine]]
+        return found, n_sheets < 2
+
     def inside(self, factors: Sequence[_Factor], bounds_m: np.ndarray) -> '_Products':
         """Return the products with averages over the region and moments in it."""
         found = self.select(~self.are_constant(factors))
-        mass = Mixture._make(map(np.empty_like, found.moments))
-        chosen = np.arange(len(found.rows))
+        mass, single = found._single(factors)
+        chosen = np.flatnonzero(~single)
         for number, total in zip(_LIMITS.of_product, _LIMITS.samples, strict=True):
+            if not len(chosen):
+                break
             n = min(max(total // len(chosen), 16), number)
             normal, part = standard_normal(1 << (n.bit_length() - 1)), found.select(chosen)
             poor = np.zeros(len(chosen), bool)
@@ -326,8 +355,6 @@ class _Products(NamedTuple):
                     old[chosen[mine]] = new
             heavy = mass.log_weights >= mass.log_weights.max() - _LIMITS.margin
             chosen = chosen[poor & heavy[chosen]]
-            if not len(chosen):
-                break
         kept = np.flatnonzero(_has_mass(mass))
         return _Products(found.rows[kept], select(mass, kept))
 
@@ -385,7 +412,7 @@ def _proposal(terms: _Terms, positions: np.ndarray, bounds_m: np.ndarray) -> Ins
     size = np.maximum(size, _LIMITS.extent * size.max())
     curvature, gradient = first.curvature[rows], np.zeros((len(rows), 3))
     points = to_polar(pose.to_surface(positions))
-    for _ in range(_LIMITS.passes if others else 1):
+    for _ in range(_LIMITS.passes):
         # The centre and the width of the Gaussian in the region.
         by_point = pose.rotation @ jacobian(points)
         by_site = np.swapaxes(by_point, 1, 2) / size**2 * 12
