@@ -16,8 +16,6 @@ MODULES = {'.'.join(('rhs_isac_ros', *path.relative_to(ROOT).with_suffix('').par
 REFUSED = (
     'rclpy', 'launch', 'launch_ros', 'tf2_ros', 'rosidl_runtime_py', 'dask', 'distributed',
     'joblib', 'lz4', 'matplotlib', 'mcap', 'pymoo', 'rerun', 'rich', 'rosbags', 'sklearn', 'tqdm')
-# A name that a class of the positioning and one of the model still have in common.
-PENDING = {'Scope'}
 CODE = '''
 import importlib, sys
 
@@ -61,4 +59,4 @@ def test_no_two_public_classes_have_the_same_name():
             if isinstance(node, ast.ClassDef) and not node.name.startswith('_'):
                 found[node.name].append(name)
     assert {name: modules for name, modules in found.items()
-            if len(modules) > 1 and name not in PENDING} == {}
+            if len(modules) > 1} == {}

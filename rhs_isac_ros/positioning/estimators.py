@@ -76,7 +76,7 @@ class _Limits(NamedTuple):
 _LIMITS = _Limits()
 
 
-class Scope(NamedTuple):
+class SearchScope(NamedTuple):
     """Where modes are searched for, and what depends on the templates there."""
 
     table: TemplateTable
@@ -87,7 +87,8 @@ class Scope(NamedTuple):
     drawn: DrawnPosterior | None = None
 
     @classmethod
-    def of(cls, likelihood: Likelihood, arrays: Mapping[str, np.ndarray], grid: Grid) -> 'Scope':
+    def of(cls, likelihood: Likelihood, arrays: Mapping[str, np.ndarray], grid: Grid
+           ) -> 'SearchScope':
         """Take the templates of a grid, which may be part of the region's."""
         scenario = likelihood.scenario
         table = TemplateTable(scenario, arrays, grid=grid)
@@ -153,10 +154,10 @@ class SearchEstimator(abc.ABC):
             else self.normal if prior.is_coarse else self.normal[:_LIMITS.narrow])
 
     @functools.cached_property
-    def _region(self) -> Scope:
+    def _region(self) -> SearchScope:
         """The whole region."""
         scenario = self.scenario
-        scope = Scope.of(self._likelihood, self._load(), lay_grid(scenario))
+        scope = SearchScope.of(self._likelihood, self._load(), lay_grid(scenario))
         if self._rejects_outside:
             outside = Outside(scenario, self._load(outside=True))
             scope = scope._replace(alternatives=[outside, *scope.alternatives])
@@ -168,7 +169,7 @@ class SearchEstimator(abc.ABC):
         """Compute the table of the region, unless it exists; any thread may call this."""
         _ = self._region
 
-    def _scopes(self, bent: Sheets, wrong: float) -> Iterator[Scope]:
+    def _scopes(self, bent: Sheets, wrong: float) -> Iterator[SearchScope]:
         """Yield the part of the grid that a prior in (r [m], u, v) covers, and then the region.
 
         A user is outside only if the prior is wrong. The part is left out if the table of the
@@ -179,7 +180,7 @@ class SearchEstimator(abc.ABC):
         # A cached property is in vars() once it is computed.
         if '_region' not in vars(self) and chosen.any():
             part = grid.within(chosen)
-            scope = Scope.of(likelihood, tabulate(likelihood.model, grid=part), part)
+            scope = SearchScope.of(likelihood, tabulate(likelihood.model, grid=part), part)
             yield scope._replace(favoured=np.ones(1, bool))
         yield self._region._replace(
             alternatives=[one.given(wrong) for one in self._region.alternatives], favoured=chosen)
@@ -308,7 +309,8 @@ class SearchEstimator(abc.ABC):
             blocks(len(batch), _LIMITS.block))
         return itertools.chain.from_iterable(parts)
 
-    def _locate_block(self, scope: Scope, signals: Signals, draws: bool = True) -> list['_Found']:
+    def _locate_block(self, scope: SearchScope, signals: Signals, draws: bool = True
+                      ) -> list['_Found']:
         """Locate each of several shots.
 
         With `draws`, positions are drawn if the search for modes would be too long.
@@ -328,8 +330,8 @@ class SearchEstimator(abc.ABC):
                 found[row] = _Found(self, estimate, fit, modes, log_ratios)
         return found
 
-    def _fits(self, scope: Scope, signals: Signals, aligned: np.ndarray, whitened: np.ndarray,
-              draws: bool) -> list[tuple[Fit, Modes | None]]:
+    def _fits(self, scope: SearchScope, signals: Signals, aligned: np.ndarray,
+              whitened: np.ndarray, draws: bool) -> list[tuple[Fit, Modes | None]]:
         """Find the posterior and the modes of each shot; the modes are None after draws."""
         # Margin of modes in each cell, beyond the usual one.
         margin = self._refinement.margin + PRIOR_MARGIN * scope.favoured
@@ -344,7 +346,7 @@ class SearchEstimator(abc.ABC):
             fits.update(self._fits_of(scope, modes, signals))
         return [fits[shot] for shot in range(len(aligned))]
 
-    def _fits_of(self, scope: Scope, modes: Modes, signals: Signals
+    def _fits_of(self, scope: SearchScope, modes: Modes, signals: Signals
                  ) -> Iterator[tuple[int, tuple[Fit, Modes]]]:
         """Yield each shot that has modes, with its posterior and its refined modes."""
         likelihood = self._likelihood
