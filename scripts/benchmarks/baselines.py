@@ -36,7 +36,7 @@ from rhs_isac_ros.model.multipath import (
 from rhs_isac_ros.model.surface import AppliedBeams, radiation_matrix
 from rhs_isac_ros.positioning.grid import TemplateTable
 from rhs_isac_ros.positioning.lattice import Resolution
-from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
+from rhs_isac_ros.positioning.likelihood import Factors, Likelihood, Signals
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.posterior import draw_samples
 from rhs_isac_ros.positioning.search import find_modes
@@ -158,6 +158,9 @@ class ArrayLikelihood(Likelihood):
                       scenario.n_feeds)))
         # The prior of no parameters is the same for all beams.
         self.nuisance = NuisancePrior(MeasurementModel(scenario, dark))
+        # The factor of a white covariance is its own inverse.
+        self.factors = Factors.of_roots(self.nuisance, receiver.whitener)
+        self.log_det = float(np.sum(self.factors.log_det))
         self.resolution = Resolution.of(scenario)
 
 
