@@ -113,7 +113,9 @@ class RepublisherNode(Node):
         self.unanswered, self.unconfirmed = 0, set[str]()
         # Cycle and user of signals without an answer.
         self._pending: tuple[int, int] | None = None
-        self._answer_timeout_s = timeout_s
+        # Time of the first check [s]: the time to discover an optimizer does not count.
+        self._begin_s = math.inf
+        self._timeout_s = self._answer_timeout_s = timeout_s
         self._waits_s = self._publish(messages, rate)
         # Numbers of publishers and subscribers by topic, and the time of their last change [s].
         self._endpoints: list[tuple[int, int]] = []
@@ -212,13 +214,14 @@ class RepublisherNode(Node):
             self.unanswered += 1
             self._answer_timeout_s = _SHORT_S
 
-    def check(self, end_s: float, timeout_s: float) -> None:
-        """Raise ToolError if a topic has another publisher, or lacks subscribers after `end_s`."""
+    def check(self) -> None:
+        """Raise ToolError if a topic has another publisher, or lacks subscribers for too long."""
+        self._begin_s = min(self._begin_s, time.monotonic())
         for name, publisher in self._message_publishers.items():
             if self.count_publishers(publisher.topic_name) > 1:
                 raise ToolError(f'{name}: already published by another node')
-        if self.waits_for and time.monotonic() > end_s:
-            raise ToolError(f'{self.waits_for}: no subscriber within {timeout_s:g} s')
+        if self.waits_for and time.monotonic() > self._begin_s + self._timeout_s:
+            raise ToolError(f'{self.waits_for}: no subscriber within {self._timeout_s:g} s')
 
 
 def _without_gaps(
@@ -252,7 +255,6 @@ def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     if first_codebook:
         first_codebook.check(scenario)
     nodes: list[RepublisherNode] = []
-    end_s = time.monotonic() + options.timeout
 
     def create() -> list[Node]:
         node = RepublisherNode(_messages(options, [*names, topics.CODEBOOK]), names,
@@ -268,7 +270,7 @@ def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         return [node, node.optimizer]
 
     def done() -> bool:
-        nodes[0].check(end_s, options.timeout)
+        nodes[0].check()
         return nodes[0].finished
     code = run(create, arguments, done)
     if nodes:
