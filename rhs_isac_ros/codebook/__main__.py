@@ -168,7 +168,7 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
 
     def search(scenario: Scenario) -> OptimizeResult:
         with progress_bar(options.steps or METHODS[options.method].steps, 'step',
-                          quiet=options.quiet, line_every=50) as show:
+                          quiet=options.quiet) as show:
             return optimize(
                 scenario, method=options.method, objective=objective,
                 sampling=options.sampling, n_positions=options.positions, seed=options.seed,

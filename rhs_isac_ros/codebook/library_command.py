@@ -76,7 +76,7 @@ def _run(options: argparse.Namespace) -> None:
             scenario, start, options.objective, sorted(options.spreads), options.loss,
             None if options.quiet else _print_loss)
     cells, kept_s = plan.cells(scenario), time.monotonic()
-    with progress_bar(len(cells), 'codebook', quiet=options.quiet, line_every=10) as show:
+    with progress_bar(len(cells), 'codebook', quiet=options.quiet) as show:
         def keep(found: Library) -> None:
             nonlocal kept_s
             if show:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rhs_isac_ros.codebook import OBJECTIVES, CodebookError
-from rhs_isac_ros.experiments.jobs import add_run_options, markdown_table, run_command
 from rhs_isac_ros.experiments.sweep import KINDS, OPTIMIZE, Point, Sweep, run_sweep, table
 from rhs_isac_ros.experiments.sweep_picture import draw, shown
 from rhs_isac_ros.experiments.sweep_settings import (
@@ -44,6 +43,7 @@ from rhs_isac_ros.support.arguments import (
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.jobs import add_run_options, markdown_table, run_command
 from rhs_isac_ros.support.pictures import write_picture
 
 # The bootstrap keeps 2000 weights for each position in memory.

@@ -7,7 +7,7 @@ import hashlib
 import io
 import json
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +25,6 @@ from rhs_isac_ros.codebook import (
     random_codebook,
 )
 from rhs_isac_ros.codebook.optimize import INTERRUPTED
-from rhs_isac_ros.experiments.jobs import Job, as_json, run_jobs
 from rhs_isac_ros.experiments.sweep_settings import (
     FIELDS,
     MEASURES,
@@ -39,6 +38,7 @@ from rhs_isac_ros.link import capacity_report, choose_beam
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import Estimator, make_estimator
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.jobs import Job, Strand, Workers, as_json
 from rhs_isac_ros.system import System
 
 # Kinds of codebooks that are made for a scenario.
@@ -258,11 +258,10 @@ class Sweep:
             **({} if family in (CRLB, BOUND) else {'estimator': setting.estimator})})
             for first in range(0, self.n_positions, BLOCK)] for family in families(quantities)}
 
-    def codebooks(self, setting: Setting, made: Mapping[str, Mapping[str, Any]]) -> list[Codebook]:
-        """Return the codebooks of a setting; `made` has the results of `designs` by job name."""
-        books = [Codebook.from_parameters(dict(made[job.name])) for job in self.designs(setting)]
-        return [_fitted(book, setting)
-                for book in books or [self._files[setting.codebook]]]
+    def codebook(self, setting: Setting, made: Mapping[str, Any] | None) -> Codebook:
+        """Return a codebook of a setting, from the result of a job of `designs`, if any."""
+        return _fitted(Codebook.from_parameters(dict(made)) if made
+                       else self._files[setting.codebook], setting)
 
 
 def run_sweep(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = None
@@ -280,17 +279,30 @@ def run_blocks(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = 
 
     Several sweeps may share a folder. `run_jobs` describes the other arguments and the errors.
     """
-    designs = [job for setting in sweep.settings for job in sweep.designs(setting)]
-    made = _results(design, designs, folder, n_jobs, dask, 'codebooks')
-    codebooks = [sweep.codebooks(setting, made) for setting in sweep.settings]
-    blocks = [[sweep.blocks(setting, codebook) for codebook in of_setting]
-              for setting, of_setting in zip(sweep.settings, codebooks, strict=True)]
-    jobs = [job for of_setting in blocks for of_codebook in of_setting
-            for of_family in of_codebook.values() for job in of_family]
-    found = _results(evaluate, jobs, folder, n_jobs, dask, 'positions')
-    return [Results(setting, tuple(of_setting), _stacked(of_blocks, found))
-            for setting, of_setting, of_blocks in zip(
-                sweep.settings, codebooks, blocks, strict=True)]
+    found = iter(Workers(n_jobs, dask, folder, 'sweep').run(
+        [_evaluated(sweep, setting, job) for setting in sweep.settings
+         for job in sweep.designs(setting) or (None,)]))
+    results = []
+    for setting in sweep.settings:
+        parts = [next(found) for _ in sweep.designs(setting) or (None,)]
+        results.append(Results(setting, tuple(codebook for codebook, _ in parts), {
+            name: np.array([quantities[name] for _, quantities in parts])
+            for name in parts[0][1]}))
+    return results
+
+
+def _evaluated(sweep: Sweep, setting: Setting, job: Job | None
+               ) -> Strand[tuple[Codebook, dict[str, np.ndarray]]]:
+    """Make a codebook of a setting, and compute its quantities at all positions, [positions]."""
+    made = (yield design, [job])[0] if job else None
+    codebook = sweep.codebook(setting, made)
+    blocks = sweep.blocks(setting, codebook)
+    found = iter((yield evaluate, [one for jobs in blocks.values() for one in jobs]))
+    quantities: dict[str, np.ndarray] = {}
+    for jobs in blocks.values():
+        parts = [next(found) for _ in jobs]
+        quantities |= {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return codebook, quantities
 
 
 def table(sweep: Sweep, points: Sequence[Point]) -> str:
@@ -322,24 +334,7 @@ def _fitted(codebook: Codebook, setting: Setting) -> Codebook:
     return fitted
 
 
-def _stacked(blocks: Sequence[Mapping[str, Sequence[Job]]],
-             found: Mapping[str, Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """Return quantities by name, [codebooks, positions], from the job results in `found`."""
-    return {quantity: np.array([
-        np.concatenate([found[job.name][quantity] for job in of_codebook[family]])
-        for of_codebook in blocks])
-        for family, (first, *_) in blocks[0].items() for quantity in found[first.name]}
-
-
 def _job(kind: str, arguments: dict[str, Any]) -> Job:
     arguments = as_json(arguments)
     digest = hashlib.sha256(json.dumps(arguments).encode()).hexdigest()
     return Job(f'{kind}-{digest[:24]}', arguments)
-
-
-def _results(function: Callable[..., dict[str, Any]], jobs: Iterable[Job], folder: Path,
-             n_jobs: int, dask: str | None, label: str) -> dict[str, dict[str, Any]]:
-    """Run each distinct job that has no stored result; return all results by job name."""
-    distinct = {job.name: job for job in jobs}
-    results = run_jobs(function, [*distinct.values()], folder, n_jobs, dask, label)
-    return dict(zip(distinct, results, strict=True))

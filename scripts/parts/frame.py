@@ -14,7 +14,6 @@ import numpy as np
 from scipy.special import chdtri
 
 from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.experiments.jobs import add_run_options
 from rhs_isac_ros.experiments.resampling import replicate, share_percent
 from rhs_isac_ros.experiments.sweep import with_power
 from rhs_isac_ros.model import Scenario, ScenarioError
@@ -30,6 +29,7 @@ from rhs_isac_ros.support.arguments import (
 )
 from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.jobs import add_run_options
 from rhs_isac_ros.support.pictures import PICTURE_FORMATS, write_picture
 
 CONFIG = Path(__file__).parents[2] / 'config'

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.experiments import Job, JobError, run_jobs
-from rhs_isac_ros.experiments import jobs as jobs_module
+from rhs_isac_ros.support import jobs as jobs_module
+from rhs_isac_ros.support.jobs import Workers
 from rhs_isac_ros.support.optional import MissingLibraryError
 
 pytestmark = pytest.mark.slow
@@ -34,6 +35,35 @@ def work(number):
 
 jobs = [Job(str(number), {'number': number}) for number in range(4)]
 sys.exit(run_command(lambda: run_jobs(work, jobs, Path(sys.argv[1]), n_jobs=2)))
+'''
+
+
+# A job waits far longer than the test, in a process of this machine or on a cluster.
+ABANDONED = '''
+import os, sys, time
+from pathlib import Path
+from rhs_isac_ros.experiments import Job, run_jobs
+
+def work(begun):
+    Path(begun).write_text(str(os.getpid()))
+    for _ in range(6000):
+        time.sleep(0.1)
+
+jobs = [Job(name, {'begun': sys.argv[1] + name}) for name in 'ab']
+run_jobs(work, jobs, n_jobs=2, dask=sys.argv[2] if len(sys.argv) > 2 else None)
+'''
+
+# A scheduler with one worker, in one process.
+SCHEDULER = '''
+import signal
+
+from distributed import LocalCluster
+
+if __name__ == '__main__':
+    cluster = LocalCluster(n_workers=1, threads_per_worker=1, processes=False, protocol='tcp',
+                           host='127.0.0.1', dashboard_address=':0')
+    print(cluster.scheduler_address, flush=True)
+    signal.pause()
 '''
 
 
@@ -160,6 +190,54 @@ def test_an_error_names_its_job_and_other_results_are_kept(tmp_path, failure, te
     assert numbers_run_again(tmp_path, JOBS[:3])[-1] == 2
 
 
+def test_a_strand_continues_as_soon_as_its_own_jobs_are_done():
+    order = []
+
+    def work(name):
+        order.append(name)
+        return {'name': name}
+
+    def strand(name, n_stages):
+        found = []
+        for stage in range(n_stages):
+            found += yield work, [Job(f'{name}{stage}', {'name': f'{name}{stage}'})]
+        return [one['name'] for one in found]
+
+    ends = Workers().run([strand('a', 3), strand('b', 1), strand('a', 2), strand('c', 0)])
+    # Two strands share the first jobs, which run once.
+    assert ends == [['a0', 'a1', 'a2'], ['b0'], ['a0', 'a1'], []]
+    assert order == ['a0', 'b0', 'a1', 'a2']
+
+
+def test_jobs_of_one_name_with_other_arguments_are_an_error():
+    def strand(value):
+        yield (lambda value: {}), [Job('one', {'value': value})]
+
+    with pytest.raises(ValueError, match='^jobs: two have the name one'):
+        Workers().run([strand(1), strand(1.0)])
+
+
+def abandon(arguments, folder):
+    """Kill a client once its two jobs have begun, and wait for its processes to end.
+
+    Returns the ids of the processes of the jobs.
+    """
+    with subprocess.Popen([sys.executable, '-c', ABANDONED, f'{folder}/', *arguments],
+                          stderr=subprocess.PIPE, start_new_session=True) as client:
+        deadline = time.monotonic() + 60
+        while not all((folder / name).exists() and (folder / name).read_text() for name in 'ab'):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        client.kill()
+        # The pipe ends with the last process that has inherited it.
+        client.communicate(timeout=60)
+    return [int((folder / name).read_text()) for name in 'ab']
+
+
+def test_jobs_of_a_killed_client_end(tmp_path):
+    assert len({*abandon([], tmp_path)}) == 2
+
+
 def test_a_process_that_dies_is_an_error(tmp_path):
     def work(number, of):
         import os
@@ -241,6 +319,47 @@ def test_a_cluster_that_loses_a_worker_gives_every_result(tmp_path, two_workers)
     assert results[3]['process'] != int(killed.read_text(encoding='ascii'))
 
 
+def test_a_cluster_ends_the_jobs_of_a_killed_client(tmp_path, two_workers):
+    def work(number):
+        import os
+        return {'process': os.getpid()}
+
+    occupied = abandon([two_workers], tmp_path)
+    # The workers are free again.
+    results = run_jobs(work, [Job(str(n), {'number': n}) for n in range(8)], dask=two_workers)
+    assert {result['process'] for result in results} <= {*occupied}
+
+
+def test_a_scheduler_that_ends_is_an_error_and_finished_jobs_are_kept(tmp_path):
+    pytest.importorskip('distributed')
+
+    def work(number, scheduler, stored):
+        import os
+        import signal
+        import time
+        from pathlib import Path
+        if number:
+            while not Path(stored).exists():
+                time.sleep(0.01)
+            os.kill(scheduler, signal.SIGKILL)
+            signal.pause()
+        return {'number': number}
+
+    scheduler = subprocess.Popen(
+        [sys.executable, '-c', SCHEDULER], stdout=subprocess.PIPE, text=True)
+    try:
+        address = scheduler.stdout.readline().strip()
+        jobs = [Job(str(n), {'number': n, 'scheduler': scheduler.pid,
+                             'stored': str(tmp_path / '0.json')}) for n in range(2)]
+        with pytest.raises(ConnectionError, match='connection lost'):
+            run_jobs(work, jobs, tmp_path, dask=address)
+    finally:
+        scheduler.kill()
+        scheduler.wait()
+        scheduler.stdout.close()
+    assert [file.name for file in tmp_path.iterdir()] == ['0.json']
+
+
 def test_a_dask_cluster_without_workers_is_an_error(tmp_path):
     distributed = pytest.importorskip('distributed')
     with distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=':0') as empty:
@@ -253,6 +372,7 @@ def test_a_terminal_shows_the_progress(tmp_path, monkeypatch):
     terminal = io.StringIO()
     terminal.isatty = lambda: True
     monkeypatch.setattr(sys, 'stderr', terminal)
+    pytest.importorskip('tqdm')
     run_jobs(Worker(), JOBS, tmp_path, n_jobs=1, label='squares')
     assert 'squares: 100%' in terminal.getvalue()
 
@@ -262,9 +382,7 @@ def test_duplicate_names_are_an_error(tmp_path):
         run_jobs(Worker(), [JOBS[0], JOBS[0]], tmp_path, n_jobs=1)
 
 
-@pytest.mark.parametrize(('library', 'purpose'), [
-    ('tqdm', 'showing progress'), ('joblib', 'running jobs')])
-def test_a_missing_library_is_named(tmp_path, monkeypatch, library, purpose):
-    monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(MissingLibraryError, match=f'^{purpose} needs {library}, .*experiments'):
-        run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
+def test_a_missing_library_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'joblib', None)
+    with pytest.raises(MissingLibraryError, match='^running jobs needs joblib, .*experiments'):
+        run_jobs(Worker(), JOBS, tmp_path, n_jobs=2)

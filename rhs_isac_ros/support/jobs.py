@@ -1,0 +1,460 @@
+"""Jobs: calls of a function with plain arguments and a stored result, on cores or a Dask cluster.
+
+`run_jobs` runs independent jobs. Jobs that depend on the results of others belong to a `Strand`: a
+generator that yields a function with its next jobs, receives their results, and returns its own.
+`Workers.run` runs strands side by side. Each continues as soon as its own jobs are done.
+"""
+
+import argparse
+import contextlib
+import ctypes
+import dataclasses
+import json
+import os
+import queue
+import re
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias, TypeVar
+
+import numpy as np
+
+from rhs_isac_ros import __version__
+from rhs_isac_ros.support.arguments import integer, output_folder
+from rhs_isac_ros.support.exits import print_error
+from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
+from rhs_isac_ros.support.progress import progress_bar
+from rhs_isac_ros.support.threads import one_blas_thread
+
+
+class JobError(Exception):
+    """A job failed, its process died, or its worker has another version of this package."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """A call of an experiment's function with arguments that JSON or NumPy can represent.
+
+    `run_jobs` converts those of NumPy to numbers and lists. `name` is the name of the result file
+    without its suffix, unique in its folder.
+    """
+
+    name: str
+    arguments: Mapping[str, Any]
+
+
+class JobResult(NamedTuple):
+    """The result of a job as JSON in `text`, or its error, with the package version used."""
+
+    job: Job
+    text: str = ''
+    error: str = ''
+    version: str = __version__
+
+
+@one_blas_thread
+def attempt(function: Callable[..., Mapping[str, Any]], job: Job) -> JobResult:
+    """Run a job in this process; return errors as text, because some errors cannot be pickled."""
+    try:
+        return JobResult(job, text=json.dumps(as_json(function(**job.arguments))))
+    except MissingLibraryError as error:
+        return JobResult(job, error=str(error))
+    except Exception:
+        return JobResult(job, error=traceback.format_exc())
+
+
+def _stored(folder: Path, job: Job) -> dict[str, Any] | None:
+    """Return the stored result of a job; None if it is missing, damaged or out of date."""
+    try:
+        record = json.loads(_file(folder, job).read_bytes())
+    except (FileNotFoundError, ValueError):
+        return None
+    if not isinstance(record, dict) or not isinstance(record.get('result'), dict):
+        return None
+    return (record['result'] if _as_text(record | {'result': {}}) == _as_text(_record(job, {}))
+            else None)
+
+
+def _as_text(value: Mapping[str, Any]) -> str:
+    """Return JSON, in which 1, 1.0 and True differ, but lists and tuples do not."""
+    return json.dumps(json.loads(json.dumps(value)), sort_keys=True)
+
+
+def _record(job: Job, result: Mapping[str, Any]) -> dict[str, Any]:
+    return {'version': __version__, 'arguments': dict(job.arguments), 'result': result}
+
+
+def as_json(value: Any) -> Any:
+    """Return a value in which numbers and arrays of NumPy are numbers and lists."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {key: as_json(entry) for key, entry in value.items()}
+    return type(value)(map(as_json, value)) if type(value) in (list, tuple) else value
+
+
+def _checked(job: Job) -> Job:
+    """Return a job without values of NumPy; raise ValueError if JSON cannot represent one."""
+    arguments = as_json(job.arguments)
+    for name, value in arguments.items():
+        try:
+            json.dumps(value)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f'job {job.name}: {name}: {value!r}, expected numbers, texts, lists '
+                             f'and mappings: {error}') from None
+    return dataclasses.replace(job, arguments=arguments)
+
+
+def _file(folder: Path, job: Job) -> Path:
+    return folder / f'{job.name}.json'
+
+
+# Timeouts for the scheduler of a cluster and its first worker, and time after which a job notices
+# that nobody waits for it any more.
+_SCHEDULER_TIMEOUT_S = 30
+_WORKER_TIMEOUT_S = 30
+_WATCH_S = 1.0
+_ONE_THREAD = {f'{library}_NUM_THREADS': '1'
+               for library in ('OMP', 'OPENBLAS', 'MKL', 'BLIS', 'VECLIB', 'NUMBA', 'NUMEXPR')}
+
+Function: TypeAlias = Callable[..., Mapping[str, Any]]
+_End = TypeVar('_End')
+#: Yields a function with jobs, receives their results in the same order, and returns its own.
+Strand: TypeAlias = Generator[tuple[Function, Sequence[Job]], list[dict[str, Any]], _End]
+
+
+@dataclasses.dataclass(frozen=True)
+class Workers:
+    """Where jobs run, and where their results are kept."""
+
+    n_jobs: int = 1  #: Processes on this machine: 1 for this process, -1 for one per core.
+    dask: str | None = None  #: Scheduler of a Dask cluster to use instead, as ``HOST:PORT``.
+    folder: Path | None = None  #: Folder of a file for each result; None to keep no results.
+    label: str = ''  #: Text beside the progress.
+    quiet: bool = False  #: Whether to show no progress.
+    worker_timeout_s: float = _WORKER_TIMEOUT_S  #: Time in which a cluster must have a worker [s].
+
+    def run(self, strands: Sequence[Strand[_End]]) -> list[_End]:
+        """Run strands until all have returned; return what they return.
+
+        Results do not depend on where the jobs run. Jobs of one name are one job, which runs once.
+        Raises the errors of `run_jobs`, and those of the strands.
+        """
+        if self.folder:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        with contextlib.ExitStack() as stack:
+            show = stack.enter_context(progress_bar(
+                0, 'job', quiet=self.quiet, label=self.label))
+            state, done = _State(strands, self.folder), queue.SimpleQueue[Future[JobResult]]()
+            running: dict[Future[JobResult], Job] = {}
+            executor, slots = None, 0
+            while state.ready or running:
+                if not executor:
+                    executor, slots = stack.enter_context(self._executor())
+                while state.ready and len(running) < slots:
+                    function, job = state.ready.popleft()
+                    with _interrupts_ignored() if slots > 1 else contextlib.nullcontext():
+                        future = executor.submit(*self._call(function, job))
+                    running[future] = job
+                    future.add_done_callback(done.put)
+                future = done.get()
+                job = running.pop(future)
+                state.take(job, self._result(job, future))
+                if show:
+                    show(state.n_done, '', state.n_jobs)
+            return [state.ends[number] for number in range(len(strands))]
+
+    def _call(self, function: Function, job: Job) -> tuple[Any, ...]:
+        return _attempt_on_cluster if self.dask else attempt, function, job
+
+    @contextlib.contextmanager
+    def _executor(self) -> Iterator[tuple[Executor, int]]:
+        """Yield an executor, and the number of jobs that it should have at a time."""
+        if self.dask:
+            with _cluster(self.dask, self.worker_timeout_s) as executor:
+                # The scheduler balances the load only among jobs that it knows.
+                yield executor, sys.maxsize
+            return
+        if self.n_jobs == 1:
+            yield _ThisProcess(), 1
+            return
+        with optional_import('running jobs', extra='experiments'):
+            import joblib  # noqa: F401 - its absence is reported by name
+            from joblib.externals import loky
+
+        number = loky.cpu_count() if self.n_jobs < 0 else self.n_jobs
+        executor = loky.ProcessPoolExecutor(
+            number, initializer=_begin_process, initargs=(os.getpid(),), env=_ONE_THREAD)
+        try:
+            yield executor, number
+        finally:
+            executor.shutdown(kill_workers=True)
+
+    def _result(self, job: Job, future: 'Future[JobResult]') -> dict[str, Any]:
+        """Return the result of a job; raise JobError if it failed or ran with another version."""
+        try:
+            return _decoded(future.result())
+        except BrokenExecutor as error:
+            raise JobError(f'a process died, possibly out of memory: {error}') from error
+        except CancelledError:
+            raise ConnectionError(f'Dask cluster {self.dask}: connection lost') from None
+        except JobError:
+            raise
+        except Exception as error:  # The job killed its worker or could not be sent to one.
+            raise JobError(f'job {job.name} failed: {type(error).__name__}: {error}') from error
+
+
+class _State:
+    """Strands, the results they wait for, and jobs that are ready to run."""
+
+    def __init__(self, strands: Sequence[Strand[Any]], folder: Path | None) -> None:
+        self.ready: deque[tuple[Function, Job]] = deque()
+        self.ends: dict[int, Any] = {}
+        self._strands, self._folder = strands, folder
+        self._jobs: dict[str, Job] = {}
+        self._known: dict[str, dict[str, Any]] = {}
+        # Jobs that each strand has asked for, names of those without a result, and strands that
+        # wait for a job.
+        self._asked: dict[int, Sequence[Job]] = {}
+        self._missing: dict[int, set[str]] = {}
+        self._waiting: dict[str, list[int]] = {}
+        for number in range(len(strands)):
+            self._advance(number, None)
+
+    @property
+    def n_jobs(self) -> int:
+        """The number of jobs so far."""
+        return len(self._jobs)
+
+    @property
+    def n_done(self) -> int:
+        """The number of jobs with a result."""
+        return len(self._known)
+
+    def take(self, job: Job, result: dict[str, Any]) -> None:
+        """Keep the result of a job, and advance each strand that has waited only for this one."""
+        if self._folder:
+            write_whole(_file(self._folder, job),
+                        json.dumps(_record(job, result), indent=1) + '\n')
+        self._known[job.name] = result
+        for number in self._waiting.pop(job.name):
+            self._missing[number].remove(job.name)
+            if not self._missing[number]:
+                self._advance(number, self._results(number))
+
+    def _results(self, number: int) -> list[dict[str, Any]]:
+        return [self._known[job.name] for job in self._asked[number]]
+
+    def _advance(self, number: int, results: Any) -> None:
+        """Send results to a strand until it waits for a job."""
+        while True:
+            try:
+                function, jobs = self._strands[number].send(results)
+            except StopIteration as end:
+                self.ends[number] = end.value
+                return
+            self._asked[number] = [self._admitted(function, _checked(job)) for job in jobs]
+            self._missing[number] = {job.name for job in self._asked[number]} - {*self._known}
+            for name in self._missing[number]:
+                self._waiting[name].append(number)
+            if self._missing[number]:
+                return
+            results = self._results(number)
+
+    def _admitted(self, function: Function, job: Job) -> Job:
+        """Return a job, which is ready to run if it is new and has no stored result."""
+        known = self._jobs.setdefault(job.name, job)
+        if known is job:
+            stored = _stored(self._folder, job) if self._folder else None
+            if stored is None:
+                self.ready.append((function, job))
+                self._waiting[job.name] = []
+            else:
+                self._known[job.name] = stored
+        elif _as_text(known.arguments) != _as_text(job.arguments):
+            raise ValueError(f'jobs: two have the name {job.name}, expected unique names')
+        return job
+
+
+class _ThisProcess(Executor):
+    """Runs each call in this process before `submit` returns."""
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any
+               ) -> 'Future[Any]':
+        """Return a future that is done."""
+        future: Future[Any] = Future()
+        future.set_result(function(*arguments, **options))
+        return future
+
+
+@contextlib.contextmanager
+def _cluster(address: str, worker_timeout_s: float) -> Iterator[Executor]:
+    """Yield an executor on a Dask cluster; at the end, cancel its jobs.
+
+    This function uses `distributed` directly: joblib would never return if a worker died.
+    """
+    with optional_import('running jobs on a Dask cluster', extra='experiments'):
+        from distributed import Client
+
+    with contextlib.ExitStack() as stack:
+        try:
+            client = stack.enter_context(Client(  # type: ignore[no-untyped-call]
+                address, timeout=_SCHEDULER_TIMEOUT_S, set_as_default=False))
+            client.wait_for_workers(1, timeout=worker_timeout_s)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise ConnectionError(f'Dask cluster {address}: {error}') from error
+        yield client.get_executor()
+
+
+class _AbandonedError(BaseException):
+    """Nobody waits for a job any more."""
+
+
+def _attempt_on_cluster(function: Function, job: Job) -> JobResult:
+    """Run a job on a worker of a Dask cluster; end it if its client has ended.
+
+    Dask itself only forgets such a job, which would occupy the worker until its end.
+    """
+    from distributed import get_worker
+
+    worker, thread = get_worker(), threading.get_ident()
+    key, over, lock = worker.get_current_task(), threading.Event(), threading.Lock()
+
+    def watch() -> None:
+        while not over.wait(_WATCH_S):
+            task = worker.state.tasks.get(key)
+            with lock:
+                if (task is None or task.state != 'executing') and not over.is_set():
+                    ctypes.pythonapi.PyThreadState_SetAsyncExc(
+                        ctypes.c_ulong(thread), ctypes.py_object(_AbandonedError))
+                    return
+
+    threading.Thread(target=watch, daemon=True).start()
+    try:
+        return attempt(function, job)
+    finally:
+        with lock:
+            over.set()
+
+
+def _begin_process(parent: int) -> None:
+    """Let a process ignore Ctrl-C, which its parent handles, and end with its parent."""
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_WATCH_S)
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Ignore SIGINT inside a block of the main thread, and in processes that are started there.
+
+    A terminal sends SIGINT to the whole process group, but only this process may end the workers.
+    A signal mask would not do: it would only delay the signal until the end of the block.
+    """
+    # Only the main thread can set handlers, and SIGINT raises KeyboardInterrupt only there.
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def run_jobs(
+        function: Callable[..., dict[str, Any]], jobs: Sequence[Job], folder: Path | None = None,
+        n_jobs: int = -1, dask: str | None = None, label: str = '',
+        worker_timeout_s: float = _WORKER_TIMEOUT_S) -> list[dict[str, Any]]:
+    """Run the jobs that have no stored result; return all results in order, decoded from JSON.
+
+    `function` takes the arguments of a job and returns a dict that JSON or NumPy can represent.
+    Each result is stored as soon as it is available, in a file in `folder`. After an interruption
+    or an error, the same call resumes the experiment. `n_jobs` jobs run in parallel on this
+    machine, by default one per core; `dask` is the address of the scheduler of a Dask cluster to
+    use instead, whose first worker may take `worker_timeout_s` to appear. Progress, with the
+    label, appears on stderr.
+
+    Raises JobError if a job fails, its process dies or its worker has another version of this
+    package, ConnectionError if the cluster does not respond, OSError if a result cannot be read or
+    stored, MissingLibraryError if a library is not installed, and ValueError if two jobs have the
+    same name, or JSON cannot represent an argument.
+    """
+    if len({job.name for job in jobs}) < len(jobs):
+        raise ValueError('jobs: two have the same name, expected unique names')
+
+    def strand() -> Strand[list[dict[str, Any]]]:
+        return (yield function, jobs)
+
+    (results,) = Workers(n_jobs, dask, folder, label,
+                         worker_timeout_s=worker_timeout_s).run([strand()])
+    return results
+
+
+def _decoded(job_result: JobResult) -> dict[str, Any]:
+    """Return the result of a job; raise JobError if it failed or ran with another version."""
+    name = job_result.job.name
+    if job_result.error:
+        raise JobError(f'job {name} failed: {job_result.error.strip()}')
+    if job_result.version != __version__:
+        raise JobError(f'job {name}: the worker has rhs_isac_ros {job_result.version}, expected '
+                       f'{__version__}, the version of this machine')
+    return json.loads(job_result.text)
+
+
+def add_run_options(parser: argparse.ArgumentParser, output: str = '') -> None:
+    """Add the options of `run_jobs`; `output` is the default folder of the results, if any."""
+    parser.add_argument('--jobs', type=integer(1, 1024), default=-1, metavar='N',
+                        help='number of parallel jobs (default: one per core)')
+    parser.add_argument('--dask', type=_address, metavar='ADDRESS',
+                        help='scheduler of a Dask cluster to use instead of this machine; '
+                             'its workers need this package, and one thread each for '
+                             'accurate timing')
+    if output:
+        parser.add_argument('--output', type=output_folder, default=output, metavar='DIR',
+                            help='folder of the results (default: %(default)s); jobs that have '
+                                 'results there are not repeated')
+
+
+def _address(text: str) -> str:
+    if not re.fullmatch(r'(\w+://)?[^\s/:]+:\d{1,5}', text):
+        raise argparse.ArgumentTypeError(f'{text!r}, expected HOST:PORT')
+    return text
+
+
+def run_command(experiment: Callable[[], None]) -> int:
+    """Run an experiment; return 0, 130 after Ctrl-C, or 1 after a job, file or library error."""
+    try:
+        experiment()
+    except KeyboardInterrupt:
+        print('interrupted: finished jobs are kept; repeat the command to resume',
+              file=sys.stderr)
+        # The exit code by which shells report Ctrl-C.
+        return 130
+    except (JobError, MissingLibraryError, OSError) as error:
+        print_error(f'{error}; finished jobs are kept; repeat the command to resume')
+        return 1
+    return 0
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Format a Markdown table: the first column is left-aligned, the others right-aligned."""
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    rule = ['-' * widths[0], *('-' * (width - 1) + ':' for width in widths[1:])]
+    lines = [
+        [entry.ljust(width) if column == 0 else entry.rjust(width)
+         for column, (entry, width) in enumerate(zip(row, widths, strict=True))]
+        for row in (header, rule, *rows)]
+    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
