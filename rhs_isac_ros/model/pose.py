@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rhs_isac_ros.model.arrays import numbers, read_only
+from rhs_isac_ros.model.arrays import cross, numbers, read_only
 
 # Smallest eigenvalue of a covariance relative to the largest one, up to rounding.
 _MIN_EIGENVALUE = -1e-9
@@ -168,12 +168,12 @@ def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
 def quaternion_product(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return the quaternion of two successive rotations: first `other`, then `one`."""
     (u, a), (v, b) = (one[:3], one[3]), (other[:3], other[3])
-    return np.append(a * v + b * u + np.cross(u, v), a * b - u @ v)
+    return np.append(a * v + b * u + cross(u, v), a * b - u @ v)
 
 
 def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
     """Return the matrices [..., 3, 3] whose products with a vector are cross products."""
-    return np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
+    return cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
 
 
 def _check_covariance(name: str, matrix: np.ndarray) -> None:

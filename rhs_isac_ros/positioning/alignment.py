@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import Pose
-from rhs_isac_ros.model.arrays import mixture_weights
+from rhs_isac_ros.model.arrays import cross, mixture_weights
 from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximum, symmetric
 from rhs_isac_ros.positioning.estimate import Sighting
 from rhs_isac_ros.positioning.mixture import Mixture
@@ -67,7 +67,7 @@ _LIMITS = _Limits()
 # Information of a prior that keeps undetermined errors finite: 10 m and 1 rad.
 _PRIOR = np.diag(1 / np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])**2)
 # Cross products of the unit vectors, [3, 3, 3].
-_CROSS = np.cross(np.eye(3)[:, None], np.eye(3))
+_CROSS = cross(np.eye(3)[:, None], np.eye(3))
 
 
 class PoseError(ValueError):
@@ -152,7 +152,7 @@ def _moments(pairs: '_Pairs', pose: Pose, found: Sequence[tuple['_Score', Pose]]
     errors = np.concatenate([mean + normal @ root.T for mean, root in zip(
         proposal.means, np.linalg.cholesky(proposal.covariances), strict=True)])
     density = proposal._replace(log_weights=np.zeros(len(components))).log_density(errors)
-    values = np.array([pairs.score(pose.displaced(error), 0.0).value for error in errors])
+    values = np.array([pairs.value(pose.displaced(error)) for error in errors])
     weights, _ = mixture_weights(values - density)
     return moments(weights, errors)
 
@@ -168,10 +168,8 @@ def _inverses(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     For many small matrices, the cofactors take a third of the time of a decomposition of each.
     """
-    first, second, third = np.moveaxis(covariances, 1, 0)
-    cofactors = np.stack(
-        [np.cross(second, third), np.cross(third, first), np.cross(first, second)], axis=1)
-    determinants = np.einsum('pq,pq->p', first, cofactors[:, 0])
+    cofactors = cross(covariances[:, [1, 2, 0]], covariances[:, [2, 0, 1]])
+    determinants = np.einsum('pq,pq->p', covariances[:, 0], cofactors[:, 0])
     return cofactors / determinants[:, None, None], np.log(determinants)
 
 
@@ -260,13 +258,10 @@ class _Pairs(NamedTuple):
     def score(self, pose: Pose, width_m: float) -> _Score:
         """Return derivatives at a pose, with mixtures widened by a standard deviation [m]."""
         turned, offsets, precisions, logs = self._compared(pose, width_m)
-        highest = np.maximum(self.of_user.max(logs), self.log_outlier)
-        densities = np.exp(logs - self.of_user.repeat(highest))
-        totals = self.of_user.sum(densities) + np.exp(self.log_outlier - highest)
-        shares = densities / self.of_user.repeat(totals)
+        shares, values = self._shares(logs)
         pulls = np.matmul(precisions, offsets[..., None])[..., 0]
         # An error of the pose moves candidates by its shift and by the turn times their offset.
-        slopes = np.concatenate([pulls, np.cross(turned, pulls)], axis=1)
+        slopes = np.concatenate([pulls, cross(turned, pulls)], axis=1)
         gradients = self.of_user.sum(shares[:, None] * slopes)
         weights = shares * self.of_user.repeat(self.weights)
         lost = slopes.T @ (weights[:, None] * slopes) - (
@@ -274,15 +269,27 @@ class _Pairs(NamedTuple):
         (likely,) = np.nonzero(shares > _LIMITS.share)
         places_m, covariances = self._places(likely, offsets, precisions)
         weights, precisions = weights[likely], precisions[likely]
-        crosses = np.cross(np.eye(3), (places_m - pose.origin)[:, None])
+        crosses = cross(np.eye(3), (places_m - pose.origin)[:, None])
         moves = np.concatenate([np.broadcast_to(np.eye(3), crosses.shape), crosses], axis=1)
         paired = np.tensordot(weights, moves @ precisions @ np.swapaxes(moves, 1, 2), axes=1)
         # The mean of `paired` over the errors of the places, less that without them.
         both = np.tensordot(weights[:, None, None] * covariances, precisions, axes=(0, 0))
         noise = np.zeros((6, 6))
         noise[3:, 3:] = np.einsum('aki,blj,klij->ab', _CROSS, _CROSS, both)
-        value = float(self.weights @ (highest + np.log(totals)))
-        return _Score(value, self.weights @ gradients, paired, lost, noise)
+        return _Score(
+            float(self.weights @ values), self.weights @ gradients, paired, lost, noise)
+
+    def value(self, pose: Pose) -> float:
+        """Return the log-likelihood of a pose."""
+        *_, logs = self._compared(pose, 0.0)
+        return float(self.weights @ self._shares(logs)[1])
+
+    def _shares(self, logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the probabilities of pairs, [P], and the log-likelihood for each user, [N]."""
+        highest = np.maximum(self.of_user.max(logs), self.log_outlier)
+        densities = np.exp(logs - self.of_user.repeat(highest))
+        totals = self.of_user.sum(densities) + np.exp(self.log_outlier - highest)
+        return densities / self.of_user.repeat(totals), highest + np.log(totals)
 
     def _compared(self, pose: Pose, width_m: float) -> tuple[np.ndarray, ...]:
         """Compare the candidates of all pairs for a pose.
