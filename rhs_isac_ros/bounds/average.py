@@ -21,7 +21,7 @@ from rhs_isac_ros.bounds.rows import (
     rows_within,
 )
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import adjoint, checked_positions
+from rhs_isac_ros.model.arrays import checked_positions
 from rhs_isac_ros.model.elements import (
     SurfaceEstimate,
     element_correlation,
@@ -37,7 +37,7 @@ from rhs_isac_ros.model.multipath import (
     declared_covariance,
     measurement_correlation,
 )
-from rhs_isac_ros.model.surface import AppliedBeams, Beamforming, feed_weights, onboard_matrix
+from rhs_isac_ros.model.surface import NOMINAL, Beamforming, Response, ports_of
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Function of a block of n items and their forms, float64 [n, G, G]. It returns the losses [n] and
@@ -252,15 +252,16 @@ def quadratic_gradients(
             correlation * (covariance_terms @ to_survey @ measured.excess),
             declared.scatter(measured.radiation))
     by_radiation = 4 * (through_covariance - mean_terms) / n_items
-    slope, offset, band_gains = model.elements.response
-    terms = [(offset, slope, np.reshape(np.conj(band_gains), (-1, 1, 1)) * by_radiation)]
+    terms = [(model.elements.response, by_radiation)]
     if not model.elements.is_exact:
         radiation = error_radiation(scenario, codebook)
         terms += [
-            (*term, _by_error(scenario, of_term, covariance_terms, n_items))
-            for term, of_term in zip(error_terms(scenario), radiation, strict=True)]
-    gradients = [_through_term(scenario, codebook, *term) for term in terms]
-    by_analog, by_digital = (np.sum(parts, axis=0) for parts in zip(*gradients, strict=True))
+            ((slope, constant, 1.0), _by_error(scenario, of_term, covariance_terms, n_items))
+            for (constant, slope), of_term in zip(
+                error_terms(scenario), radiation, strict=True)]
+    by_analog, by_digital = (
+        np.sum([gradient(scenario, codebook, by_term, response) for response, by_term in terms],
+               axis=0) for gradient in (gradient_analog, gradient_digital))
     return by_analog, by_digital
 
 
@@ -273,32 +274,31 @@ def _by_error(scenario: Scenario, radiation: np.ndarray, covariance_terms: np.nd
         for band, (terms, columns) in enumerate(zip(covariance_terms, radiation, strict=True))])
 
 
-def _through_term(
-        scenario: Scenario, codebook: Beamforming, constant: np.ndarray | float,
-        slope: np.ndarray | float, by_radiation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gradients with respect to C and S of a term (constant + slope C) * (S B)."""
-    beams = AppliedBeams(np.conj(constant + slope * codebook.analog), codebook.digital)
-    return (gradient_analog(scenario, codebook, np.conj(slope) * by_radiation),
-            gradient_digital(scenario, beams, by_radiation))
-
-
 def gradient_analog(
-        scenario: Scenario, codebook: Beamforming, by_radiation: np.ndarray) -> np.ndarray:
+        scenario: Scenario, codebook: Beamforming, by_radiation: np.ndarray,
+        response: Response = NOMINAL) -> np.ndarray:
     """Implements Proposition 2. Derivative with respect to C_i, float64 [N_B, F, N_E].
 
     The paper writes the chain rule for every pair of coordinates. Here, the derivative with
     respect to T_i already contains the sum over these pairs.
     """
-    weights = feed_weights(scenario, codebook)
-    by_radiation = by_radiation.reshape(weights.shape)
-    return np.einsum('ijqm,ijqm->iqm', np.conj(by_radiation), weights).real
+    slope, _, gains = response
+    by_radiation = np.reshape(np.conj(gains), (-1, 1, 1)) * by_radiation
+    return scenario.board.by_tunings(
+        ports_of(scenario), codebook.analog, codebook.digital,
+        _frames(scenario, np.conj(slope) * by_radiation))
 
 
 def gradient_digital(
-        scenario: Scenario, codebook: Beamforming, by_radiation: np.ndarray) -> np.ndarray:
+        scenario: Scenario, codebook: Beamforming, by_radiation: np.ndarray,
+        response: Response = NOMINAL) -> np.ndarray:
     """Implements Proposition 3. Derivative d/dRe(S) + i d/dIm(S), complex128 [N_B, N_SB, F, K]."""
-    onboard = onboard_matrix(scenario)
-    n_bands, n_subbands, _, n_elements = onboard.shape
-    by_radiation = by_radiation.reshape(n_bands, n_subbands, -1, n_elements)
-    weighted = by_radiation * codebook.analog[:, None]
-    return np.matmul(weighted, adjoint(onboard))
+    slope, offset, gains = response
+    by_radiation = np.reshape(np.conj(gains), (-1, 1, 1)) * by_radiation
+    return scenario.board.by_digital(
+        ports_of(scenario), codebook.analog, _frames(scenario, by_radiation), slope, offset)
+
+
+def _frames(scenario: Scenario, by_radiation: np.ndarray) -> np.ndarray:
+    return by_radiation.reshape(
+        scenario.n_bands, scenario.n_subbands, -1, scenario.n_elements)

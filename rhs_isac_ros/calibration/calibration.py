@@ -144,8 +144,11 @@ def known_states(scenario: Scenario, off: complex, on: complex) -> Calibration:
     """Return the calibration of a surface whose elements have the coefficients `off` and `on`.
 
     These are the coefficients for 0 and 1 in a configuration, known exactly, in all bands.
-    Raises ValueError if one of them is not finite.
+    Raises ValueError if one of them is not finite, or the board has other coefficients.
     """
+    if not scenario.board.is_amplitude:
+        raise ValueError(f'board: {scenario.board.kind!r} with states of elements, expected '
+                         "'paper': the board itself has the coefficients")
     n, n_bands = scenario.n_elements, scenario.n_bands
     surface = SurfaceEstimate(
         np.full(n, on - off), np.full(n, off), np.ones(n_bands),

@@ -69,8 +69,10 @@ class Pilots:
 
 def prior_of(scenario: Scenario) -> SurfacePrior:
     """Return the prior that a scenario declares, with defaults for fields that are zero."""
+    # Failed elements are described by amplitudes.
+    failed_share = DEFAULT_FAILED_SHARE * scenario.board.is_amplitude
     return SurfacePrior(scenario.element_error_rms or DEFAULT_ERROR_RMS,
-                        scenario.failed_element_share or DEFAULT_FAILED_SHARE)
+                        scenario.failed_element_share or failed_share)
 
 
 def places_of(scenario: Scenario, positions: np.ndarray, wavelengths: float) -> list[np.ndarray]:

@@ -13,7 +13,7 @@ import numpy as np
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.surface import matched_configuration, on_levels, onboard_matrix
+from rhs_isac_ros.model.surface import feed_signals, on_levels, ports_of
 
 
 def random_codebook(scenario: Scenario, rng: np.random.Generator) -> Codebook:
@@ -34,10 +34,11 @@ def directional_codebook(
         scan: str = 'width') -> Codebook:
     """Focus each of the N_B F frames on a point of a scan: the paper's `Directional`.
 
-    The configuration follows the holographic principle, rounded to the amplitude levels, if any.
-    The weights of each sub-band are the matched filter of the resulting feed signals, with equal
-    power in all sub-bands. The codebook is deterministic, so `rng` is unused. `scan` is one of
-    `SCANS`. Raises ValueError if it is unknown, or no element has a gain at a focal point.
+    The configuration is that of `Board.focused`: on the board of the paper, by the holographic
+    principle. The weights of each sub-band are the matched filter of the resulting feed signals,
+    with equal power in all sub-bands. The codebook is deterministic, so `rng` is unused. `scan` is
+    one of `SCANS`. Raises ValueError if it is unknown, no element has a gain at a focal point, or
+    the elements of the board are coupled.
     """
     if scan not in SCANS:
         raise ValueError(f'scan: {scan!r}, expected one of {sorted(SCANS)}')
@@ -45,11 +46,11 @@ def directional_codebook(
     analog = np.empty([sizes[s] for s in ('N_B', 'F', 'N_E')])
     digital = np.empty([sizes[s] for s in ('N_B', 'N_SB', 'F', 'K')], complex)
     points = SCANS[scan](scenario)
-    for band, onboard in enumerate(onboard_matrix(scenario)):
+    for band in range(scenario.n_bands):
         for frame, los in enumerate(los_gain(scenario, points[:, band], band)):
-            analog[band, frame] = on_levels(
-                scenario, matched_configuration(los, onboard))
-            feeds = np.einsum('jkm,jm->jk', onboard, analog[band, frame] * los)
+            analog[band, frame] = scenario.board.focused(
+                ports_of(scenario, band), los, scenario.amplitude_levels)
+            feeds = feed_signals(scenario, band, analog[band, frame], los)
             if not los.any():
                 raise ValueError(
                     f'element_gain, user_gain: no gain at {points[frame, band].tolist()} m, '

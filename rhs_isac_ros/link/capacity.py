@@ -13,7 +13,7 @@ from rhs_isac_ros.model.arrays import checked_position, numbers, read_only
 from rhs_isac_ros.model.los import direct_gain, los_sums
 from rhs_isac_ros.model.multipath import spatial_covariance
 from rhs_isac_ros.model.scenario import check_shape
-from rhs_isac_ros.model.surface import onboard_matrix
+from rhs_isac_ros.model.surface import NOMINAL, Response, ports_of
 from rhs_isac_ros.support.fields import finite
 from rhs_isac_ros.support.threads import one_blas_thread
 
@@ -30,6 +30,8 @@ class Beamformer:
     analog: np.ndarray  #: Configuration c-hat, float64 [N_E], each entry in [0, 1].
     digital: np.ndarray  #: Digital beamforming vectors s-hat, complex128 [N_SB, K] [sqrt(W)].
     band: int = 0  #: Index of the band, from 0.
+    #: Slope and offset of the elements, and gain of the band, if the surface is known.
+    response: Response = NOMINAL
 
 
 @one_blas_thread
@@ -141,9 +143,11 @@ def _radiation(scenario: Scenario, beam: Beamformer) -> np.ndarray:
     check_shape('digital', beam.digital, 'N_SB K', scenario)
     if not 0 <= beam.band < scenario.n_bands:
         raise ValueError(f'band: {beam.band}, expected 0 to {scenario.n_bands - 1}')
-    digital, onboard = numbers('digital', beam.digital, complex), onboard_matrix(scenario)
-    feeds = np.einsum('jk,jkm->jm', digital, onboard[beam.band])
-    return feeds * numbers('analog', beam.analog, complex)
+    slope, offset, gain = beam.response
+    digital = numbers('digital', beam.digital, complex)
+    return scenario.board.radiation(
+        ports_of(scenario, beam.band), numbers('analog', beam.analog)[None, None],
+        gain * digital[None, :, None], slope, offset)[0, :, 0]
 
 
 def _rate(scenario: Scenario, power_w: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from rhs_isac_ros.link.band_link import (
 )
 from rhs_isac_ros.link.candidates import candidate_configurations, tables
 from rhs_isac_ros.link.capacity import Beamformer, actual_capacity, expected_capacities
+from rhs_isac_ros.link.tuned import tuned_beam
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -154,7 +155,8 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
 
     A search from many starts, including the matched filter, proposes configurations. The best few
     are improved together with the digital part. Amplitudes are 0 or 1, which are valid for any
-    number of amplitude levels. The power over all sub-bands is P_max. The beam is deterministic.
+    number of amplitude levels. On a board whose coefficients are not amplitudes, the search is
+    that of `tuned_beam`. The power over all sub-bands is P_max. The beam is deterministic.
     Bands are counted from 0. A calibrated surface applies its coefficients to the configuration.
     Raises ValueError if the position is not a finite [3] array, or the band is out of range.
 
@@ -176,6 +178,8 @@ def steer_bands(
     for band in bands:
         if not 0 <= band < scenario.n_bands:
             raise ValueError(f'band: {band}, expected 0 to {scenario.n_bands - 1}')
+    if not scenario.board.is_amplitude:
+        return [tuned_beam(scenario, position, band, surface) for band in bands]
     link = BandLink.to(scenario, position, bands, surface)
     starts = candidate_configurations(
         tables(scenario, surface), link, band_index(bands), _N_ASCENTS)
@@ -193,11 +197,11 @@ def prepare_steering(scenario: Scenario, surface: SurfaceEstimate | None = None)
 
 
 def applied_beam(beam: Beamformer, surface: SurfaceEstimate | None) -> Beamformer:
-    """Return a beam with the coefficients and band gain of a calibrated surface, if any."""
+    """Return a beam with the response of a calibrated surface, if any."""
     if surface is None:
         return beam
-    return Beamformer(surface.applied(beam.analog), surface.band_gains[beam.band] * beam.digital,
-                beam.band)
+    return dataclasses.replace(
+        beam, response=(surface.gains, surface.offsets, surface.band_gains[beam.band]))
 
 
 @one_blas_thread

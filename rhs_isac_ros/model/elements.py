@@ -20,7 +20,6 @@ each band, so the covariance of their errors has a closed form.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import TypeAlias
 
 import numpy as np
 
@@ -33,7 +32,7 @@ from rhs_isac_ros.model.multipath import (
     spatial_covariance,
 )
 from rhs_isac_ros.model.scenario import Scenario
-from rhs_isac_ros.model.surface import AppliedBeams, Beamforming, feed_weights
+from rhs_isac_ros.model.surface import Beamforming, Response, radiation_matrix
 
 # Quadrature nodes along each side of the region of interest. A few suffice, because the carrier
 # cancels in the product of the gain in one sub-band and the conjugate gain in another.
@@ -43,8 +42,6 @@ _LOG2_NODES = 7
 # Number of positions evaluated at a time.
 _BLOCK = 32
 
-# Slope of the coefficients in c and their offset, numbers or [N_E]; gains of bands, 1 or [N_B].
-Response: TypeAlias = tuple[np.ndarray | float, np.ndarray | float, np.ndarray | float]
 # Function of a band and positions, float64 [N, 3] [m]. It returns matrices E, complex128
 # [N, N_SB F, R]; the errors of the direct-path signals are E z, with R white numbers z.
 DirectErrors = Callable[[int, np.ndarray], np.ndarray]
@@ -67,20 +64,9 @@ class SurfaceModel:
         return True
 
     def applied(self, analog: np.ndarray) -> np.ndarray:
-        """Return the expected coefficients for configurations [..., N_E].
-
-        Raises ValueError if the surface has another number of elements.
-        """
+        """Return the expected coefficients for configurations [..., N_E] of the paper's board."""
         slope, offset, _ = self.response
-        if np.ndim(slope) and np.shape(slope) != analog.shape[-1:]:
-            raise ValueError(f'surface: {np.size(slope)} elements, expected N_E = '
-                             f'{analog.shape[-1]} as in the configurations')
         return slope * analog + offset
-
-    def applied_beams(self, beams: Beamforming) -> AppliedBeams:
-        """Return the beamforming with expected coefficients, times the gains of the bands."""
-        band_gains = np.reshape(self.response[2], (-1, 1, 1, 1))
-        return AppliedBeams(self.applied(beams.analog), band_gains * beams.digital)
 
     def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
         """Return the covariance of multipath errors, [N_B, N_SB F, N_SB F], and `DirectErrors`."""
@@ -268,12 +254,11 @@ def error_terms(scenario: Scenario) -> list[tuple[float, float]]:
 
 
 def error_radiation(scenario: Scenario, beams: Beamforming) -> np.ndarray:
-    """Multiply `feed_weights` by the factors of `error_terms`; return [T, N_B, N_SB F, N_E]."""
-    factors = np.array([constant + slope * beams.analog
-                        for constant, slope in error_terms(scenario)])
-    return (factors.reshape(-1, *beams.analog.shape)[:, :, None]
-            * feed_weights(scenario, beams)).reshape(
-                len(factors), scenario.n_bands, -1, scenario.n_elements)
+    """Return the radiation for the factors of `error_terms`, [T, N_B, N_SB F, N_E]."""
+    return np.array([
+        radiation_matrix(scenario, beams, (slope, constant, 1.0))
+        for constant, slope in error_terms(scenario)
+    ]).reshape(-1, scenario.n_bands, scenario.n_subbands * scenario.n_frames, scenario.n_elements)
 
 
 @functools.lru_cache(maxsize=16)
@@ -304,9 +289,8 @@ def element_radiation(scenario: Scenario, beams: Beamforming) -> np.ndarray:
 
     Returns complex128 [N_B, N_SB F, 2 N_E], for unit gains of the bands.
     """
-    weights = feed_weights(scenario, beams)
-    both = np.concatenate([beams.analog[:, None] * weights, weights], axis=-1)
-    return both.reshape(scenario.n_bands, -1, 2 * scenario.n_elements)
+    return np.concatenate([radiation_matrix(scenario, beams),
+                           radiation_matrix(scenario, beams, (0.0, 1.0, 1.0))], axis=-1)
 
 
 def direct_design(scenario: Scenario, radiation: np.ndarray, band: int,

@@ -32,7 +32,7 @@ from rhs_isac_ros.model.multipath import (
     square_root,
 )
 from rhs_isac_ros.model.scenario import Scenario
-from rhs_isac_ros.model.surface import Beamforming, combine, radiation_matrix
+from rhs_isac_ros.model.surface import NOMINAL, Beamforming, combine, radiation_matrix
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
 # Knowledge of the elements of one surface: known errors, or an estimate of the coefficients.
@@ -96,8 +96,7 @@ def simulate_received(
     drawn, factors = draw_impairments(scenario, len(positions), rng)
     blocked = draw_blocked(scenario, len(positions), rng)
     surface = surface or drawn
-    radiation = radiation_matrix(
-        scenario, surface.applied_beams(codebook) if surface else codebook)
+    radiation = radiation_matrix(scenario, codebook, surface.response if surface else NOMINAL)
     n_bands, n_measurements, _ = radiation.shape
     received = np.empty((len(positions), n_bands, n_measurements), complex)
     for block in blocks(len(positions), _BLOCK):
@@ -164,7 +163,7 @@ class MeasurementModel:
         self.elements: SurfaceModel = surface or DeclaredElements(scenario)
         #: T_i of Eq. (9) for the coefficients in effect, complex128 [N_B, N_SB F, N_E].
         self.radiation = read_only(
-            radiation_matrix(scenario, self.elements.applied_beams(beamforming)))
+            radiation_matrix(scenario, beamforming, self.elements.response))
 
     @property
     def shape(self) -> tuple[int, int]:

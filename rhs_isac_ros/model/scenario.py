@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.model.arrays import read_only
+from rhs_isac_ros.model.board import Board, Paper, board_of
 from rhs_isac_ros.model.external import ArrayFile, External
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.hall import MultipathEstimate, PathChannel
@@ -178,6 +179,10 @@ class Extensions:
         'amplitudes are continuous.', '',
         'Smith, Yurduseven, Mancera, Bowen and Kundtz, Analysis of a waveguide-fed metasurface '
         'antenna, Phys. Rev. Applied 8, 2017', label='amplitude levels $L$')
+    board: Board = declare(
+        Paper(), 0.0, 0.0,
+        'How tunings of the elements determine the transfer from elements to feeds: the name of a '
+        'board, or a mapping of kind and its fields (see `model.board`).', '', label='board')
     impairments: tuple[tuple[str, float], ...] = declare(
         (), 0.0, 1e300,
         'Impairments of installed plug-ins: a mapping of names to strengths, each in the unit '
@@ -273,6 +278,8 @@ class Scenario(Extensions, Table1):
         if self.amplitude_levels == 1:
             raise ScenarioError(
                 'amplitude_levels: 1, expected 0 for continuous amplitudes, or at least 2')
+        if misfit := self.board.misfit(self):
+            raise ScenarioError(f'board: {misfit}')
         for name in _FILES:
             arrays = getattr(self, name)
             if arrays is not None and (misfit := arrays.misfit(self)):
@@ -323,7 +330,7 @@ class Scenario(Extensions, Table1):
         """Hash of the fields: ``sc`` and 16 hex digits, which YAML never parses as a number."""
         changes, fields = self.changes(), self.fields()
         for name in ('impairments', 'multipath_direction_deg', 'blocked_probability',
-                     'outside_probability', *_FILES, 'pose'):
+                     'outside_probability', *_FILES, 'pose', 'board'):
             # Existing files contain identifiers from before these fields were introduced.
             if name not in changes:
                 del fields[name]
@@ -403,6 +410,8 @@ def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) 
 def _plain(value: Any) -> Any:
     if isinstance(value, External | str):
         return str(value)
+    if isinstance(value, Board):
+        return value.plain
     if isinstance(value, float) and value == np.inf:
         return UNKNOWN
     if isinstance(value, Pose):
@@ -420,6 +429,9 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
         return _strengths(field, value)
     if name == 'pose':
         return _pose(field, value)
+    if name == 'board':
+        with translated(ValueError, ScenarioError, name):
+            return board_of(value)
     if name in _FILES or name in _EXTERNAL and not isinstance(to_number(value, float), float):
         return _external(field, value, _EXTERNAL[name])
     if name in _OF_AXES and isinstance(value, list | tuple | np.ndarray):

@@ -1,14 +1,17 @@
 """The surface: propagation from its elements to the feeds, and combining at the base station."""
 
 import functools
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import read_only
-from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
+from rhs_isac_ros.model.board import Factor, Ports, rounded
 from rhs_isac_ros.model.geometry import element_positions, feed_positions, subband_frequencies_hz
 from rhs_isac_ros.model.scenario import Scenario, check_shape
+
+# Slope and offset of the elements, as in `board`, and gains of the bands, a number or [N_B].
+Response: TypeAlias = tuple[Factor, Factor, Factor]
+NOMINAL: Response = 1.0, 0.0, 1.0
 
 
 class Beamforming(Protocol):
@@ -26,7 +29,7 @@ class Beamforming(Protocol):
 
 
 class AppliedBeams(NamedTuple):
-    """Beamforming with arbitrary complex coefficients, such as those of faulty elements."""
+    """Beamforming with arbitrary tunings; on the paper's board, complex coefficients."""
 
     analog: np.ndarray
     digital: np.ndarray
@@ -42,27 +45,20 @@ def element_signals(
 
 
 def feed_signals(
-        scenario: Scenario, band: int, analog: np.ndarray, elements: np.ndarray) -> np.ndarray:
+        scenario: Scenario, band: int, analog: np.ndarray, elements: np.ndarray,
+        response: Response = NOMINAL) -> np.ndarray:
     """Implements Eq. (5). Signals that the feeds receive from the elements, [..., N_SB, K].
 
-    Takes the configuration c of each frame, float64 [..., N_E], and the element signals tau,
-    complex128 [..., N_SB, N_E]. The configuration is applied here; the paper introduces it with
-    Eq. (9).
+    Takes the configuration c of each frame, float64 [..., N_E], the element signals tau,
+    complex128 [..., N_SB, N_E], and the response of the elements. The configuration is applied
+    here; the paper introduces it with Eq. (9).
     """
-    return np.einsum('...jm,jkm->...jk', analog[..., None, :] * elements,
-                     onboard_matrix(scenario)[band])
-
-
-def onboard_gain(
-        scenario: Scenario, frequency_hz: float | np.ndarray, source: np.ndarray,
-        sink: np.ndarray) -> np.ndarray:
-    """Implements Eq. (6). Propagation kappa on the board between two points, complex128.
-
-    Frequencies [Hz] and positions, float64 [..., 3] [m], may have any shapes that broadcast.
-    """
-    distance = np.linalg.norm(sink - source, axis=-1)
-    wavenumber = 2 * np.pi * scenario.refractive_index * frequency_hz / SPEED_OF_LIGHT_MPS
-    return np.exp(-1j * wavenumber * distance)
+    n_subbands, n_elements = elements.shape[-2:]
+    slope, offset, gain = response
+    signals = scenario.board.feeds(
+        ports_of(scenario, band), analog.reshape(1, -1, n_elements),
+        np.swapaxes(elements.reshape(1, -1, n_subbands, n_elements), 1, 2), slope, offset)
+    return gain * np.swapaxes(signals[0], 0, 1).reshape(*elements.shape[:-1], -1)
 
 
 def combine(digital: np.ndarray, feeds: np.ndarray, noise: np.ndarray | float) -> np.ndarray:
@@ -74,46 +70,41 @@ def combine(digital: np.ndarray, feeds: np.ndarray, noise: np.ndarray | float) -
     return np.einsum('...k,...k->...', digital, feeds) + noise
 
 
-def radiation_matrix(scenario: Scenario, beams: Beamforming) -> np.ndarray:
+def radiation_matrix(
+        scenario: Scenario, beams: Beamforming, response: Response = NOMINAL) -> np.ndarray:
     """Implements Eq. (9). Weight of every element in every measurement.
 
-    Returns T_i, complex128 [N_B, N_SB F, N_E], rows sub-band-major (row j F + q). Raises
-    ValueError if the beamforming does not have the sizes of the scenario.
+    Returns T_i, complex128 [N_B, N_SB F, N_E], rows sub-band-major (row j F + q), for elements
+    with a response. Raises ValueError if the beamforming or the response does not have the sizes
+    of the scenario, and BoardError if elements of the board cannot have such a response.
     """
     check_shape('analog', beams.analog, 'N_B F N_E', scenario)
     check_shape('digital', beams.digital, 'N_B N_SB F K', scenario)
-    return (beams.analog[:, None] * feed_weights(scenario, beams)).reshape(
-        scenario.n_bands, -1, scenario.n_elements)
+    slope, offset, band_gains = response
+    if np.ndim(slope) == 1 and np.shape(slope) != beams.analog.shape[-1:]:
+        raise ValueError(f'surface: {np.size(slope)} elements, expected N_E = '
+                         f'{scenario.n_elements} as in the configurations')
+    digital = np.reshape(band_gains, (-1, 1, 1, 1)) * beams.digital
+    return scenario.board.radiation(
+        ports_of(scenario), beams.analog, digital, slope, offset).reshape(
+            scenario.n_bands, -1, scenario.n_elements)
 
 
-def feed_weights(scenario: Scenario, beams: Beamforming) -> np.ndarray:
-    """Compute S B, the weights of elements whose coefficient is 1, [N_B, N_SB, F, N_E]."""
-    return np.matmul(beams.digital, onboard_matrix(scenario))
+@functools.lru_cache(maxsize=64)
+def ports_of(scenario: Scenario, *bands: int) -> Ports:
+    """Return the ports of the board in some bands, by default in all."""
+    return Ports(subband_frequencies_hz(scenario)[list(bands) or slice(None)],
+                 element_positions(scenario), feed_positions(scenario), scenario.refractive_index)
 
 
-@functools.lru_cache(maxsize=16)
 def onboard_matrix(scenario: Scenario) -> np.ndarray:
-    """Compute B_{i,j} below Eq. (9), the on-board propagation from all elements to all feeds.
+    """Return B_{i,j} below Eq. (9), the on-board propagation from all elements to all feeds.
 
-    Returns complex128 [N_B, N_SB, K, N_E], read-only.
+    Returns complex128 [N_B, N_SB, K, N_E], read-only. Raises BoardError if elements are coupled.
     """
-    frequencies = subband_frequencies_hz(scenario)[:, :, None, None]
-    elements, feeds = element_positions(scenario), feed_positions(scenario)
-    return read_only(onboard_gain(scenario, frequencies, elements, feeds[:, None, :]))
+    return scenario.board.paths(ports_of(scenario))
 
 
 def on_levels(scenario: Scenario, analog: np.ndarray) -> np.ndarray:
-    """Round configurations to the amplitude levels of the elements; keep continuous amplitudes."""
-    steps = scenario.amplitude_levels - 1
-    return np.rint(analog * steps) / steps if steps > 0 else analog
-
-
-def matched_configuration(los: np.ndarray, onboard: np.ndarray) -> np.ndarray:
-    """Compute a configuration by the holographic principle, float64 [N_E], entries in [0, 1].
-
-    Takes line-of-sight gains, complex128 [N_SB, N_E], and B_j, complex128 [N_SB, K, N_E]. The
-    amplitude of an element is high if the phases of its line-of-sight gain and of its propagation
-    on the board cancel. If all gains are 0, all entries are 0.5.
-    """
-    interference = np.einsum('jm,jkm->m', los, onboard).real
-    return (interference / (np.abs(interference).max() or 1.0) + 1) / 2
+    """Round configurations to the levels of the elements; keep continuous tunings."""
+    return rounded(analog, scenario.amplitude_levels)

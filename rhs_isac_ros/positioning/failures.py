@@ -29,7 +29,7 @@ from rhs_isac_ros.model.gaussian import energy_limit
 from rhs_isac_ros.model.geometry import jacobian, to_positions
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
-from rhs_isac_ros.model.surface import onboard_matrix
+from rhs_isac_ros.model.surface import radiation_matrix
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.likelihood import (
     Columns,
@@ -203,12 +203,10 @@ class FailureEffects(NamedTuple):
     @classmethod
     def of(cls, scenario: Scenario, codebook: Codebook) -> 'FailureEffects':
         """Compute the effects on the signals of a codebook."""
-        weights = np.matmul(codebook.digital, onboard_matrix(scenario))
-        n_bands, n_subbands, n_frames, n_elements = weights.shape
-        shape = n_bands, n_subbands * n_frames, n_elements
         shift, amplitude = (
-            np.ascontiguousarray(np.moveaxis(one.reshape(shape), 2, 0))
-            for one in ((0.5 - codebook.analog[:, None]) * weights, weights / np.sqrt(12)))
+            np.ascontiguousarray(np.moveaxis(one, 2, 0)) for one in (
+                radiation_matrix(scenario, codebook, (-1.0, 0.5, 1.0)),
+                radiation_matrix(scenario, codebook, (0.0, 1.0, 1.0)) / np.sqrt(12)))
         return cls(shift, amplitude, multipath_covariance(scenario),
                    measurement_correlation(scenario))
 

@@ -19,7 +19,7 @@ from rhs_isac_ros.model.elements import DeclaredElements, SurfaceEstimate, draw_
 from rhs_isac_ros.model.impairments import draw_factors
 from rhs_isac_ros.model.los import direct_gain, draw_blocked
 from rhs_isac_ros.model.multipath import draw_multipath, time_correlation
-from rhs_isac_ros.model.surface import element_signals, feed_signals
+from rhs_isac_ros.model.surface import NOMINAL, Response, element_signals, feed_signals
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
     ApplyPatterns,
@@ -360,11 +360,16 @@ class Channel(Role):
         bits = min(event.bits, cycle.rate_bps * event.duration_s // 1)
         return dataclasses.replace(event, stage=m.Stage.DELIVERED, bits=bits)
 
-    def _coefficients(self, configurations: np.ndarray, band: int) -> np.ndarray:
-        """Return the coefficients of the elements in each frame of a band, [F, N_E]."""
+    def _response(self, band: int) -> Response:
+        """Return the response of the elements in a band: known states, and then errors."""
+        slope, offset, gain = NOMINAL
         if self._states:
-            configurations = self._states.band_gains[band] * self._states.applied(configurations)
-        return configurations if self._elements is None else self._elements.applied(configurations)
+            slope, offset, gains = self._states.response
+            gain = np.ravel(gains)[band]
+        if self._elements:
+            errors, stuck, _ = self._elements.response
+            slope, offset = errors * slope, errors * offset + stuck / gain
+        return slope, offset, gain
 
     def _sounding(self, event: m.Pilot | m.Data, cycle: _Cycle,
                   configurations: np.ndarray) -> Sounding | None:
@@ -373,8 +378,8 @@ class Channel(Role):
             return None
         band = event.band
         elements = element_signals(cycle.los[band][:, None], cycle.multipath[band], 1.0)
-        feeds = feed_signals(self._scenario, band, self._coefficients(configurations, band),
-                             elements.swapaxes(0, 1))
+        feeds = feed_signals(self._scenario, band, configurations, elements.swapaxes(0, 1),
+                             self._response(band))
         if cycle.factors is not None:
             feeds = feeds * cycle.factors[band].T[:, :, None]
         return Sounding(event.cycle_id, band, event.symbols, feeds, event.user,
@@ -385,14 +390,14 @@ class Channel(Role):
         if (steered := self._steered(cycle)) is None:
             return None
         beam, shown = steered
-        (applied,) = self._coefficients(shown, beam.band)
         digital = beam.digital
         if cycle.factors is not None:
             # The phases of the factors do not change the capacity.
             digital = digital * np.abs(cycle.factors[beam.band, 0, 0])
         return float(actual_capacity(
-            self._scenario, Beamformer(applied, digital, beam.band), cycle.position,
-            cycle.blocked)[0])
+            self._scenario,
+            Beamformer(shown[0], digital, beam.band, self._response(beam.band)),
+            cycle.position, cycle.blocked)[0])
 
 
 def _is_from_other_instance(event: m.Pilot | m.Data, truth: m.GroundTruth) -> bool:

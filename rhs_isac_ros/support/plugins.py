@@ -8,6 +8,7 @@ IMPAIRMENTS = 'rhs_isac_ros.impairments'
 ESTIMATORS = 'rhs_isac_ros.estimators'
 MOBILITIES = 'rhs_isac_ros.mobilities'
 GAIN_PATTERNS = 'rhs_isac_ros.gain_patterns'
+BOARDS = 'rhs_isac_ros.boards'
 SURFACES = 'rhs_isac_ros.surfaces'
 RADIOS = 'rhs_isac_ros.radios'
 

@@ -139,3 +139,8 @@ def test_the_report_lists_failures_errors_and_gains(calibration, scenario):
     rms = 100 * np.sqrt(np.mean(np.abs(calibration.surface.gains[working] - 1)**2))
     known = 100 * np.sqrt(np.mean(calibration.surface.std()[:25][working]**2))
     assert f'errors of working elements: {rms:.2f} % rms, known to {known:.2f} % rms' in lines
+
+
+def test_states_of_elements_are_those_of_a_board_of_amplitudes():
+    with pytest.raises(ValueError, match="^board: 'phase' with states of elements, expected 'pap"):
+        known_states(Scenario(board='phase'), 0, 1)

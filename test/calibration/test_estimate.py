@@ -95,9 +95,9 @@ def test_without_pilots_the_estimate_is_the_prior(scenario, beams):
     found = calibrate(scenario, [], SurfacePrior(
         scenario.element_error_rms, scenario.failed_element_share, band_gain_rms=0.0)).surface
     elements = DeclaredElements(scenario)
-    applied, expected = found.applied_beams(beams), elements.applied_beams(beams)
-    np.testing.assert_allclose(applied.analog, expected.analog, atol=1e-9)
-    np.testing.assert_allclose(applied.digital, expected.digital)
+    np.testing.assert_allclose(
+        found.applied(beams.analog), elements.applied(beams.analog), atol=1e-9)
+    np.testing.assert_allclose(found.band_gains, 1)
     np.testing.assert_allclose(found.failed_probability, scenario.failed_element_share)
     covariance = found.error_covariance(scenario, beams)
     declared = elements.error_covariance(scenario, beams)

@@ -10,8 +10,8 @@ from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.link.candidates import candidate_configurations, tables
 from rhs_isac_ros.link.steering import ascend
 from rhs_isac_ros.model import Scenario, multipath
+from rhs_isac_ros.model.board import matched_configuration
 from rhs_isac_ros.model.multipath import multipath_covariance
-from rhs_isac_ros.model.surface import matched_configuration
 
 POSITION = np.array([8.0, -2.0, 0.5])
 ONE_BAND = {'center_frequencies_hz': (2.5e9,), 'elements_per_side': 4, 'n_feeds': 2}

@@ -1,0 +1,136 @@
+"""Search for a beam on any board, also with coupling, by the gradient of the capacity.
+
+The searches of `steering` change single elements, whose coefficients are amplitudes. On other
+boards, L-BFGS-B climbs in the tunings of all elements from several starts. If tunings are
+discrete, single tunings are then exchanged as long as this increases the capacity.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from rhs_isac_ros.link.band_link import representative_subbands, water_filling
+from rhs_isac_ros.link.capacity import Beamformer
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import checked_position
+from rhs_isac_ros.model.board import BoardError, Ports
+from rhs_isac_ros.model.elements import SurfaceEstimate
+from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
+from rhs_isac_ros.model.surface import NOMINAL, Response, on_levels, ports_of
+from rhs_isac_ros.support.threads import one_blas_thread
+
+# Numbers of random starts, of steps from each, and of exchanges.
+_N_RANDOM, _N_STEPS, _N_EXCHANGES = 3, 60, 40
+# Drift of phases between sub-bands of the search, and largest number of these sub-bands.
+_MAX_DRIFT_RAD, _MAX_SUBBANDS = 0.05, 4
+# Smallest relative increase of the capacity that justifies an exchange.
+_MIN_GAIN = 1e-9
+
+
+def tuned_beam(scenario: Scenario, position: np.ndarray, band: int,
+               surface: SurfaceEstimate | None) -> Beamformer:
+    """Find a beam that nearly maximises Eq. (10) for a user at a position, float64 [3] [m]."""
+    from scipy.optimize import minimize
+
+    one_blas_thread.find_libraries()
+    whole = TunedLink.to(scenario, position, band, surface)
+    link = whole.at_subbands(representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS))
+    n, rng = scenario.n_elements, np.random.default_rng(0)
+    starts = list(rng.uniform(size=(_N_RANDOM, n)))
+    try:
+        starts.insert(0, scenario.board.focused(whole.ports, whole.los))
+    except BoardError:
+        # With coupling, no element has a best tuning of its own.
+        starts.insert(0, np.full(n, 0.5))
+
+    def loss(tunings: np.ndarray) -> tuple[float, np.ndarray]:
+        rate, gradient = link.rate_and_gradient(tunings)
+        return -rate, -gradient
+
+    ends = [minimize(loss, start, jac=True, method='L-BFGS-B', bounds=[(0.0, 1.0)] * n,
+                     options={'maxiter': _N_STEPS}).x for start in starts]
+    ends = [link.exchanged(on_levels(scenario, end), scenario.amplitude_levels) for end in ends]
+    best = max(ends, key=lambda end: float(link.rates(end[None])[0]))
+    return Beamformer(best, whole.best_digital(best), band)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TunedLink:
+    """The link between a surface and one position in a band, for any board."""
+
+    scenario: Scenario
+    ports: Ports
+    response: Response
+    los: np.ndarray  #: Line-of-sight gains, complex128 [N_SB, N_E].
+    spatial: SpatialCovariance  #: V_i.
+    power_w: float  #: Power of the digital part, summed over sub-bands [W].
+
+    @classmethod
+    def to(cls, scenario: Scenario, position: np.ndarray, band: int,
+           surface: SurfaceEstimate | None) -> 'TunedLink':
+        """Return the link to a position, float64 [3] [m]."""
+        slope, offset, gains = NOMINAL if surface is None else surface.response
+        place = checked_position(position)[None]
+        return cls(
+            scenario, ports_of(scenario, band), (slope, offset, np.ravel(gains)[band % np.size(
+                gains)]), los_gain(scenario, place, band)[0],
+            spatial_covariance(scenario)[band], scenario.max_power_w)
+
+    def at_subbands(self, subbands: np.ndarray) -> 'TunedLink':
+        """Return the link in a subset of the sub-bands, with their share of the power."""
+        ports = dataclasses.replace(
+            self.ports, frequencies_hz=self.ports.frequencies_hz[:, subbands])
+        return dataclasses.replace(self, ports=ports, los=self.los[subbands],
+                                   power_w=self.power_w * len(subbands) / len(self.los))
+
+    def rates(self, tunings: np.ndarray) -> np.ndarray:
+        """Return the capacities with the best digital parts [nat/symbol], [n], for [n, N_E]."""
+        return np.log1p(self._beams(tunings)[0]).sum(axis=0)
+
+    def best_digital(self, tunings: np.ndarray) -> np.ndarray:
+        """Return the best digital part for tunings [N_E], complex128 [N_SB, K] [sqrt(W)]."""
+        return self._beams(tunings[None])[1][:, 0]
+
+    def rate_and_gradient(self, tunings: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the capacity of tunings [N_E], and its gradient [N_E].
+
+        The digital part is the best one, so its changes do not contribute to the gradient.
+        """
+        snr, digital = self._beams(tunings[None])
+        slope, offset, gain = self.response
+        board, ports, received = self.scenario.board, self.ports, gain * digital[None]
+        radiation = board.radiation(ports, tunings[None, None], received, slope, offset)[0, :, 0]
+        by_radiation = np.sum(radiation * self.los, axis=1, keepdims=True) * np.conj(self.los)
+        by_radiation += self.spatial.scatter(radiation)
+        by_radiation *= 2 / self.scenario.noise_power_w / (1 + snr)
+        gradient = board.by_tunings(
+            ports, tunings[None, None], received, np.conj(slope) * by_radiation[None, :, None])
+        return float(np.log1p(snr).sum()), gradient[0, 0]
+
+    def exchanged(self, tunings: np.ndarray, n_levels: int) -> np.ndarray:
+        """Return tunings after the best exchanges of single ones for other levels, if any."""
+        if not n_levels:
+            return tunings
+        rate, rows = self.rates(tunings[None])[0], np.arange(len(tunings))
+        for _ in range(_N_EXCHANGES):
+            others = np.repeat(tunings[None], len(tunings) * n_levels, axis=0)
+            others[np.arange(len(others)), np.repeat(rows, n_levels)] = np.tile(
+                np.linspace(0, 1, n_levels), len(tunings))
+            rates = self.rates(others)
+            if rates.max() <= rate * (1 + _MIN_GAIN):
+                break
+            rate, tunings = rates.max(), others[rates.argmax()]
+        return tunings
+
+    def _beams(self, tunings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return SNRs [N_SB, n] and the best digital parts [N_SB, n, K] for tunings [n, N_E]."""
+        slope, offset, gain = self.response
+        channels = gain * self.scenario.board.channels(self.ports, tunings[None], slope, offset)[0]
+        direct = channels @ self.los[:, None, :, None]
+        correlations = np.matmul(direct, np.conj(np.swapaxes(direct, -1, -2))) + np.matmul(
+            self.spatial.scatter(channels), np.conj(np.swapaxes(channels, -1, -2)))
+        gains, directions = np.linalg.eigh(correlations)
+        gain_of_noise = np.maximum(gains[..., -1], 0) / self.scenario.noise_power_w
+        power = water_filling(gain_of_noise.T, self.power_w).T
+        return gain_of_noise * power, np.conj(directions[..., -1]) * np.sqrt(power)[..., None]

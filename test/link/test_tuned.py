@@ -1,0 +1,52 @@
+"""Beams on boards whose coefficients are not amplitudes."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.link import capacity, steer
+from rhs_isac_ros.link.tuned import TunedLink
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.elements import SurfaceEstimate
+
+POSITION = np.array([8.0, 1.0, 0.2])
+BOARDS = [('phase', 0), ('resonant', 0), ({'kind': 'states', 'states': [[1, 0], [-1, 0]]}, 2)]
+
+
+@pytest.mark.parametrize(('board', 'levels'), BOARDS)
+def test_the_beam_is_a_maximum_over_single_tunings(board, levels):
+    scenario = Scenario(elements_per_side=5, board=board, amplitude_levels=levels)
+    beam = steer(scenario, POSITION, 1)
+    assert beam.band == 1
+    assert np.sum(np.abs(beam.digital)**2) == pytest.approx(scenario.max_power_w)
+    link = TunedLink.to(scenario, POSITION, 1, None)
+    best = link.rates(beam.analog[None])[0]
+    bits = best / np.log(2) * scenario.subband_width_hz
+    assert capacity(scenario, beam, POSITION[None])[0] == pytest.approx(bits)
+    steps = [0.0, 1.0] if levels else [0.02, -0.02]
+    for element in range(25):
+        for step in steps:
+            changed = beam.analog.copy()
+            changed[element] = step if levels else np.clip(changed[element] + step, 0, 1)
+            assert link.rates(changed[None])[0] <= best * (1 + 1e-6)
+
+
+def test_the_gradient_is_a_limit_of_differences_also_with_a_known_surface():
+    scenario, rng = Scenario(elements_per_side=4, board='resonant'), np.random.default_rng(0)
+    surface = SurfaceEstimate(
+        1 + 0.1 * rng.normal(size=(16, 2)) @ [1, 1j], 0.1j * np.ones(16), [1.1, 0.9j],
+        np.zeros((34, 0)), np.zeros(16))
+    link = TunedLink.to(scenario, POSITION, 1, surface)
+    tunings, step = rng.uniform(size=16), 1e-6 * rng.normal(size=16)
+    _, gradient = link.rate_and_gradient(tunings)
+    low, high = link.rates(tunings + np.array([[-1], [1]]) * step)
+    assert (high - low) / 2 == pytest.approx(gradient @ step, rel=1e-5)
+
+
+def test_boards_with_more_freedom_reach_more_capacity():
+    def reached(board, levels=0):
+        scenario = Scenario(elements_per_side=6, board=board, amplitude_levels=levels)
+        return capacity(scenario, steer(scenario, POSITION), POSITION[None])[0]
+
+    amplitudes = reached('paper')
+    assert reached('phase') > reached(*BOARDS[2]) > amplitudes
+    assert reached('resonant') > amplitudes
