@@ -62,6 +62,7 @@ def estimate(beams):
     return survey(DECLARED, beams, *send(HALL, beams, 100))
 
 
+@pytest.mark.slow
 def test_fields_are_those_of_the_hall(estimate):
     assert estimate.multipath_to_los_db == pytest.approx(-5, abs=1)
     assert estimate.delay_spread_s == pytest.approx(200e-9, rel=0.2)

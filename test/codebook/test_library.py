@@ -39,6 +39,7 @@ def test_every_position_is_within_half_a_pitch_of_a_cell(plan):
     assert len(centres) == 3 * 2 * 1
 
 
+@pytest.mark.slow
 def test_the_codebook_is_that_of_the_nearest_cell_with_the_next_wider_spread(built):
     cells = built.plan.cells(SCENARIO)
     place = np.array(cells[3].centre_m) + 0.05

@@ -73,6 +73,7 @@ def test_a_position_without_fix_counts_with_the_region(case, monkeypatch):
     assert min(result['capacity_bps']) > 0
 
 
+@pytest.mark.slow
 def test_the_global_bound_of_a_coarse_lattice_is_missing(case):
     found = evaluate('bound', **case, first=0, n=4)['bound_m2']
     assert len(found) == 4

@@ -79,6 +79,7 @@ def test_no_beam_waits_for_tables_after_the_preparation(small):
     assert [cache.cache_info().misses for cache in caches] == before
 
 
+@pytest.mark.slow
 def test_a_beam_of_a_small_surface_is_close_to_the_optimum(small, reference_link):
     """The optimum is a corner of the box; water-filling divides the power evenly here."""
     scenario, link = small.scenario, reference_link(small)

@@ -31,6 +31,7 @@ def suspects(shifts=None, seed=1, n=WINDOW, references=500):
     return test.suspects()
 
 
+@pytest.mark.slow
 def test_right_poses_raise_few_alarms():
     # Each of three pairs fails by chance in one of a thousand windows.
     assert sum(bool(suspects(seed=seed)) for seed in range(1, 301)) <= 4

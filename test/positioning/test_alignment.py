@@ -42,6 +42,7 @@ def normalised_error(found):
     return error @ np.linalg.solve(found.covariance, error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('n', 'seeds'), [(40, range(6)), (MIN_USERS, range(2))])
 def test_a_pose_is_found_with_a_covariance_that_fits_its_error(n, seeds):
     squares = [normalised_error(estimate_pose(
@@ -50,6 +51,7 @@ def test_a_pose_is_found_with_a_covariance_that_fits_its_error(n, seeds):
     assert 2.0 < np.mean(squares) < 11.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('n_candidates', 'n_outliers'), [(4, 0), (1, 6), (3, 4)])
 def test_wrong_candidates_and_outliers_do_not_matter(n_candidates, n_outliers):
     found = estimate_pose(*sightings(
@@ -79,6 +81,7 @@ def test_the_number_of_sightings_is_checked():
         estimate_pose(reference[1:], other[1:], BOUNDS)
 
 
+@pytest.mark.slow
 def test_users_at_rest_count_once():
     once = sightings(np.random.default_rng(6), n=20)
     found, again = (estimate_pose(*(n * one for one in once), BOUNDS) for n in (1, 4))

@@ -273,6 +273,7 @@ def test_the_probability_of_blocked_users_is_calibrated(name, change, reject_out
     assert probability[blocked].mean() > probability[~blocked].mean() + 0.3
 
 
+@pytest.mark.slow
 def test_the_inflation_of_a_survey_makes_no_user_in_sight_blocked(shipped):
     """The residuals are weaker than the inflated covariance, as those of a blocked user are."""
     declared = Scenario(multipath_to_los_db=-8.0)

@@ -163,6 +163,7 @@ def without_warning(values, *arguments, expected=EXPECTED):
     return test
 
 
+@pytest.mark.slow
 def test_residuals_of_the_model_cause_no_warning():
     test = without_warning(energies(5000))
     assert test.n_residuals == WINDOW

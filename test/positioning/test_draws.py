@@ -50,6 +50,7 @@ def found_and_exact(scenario, codebook, n=N, sampling=SAMPLING):
     return found, exact
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('changes', [{}, {'roi_size_m': (6, 6, 0)}])
 def test_draws_have_the_moments_of_the_posterior(changes, codebook):
     """The mean of 150 random draws would have an error of 0.08 standard deviations."""
@@ -65,6 +66,7 @@ def test_draws_have_the_moments_of_the_posterior(changes, codebook):
     assert np.mean(spreads) == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_later_rounds_follow_earlier_ones_without_bias(codebook):
     """A cell whose first draws miss its peak gets few more of them, and must not lose weight."""
     found, exact = found_and_exact(

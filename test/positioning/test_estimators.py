@@ -95,6 +95,7 @@ def test_a_position_just_outside_the_region_gives_one_inside(single_mode):
     assert np.linalg.eigvalsh(estimate.covariance).min() > 0
 
 
+@pytest.mark.slow
 def test_moments_match_a_brute_force_posterior(plain, random_beams):
     """The reference weights 65 536 points of a small region with the plain likelihood.
 
@@ -294,6 +295,7 @@ def test_posteriors_of_several_shots_are_those_of_each(table1_estimator, phases)
     assert found[3].mixture is None
 
 
+@pytest.mark.slow
 def test_a_region_far_shorter_than_the_wavelength_has_a_mode_for_all_signals(random_beams):
     """The likelihood has no maximum along the range in the few cells near the prior of a track."""
     scenario = Scenario(
@@ -337,6 +339,7 @@ def test_regions_contain_the_range_within_a_wavelength(shipped):
     assert np.mean(squares < chdtri(3, 0.05)) > 0.85
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('changes', [
     {'roi_size_m': (10, 0, 0)}, {'roi_size_m': (0, 10, 2)}, {'roi_size_m': (0, 10, 0)},
     {'roi_size_m': (10, 10, 0), 'roi_center_m': (10, 0, -2)}, {'delay_spread_s': 0.0},

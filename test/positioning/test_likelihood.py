@@ -115,6 +115,7 @@ def test_the_information_is_the_covariance_of_the_gradient(codebook, changes):
     np.testing.assert_allclose(found, information / np.outer(scale, scale), atol=0.15)
 
 
+@pytest.mark.slow
 def test_the_signals_alone_reveal_the_offsets_of_carrier_and_timing(codebook):
     scenario = declaring(carrier_offset_std_hz=2e3, timing_std_s=1e-7)
     likelihood = Likelihood(System(scenario, codebook))

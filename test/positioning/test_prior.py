@@ -116,6 +116,7 @@ def test_a_share_is_an_exponent_of_the_likelihood(share):
         found.means[0], covariance @ (precision @ before.means[0] + share * curvature @ point))
 
 
+@pytest.mark.slow
 def test_the_posterior_is_the_prior_times_the_likelihood(table1_estimator, model):
     """The reference weighs points drawn from the prior with the exact likelihood."""
     rng, errors = np.random.default_rng(5), []

@@ -70,6 +70,7 @@ def test_the_true_position_is_not_more_likely_than_the_best_mode(setting):
     assert 0.5 < np.mean(best - truths) < 4
 
 
+@pytest.mark.slow
 def test_no_ascent_ends_below_its_start(random_beams):
     """With few measurements, the likelihood is far from quadratic."""
     scenario = dataclasses.replace(

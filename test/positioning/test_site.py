@@ -41,6 +41,7 @@ def cycles():
                        for number in range(len(positions))]
 
 
+@pytest.mark.slow
 def test_all_surfaces_locate_better_than_one(estimator, cycles):
     def error_m2(names):
         means = [estimator.estimate({name: one[name] for name in names}).mixture.moments()[0]
@@ -74,6 +75,7 @@ def test_several_shots_are_located_at_once(estimator, cycles):
         estimator.estimate({**received, 'side': received['side'][:1]})
 
 
+@pytest.mark.slow
 def test_users_outside_have_no_position_and_users_inside_have_one(estimator, cycles):
     assert sum(not estimator.estimate(one).fix for one in cycles[1]) == 0
     rng = np.random.default_rng(6)

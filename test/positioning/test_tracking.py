@@ -213,6 +213,7 @@ def test_a_walk_of_metres_between_phases(tracker, sample):
     assert np.linalg.norm(estimate.velocity - velocity) < 2.0
 
 
+@pytest.mark.slow
 def test_a_gap_widens_the_prior_and_a_longer_one_ends_the_track(follow, tracker, sample):
     times_s = np.arange(20) * PERIOD_S
     before = follow(times_s)
@@ -262,6 +263,7 @@ def test_signals_without_a_position_do_not_change_the_track(tracker, follow, sam
     assert follow([7 * PERIOD_S]).n_phases == 6
 
 
+@pytest.mark.slow
 def test_a_track_finds_a_user_that_is_suddenly_elsewhere(tracker, sample):
     elsewhere = np.array([12.0, 3.0, -0.3])
     for k in range(15):
