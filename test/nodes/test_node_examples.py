@@ -1,4 +1,4 @@
-"""The examples of a radio and a user, which know only the documented interfaces."""
+"""The examples of other nodes, which know only the documented interfaces."""
 
 import importlib.util
 import signal
@@ -21,7 +21,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Send
 from rhs_isac_ros.protocol.user import UserState
 from rhs_isac_ros.ros import topics
-from rhs_isac_ros.ros.endpoints import LATCHED
+from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED
 from rhs_isac_ros.ros.roster import ROSTER
 
 EXAMPLES = Path(__file__).parents[2] / 'docs' / 'examples'
@@ -30,13 +30,17 @@ PLACE = [9.0, 1.0, 0.0]
 TOPICS = sorted({f'/{topic}' for member in ROSTER.values() for topic in member.received})
 
 
-@pytest.fixture(scope='module')
-def example():
-    """The example as a module."""
-    spec = importlib.util.spec_from_file_location('radio_node', EXAMPLES / 'radio_node.py')
+def module_of(name):
+    """Return an example as a module."""
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f'{name}.py')
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope='module')
+def example():
+    return module_of('radio_node')
 
 
 class Hardware:
@@ -72,9 +76,10 @@ def test_a_network_with_the_radio_serves_the_user_without_repetitions(
             'bs': {'receiver_noise': False, 'rest_s': 0.0}}.items():
         bench.add_role(role, values={'scenario_file': file, **values})
     bench.add(example.RadioNode, hardware.measure, hardware.carry, values={'scenario_file': file})
-    receiver = bench.add(Node, 'receiver')
-    states, received, requests = (bench.collect(receiver, kind) for kind in (
-        m.ProtocolState, m.ReceivedSignals, m.PilotRequest))
+    receiver, posteriors = bench.add(Node, 'receiver'), []
+    states, received, requests, estimates = (bench.collect(receiver, kind) for kind in (
+        m.ProtocolState, m.ReceivedSignals, m.PilotRequest, m.PositionEstimate))
+    receiver.create_subscription(ros.Posterior, 'posterior', posteriors.append, EXCHANGE)
     with subprocess.Popen([sys.executable, EXAMPLES / 'user_node.py']) as user:
         try:
             bench.until(lambda: not list(incomplete(receiver)), 'all endpoints')
@@ -86,6 +91,8 @@ def test_a_network_with_the_radio_serves_the_user_without_repetitions(
                         if state.outcome == 'served' and asked.count(state.cycle_id) == 1]
             cycle_id = bench.until(served, 'a served cycle')[-1]
             check_endpoints(receiver)
+            posterior, estimate = bench.until(
+                lambda: both(posteriors, estimates), 'a posterior and its estimate')[0]
         finally:
             user.terminate()
             try:
@@ -101,6 +108,23 @@ def test_a_network_with_the_radio_serves_the_user_without_repetitions(
     np.testing.assert_array_equal(
         signals, combine(codebook.digital, np.swapaxes(feeds, 1, 2), 0.0))
     assert hardware.carried[:2] == [m.Direction.DOWNLINK, m.Direction.UPLINK]
+    mean, covariance = module_of('read_posterior').estimate(posterior)
+    np.testing.assert_allclose(mean, estimate.position, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(covariance, estimate.covariance_m2, rtol=1e-6)
+
+
+def both(posteriors, estimates):
+    """Return pairs of messages of the same cycle."""
+    return [(one, other) for one in posteriors for other in estimates
+            if one.cycle_id == other.cycle_id]
+
+
+def test_the_reader_of_posteriors_imports_nothing_of_this_package():
+    done = subprocess.run(
+        [sys.executable, '-c', "import runpy, sys; runpy.run_path(sys.argv[1]); "
+         "assert not [name for name in sys.modules if name.startswith('rhs_isac_ros')]",
+         EXAMPLES / 'read_posterior.py'], timeout=60, check=False)
+    assert done.returncode == 0
 
 
 def incomplete(node):

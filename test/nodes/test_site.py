@@ -219,9 +219,15 @@ def test_any_program_can_read_posteriors_poses_and_odometry(running):
     running.fused.until(lambda: posteriors and poses and tracks, 'a message on each topic')
     assert {one[0].header.frame_id for one in (posteriors, poses, tracks)} == {'map'}
     assert tracks[0].child_frame_id == 'user_1'
-    weights = np.exp(posteriors[0].log_weights.data)
+    posterior = posteriors[0]
+    weights = np.exp(posterior.log_weights.data)
     assert weights.sum() == pytest.approx(1)
-    assert posteriors[0].means.shape.tolist() == [len(weights), 3]
+    assert posterior.means.shape.tolist() == [len(weights), 3]
+    estimate, = running.fused.until(lambda: [
+        one for one in running.fused.received[m.PositionEstimate]
+        if one.cycle_id == posterior.cycle_id], 'the estimate of the same cycle')
+    mean = weights @ np.reshape(posterior.means.data, (-1, 3))
+    np.testing.assert_allclose(mean, estimate.position, rtol=0, atol=1e-6)
 
 
 def test_data_of_walking_users_move_to_another_surface(running):
