@@ -6,8 +6,9 @@ import importlib.util
 import math
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -23,6 +24,7 @@ from rhs_isac_ros.codebook.band_plan import (
 )
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.codebook.objective import OBJECTIVES, SAMPLINGS
+from rhs_isac_ros.codebook.optimisations import restarted
 from rhs_isac_ros.codebook.optimize import (
     DEFAULT_POSITIONS,
     METHODS,
@@ -49,6 +51,7 @@ from rhs_isac_ros.support.arguments import (
 )
 from rhs_isac_ros.support.exits import exit_code_of, print_error
 from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.jobs import JobError, Workers, add_run_options, unfinished
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.pictures import write_picture
 from rhs_isac_ros.support.progress import progress_bar
@@ -58,14 +61,14 @@ HELD_OUT_POSITIONS = 2000
 # With more positions, the samples would fill the memory.
 _MAX_POSITIONS = 10**5
 # Errors that the user can correct; the command prints their messages.
-ERRORS = (MissingLibraryError, ValueError, OSError, MemoryError)
+ERRORS = (JobError, MissingLibraryError, ValueError, OSError, MemoryError)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, even if Ctrl-C ends the search, or 2 after one of `ERRORS`.
 
-    The exit code is 130 if Ctrl-C ends the comparison of band plans, which writes no codebook. If
-    the first argument is ``library``, the others are those of `library_command`.
+    The exit code is 130 if Ctrl-C ends jobs, which writes no codebook. If the first argument is
+    ``library``, the others are those of `library_command`.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ['library']:
@@ -112,6 +115,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add('--seed', type=seed, default=0, help='seed of the samples, the start and the method')
     add('--start', type=_start_name, metavar='START',
         help=f'{", ".join(STARTS)} or a codebook file; random if omitted')
+    add('--restarts', type=positive_int, default=1, metavar='N',
+        help='number of searches, from different random starts, of which the best one counts')
     add('--resume', action='store_true',
         help='continue from OUTPUT.part, which an unfinished run leaves, or from OUTPUT')
     add('--plot', type=picture_file,
@@ -126,6 +131,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add('--plan', type=output_file, default='bandplan.yaml',
         help='file to write, with the scenario of the chosen bands')
     add('--quiet', action='store_true', help='show no progress')
+    add_run_options(parser)
 
 
 def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
@@ -135,10 +141,15 @@ def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
         parser.error('argument --bands: expected together with --spectrum')
     if options.spectrum and (options.start or options.resume):
         parser.error('argument --spectrum: not allowed with --start or --resume; to resume, '
-                     'expected --scenario with the file of --plan')
+                     'repeat the command')
     if options.spectrum and options.calibration:
         parser.error('argument --calibration: not allowed with --spectrum, because a calibration '
                      'belongs to one scenario')
+    if options.restarts > 1 and (options.spectrum or options.start):
+        parser.error('argument --restarts: not allowed with --spectrum or --start')
+    if options.resume and (options.restarts > 1 or options.dask):
+        parser.error('argument --resume: not allowed with --restarts or --dask; to resume jobs, '
+                     'repeat the command')
     if options.resume and options.start:
         parser.error('argument --start: not allowed with --resume, which continues from a file')
     partial = _partial(options.output)
@@ -152,10 +163,11 @@ def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
 def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     """Optimise according to the options of `add_options`, write the file and print a summary.
 
-    If Ctrl-C ends the search, the best codebook so far is written; before that, while band plans
-    are compared, Ctrl-C raises KeyboardInterrupt. Returns the codebook in the file and the reason
-    why the search stopped. Raises one of `ERRORS` if an option or a file is invalid, or a library
-    is missing; an existing output file is then kept, unless only the plot fails.
+    If Ctrl-C ends a search in this process, the best codebook so far is written. With jobs, Ctrl-C
+    raises KeyboardInterrupt; the same call then continues with the unfinished jobs. Returns the
+    codebook in the file and the reason why the search stopped. Raises one of `ERRORS` if an option
+    or a file is invalid, or a library is missing; an existing output file is then kept, unless
+    only the plot fails.
     """
     output, partial = options.output, _partial(options.output)
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
@@ -166,22 +178,26 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     for codebook in filter(None, (start, resumed)):
         check_start(codebook, scenario)
 
-    def search(scenario: Scenario) -> OptimizeResult:
+    given: dict[str, Any] = {
+        'method': options.method, 'objective': objective, 'sampling': options.sampling,
+        'n_positions': options.positions, 'max_steps': options.steps,
+        'max_evaluations': options.evaluations}
+    if options.spectrum:
+        with unfinished(options) as workers:
+            plan = _choose_bands(options, scenario, given, workers)
+        scenario, result = plan.scenario, plan.result
+    elif options.restarts > 1 or options.dask:
+        with unfinished(options) as workers:
+            (result,) = workers.run([restarted(
+                scenario, options.restarts, options.seed, start=start,
+                calibration=options.calibration, **given)])
+    else:
         with progress_bar(options.steps or METHODS[options.method].steps, 'step',
                           quiet=options.quiet) as show:
-            return optimize(
-                scenario, method=options.method, objective=objective,
-                sampling=options.sampling, n_positions=options.positions, seed=options.seed,
-                start=start, resume=resumed, calibration=calibration, max_steps=options.steps,
-                max_evaluations=options.evaluations,
+            result = optimize(
+                scenario, seed=options.seed, start=start, resume=resumed, calibration=calibration,
                 progress=show and (lambda progress: show(progress.step, _value(progress))),
-                keep=lambda result: _save_partial(result, partial))
-
-    if options.spectrum:
-        plan = _choose_bands(options, scenario, search)
-        scenario, result = plan.scenario, plan.result
-    else:
-        result = search(scenario)
+                keep=lambda result: _save_partial(result, partial), **given)
     held_out = scenario.sample_positions(
         HELD_OUT_POSITIONS, streams.generator(options.seed, streams.HELD_OUT))
     bounds = crlb_of(MeasurementModel(
@@ -198,23 +214,18 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
 
 
 def _choose_bands(
-        options: argparse.Namespace, scenario: Scenario,
-        search: Callable[[Scenario], OptimizeResult]) -> BandPlan:
+        options: argparse.Namespace, scenario: Scenario, given: Mapping[str, Any],
+        workers: Workers) -> BandPlan:
     """Choose the bands and the codebook, and write the scenario with these bands."""
     def report(candidate: Candidate) -> None:
         if not options.quiet:
             print(f'{_in_ghz(candidate.frequencies_hz)}: {candidate.error_m2:.4f} m^2 expected',
                   file=sys.stderr)
 
-    def write_and_search(scenario: Scenario) -> OptimizeResult:
-        # The codebook of an unfinished search belongs to the plan in this file.
-        _save_plan(options.plan, scenario)
-        return search(scenario)
-
     candidates = choose_bands(
         scenario, options.spectrum, options.bands, raster_hz=options.raster,
-        min_gap_hz=options.min_gap, seed=options.seed, report=report)
-    best = best_of(scenario, candidates, write_and_search, options.seed, report)
+        min_gap_hz=options.min_gap, seed=options.seed, report=report, workers=workers)
+    best = best_of(scenario, candidates, given, options.seed, report, workers=workers)
     _save_plan(options.plan, best.scenario)
     print(f'{options.plan}: {_in_ghz(best.scenario.center_frequencies_hz)}, '
           f'{best.scenario.n_frames} frames each')

@@ -9,19 +9,21 @@ the third fully for the best plans. The last two stages compare expected squared
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from rhs_isac_ros.bounds import crlb_of, global_bound
 from rhs_isac_ros.bounds.range_ambiguity import range_confusion_error, range_confusion_error_of
 from rhs_isac_ros.codebook.codebook import Codebook
-from rhs_isac_ros.codebook.optimize import INTERRUPTED, OptimizeResult, optimize
+from rhs_isac_ros.codebook.optimisations import optimisation, optimised, result_of
+from rhs_isac_ros.codebook.optimize import OptimizeResult
 from rhs_isac_ros.codebook.unoptimised import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.jobs import HERE, Job, Strand, Workers
 
 # Largest number of plans that are all compared; beyond it, a coordinate search selects some.
 MAX_EXHAUSTIVE = 20_000
@@ -149,7 +151,7 @@ class BandPlan:
     """The result of `best_of`: a scenario with the chosen bands, and a codebook for it.
 
     `candidates` are the plans compared by `choose_bands`, the best one first. `error_m2` is the
-    expected squared error, or NaN if the optimisation of the codebook was interrupted.
+    expected squared error.
     """
 
     scenario: Scenario
@@ -158,47 +160,68 @@ class BandPlan:
     error_m2: float
 
 
+Report: TypeAlias = Callable[[Candidate], None]
+
+
 def best_of(
-        scenario: Scenario, candidates: Sequence[Candidate],
-        search: Callable[[Scenario], OptimizeResult], seed: int = 0,
-        report: Callable[[Candidate], None] | None = None, effort: Effort = EFFORT) -> BandPlan:
+        scenario: Scenario, candidates: Sequence[Candidate], options: Mapping[str, Any],
+        seed: int = 0, report: Report | None = None, effort: Effort = EFFORT,
+        workers: Workers = HERE) -> BandPlan:
     """Optimise codebooks for the first candidates, and return the best plan.
 
     The candidates are in ascending order of their errors. A later plan replaces an earlier one
     only if its new error is clearly lower; candidates with much larger errors are skipped.
-    `search` optimises a codebook; if it is interrupted, the best plan so far is returned. After
-    each complete optimisation, `report` is called with the candidate and its new error.
+    `options` are those of `optimize`. `report` is called with each candidate and its new error.
     """
-    best: BandPlan | None = None
-    for candidate in candidates[:effort.finalists]:
-        if candidate.error_m2 > effort.max_ratio * candidates[0].error_m2:
-            break
-        plan = with_bands(scenario, candidate.frequencies_hz)
-        result = search(plan)
-        if result.reason == INTERRUPTED:
-            return best or BandPlan(plan, result, tuple(candidates), math.nan)
-        error = expected_error(plan, result.codebook, seed, effort.shots)
-        if report:
-            report(dataclasses.replace(candidate, error_m2=error))
-        if best is None or error < effort.better * best.error_m2:
-            best = BandPlan(plan, result, tuple(candidates), error)
-    if best is None:
+    if not candidates:
         raise ValueError('candidates: none, expected at least one')
-    return best
+    finalists = [one for one in candidates[:effort.finalists]
+                 if one.error_m2 <= effort.max_ratio * candidates[0].error_m2]
+    found = workers.run([_compared(scenario, one, seed, effort.shots, report, options)
+                         for one in finalists])
+    best, result = found[0]
+    for candidate, other in found[1:]:
+        if candidate.error_m2 < effort.better * best.error_m2:
+            best, result = candidate, other
+    return BandPlan(with_bands(scenario, best.frequencies_hz), result, tuple(candidates),
+                    best.error_m2)
+
+
+def _compared(scenario: Scenario, candidate: Candidate, seed: int, n_shots: int,
+              report: Report | None, options: Mapping[str, Any]
+              ) -> Strand[tuple[Candidate, OptimizeResult]]:
+    """Optimise a codebook for a candidate, and return the candidate with its expected error."""
+    plan = with_bands(scenario, candidate.frequencies_hz)
+    (found,) = yield optimised, [optimisation(plan, seed=seed, **options)]
+    result = result_of(found)
+    (error,) = yield _expected, [Job.of('expected', {
+        'scenario': plan.changes(), 'codebook': result.codebook.to_parameters(), 'seed': seed,
+        'n_shots': n_shots})]
+    candidate = dataclasses.replace(candidate, error_m2=error['error_m2'])
+    if report:
+        report(candidate)
+    return candidate, result
+
+
+def _expected(scenario: Mapping[str, Any], codebook: Mapping[str, Any], seed: int, n_shots: int
+              ) -> dict[str, float]:
+    """Run a job: compute the expected error of a codebook."""
+    return {'error_m2': expected_error(
+        Scenario(**scenario), Codebook.from_parameters(dict(codebook)), seed, n_shots)}
 
 
 def choose_bands(
         scenario: Scenario, spectrum_hz: Sequence[tuple[float, float]], n_bands: int, *,
         raster_hz: float = DEFAULT_RASTER_HZ, min_gap_hz: float | None = None, seed: int = 0,
-        report: Callable[[Candidate], None] | None = None,
-        effort: Effort = EFFORT) -> tuple[Candidate, ...]:
+        report: Report | None = None, effort: Effort = EFFORT,
+        workers: Workers = HERE) -> tuple[Candidate, ...]:
     """Propose centre frequencies with which users can be located accurately.
 
     `spectrum_hz` are intervals of centre frequencies, including their ends. `raster_hz` is the
     spacing of frequencies from the low end of each interval. `min_gap_hz` is the smallest distance
     between two frequencies, by default the width of a band. `report` is called with each plan for
     which a codebook was optimised. Returns these plans, the best one first. Raises ValueError if
-    an argument is invalid or no plan has the gap, and KeyboardInterrupt on Ctrl-C.
+    an argument is invalid or no plan has the gap, and the errors of `Workers.run`.
     """
     if n_bands < 1 or scenario.n_bands * scenario.n_frames % n_bands:
         raise ValueError(
@@ -211,20 +234,15 @@ def choose_bands(
         raise ValueError(
             f'bands: {n_bands} with gaps of {gap_hz:g} Hz, expected fewer on the '
             f'{len(frequencies_hz)} frequencies of the raster')
-    candidates = []
-    for plan, screening in _proposals(
+    options = {'objective': 'error', 'n_positions': effort.short_positions,
+               'max_steps': effort.short_steps}
+    found = workers.run([
+        _compared(scenario, Candidate(plan, screening, math.nan), seed, effort.short_shots, report,
+                  options) for plan, screening in _proposals(
             scenario, frequencies_hz, n_bands, gap_hz, effort.min_difference * raster_hz,
-            streams.generator(seed, streams.PLANS), effort):
-        world = with_bands(scenario, plan)
-        short = optimize(world, objective='error', seed=seed, n_positions=effort.short_positions,
-                         max_steps=effort.short_steps)
-        if short.reason == INTERRUPTED:
-            raise KeyboardInterrupt
-        error_m2 = expected_error(world, short.codebook, seed, effort.short_shots)
-        candidates.append(Candidate(plan, screening, error_m2))
-        if report:
-            report(candidates[-1])
-    return tuple(sorted(candidates, key=lambda candidate: candidate.error_m2))
+            streams.generator(seed, streams.PLANS), effort)])
+    return tuple(sorted((candidate for candidate, _ in found),
+                        key=lambda candidate: candidate.error_m2))
 
 
 def with_bands(scenario: Scenario, frequencies_hz: Sequence[float]) -> Scenario:

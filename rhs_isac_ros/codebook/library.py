@@ -22,12 +22,13 @@ import numpy as np
 from rhs_isac_ros.codebook.cell import Cell
 from rhs_isac_ros.codebook.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.objective import OBJECTIVES, sobol
-from rhs_isac_ros.codebook.optimize import optimize
+from rhs_isac_ros.codebook.optimisations import optimisation, optimised, result_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import numbers
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
+from rhs_isac_ros.support.jobs import HERE, Job, Strand, Workers
 
 # Default spreads [m], and the loss from which the pitch of their cells follows.
 SPREADS_M = (0.2, 0.5)
@@ -67,7 +68,7 @@ class Plan:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Library:
-    """Codebooks of the first L cells of a plan; all of them if the library is complete.
+    """Codebooks of the L cells of a plan.
 
     Raises CodebookError if a codebook is malformed.
     """
@@ -169,71 +170,74 @@ EMPTY = Library(Plan('', '', '', (), ()), np.empty((0, 3)), np.empty(0),
                 np.empty((0, 1, 1, 1)), np.empty((0, 1, 1, 1, 1), complex))
 
 
-def plan_library(
+def make_library(
         scenario: Scenario, start: Codebook, objective: str,
         spreads_m: Sequence[float] = SPREADS_M, loss: float = LOSS,
-        report: Callable[[float, float, float], None] | None = None) -> Plan:
-    """Choose the pitch of the cells: the largest one tried with a small enough loss.
+        report: Callable[[float, float, float], None] | None = None,
+        workers: Workers = HERE) -> Library:
+    """Choose the cells, and optimise their codebooks from one for the whole region.
 
-    `report` is called with each spread [m], pitch [m] and loss. Raises ValueError if the objective
-    is unknown, or a number is not positive.
+    The pitch for each spread is the largest one tried with a small enough loss. `report` is called
+    with each spread [m], pitch [m] and loss. Raises ValueError if the objective is unknown, and
+    the errors of `Workers.run`.
     """
     if objective not in OBJECTIVES:
         raise ValueError(f'objective: {objective!r}, expected one of {sorted(OBJECTIVES)}')
-    pitches_m = []
-    for spread_m in spreads_m:
-        rng = streams.generator(0, streams.SAMPLES)
-        places = scenario.sample_positions(_N_TRIALS, rng)
-        own = [improve(scenario, Cell(_tuple(place), spread_m), start, objective)
-               for place in places]
-        for pitch_m in spread_m * np.array(_PITCHES):
-            # A codebook is used at most half a pitch from the centre of its cell.
-            offsets = pitch_m * (rng.random(places.shape) - 0.5)
-            found = loss_at(scenario, spread_m, objective, places,
-                            np.clip(places - offsets, *scenario.roi_bounds_m), own, start)
-            if report:
-                report(spread_m, float(pitch_m), found)
-            if found <= loss:
-                break
-        pitches_m.append(float(pitch_m))
-    return Plan(scenario.unplaced.id, start.id, objective, tuple(spreads_m), tuple(pitches_m))
+
+    def of_spread(spread_m: float) -> Strand[tuple[float, list[Codebook]]]:
+        pitch_m = yield from pitch(scenario, start, objective, spread_m, loss, report)
+        part = Plan(scenario.unplaced.id, start.id, objective, (spread_m,), (pitch_m,))
+        return pitch_m, (yield from codebooks_of(scenario, part.cells(scenario), start, objective))
+
+    found = workers.run([of_spread(spread_m) for spread_m in spreads_m])
+    plan = Plan(scenario.unplaced.id, start.id, objective, tuple(spreads_m),
+                tuple(pitch_m for pitch_m, _ in found))
+    return Library.of(plan, plan.cells(scenario), [one for _, part in found for one in part])
 
 
-def loss_at(scenario: Scenario, spread_m: float, objective: str, places: np.ndarray,
-            centres: np.ndarray, best: Sequence[Codebook], start: Codebook) -> float:
-    """Return the relative loss at places [N, 3] with codebooks for other centres [N, 3] [m].
-
-    `best` are the codebooks for the very places.
-    """
-    totals = np.zeros(2)
-    for place, centre, own in zip(places, centres, best, strict=True):
-        cell, rng = Cell(_tuple(place), spread_m), streams.generator(0, streams.HELD_OUT)
-        average = OBJECTIVES[objective](
-            scenario, cell.positions(scenario, sobol(scenario, 2 * _N_POSITIONS, rng)), rng,
-            prior=cell)
-        other = improve(scenario, Cell(_tuple(centre), spread_m), start, objective)
-        totals += average.value(other), average.value(own)
-    return float(totals[0] / totals[1] - 1)
-
-
-def build(scenario: Scenario, plan: Plan, start: Codebook, done: Sequence[Codebook] = (),
-          keep: Callable[[Library], None] | None = None) -> Library:
-    """Optimise the codebooks of all cells of a plan, after those that are `done`.
-
-    `keep` is called with the library so far after each codebook.
-    """
-    cells, codebooks = plan.cells(scenario), list(done)
-    for cell in cells[len(codebooks):]:
-        codebooks.append(improve(scenario, cell, start, plan.objective))
-        if keep:
-            keep(Library.of(plan, cells[:len(codebooks)], codebooks))
-    return Library.of(plan, cells, codebooks)
+def pitch(scenario: Scenario, start: Codebook, objective: str, spread_m: float, loss: float,
+          report: Callable[[float, float, float], None] | None = None) -> Strand[float]:
+    """Find the pitch of the cells for a spread [m]; see `make_library`."""
+    rng = streams.generator(0, streams.SAMPLES)
+    places = scenario.sample_positions(_N_TRIALS, rng)
+    own = yield from codebooks_of(
+        scenario, [Cell(_tuple(place), spread_m) for place in places], start, objective)
+    pitch_m = spread_m
+    for pitch_m in spread_m * np.array(_PITCHES):
+        # A codebook is used at most half a pitch from the centre of its cell.
+        offsets = pitch_m * (rng.random(places.shape) - 0.5)
+        centres = np.clip(places - offsets, *scenario.roi_bounds_m)
+        others = yield from codebooks_of(
+            scenario, [Cell(_tuple(centre), spread_m) for centre in centres], start, objective)
+        values = yield compared, [Job.of('compared', {
+            'scenario': scenario.changes(), 'objective': objective, 'cell': (place, spread_m),
+            'codebooks': [one.to_parameters() for one in pair]})
+            for place, *pair in zip(places, others, own, strict=True)]
+        totals = np.sum([one['values'] for one in values], axis=0)
+        found = float(totals[0] / totals[1] - 1)
+        if report:
+            report(spread_m, float(pitch_m), found)
+        if found <= loss:
+            break
+    return float(pitch_m)
 
 
-def improve(scenario: Scenario, cell: Cell, start: Codebook, objective: str) -> Codebook:
-    """Optimise a codebook for a cell, from a codebook for the whole region."""
-    return optimize(scenario, objective=objective, n_positions=_N_POSITIONS, start=start,
-                    max_steps=_STEPS, prior=cell).codebook
+def compared(scenario: Mapping[str, Any], objective: str, cell: Sequence[Any],
+             codebooks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Run a job: evaluate the objective of codebooks for a user in a cell."""
+    world, own = Scenario(**scenario), Cell(_tuple(np.array(cell[0])), cell[1])
+    rng = streams.generator(0, streams.HELD_OUT)
+    average = OBJECTIVES[objective](
+        world, own.positions(world, sobol(world, 2 * _N_POSITIONS, rng)), rng, prior=own)
+    return {'values': [average.value(Codebook.from_parameters(dict(one))) for one in codebooks]}
+
+
+def codebooks_of(scenario: Scenario, cells: Sequence[Cell], start: Codebook, objective: str
+                 ) -> Strand[list[Codebook]]:
+    """Optimise a codebook for each cell, from one for the whole region."""
+    jobs = [optimisation(scenario, objective=objective, n_positions=_N_POSITIONS, start=start,
+                         max_steps=_STEPS, cell=cell) for cell in cells]
+    return [result_of(found).codebook for found in (yield optimised, jobs)]
 
 
 def _numbers(scenario: Scenario, pitch_m: float) -> list[int]:
@@ -244,9 +248,3 @@ def _numbers(scenario: Scenario, pitch_m: float) -> list[int]:
 def _tuple(position: np.ndarray) -> tuple[float, float, float]:
     x, y, z = position.tolist()
     return x, y, z
-
-
-def describe(plan: Plan, scenario: Scenario) -> dict[str, Any]:
-    """Return the numbers of cells for each spread."""
-    return {f'{spread_m:g} m': int(np.prod(_numbers(scenario, pitch_m)))
-            for spread_m, pitch_m in zip(plan.spreads_m, plan.pitches_m, strict=True)}

@@ -7,6 +7,7 @@ do not depend on the codebook, it calls `tick` repeatedly, which may end them wi
 """
 
 import dataclasses
+import threading
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -94,15 +95,21 @@ def sobol(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
     """Draw scrambled Sobol points in the region of interest, float64 [n, 3] [m].
 
     They are more evenly spread than independent points, and most evenly if `n` is a power of two.
+    SciPy scrambles them with a child of the seed of the generator, not with its next numbers: a
+    second call gives other points, but numbers drawn in between make no difference.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.stats import qmc
 
-    points = qmc.Sobol(3, scramble=True, seed=rng).random_base2(max(n - 1, 0).bit_length())[:n]
+    # SciPy has no lock for the table that the first sequence loads.
+    with _FIRST_SOBOL:
+        sequence = qmc.Sobol(3, scramble=True, seed=rng)
+    points = sequence.random_base2(max(n - 1, 0).bit_length())[:n]
     low, high = scenario.roi_bounds_m
     return low + (high - low) * points
 
 
+_FIRST_SOBOL = threading.Lock()
 # The paper draws independent uniform positions.
 SAMPLINGS: Mapping[str, Callable[[Scenario, int, np.random.Generator], np.ndarray]] = {
     'monte_carlo': Scenario.sample_positions, 'sobol': sobol}

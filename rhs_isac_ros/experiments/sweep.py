@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import functools
-import hashlib
 import io
 import json
 import threading
@@ -21,10 +20,9 @@ from rhs_isac_ros.codebook import (
     Codebook,
     CodebookError,
     directional_codebook,
-    optimize,
     random_codebook,
 )
-from rhs_isac_ros.codebook.optimize import INTERRUPTED
+from rhs_isac_ros.codebook.optimisations import optimised
 from rhs_isac_ros.experiments.sweep_settings import (
     FIELDS,
     MEASURES,
@@ -38,7 +36,7 @@ from rhs_isac_ros.link import capacity_report, choose_beam
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import Estimator, make_estimator
 from rhs_isac_ros.support import streams
-from rhs_isac_ros.support.jobs import Job, Strand, Workers, as_json
+from rhs_isac_ros.support.jobs import Job, Strand, Workers
 from rhs_isac_ros.system import System
 
 # Kinds of codebooks that are made for a scenario.
@@ -95,12 +93,9 @@ def design(scenario: Mapping[str, Any], kind: str, seed: int, objective: str = '
     if kind == RANDOM:
         generator = streams.generator(seed, streams.START)
         return random_codebook(world, generator).to_parameters()
-    _initialise_sobol()
-    result = optimize(world, objective=objective, n_positions=_SAMPLES, seed=seed,
+    found = optimised(scenario, objective=objective, n_positions=_SAMPLES, seed=seed,
                       max_steps=steps)
-    if result.reason == INTERRUPTED:
-        raise KeyboardInterrupt
-    return result.codebook.to_parameters()
+    return dict(found['codebook'])
 
 
 def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, Any], seed: int,
@@ -245,7 +240,7 @@ class Sweep:
         if setting.codebook == OPTIMIZE:
             arguments |= {'objective': self.objective, 'steps': self.steps}
         repeats = self.repeats if setting.codebook in (OPTIMIZE, RANDOM) else 1
-        return [_job('codebook', {**arguments, 'seed': self.seed + repeat})
+        return [Job.of('codebook', {**arguments, 'seed': self.seed + repeat})
                 for repeat in range(repeats)]
 
     def blocks(self, setting: Setting, codebook: Codebook) -> dict[str, list[Job]]:
@@ -253,7 +248,7 @@ class Sweep:
         quantities = [MEASURES[measure].quantity for measure in self.measures]
         common = {'scenario': setting.scenario.changes(), 'codebook': codebook.to_parameters(),
                   'seed': self.seed}
-        return {family: [_job(family, {
+        return {family: [Job.of(family, {
             **common, 'family': family, 'first': first, 'n': min(BLOCK, self.n_positions - first),
             **({} if family in (CRLB, BOUND) else {'estimator': setting.estimator})})
             for first in range(0, self.n_positions, BLOCK)] for family in families(quantities)}
@@ -332,9 +327,3 @@ def _fitted(codebook: Codebook, setting: Setting) -> Codebook:
     fitted = with_power(codebook, setting.scenario.max_power_w)
     fitted.check(setting.scenario)
     return fitted
-
-
-def _job(kind: str, arguments: dict[str, Any]) -> Job:
-    arguments = as_json(arguments)
-    digest = hashlib.sha256(json.dumps(arguments).encode()).hexdigest()
-    return Job(f'{kind}-{digest[:24]}', arguments)

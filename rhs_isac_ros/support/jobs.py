@@ -9,10 +9,13 @@ import argparse
 import contextlib
 import ctypes
 import dataclasses
+import hashlib
+import importlib.util
 import json
 import os
 import queue
 import re
+import shutil
 import signal
 import sys
 import threading
@@ -49,6 +52,13 @@ class Job:
 
     name: str
     arguments: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, kind: str, arguments: Mapping[str, Any]) -> 'Job':
+        """Return a job whose name is a kind and a digest of the arguments."""
+        plain = as_json(arguments)
+        digest = hashlib.sha256(json.dumps(plain).encode()).hexdigest()
+        return cls(f'{kind}-{digest[:24]}', plain)
 
 
 class JobResult(NamedTuple):
@@ -135,7 +145,8 @@ Strand: TypeAlias = Generator[tuple[Function, Sequence[Job]], list[dict[str, Any
 class Workers:
     """Where jobs run, and where their results are kept."""
 
-    n_jobs: int = 1  #: Processes on this machine: 1 for this process, -1 for one per core.
+    #: Processes on this machine: 1 for this process, -1 for one per core if joblib is installed.
+    n_jobs: int = 1
     dask: str | None = None  #: Scheduler of a Dask cluster to use instead, as ``HOST:PORT``.
     folder: Path | None = None  #: Folder of a file for each result; None to keep no results.
     label: str = ''  #: Text beside the progress.
@@ -183,7 +194,7 @@ class Workers:
                 # The scheduler balances the load only among jobs that it knows.
                 yield executor, sys.maxsize
             return
-        if self.n_jobs == 1:
+        if self.n_jobs == 1 or self.n_jobs < 0 and not importlib.util.find_spec('joblib'):
             yield _ThisProcess(), 1
             return
         with optional_import('running jobs', extra='experiments'):
@@ -210,6 +221,10 @@ class Workers:
             raise
         except Exception as error:  # The job killed its worker or could not be sent to one.
             raise JobError(f'job {job.name} failed: {type(error).__name__}: {error}') from error
+
+
+#: Runs jobs in this process, and keeps no results.
+HERE = Workers(quiet=True)
 
 
 class _State:
@@ -426,6 +441,17 @@ def add_run_options(parser: argparse.ArgumentParser, output: str = '') -> None:
         parser.add_argument('--output', type=output_folder, default=output, metavar='DIR',
                             help='folder of the results (default: %(default)s); jobs that have '
                                  'results there are not repeated')
+
+
+@contextlib.contextmanager
+def unfinished(options: argparse.Namespace) -> Iterator[Workers]:
+    """Yield the workers of options whose results are kept in OUTPUT.jobs until the block succeeds.
+
+    The options are ``output``, ``quiet`` and those of `add_run_options`.
+    """
+    folder = options.output.with_name(options.output.name + '.jobs')
+    yield Workers(options.jobs, options.dask, folder, quiet=options.quiet)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _address(text: str) -> str:

@@ -157,15 +157,20 @@ def test_the_bands_are_chosen_with_the_codebook(call, files, scenario, capsys, m
     for name in ('choose_bands', 'best_of'):
         monkeypatch.setattr(__main__, name, functools.partial(
             getattr(band_plan, name), effort=short))
-    plan, optimize = files / 'plan.yaml', __main__.optimize
+    plan, optimised = files / 'plan.yaml', band_plan.optimised
+    arguments = ['--spectrum', '2.5e9:2.52e9', '3e9:3e9', '--bands', 2, '--raster', 5e6,
+                 '--steps', 3, '--plan', plan, '--jobs', 1]
 
-    def checked(scenario, **options):
-        # If the search does not finish, its codebook belongs to the plan in the file.
-        assert Scenario.from_yaml(plan).id == scenario.id
-        return optimize(scenario, **options)
-    monkeypatch.setattr(__main__, 'optimize', checked)
-    assert call('--spectrum', '2.5e9:2.52e9', '3e9:3e9', '--bands', 2, '--raster', 5e6,
-                '--steps', 3, '--plan', plan) == 0
+    def interrupted(**options):
+        if options['max_steps'] == 3:
+            raise KeyboardInterrupt
+        return optimised(**options)
+    monkeypatch.setattr(band_plan, 'optimised', interrupted)
+    assert call(*arguments) == 130
+    assert not (files / 'codebook.yaml').exists()
+    monkeypatch.setattr(band_plan, 'optimised', lambda **options: optimised(**options) if options[
+        'max_steps'] == 3 else pytest.fail('a finished job ran again'))
+    assert call(*arguments) == 0
     chosen, codebook = Scenario.from_yaml(plan), Codebook.load(files / 'codebook.yaml')
     assert (chosen.n_bands, chosen.n_frames) == (2, scenario.n_bands * scenario.n_frames // 2)
     allowed = [2.5e9, 2.505e9, 2.51e9, 2.515e9, 2.52e9, 3e9]
@@ -173,27 +178,17 @@ def test_the_bands_are_chosen_with_the_codebook(call, files, scenario, capsys, m
     codebook.check(chosen)
     assert Provenance.parse(codebook.provenance).objective == 'error'
     assert f'{plan}: ' in capsys.readouterr().out
-
-    def first_of_two(scenario, candidates, search, *rest):
-        best = band_plan.best_of(scenario, candidates[:1], search, *rest, short)
-        search(band_plan.with_bands(scenario, candidates[1].frequencies_hz))
-        return best
-    monkeypatch.setattr(__main__, 'best_of', first_of_two)
-    assert call('--spectrum', '2.5e9:2.52e9', '3e9:3e9', '--bands', 2, '--raster', 5e6,
-                '--steps', 3, '--plan', plan) == 0
-    Codebook.load(files / 'codebook.yaml').check(Scenario.from_yaml(plan))
-    (_, line) = [line for line in capsys.readouterr().out.splitlines() if 'GHz' in line][-1].split(
-        ': ')
-    assert line.startswith(', '.join(
-        f'{frequency / 1e9:g}' for frequency in Scenario.from_yaml(plan).center_frequencies_hz))
+    assert not (files / 'codebook.yaml.jobs').exists()
 
 
-def test_ctrl_c_while_plans_are_compared_writes_no_codebook(call, files, monkeypatch):
-    def interrupted(*arguments, **options):
-        raise KeyboardInterrupt
-    monkeypatch.setattr(__main__, 'choose_bands', interrupted)
-    assert call('--spectrum', '2.5e9:3e9', '--bands', 2, '--plan', files / 'plan.yaml') == 130
-    assert not (files / 'codebook.yaml').exists()
+def test_the_best_of_several_starts_is_written(call, files, scenario):
+    values = {}
+    for n in (1, 2, 8):
+        assert call('--steps', 4, '--restarts', n, '--jobs', 1) == 0
+        made = Provenance.parse(Codebook.load(files / 'codebook.yaml').provenance)
+        values[n] = made.value_m2
+        assert (made.seed, made.steps) == (0, 4)
+    assert values[1] >= values[2] >= values[8] != values[1]
 
 
 @pytest.mark.parametrize(('arguments', 'words'), [
@@ -204,6 +199,8 @@ def test_ctrl_c_while_plans_are_compared_writes_no_codebook(call, files, monkeyp
     (['--spectrum', '2e9:3e9', '--bands', '2', '--start', 'random'], ['not allowed with']),
     (['--spectrum', '2e9:3e9', '--bands', '2', '--calibration', __file__],
      ['--calibration: not allowed with --spectrum']),
+    (['--restarts', '2', '--start', 'random'], ['--restarts: not allowed with']),
+    (['--resume', '--dask', 'localhost:1'], ['--resume: ']),
     (['--spectrum', '2e9:3e9', '--bands', '3'], ['bands: 3, expected a divisor of 2'])])
 def test_invalid_band_plans_are_errors(call, files, capsys, arguments, words):
     fails_with(call, capsys, words, '--plan', files / 'plan.yaml', *arguments)

@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook import CodebookError, library, library_command
-from rhs_isac_ros.codebook.cell import Cell
+from rhs_isac_ros.codebook import CodebookError, library, library_command, random_codebook
 from rhs_isac_ros.codebook.library import Library, Plan
 from rhs_isac_ros.codebook.objective import OBJECTIVES, sobol
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.support.jobs import HERE
 
 SCENARIO = Scenario(
     center_frequencies_hz=(2.5e9, 2.6e9), n_subbands=2, n_frames=2, elements_per_side=4,
@@ -28,7 +28,9 @@ def plan(start):
 
 @pytest.fixture(scope='module')
 def built(plan, start):
-    return library.build(SCENARIO, plan, start)
+    (codebooks,) = HERE.run([library.codebooks_of(
+        SCENARIO, plan.cells(SCENARIO), start, plan.objective)])
+    return Library.of(plan, plan.cells(SCENARIO), codebooks)
 
 
 def test_every_position_is_within_half_a_pitch_of_a_cell(plan):
@@ -56,14 +58,6 @@ def test_a_codebook_has_a_lower_objective_in_its_cell(built, start):
         places = cell.positions(SCENARIO, sobol(SCENARIO, 64, rng))
         average = OBJECTIVES['ambiguity'](SCENARIO, places, rng, prior=cell)
         assert average.value(built.codebooks[number]) < 0.9 * average.value(start)
-
-
-def test_a_resumed_library_equals_one_built_at_once(built, start):
-    kept = []
-    again = library.build(SCENARIO, built.plan, start, built.codebooks[:5], kept.append)
-    assert [len(one.codebooks) for one in kept] == [6, 7]
-    assert again.id == built.id
-    assert list(again.by_id) == [one.id for one in built.codebooks]
 
 
 def test_a_file_has_all_content(built, tmp_path):
@@ -125,47 +119,59 @@ def test_the_order_of_the_cells_is_part_of_the_library(built):
 def test_the_pitch_is_the_largest_with_a_small_loss(start, monkeypatch):
     losses = dict(zip(
         (0.8, 0.625, 0.5, 0.4, 0.3, 0.2), (0.3, 0.1, 0.04, 0.01, 0.0, 0.0), strict=True))
-    tried = []
+    reports, cells = [], []
 
-    def loss_at(scenario, spread_m, objective, places, centres, best, start):
-        reach = 2 * np.abs(places - centres).max()
-        pitch = min(one for one in losses if one >= reach - 1e-9)
-        tried.append(pitch)
-        return losses[pitch]
+    def optimised(cell, start, **options):
+        cells.append(np.array(cell[0]))
+        other = random_codebook(SCENARIO, np.random.default_rng(len(cells)))
+        return {'codebook': other.to_parameters(), 'history': [], 'reason': ''}
 
-    monkeypatch.setattr(library, 'loss_at', loss_at)
-    monkeypatch.setattr(library, 'improve', lambda *_: start)
+    def compared(cell, **options):
+        # The cells of the last pitch, of which each is at most half a pitch from its place.
+        reach = 2 * max(np.abs(one - two).max() for one, two in zip(
+            cells[:12], cells[-12:], strict=True))
+        loss = losses[min(one for one in losses if one >= reach - 1e-9)]
+        return {'values': [1 + loss, 1.0]}
+
+    monkeypatch.setattr(library, 'optimised', optimised)
+    monkeypatch.setattr(library, 'compared', compared)
     wide = dataclasses.replace(SCENARIO, roi_size_m=(4.0, 4.0, 4.0), roi_center_m=(4, 0, 0))
-    reports = []
-    plan = library.plan_library(
+    found = library.make_library(
         wide, start, 'error', (0.1,), 0.05, lambda *report: reports.append(report))
-    assert plan.pitches_m == (pytest.approx(0.5),)
+    found.check(wide)
+    assert found.plan.pitches_m == (pytest.approx(0.5),)
     assert [pitch for _, pitch, _ in reports] == pytest.approx([0.8, 0.625, 0.5])
+    assert [loss for *_, loss in reports] == pytest.approx([0.3, 0.1, 0.04])
 
 
-def test_the_loss_at_the_centre_of_a_cell_is_zero(start):
-    places = SCENARIO.sample_positions(1, np.random.default_rng(5))
-    own = [library.improve(SCENARIO, Cell(tuple(place), 0.1), start, 'ambiguity')
-           for place in places.tolist()]
-    assert library.loss_at(
-        SCENARIO, 0.1, 'ambiguity', places, places, own, start) == pytest.approx(0.0)
-
-
-def test_the_command_resumes_an_unfinished_library(built, start, tmp_path, capsys):
+def test_the_command_continues_after_an_interruption_and_on_other_workers(
+        start, tmp_path, capsys, monkeypatch):
+    pytest.importorskip('joblib')
+    monkeypatch.setattr(library, '_N_TRIALS', 1)
+    monkeypatch.setattr(library, '_STEPS', 2)
     scenario_file = tmp_path / 'scenario.yaml'
     scenario_file.write_text(
         'center_frequencies_hz: [2.5e+9, 2.6e+9]\nn_subbands: 2\nn_frames: 2\n'
         'elements_per_side: 4\nroi_center_m: [4, 0, 0]\nroi_size_m: [2, 1, 0.5]\n',
         encoding='utf-8')
     start.save(tmp_path / 'start.yaml')
-    output = tmp_path / 'library.npz'
-    part = Library.of(built.plan, built.plan.cells(SCENARIO)[:5], built.codebooks[:5])
-    part.save(tmp_path / 'library.npz.part')
+    output, optimised, calls = tmp_path / 'library.npz', library.optimised, []
     arguments = ['--scenario', str(scenario_file), '--start', str(tmp_path / 'start.yaml'),
-                 '--objective', 'ambiguity', '--output', str(output), '--quiet', '--spreads']
-    assert library_command.main([*arguments, '0.3']) == 2
-    assert 'made with other arguments' in capsys.readouterr().err
-    assert library_command.main([*arguments, '0.4', '0.1']) == 0
+                 '--objective', 'ambiguity', '--output', str(output), '--quiet', '--loss', '10',
+                 '--spreads', '0.4', '0.1', '--jobs']
+
+    def interrupted(**options):
+        calls.append(options)
+        if len(calls) > 5:
+            raise KeyboardInterrupt
+        return optimised(**options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(library, 'optimised', interrupted)
+        assert library_command.main([*arguments, '1']) == 130
+    assert len([*(tmp_path / 'library.npz.jobs').glob('optimisation-*')]) == 5
+    assert library_command.main([*arguments, '2']) == 0
     assert '7 codebooks: 6 for 0.1 m, 1 for 0.4 m' in capsys.readouterr().out
-    assert Library.load(output).id == built.id
-    assert not (tmp_path / 'library.npz.part').exists()
+    assert Library.load(output).id == library.make_library(
+        SCENARIO, start, 'ambiguity', (0.1, 0.4), 10).id
+    assert not (tmp_path / 'library.npz.jobs').exists()
