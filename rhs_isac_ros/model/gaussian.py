@@ -15,6 +15,8 @@ FALSE_ALARM = 1e-9
 # Smallest square of a pivot relative to the largest variance, in units of the rounding error of n
 # variances. Below it, bounds have errors of more than about a per cent.
 _MIN_PIVOT = 4
+# Smallest size of the blocks of `inverse_lower`.
+_MIN_DIVIDED = 8
 
 
 class Marginal(NamedTuple):
@@ -61,6 +63,19 @@ def covariance_root(scenario: Scenario, covariance: np.ndarray, *, orthogonal: b
         values, vectors = np.linalg.eigh(covariance)
         return vectors * np.sqrt(np.maximum(values, scenario.noise_power_w))[..., None, :]
     return roots
+
+
+def inverse_lower(roots: np.ndarray) -> np.ndarray:
+    """Invert lower triangular matrices [..., n, n]."""
+    n = roots.shape[-1] // 2
+    if n < _MIN_DIVIDED:
+        return np.linalg.inv(roots)
+    # The inverse of a block triangular matrix takes a quarter of the operations.
+    inverse = np.zeros_like(roots)
+    first, last = inverse[..., :n, :n], inverse[..., n:, n:]
+    first[:], last[:] = inverse_lower(roots[..., :n, :n]), inverse_lower(roots[..., n:, n:])
+    inverse[..., n:, :n] = -np.matmul(np.matmul(last, roots[..., n:, :n]), first)
+    return inverse
 
 
 def energy_limit(n: int, probability: float = FALSE_ALARM) -> float:

@@ -92,7 +92,22 @@ class Exponents:
 
     def divide(self, signals: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Remove the factors of values z [..., Q] from signals [..., N_B, N_SB F]."""
-        return signals * np.exp(-np.tensordot(values, self.scaled_patterns, axes=1))
+        patterns, index = self._distinct
+        factors = np.exp(values @ -patterns)[..., index]
+        return signals * factors.reshape(*values.shape[:-1], *self.scaled_patterns.shape[1:])
+
+    @functools.cached_property
+    def _distinct(self) -> tuple[np.ndarray, np.ndarray]:
+        """The D different exponents, complex128 [Q, D], and the one of each measurement, int.
+
+        Offsets of timing and carrier are the same in all frames or sub-bands of a band.
+        """
+        flat = self.scaled_patterns.reshape(len(self), math.prod(self.scaled_patterns.shape[1:]))
+        # The row of zeros is for no parameters.
+        _, first, index = np.unique(
+            np.vstack([np.zeros(flat.shape[1]), flat.real, flat.imag]), axis=1,
+            return_index=True, return_inverse=True)
+        return flat[:, first], index.reshape(-1)
 
     def derivatives(self, divided: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Return the derivatives of signals with respect to z, [N, Q, N_B, N_SB F].

@@ -9,7 +9,7 @@ import functools
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import blocks, checked_positions, read_only
+from rhs_isac_ros.model.arrays import blocks, checked_positions, multiply_rows, read_only
 from rhs_isac_ros.model.elements import (
     DeclaredElements,
     ElementErrors,
@@ -218,20 +218,12 @@ class MeasurementModel:
 
     def whiten(self, signals: np.ndarray) -> np.ndarray:
         """Transform signals [..., N_B, N_SB F] to unit covariance; the shape stays the same."""
-        # Unlike a matrix product, this rounds a signal in the same way in batches of any size.
-        return np.einsum('irs,...is->...ir', self.whitener, signals)
+        return multiply_rows(self.whitener, signals)
 
     def mean(self, positions: np.ndarray) -> np.ndarray:
         """Compute the mean signals, complex128 [N, N_B, N_SB F]: Eq. (8) for the direct path."""
-        positions, weights = checked_positions(positions), self._weights
-        mean = np.empty((len(positions), *self.shape), complex)
-
-        def fill(block: slice) -> None:
-            terms = weights.terms(positions[block], slopes=False)
-            mean[block] = np.swapaxes(terms[:, :, 0], 0, 1)
-
-        map_blocks(fill, blocks(len(positions), weights.block))
-        return mean
+        positions = checked_positions(positions)
+        return self.mean_and_jacobian(positions, np.zeros((len(positions), 3, 0)))[0]
 
     def mean_and_jacobian(
             self, positions: np.ndarray, by_coordinate: np.ndarray | None = None, *,
@@ -247,16 +239,19 @@ class MeasurementModel:
         by_term = weights.weights(positions)
         if by_coordinate is not None:
             by_term = np.matmul(np.swapaxes(by_coordinate, 1, 2), by_term)
+        slopes = by_term.shape[1] > 0
         mean = np.empty((n, n_bands, n_rows), complex)
         jacobian = np.empty((n, by_term.shape[1], n_bands, n_rows), complex)
 
         def fill(block: slice) -> None:
-            terms = weights.terms(positions[block])
+            terms = weights.terms(positions[block], slopes)
             if whitened:
                 shape = terms.shape
                 terms = np.matmul(terms.reshape(n_bands, -1, n_rows),
                                   np.swapaxes(self.whitener, 1, 2)).reshape(shape)
             mean[block] = np.swapaxes(terms[:, :, 0], 0, 1)
+            if not slopes:
+                return
             parts = np.matmul(by_term[block], terms[:, :, 1:].view(float))
             jacobian[block] = np.moveaxis(parts.view(complex), 0, 2)
 

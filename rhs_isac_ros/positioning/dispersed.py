@@ -1,6 +1,7 @@
 """The likelihood with the covariance of element errors at each position."""
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,12 +13,14 @@ from rhs_isac_ros.model.gaussian import (
 from rhs_isac_ros.model.geometry import jacobian, to_positions
 from rhs_isac_ros.positioning.likelihood import (
     Columns,
+    Conditional,
     Factors,
     Likelihood,
     Local,
     Signals,
     assemble,
 )
+from rhs_isac_ros.positioning.nuisance import NuisancePrior
 
 # Numbers of failures to average over: smallest probability of each, and how many at most.
 _MIN_PROBABILITY = 1e-5
@@ -27,7 +30,7 @@ _MAX_COUNTS = 12
 _MIN_ERROR_SHARE = 0.05
 
 
-class DispersedLikelihood:
+class DispersedLikelihood(Conditional):
     """The likelihood with the covariance of element errors at each position.
 
     Errors of the direct path are stronger for near users. A surface has a whole number k of failed
@@ -46,7 +49,6 @@ class DispersedLikelihood:
         self._intact = MeasurementModel(intact, likelihood.codebook, likelihood.surface)
         self._scales, log_weights = _failure_counts(scenario.n_elements, share)
         self._offsets = log_weights + likelihood.log_det
-        self._latest: tuple[np.ndarray, list[Factors]] | None = None
         average, least = self._average.covariance(), self._intact.covariance()
         roots = covariance_root(
             scenario, least + self._scales[:, None, None, None] * (average - least))
@@ -67,32 +69,43 @@ class DispersedLikelihood:
                 return None
         return cls(likelihood)
 
-    def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate the likelihood at points; see `Conditional.local`."""
-        prior, states = self._base.nuisance, []
-        mean, slopes = self._average.mean_and_jacobian(to_positions(points), jacobian(points))
-        columns = prior.columns(values, signals.received, mean, slopes)
-        for factors, offset, information in zip(
-                self._factors_at(points), self._offsets, self._information, strict=True):
-            white = Columns.of(factors.whiten(columns), len(prior))
-            local = assemble(prior, values, white, information, factors.noise)
-            states.append(local._replace(value=local.value + offset - factors.log_det))
-        return _average_of(states)
+    def at(self, points: np.ndarray, *, moves: bool = True) -> 'LocatedStates':
+        """Return the likelihood at points; see `Conditional.at`."""
+        positions, by_point = to_positions(points), jacobian(points)[:, :, :3 * moves]
+        intact = self._intact.covariance_at(positions)
+        excess = (self._average.covariance_at(positions) - intact if any(self._scales)
+                  else np.zeros(1))
+        states = []
+        for scale, offset, information in zip(
+                self._scales, self._offsets, self._information, strict=True):
+            factors = Factors.of(self._base.nuisance, intact + scale * excess)
+            states.append((factors, offset - factors.log_det, information))
+        mean, slopes = self._average.mean_and_jacobian(positions, by_point)
+        return LocatedStates(self._base.nuisance, mean, slopes, slopes[:, :0], states)
 
-    def _factors_at(self, points: np.ndarray) -> list[Factors]:
-        """Return factors of the covariance at points for each number of failures."""
-        # Numerical integration evaluates many parameters at the same points. Another thread may
-        # replace `_latest` at any time.
-        latest = self._latest
-        if latest is None or points is not latest[0]:
-            positions = to_positions(points)
-            intact = self._intact.covariance_at(positions)
-            excess = (self._average.covariance_at(positions) - intact if any(self._scales)
-                      else np.zeros(1))
-            self._latest = latest = points, [
-                Factors.of(self._base.nuisance, intact + scale * excess)
-                for scale in self._scales]
-        return latest[1]
+
+class LocatedStates(NamedTuple):
+    """The likelihood at M points, averaged over states of the surface: a `Located`."""
+
+    prior: NuisancePrior
+    mean: np.ndarray  # Complex128 [M, N_B, N_SB F].
+    slopes: np.ndarray  # Derivatives of `mean` with respect to the point, [M, P, N_B, N_SB F].
+    linear: np.ndarray  # Those of `Columns.linear`, [M, L, N_B, N_SB F].
+    # For each state: factors of the covariance, constant of the log-likelihood, [M] or [1], and
+    # information of the covariance about the parameters.
+    states: list[tuple[Factors, np.ndarray, np.ndarray]]
+
+    def local(self, values: np.ndarray, signals: Signals) -> Local:
+        """Evaluate the likelihood; see `Located.local`."""
+        prior, found = self.prior, []
+        columns = prior.columns(
+            values, signals.received, self.mean, self.slopes, self.linear)
+        for factors, offset, information in self.states:
+            white = Columns.of(
+                factors.whiten(columns), len(prior), self.linear.shape[1], self.slopes.shape[1])
+            local = assemble(prior, values, white, information, factors.noise)
+            found.append(local._replace(value=local.value + offset))
+        return _average_of(found)
 
 
 def _average_of(states: list[Local]) -> Local:

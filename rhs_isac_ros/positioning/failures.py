@@ -30,13 +30,13 @@ from rhs_isac_ros.model.geometry import jacobian, to_positions
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import radiation_matrix
+from rhs_isac_ros.positioning.dispersed import LocatedStates
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.likelihood import (
     Columns,
     Conditional,
     Factors,
     Likelihood,
-    Local,
     Signals,
     assemble,
 )
@@ -229,21 +229,19 @@ class FailureEffects(NamedTuple):
 
 
 class Whitening(NamedTuple):
-    """Factors of the covariance matrices of H sets of failed elements."""
+    """The covariances of H sets of failed elements."""
 
-    whitener: np.ndarray  # Inverse factors, complex128 [H, N_B, N_SB F, N_SB F].
-    log_det: np.ndarray  # Logarithms of the determinants, float64 [H].
-    noise: np.ndarray | None  # As in `Factors`, float64 [H, n].
+    factors: Factors  # Of H covariances.
     information: np.ndarray  # Information of one covariance about parameters, float64 [Q, Q].
 
     @classmethod
     def of(cls, covariance: np.ndarray, prior: NuisancePrior, parent: 'Whitening | None' = None
            ) -> 'Whitening':
         """Factorise covariances [H, N_B, N_SB F, N_SB F]; a parent provides the information."""
-        roots, log_det, noise = Factors.of(prior, covariance)
-        whitener = np.linalg.inv(roots)
-        return cls(whitener, log_det, noise, parent.information if parent
-                   else prior.information_of(roots[0], whitener[0]))
+        factors = Factors.of(prior, covariance)
+        one = factors.whitener[0]
+        return cls(factors, parent.information if parent
+                   else prior.information_of(np.linalg.inv(one), one))
 
 
 class FailedSurfaces:
@@ -334,7 +332,7 @@ class Place:
         return self.columns + changes[[*failed]].sum(axis=0), amplitudes[[*failed]]
 
 
-class FailedSet:
+class FailedSet(Conditional):
     """The likelihood of positions for a set of failed elements: a `Conditional`.
 
     Its value includes the prior of the set, and omits the same constant as that of `Likelihood`.
@@ -351,28 +349,21 @@ class FailedSet:
         self._offset = len(failed) * surfaces.log_odds + intact + likelihood.log_det
         self._amplitudes = surfaces.effects.amplitude[[*failed]]
 
-    def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate the log-likelihood at points; see `Conditional.local`."""
-        scenario, prior = self._surfaces.likelihood.scenario, self._surfaces.likelihood.nuisance
+    def at(self, points: np.ndarray, *, moves: bool = True) -> LocatedStates:
+        """Return the likelihood at points; see `Conditional.at`."""
+        surfaces, scenario = self._surfaces, self._surfaces.likelihood.scenario
         positions, failed = to_positions(points), [*self._failed]
-        mean, slopes = self._mean_model.mean_and_jacobian(positions, jacobian(points))
+        mean, slopes = self._mean_model.mean_and_jacobian(
+            positions, jacobian(points)[:, :, :3 * moves])
         gains = np.stack([
             np.repeat(los_gain(scenario, positions, band)[:, :, failed],
                       scenario.n_frames, axis=1) for band in range(scenario.n_bands)])
         amplitudes = np.moveaxis(gains, (0, 1, 2, 3), (2, 0, 3, 1)) * self._amplitudes
-        columns = prior.columns(values, signals.received, mean, slopes, amplitudes)
-        whitening = self._surfaces.whitening(self._failed)
-        if self._surfaces.intact.elements.is_exact:
-            white = np.einsum(
-                'irs,mcis->mcir', whitening.whitener[0], columns, optimize=True)
-            white, log_det, noise = (
-                white.reshape(*columns.shape[:2], -1), whitening.log_det, whitening.noise)
-        else:
-            factors = self._surfaces.factors_at(self._failed, positions)
-            white, log_det, noise = factors.whiten(columns), factors.log_det, factors.noise
-        local = assemble(prior, values, Columns.of(white, len(prior), len(failed)),
-                         whitening.information, noise)
-        return local._replace(value=local.value + self._offset - log_det)
+        whitening = surfaces.whitening(self._failed)
+        factors = (whitening.factors if surfaces.intact.elements.is_exact
+                   else surfaces.factors_at(self._failed, positions))
+        return LocatedStates(surfaces.likelihood.nuisance, mean, slopes, amplitudes, [
+            (factors, self._offset - factors.log_det, whitening.information)])
 
 
 class FailureModel:
@@ -417,7 +408,7 @@ class FailureModel:
         value = self._predicted(np.stack([place.values for place in places]), columns, whitening,
                                 len(failed))
         log_prior = len(failed) * self.surfaces.log_odds
-        return log_prior - whitening.log_det + value, -value
+        return log_prior - whitening.factors.log_det + value, -value
 
     def weigh_extensions(self, failed: Failed, place: Place, remainder: float = 0.0) -> np.ndarray:
         """Weigh a set, as `weigh` does, with each element added in turn, float64 [N_E].
@@ -435,18 +426,15 @@ class FailureModel:
         parts = np.concatenate([columns + changes, own, amplitudes[:, None]], axis=1)
         values = np.broadcast_to(place.values, (len(changes), len(place.values)))
         value = self._predicted(values, parts, extended, len(failed) + 1)
-        return (len(failed) + 1) * self.surfaces.log_odds - extended.log_det + value
+        return (len(failed) + 1) * self.surfaces.log_odds - extended.factors.log_det + value
 
     def _predicted(self, values: np.ndarray, columns: np.ndarray, whitening: Whitening,
                    n_failed: int) -> np.ndarray:
         """Predict log-likelihoods [H] after a Newton step from columns [H, C, N_B, N_SB F]."""
-        n = len(columns)
-        white = np.matmul(np.swapaxes(columns, 1, 2), np.swapaxes(whitening.whitener, 2, 3))
-        white = np.swapaxes(white, 1, 2).reshape(n, columns.shape[1], -1)
-        prior = self.likelihood.nuisance
+        white, prior = whitening.factors.whiten(columns), self.likelihood.nuisance
         local = assemble(
             prior, values, Columns.of(white, len(prior), n_failed), whitening.information,
-            whitening.noise)
+            whitening.factors.noise)
         return predict(local, self.likelihood)
 
 

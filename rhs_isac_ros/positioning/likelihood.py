@@ -16,8 +16,10 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.gaussian import (
     covariance_root,
+    inverse_lower,
     marginalise,
     quadratic_form,
 )
@@ -42,24 +44,36 @@ class Local(NamedTuple):
     """
 
     value: np.ndarray  # Logarithm of the likelihood times the parameters' prior, float64 [M].
-    gradient: np.ndarray  # Float64 [M, 3 + Q].
-    information: np.ndarray  # Float64 [M, 3 + Q, 3 + Q].
+    gradient: np.ndarray  # Float64 [M, P + Q]; P is 3, or 0 without derivatives at the points.
+    information: np.ndarray  # Float64 [M, P + Q, P + Q].
     residual: np.ndarray  # Energy of the whitened residual, float64 [M].
+
+
+class Located(Protocol):
+    """The likelihood at M points, as a function of the parameters."""
+
+    def local(self, values: np.ndarray, signals: Signals) -> Local:
+        """Evaluate the likelihood at parameters [M, Q] for one or M shots."""
+        ...
 
 
 class Conditional(Protocol):
     """The likelihood for one state of the surface, or averaged over several."""
 
+    def at(self, points: np.ndarray, *, moves: bool = True) -> Located:
+        """Return the likelihood at points [M, 3]; unless `moves`, without derivatives there."""
+        ...
+
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate the likelihood at points [M, 3] and parameters [M, Q] for one or M shots."""
-        ...
+        return self.at(points).local(values, signals)
 
 
 class Columns(NamedTuple):
     """Whitened residuals and derivatives at M points, complex128, of n whitened measurements."""
 
     residual: np.ndarray  # Signals without the factors of the parameters, less the mean, [M, n].
-    by_point: np.ndarray  # Derivatives of the mean with respect to the point, [M, 3, n].
+    by_point: np.ndarray  # Derivatives of the mean with respect to the point, [M, P, n].
     # Derivatives with respect to the parameters, for the expected information, [M, Q, n].
     by_values: np.ndarray
     # Derivatives with respect to L further standard normal parameters, in which the mean is
@@ -71,13 +85,14 @@ class Columns(NamedTuple):
     observed: np.ndarray
 
     @classmethod
-    def of(cls, stacked: np.ndarray, n_values: int, n_linear: int = 0) -> 'Columns':
+    def of(cls, stacked: np.ndarray, n_values: int, n_linear: int = 0, n_coordinates: int = 3
+           ) -> 'Columns':
         """Divide columns in the order of the fields, [M, C, n].
 
         If the last Q are omitted, `observed` is `by_values`. Gradient and information then use
         the same derivatives, and never predict an energy below 0.
         """
-        ends = np.cumsum([1, 3, n_values, n_linear])
+        ends = np.cumsum([1, n_coordinates, n_values, n_linear])
         residual, by_point, by_values, linear, observed = np.split(stacked, ends, axis=1)
         return cls(residual[:, 0], by_point, by_values, linear,
                    observed if observed.shape[1] else by_values)
@@ -95,7 +110,7 @@ class Columns(NamedTuple):
 class Factors(NamedTuple):
     """Factors of covariances of signals, [..., N_B, N_SB F, N_SB F]."""
 
-    roots: np.ndarray
+    whitener: np.ndarray  # Inverses of the factors of the covariances.
     log_det: np.ndarray  # Logarithms of the determinants, added over the bands, float64 [...].
     # Share of thermal noise in the whitened measurements, float64 [..., n]; None without a gain.
     noise: np.ndarray | None
@@ -111,19 +126,19 @@ class Factors(NamedTuple):
         """Take Cholesky factors, or, with a gain, such with orthogonal columns."""
         if not prior.has_gain:
             diagonal = np.diagonal(roots, axis1=-2, axis2=-1).real
-            return cls(roots, 2 * np.log(diagonal).sum(axis=(-2, -1)), None)
+            return cls(inverse_lower(roots), 2 * np.log(diagonal).sum(axis=(-2, -1)), None)
         variance = np.sum(np.abs(roots)**2, axis=-2)
         noise = prior.scenario.noise_power_w / variance
-        return cls(roots, np.log(variance).sum(axis=(-2, -1)),
+        return cls(adjoint(roots) / variance[..., None], np.log(variance).sum(axis=(-2, -1)),
                    noise.reshape(*noise.shape[:-2], -1))
 
     def whiten(self, columns: np.ndarray) -> np.ndarray:
-        """Whiten columns [M, C, N_B, N_SB F] by the factors of each point; [M, C, n]."""
-        white = np.linalg.solve(self.roots, np.moveaxis(columns, 1, 3))
-        return np.moveaxis(white, 3, 1).reshape(*columns.shape[:2], -1)
+        """Whiten columns [M, C, N_B, N_SB F] by one factor, or by those of M points; [M, C, n]."""
+        white = np.matmul(np.swapaxes(columns, 1, 2), np.swapaxes(self.whitener, -2, -1))
+        return np.swapaxes(white, 1, 2).reshape(*columns.shape[:2], -1)
 
 
-class Likelihood:
+class Likelihood(Conditional):
     """The likelihood with one covariance, in which element errors are averaged over the region."""
 
     def __init__(self, system: System) -> None:
@@ -157,37 +172,42 @@ class Likelihood:
         weights, _ = self.nuisance.noise_weights(gains, self.factors.noise)
         return weights.reshape(len(gains), *self.model.shape)
 
-    def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
-        """Evaluate the likelihood at points; see `Conditional.local`."""
-        n, whitened = len(points), self.whitened(values, signals)
-        mean, slopes = self.model.mean_and_jacobian(
-            to_positions(points), jacobian(points), whitened=True)
-        residual, by_point = (whitened - mean).reshape(n, -1), slopes.reshape(n, 3, -1)
-        # Without parameters, both arrays have no columns.
-        observed = by_values = by_point[:, :0]
-        if len(self.nuisance):
-            observed = self.nuisance.slopes(whitened)
-            moves = self.nuisance.moves_multipath[:, None]
-            by_values = np.where(moves, observed, self.nuisance.slopes(mean))
-        columns = Columns(residual, by_point, by_values, by_point[:, :0], observed)
-        return assemble(
-            self.nuisance, values, columns, self.nuisance.information, self.factors.noise)
+    def at(self, points: np.ndarray, *, moves: bool = True) -> 'WhiteMeans':
+        """Return the likelihood at points; see `Conditional.at`."""
+        by_point = jacobian(points)[:, :, :3 * moves]
+        return WhiteMeans(self, *self.model.mean_and_jacobian(
+            to_positions(points), by_point, whitened=True))
 
-    def settle(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
+
+class WhiteMeans(NamedTuple):
+    """The likelihood at M points with one covariance."""
+
+    likelihood: Likelihood
+    mean: np.ndarray  # Whitened, complex128 [M, N_B, N_SB F].
+    slopes: np.ndarray  # Derivatives of `mean` with respect to the point, [M, P, N_B, N_SB F].
+
+    def local(self, values: np.ndarray, signals: Signals) -> Local:
+        """Evaluate the likelihood; see `Located.local`."""
+        prior, whitened = self.likelihood.nuisance, self.likelihood.whitened(values, signals)
+        by_point = self.slopes.reshape(*self.slopes.shape[:2], self.mean[0].size)
+        by_values, observed = prior.slopes(whitened, self.mean)
+        columns = Columns((whitened - self.mean).reshape(len(values), -1), by_point, by_values,
+                          by_point[:, :0], observed)
+        return assemble(
+            prior, values, columns, prior.information, self.likelihood.factors.noise)
+
+    def settled(self, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Replace uniform band phases in parameters [M, Q] by the most likely phases."""
-        # A step in range rotates these phases by many turns.
-        if not self.nuisance.is_coarse:
-            return values
-        outputs, change = self.outputs(points, values, signals), np.zeros_like(values)
+        outputs, change = self.outputs(values, signals), np.zeros_like(values)
         change[:, -outputs.shape[1]:] = np.angle(outputs) / UNIFORM_EQUIVALENT
         return values + change
 
-    def outputs(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
+    def outputs(self, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Compute the outputs of the bands' matched filters, complex128 [M, N_B]."""
-        mean = self.model.whiten(self.model.mean(to_positions(points)))
+        gains = values @ self.likelihood.nuisance.gains.T
         return np.sum(
-            mean.conj() * self.whitened(values, signals)
-            * self.weights_at(values @ self.nuisance.gains.T)**2, axis=2)
+            self.mean.conj() * self.likelihood.whitened(values, signals)
+            * self.likelihood.weights_at(gains)**2, axis=2)
 
 
 def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
@@ -201,7 +221,8 @@ def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
     if noise is not None:
         weights, shares = prior.noise_weights(values @ prior.gains.T, noise)
         columns = columns.weighted(weights)
-    n, n_linear = 3 + len(prior), columns.linear.shape[1]
+    first, n_linear = columns.by_point.shape[1], columns.linear.shape[1]
+    n = first + len(prior)
     # The residual energy, and gradient and information of its negative.
     expected = np.concatenate([columns.by_point, columns.by_values, columns.linear], axis=1)
     slopes = expected if columns.observed is columns.by_values else np.concatenate(
@@ -213,11 +234,12 @@ def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
         np.ascontiguousarray(slopes).view(float), parts[..., None])[..., 0]
     energy = np.sum(parts**2, axis=1)
     # The priors of point, parameters and further parameters.
-    information += np.diag(np.concatenate([prior.floor, prior.precision, np.ones(n_linear)]))
-    gradient[:, 3:n] -= prior.precision * values + prior.volume
+    information += np.diag(np.concatenate([
+        prior.floor[:first], prior.precision, np.ones(n_linear)]))
+    gradient[:, first:n] -= prior.precision * values + prior.volume
     # Derivatives of parameters that move the multipath already include this information.
     still = ~prior.moves_multipath
-    information[:, 3:n, 3:n] += np.outer(still, still) * information_of_covariance
+    information[:, first:n, first:n] += np.outer(still, still) * information_of_covariance
     value = prior.log_prior(values) - energy
     if noise is not None:
         # By the share of noise, a gain scales the covariance less, and so does the density.
@@ -227,8 +249,8 @@ def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
         lost = np.sum((4 * (1 - shares)**2 - 4).reshape(by_band), axis=2)
         gains = prior.gains * still
         value += 2 * np.log(weights).sum(axis=1)
-        gradient[:, 3:n] += 2 * surplus @ prior.gains
-        information[:, 3:n, 3:n] += np.einsum('bq,mb,bp->mqp', gains, lost, gains)
+        gradient[:, first:n] += 2 * surplus @ prior.gains
+        information[:, first:n, first:n] += np.einsum('bq,mb,bp->mqp', gains, lost, gains)
     marginal = marginalise(information, gradient, n)
     rise = np.sum(gradient[:, n:] * marginal.offset, axis=1) / 2
     return Local(value + rise + marginal.log_volume, marginal.gradient, marginal.information,

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.model.arrays import adjoint
+from rhs_isac_ros.model.arrays import adjoint, multiply_rows
 from rhs_isac_ros.model.impairments import (
     UNIFORM_STD_RAD,
     Exponents,
@@ -141,10 +141,22 @@ class NuisancePrior(Exponents):
             (divided - mean)[:, None], slopes, self.derivatives(divided, mean), *linear,
             self.scaled_patterns * divided[:, None]], axis=1)
 
-    def slopes(self, whitened: np.ndarray) -> np.ndarray:
-        """Multiply whitened signals [M, N_B, N_SB F] by W P W^-1; return [M, Q, N_B N_SB F]."""
-        slopes = np.einsum('qimn,kin->kqim', self._operators, whitened, optimize=True)
-        return slopes.reshape(*slopes.shape[:2], -1)
+    def slopes(self, whitened: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Multiply whitened signals and means, [M, N_B, N_SB F], by W P W^-1.
+
+        Returns `by_values` and `observed` of `Columns`, [M, Q, N_B N_SB F]; they are one array if
+        they are equal.
+        """
+        # P is the same in all measurements of a band, unless it moves the multipath.
+        constants, moves = self.scaled_patterns[:, :, :1], self.moves_multipath
+        observed = constants * whitened[:, None]
+        for row in np.flatnonzero(moves):
+            observed[:, row] = multiply_rows(self._operators[row], whitened)
+        observed = observed.reshape(*observed.shape[:2], mean[0].size)
+        if moves.all():
+            return observed, observed
+        expected = (constants * mean[:, None]).reshape(observed.shape)
+        return np.where(moves[:, None], observed, expected), observed
 
     def log_prior(self, values: np.ndarray) -> np.ndarray:
         """Return the logarithm of the prior times the change of volume, float64 [M]."""

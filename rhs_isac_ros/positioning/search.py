@@ -14,7 +14,14 @@ from rhs_isac_ros.model.gaussian import Marginal, likelihood_loss, marginalise, 
 from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable, heaviest, separate
-from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Local, Signals
+from rhs_isac_ros.positioning.likelihood import (
+    Conditional,
+    Likelihood,
+    Local,
+    Located,
+    Signals,
+    WhiteMeans,
+)
 from rhs_isac_ros.positioning.segments import Segments, select
 from rhs_isac_ros.positioning.sheets import Inside, Sheets
 
@@ -206,21 +213,33 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
 
     Newton steps start from the approximate parameters `values`, [M, Q].
     """
-    values = likelihood.settle(points, values, signals)
+    located, values = _settled(conditional, likelihood, points, values, signals, moves=False)
     for _ in range(2 if values.shape[1] else 1):
-        local = conditional.local(points, values, signals)
-        marginal = marginalise(local.information, local.gradient)
+        local = located.local(values, signals)
+        marginal = marginalise(local.information, local.gradient, 0)
         values = values + marginal.offset
-    rise = np.sum(local.gradient[:, 3:] * marginal.offset, axis=1) / 2
+    rise = np.sum(local.gradient * marginal.offset, axis=1) / 2
     return local.value + rise + marginal.log_volume, values
+
+
+def _settled(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
+             values: np.ndarray, signals: Signals, moves: bool = True
+             ) -> tuple[Located, np.ndarray]:
+    """Return the likelihood at points, and parameters [M, Q] with the most likely phases."""
+    located = conditional.at(points, moves=moves)
+    # A step in range rotates uniform phases of bands by many turns.
+    if likelihood.nuisance.is_coarse:
+        white = located if isinstance(located, WhiteMeans) else likelihood.at(points, moves=False)
+        values = white.settled(values, signals)
+    return located, values
 
 
 def _step(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
           state: int, moves: bool = True) -> tuple[Modes, np.ndarray]:
     """Take a Gauss-Newton step, or none without `moves`; return the modes and gains, [M]."""
     points = starts.points
-    values = likelihood.settle(points, starts.values, signals)
-    local = conditional.local(points, values, signals)
+    located, values = _settled(conditional, likelihood, points, starts.values, signals)
+    local = located.local(values, signals)
     marginal = marginalise(local.information, local.gradient)
     step = step_to_maximum(marginal.information, marginal.gradient)
     whole = np.zeros_like(local.gradient)

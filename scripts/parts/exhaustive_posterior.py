@@ -131,7 +131,7 @@ class _Posterior:
         conditional: Conditional = self._dispersed or likelihood
         prior, value = likelihood.nuisance, np.empty(len(points))
         values = np.repeat(self._aligned[shot][None], len(points), axis=0)
-        outputs = likelihood.outputs(points, values, select(self._signals, [shot]))
+        outputs = likelihood.at(points, moves=False).outputs(values, select(self._signals, [shot]))
         if len(prior):
             # The steps of `marginal_at` begin near the most likely gain.
             whitened = self._whitened[shot]
@@ -149,7 +149,7 @@ class _Posterior:
         value[near] = self._integrated(conditional, points[near], values[near], shot)
         if self._phases.is_informative:
             signals = select(self._signals, [shot])
-            outputs = likelihood.outputs(points, values, signals)
+            outputs = likelihood.at(points, moves=False).outputs(values, signals)
             turned = outputs * np.exp(1j * values @ prior.phases.T)
             value += self._phases.factors(turned.T)[0]
         return value
@@ -163,13 +163,14 @@ class _Posterior:
         n_values = values.shape[1]
         normal = ndtri(qmc.Sobol(n_values, seed=0).random(_N_VALUES))
         signals = select(self._signals, [shot])
-        among = conditional.local(points, values, signals).information[:, 3:, 3:]
+        located = conditional.at(points, moves=False)
+        among = located.local(values, signals).information
         roots = np.linalg.cholesky(among)
         value = np.empty((len(points), _N_VALUES))
         for column, one in enumerate(normal):
             offset = np.linalg.solve(np.swapaxes(roots, 1, 2), np.broadcast_to(
                 _SPREAD * one, values.shape)[..., None])[..., 0]
-            local = conditional.local(points, values + offset, signals)
+            local = located.local(values + offset, signals)
             value[:, column] = local.value + one @ one / 2
         highest = value.max(axis=1)
         average = highest + np.log(np.mean(np.exp(value - highest[:, None]), axis=1))
