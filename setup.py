@@ -52,11 +52,10 @@ setup(
         'recording': ['mcap>=1.6'],
         'samples': ['sigmf'],
         'watch': ['rich'],
-        # See requirements-view.txt.
-        'view': ['rerun-sdk==0.22.1', 'pyarrow==25.0.0'],
+        'view': ['rerun-sdk>=0.22.1,<0.42', 'pyarrow'],
         'all': [
             'matplotlib', 'joblib', 'dask', 'distributed', 'tqdm', 'scikit-learn',
-            'pymoo', 'mcap>=1.6', 'sigmf', 'rich', 'rerun-sdk==0.22.1', 'pyarrow==25.0.0'],
+            'pymoo', 'mcap>=1.6', 'sigmf', 'rich', 'rerun-sdk>=0.22.1,<0.42', 'pyarrow'],
         'docs': ['sphinx', 'furo', 'myst-nb'],
         'test': ['pytest', 'hypothesis', 'filterpy', 'rosbags'],
     },

@@ -26,7 +26,7 @@ KEYS = {'docutils': 'python3-sphinx', 'threadpoolctl': 'python3-sklearn'} | {
 # mcap requires lz4 and zstandard.
 PIP_ONLY = {
     'adi': None, 'distributed': 'distributed', 'jax': None, 'lz4': 'mcap>=1.6',
-    'mcap': 'mcap>=1.6', 'pymoo': 'pymoo', 'rerun': 'rerun-sdk==0.22.1',
+    'mcap': 'mcap>=1.6', 'pymoo': 'pymoo', 'rerun': 'rerun-sdk>=0.22.1,<0.42',
     'rosbags': 'rosbags', 'sigmf': 'sigmf', 'sionna': None, 'zstandard': 'mcap>=1.6',
 }
 

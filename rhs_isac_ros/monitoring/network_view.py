@@ -36,7 +36,7 @@ SURFACE = 'world/surface'
 MODES = 'modes'
 POSITIONING = 'surface/positioning'
 TRANSMISSION = 'surface/transmission'
-LOG = 'log'
+LOG, LEGEND = 'log', 'legend'
 # Title of each chart, by the prefix of the paths of its series.
 TITLES = {
     'error': 'Position error [m]',
@@ -45,8 +45,13 @@ TITLES = {
     'latency': 'Latency [ms]',
     'drops': 'Drops and given-up cycles',
 }
-# Maximum number of users, and of nodes, with their own series: a longer legend hides the chart.
+# Maximum number of users, and of nodes, with their own series, which the legend names.
 _MAX_SERIES = 4
+# First line of the legend of each chart with several series, and the number of all lines.
+_LEGEND = {'error': 0, 'capacity': 8, 'latency': 12, 'drops': 18}
+LEGEND_LINES = 24
+# Space above and below the numbers of a chart, as a share of their range.
+_MARGIN = 0.05
 # Maximum number of nodes in the counts, because the names come from messages.
 _MAX_NODES = 4096
 # Maximum number of users in the scene, because the ids come from messages.
@@ -80,6 +85,8 @@ class Charts:
 
     def __init__(self) -> None:
         self._drawn: set[str] = set()
+        self._n_named: collections.Counter[str] = collections.Counter()
+        self._ranges: dict[str, tuple[float, float]] = {}
         self._square_m2 = 0.0
         self._n_fixes = self._n_given_up = 0
         self._n_dropped: NewestDict[str, int] = NewestDict(_MAX_NODES)
@@ -88,13 +95,33 @@ class Charts:
         self._nodes: set[str] = set()
 
     def entries(self, cycle: int, samples: Iterable[Sample]) -> Iterator[Entry]:
-        """Yield the finite samples of a cycle, and the style of each new series."""
+        """Yield the finite samples of a cycle, and the style and the name of each new series."""
         for path, value, style in samples:
-            if math.isfinite(value):
-                if path not in self._drawn:
-                    self._drawn.add(path)
-                    yield Entry(0, path, style)
-                yield Entry(cycle, path, Number(float(value)))
+            if not math.isfinite(value):
+                continue
+            chart = path.partition('/')[0]
+            if path not in self._drawn:
+                self._drawn.add(path)
+                yield Entry(0, path, style)
+                if chart in _LEGEND:
+                    yield Entry(0, f'{LEGEND}/{path}', _name(
+                        style, _LEGEND[chart] + self._n_named[chart]))
+                    self._n_named[chart] += 1
+            yield Entry(cycle, path, Number(float(value)))
+            yield from self._margins(cycle, chart, float(value))
+
+    def _margins(self, cycle: int, chart: str, value: float) -> Iterator[Entry]:
+        """Yield invisible numbers around all numbers of a chart, which would cut dots in half."""
+        low, high = self._ranges.get(chart, (math.inf, -math.inf))
+        if low <= value <= high:
+            return
+        self._ranges[chart] = low, high = min(low, value), max(high, value)
+        margin = _MARGIN * (high - low)
+        for path, limit in (f'{chart}/low', low - margin), (f'{chart}/high', high + margin):
+            if path not in self._drawn:
+                self._drawn.add(path)
+                yield Entry(0, path, Series('', _GREY, dots=True))
+            yield Entry(cycle, path, Number(limit))
 
     def dropped(self, node: str, count: int) -> Iterator[Sample]:
         """Yield the number of messages dropped by all nodes, and the `count` dropped by a node."""
@@ -125,7 +152,7 @@ class Charts:
         self._square_m2 += cycle.error_m**2
         self._n_fixes += 1
         yield ('error/root_mean_square', math.sqrt(self._square_m2 / self._n_fixes),
-               Series('root mean square so far', _RED))
+               Series('RMS so far', _RED))
         yield 'error/crlb', math.sqrt(max(estimate.crlb_m2, 0.0)), Series('sqrt(CRLB)', _GREEN)
         # If the loss is small, the lines would coincide, so the actual values are dots.
         for name, value, colour in (
@@ -169,6 +196,12 @@ def mode_estimate(position: np.ndarray, origin: np.ndarray, surface: np.ndarray)
     """Return an estimate, float64 [3] [m], as a white line; see `mode_bars`."""
     error = float(np.linalg.norm(position - surface) - np.linalg.norm(origin - surface))
     return Lines((_line(error, HEIGHT_M),), (1.0, 1.0, 1.0), _LINE_WIDTH)
+
+
+def _name(style: Series, line: int) -> Points:
+    """Return the name of a series in a line of the legend."""
+    return Points(np.array([[0.0, line]]), np.array([style.colour]),
+                  np.array([shapes.INVISIBLE_M]), (style.name,))
 
 
 def _line(mark: float, height: float) -> np.ndarray:

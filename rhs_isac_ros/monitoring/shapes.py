@@ -76,7 +76,10 @@ class Picture(NamedTuple):
 
 
 class Series(NamedTuple):
-    """The name and the style of a series: a line or dots for the numbers of a path."""
+    """The name and the style of a series: a line or dots for the numbers of a path.
+
+    A series without a name is invisible, and only belongs to the range of its chart.
+    """
 
     name: str
     colour: Colour

@@ -6,6 +6,7 @@ import subprocess
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,8 @@ import numpy as np
 from rhs_isac_ros.monitoring import network_view, shapes
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
-_VERSION = '0.22'
+# Releases 0.N of rerun.
+_OLDEST, _NEWEST = 22, 41
 # Name of the timeline in the viewer.
 _TIMELINE = 'cycle'
 # Number of coordinates in a plane.
@@ -28,19 +30,43 @@ _BACKGROUND = (16, 18, 22)
 _START_S, _POLL_S = 20.0, 0.05
 
 
+def _library() -> Any:
+    """Return rerun, with the names of its newer releases and with what its server expects.
+
+    `ports` are options for the ports of the viewer, of its data, and of this process; the last two
+    are one in releases after 0.22. `data` and `address` format their addresses. Release 0.22 is
+    the last one for NumPy 1.26, the one of stock Jazzy.
+    """
+    with optional_import('view', extra='view'):
+        import rerun as rr
+
+    def of_one(archetype: Any) -> Any:
+        return lambda **values: archetype(**{name[:-1]: value for name, value in values.items()})
+
+    release = int(rr.__version__.split('.')[1])
+    if not _OLDEST <= release <= _NEWEST:
+        raise MissingLibraryError(
+            f'view needs rerun-sdk 0.{_OLDEST} to 0.{_NEWEST}, found {rr.__version__} '
+            "(pip install 'rhs_isac_ros[view]'; in a clone: scripts/setup view)")
+    if release > _OLDEST:
+        return SimpleNamespace(
+            **vars(rr), ports=('--web-viewer-port', '--port'),
+            data='rerun%2Bhttp://{}:{}/proxy', address='rerun+http://{}:{}/proxy')
+    return SimpleNamespace(**vars(rr) | {
+        'RecordingStream': rr.new_recording, 'set_time': rr.set_time_sequence,
+        'connect_grpc': rr.connect_tcp, 'Scalars': rr.Scalar,
+        'SeriesPoints': of_one(rr.SeriesPoint), 'SeriesLines': of_one(rr.SeriesLine),
+        'ports': ('--web-viewer-port', '--ws-server-port', '--port'),
+        'data': 'ws://{}:{}', 'address': '{}:{}'})
+
+
 class RerunStream:
-    """Writes the entries of a view; raises MissingLibraryError if rerun-sdk 0.22 is missing."""
+    """Writes the entries of a view; raises MissingLibraryError if no known rerun is installed."""
 
     def __init__(self) -> None:
-        with optional_import('view', extra='view'):
-            import rerun
-        if not rerun.__version__.startswith(f'{_VERSION}.'):
-            raise MissingLibraryError(
-                f'view needs rerun-sdk {_VERSION}, found {rerun.__version__} '
-                "(pip install 'rhs_isac_ros[view]'; in a clone: scripts/setup view)")
-        self._rerun = rerun
-        rerun.set_strict_mode(True)
-        self._stream = rerun.new_recording('rhs_isac_ros')
+        self._rerun = _library()
+        self._rerun.set_strict_mode(True)
+        self._stream = self._rerun.RecordingStream('rhs_isac_ros')
         # The incomplete file, and its final path.
         self._files: tuple[Path, Path] | None = None
         self._server: subprocess.Popen[bytes] | None = None
@@ -57,22 +83,23 @@ class RerunStream:
     def serve(self, port: int, bind: str) -> str:
         """Serve the viewer on a port, and the data on the next one; return the address.
 
-        A third port, ``port + 2``, receives the data from this process. `bind` is the address of a
-        network interface, or ``0.0.0.0`` for all. Raises OSError if a port is in use or the
-        address is not one of this machine, and RuntimeError if the server does not start.
+        Release 0.22 of rerun receives the data of this process on a third port, ``port + 2``.
+        `bind` is the address of a network interface, or ``0.0.0.0`` for all. Raises OSError if a
+        port is in use or the address is not one of this machine, and RuntimeError if the server
+        does not start.
         """
-        ports = range(port, port + 3)
+        rerun = self._rerun
+        ports = range(port, port + len(rerun.ports))
         for number in ports:
             with socket.socket() as probe:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind((bind, number))
         # A server in this process would listen on all network interfaces. The kernel ends the new
         # process when this one ends; a server that `python -m rerun` starts would remain.
-        program = Path(self._rerun.__file__).parents[1] / 'rerun_cli' / 'rerun'
+        program = Path(rerun.__file__).parents[1] / 'rerun_cli' / 'rerun'
         self._server = subprocess.Popen(
             ['setpriv', '--pdeathsig', 'TERM', program, '--serve-web', '--bind', bind,
-             '--web-viewer-port', str(port), '--ws-server-port', str(port + 1),
-             '--port', str(port + 2)],
+             *(f'{option}={number}' for option, number in zip(rerun.ports, ports, strict=True))],
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             start_new_session=True)
         host = 'localhost' if bind in ('127.0.0.1', '0.0.0.0') else bind
@@ -82,12 +109,13 @@ class RerunStream:
                 if self._server.poll() is not None or time.monotonic() > end_s:
                     raise RuntimeError('the Rerun server does not start')
                 time.sleep(_POLL_S)
-        self._rerun.connect_tcp(
-            f'{"127.0.0.1" if host == "localhost" else host}:{ports[-1]}',
+        rerun.connect_grpc(
+            rerun.address.format('127.0.0.1' if host == 'localhost' else host, ports[-1]),
             recording=self._stream)
-        self._rerun.send_blueprint(blueprint(), recording=self._stream)
+        rerun.send_blueprint(blueprint(), recording=self._stream)
         self._begin()
-        return f'http://{host}:{port}/?url=ws://{host}:{port + 1}'
+        # Some colours are illegible on the light background that a desktop may prefer.
+        return f'http://{host}:{port}/?theme=dark&url={rerun.data.format(host, port + 1)}'
 
     def _begin(self) -> None:
         self._rerun.log(network_view.WORLD, self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP,
@@ -97,9 +125,9 @@ class RerunStream:
         """Write entries of a view."""
         for cycle, path, entity in entries:
             if cycle:
-                self._rerun.set_time_sequence(_TIMELINE, cycle, recording=self._stream)
+                self._rerun.set_time(_TIMELINE, sequence=cycle, recording=self._stream)
             self._rerun.log(
-                path, _archetype(entity), static=not cycle, recording=self._stream)
+                path, _archetype(self._rerun, entity), static=not cycle, recording=self._stream)
 
     def close(self) -> None:
         """Complete the file, or stop the server."""
@@ -142,11 +170,14 @@ def blueprint() -> Any:
             x_range=[-1.25 * reach, 1.1 * reach], y_range=[-1.1 * height, 0.2 * height]))
     positioning = rrb.Spatial2DView(origin=network_view.POSITIONING, name='Surface: pilots')
     transmission = rrb.Spatial2DView(origin=network_view.TRANSMISSION, name='Surface: data')
-    # On the right, the legend would hide new values. A single series needs no legend.
+    # The legends of the charts would hide values.
     error, *others = (
-        rrb.TimeSeriesView(origin=path, name=title, plot_legend=rrb.PlotLegend(
-            rrb.Corner2D.LeftTop, visible=path != 'loss'))
+        rrb.TimeSeriesView(origin=path, name=title, plot_legend=rrb.PlotLegend(visible=False))
         for path, title in network_view.TITLES.items())
+    legend = rrb.Spatial2DView(
+        origin=network_view.LEGEND, name='Legend', background=_BACKGROUND,
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=[-1.0, 1.0], y_range=[-1.0, network_view.LEGEND_LINES]))
     log = rrb.TextLogView(origin=network_view.LOG, name='Cycles')
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -154,15 +185,17 @@ def blueprint() -> Any:
                 modes, rrb.Vertical(positioning, transmission), column_shares=[3, 2]),
                 row_shares=[5, 3]),
             # The log is wide, because its text is in the last of six columns.
-            rrb.Vertical(error, rrb.Grid(*others, grid_columns=2), log, row_shares=[4, 6, 3]),
+            rrb.Vertical(
+                rrb.Horizontal(
+                    rrb.Vertical(error, rrb.Grid(*others, grid_columns=2), row_shares=[4, 6]),
+                    legend, column_shares=[6, 1]),
+                log, row_shares=[10, 3]),
             column_shares=[1, 1]),
         rrb.TimePanel(state='collapsed'), rrb.SelectionPanel(state='hidden'),
         rrb.BlueprintPanel(state='hidden'))
 
 
-def _archetype(entity: shapes.Entity) -> Any:
-    import rerun as rr
-
+def _archetype(rr: Any, entity: shapes.Entity) -> Any:
     mode = rr.components.FillMode
     match entity:
         case shapes.Placement(origin, rotation):
@@ -196,11 +229,11 @@ def _archetype(entity: shapes.Entity) -> Any:
         case shapes.Series(name, colour, dots):
             shown = _colours(colour).tolist()
             if dots:
-                return rr.SeriesPoint(color=shown, name=name, marker='circle',
-                                      marker_size=_DOT_SIZE)
-            return rr.SeriesLine(color=shown, name=name, width=_LINE_WIDTH)
+                return rr.SeriesPoints(colors=shown, names=name, markers='circle',
+                                       marker_sizes=_DOT_SIZE if name else 0.0)
+            return rr.SeriesLines(colors=shown, names=name, widths=_LINE_WIDTH)
         case shapes.Number(value):
-            return rr.Scalar(value)
+            return rr.Scalars(value)
         case shapes.Text(text, warning):
             return rr.TextLog(text, level='WARN' if warning else 'INFO')
         case _:

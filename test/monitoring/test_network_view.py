@@ -12,7 +12,7 @@ from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.monitoring import network_view
 from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView
 from rhs_isac_ros.monitoring.role_statistics import Report
-from rhs_isac_ros.monitoring.shapes import Clear, Number, Text
+from rhs_isac_ros.monitoring.shapes import Clear, Number, Series, Text
 from rhs_isac_ros.protocol import messages as m
 
 N_CYCLES = 4
@@ -197,7 +197,41 @@ def test_dropped_messages_are_shown_for_all_nodes_and_for_those_with_any(scenari
     entries += view.add_report('lab/user_1', Report(False, '', {}))
     values = {entry.path: entry.entity.value for entry in entries
               if isinstance(entry.entity, Number)}
-    assert values == {'drops/bs': 4, 'drops/all': 4}
+    assert {path: value for path, value in values.items() if path not in (
+        'drops/low', 'drops/high')} == {'drops/bs': 4, 'drops/all': 4}
+
+
+def test_dots_at_the_limits_of_a_chart_are_shown_whole(watched):
+    for chart in network_view.TITLES:
+        values = {path: [entity.value for _, entity in on(watched.entries, path)
+                         if isinstance(entity, Number)]
+                  for path in {entry.path for entry in watched.entries}
+                  if path.startswith(f'{chart}/')}
+        if not values:
+            continue
+        low, high = values.pop(f'{chart}/low'), values.pop(f'{chart}/high')
+        shown = [value for found in values.values() for value in found]
+        margin = 0.05 * (max(shown) - min(shown))
+        assert (min(low), max(high)) == pytest.approx((min(shown) - margin, max(shown) + margin))
+        for path in f'{chart}/low', f'{chart}/high':
+            _, style = on(watched.entries, path)[0]
+            assert style.name == ''
+
+
+def test_the_legend_has_a_line_for_each_series(watched):
+    names, lines = {}, set()
+    for entry in watched.entries:
+        kind, _, path = entry.path.partition('/')
+        if isinstance(entry.entity, Series) and entry.entity.name and kind != 'loss':
+            names[entry.path] = entry.entity.name
+        elif kind == network_view.LEGEND:
+            (place,), (label,) = entry.entity.positions.tolist(), entry.entity.labels
+            assert names.pop(path) == label
+            assert 0 <= place[1] < network_view.LEGEND_LINES
+            assert place[1] not in lines
+            lines.add(place[1])
+    assert not names
+    assert len(lines) > 8
 
 
 def test_only_the_first_users_have_a_series_and_a_place_in_the_scene(network, scenario, places):

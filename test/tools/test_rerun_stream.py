@@ -21,6 +21,7 @@ from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.tools.rerun_stream import RerunStream, blueprint
 
 rerun = pytest.importorskip('rerun', reason='rerun-sdk is not installed (scripts/setup view)')
+rerun_file = pytest.importorskip('rerun_file')
 PLACES = np.array([[9.0, 1.0, 0.5], [8.0, 2.0, 0.0]])
 COLOURS = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.0]])
 SIZES = np.array([[1.0, 2.0, 3.0], [0.1, 0.2, 0.3]])
@@ -29,18 +30,15 @@ QUATERNIONS = np.array([[0.0, 0.0, 0.6, 0.8], [0.0, 0.0, 0.0, 1.0]])
 
 @pytest.fixture
 def read(tmp_path):
-    """Function that writes entries to a file and returns the columns of a path by component."""
-    def columns(path, *entities):
+    """Function that writes one entity in each cycle, and returns what the file has of each."""
+    def components(path, *entities):
         stream = RerunStream()
         stream.save(tmp_path / 'view.rrd')
         stream.write(Entry(cycle, path, entity) for cycle, entity in enumerate(entities, 1))
         stream.close()
         assert [file.name for file in tmp_path.iterdir()] == ['view.rrd']
-        recording = rerun.dataframe.load_recording(tmp_path / 'view.rrd')
-        table = recording.view(index='cycle', contents=f'/{path}').select().read_all()
-        return {name.rpartition(':')[2]: table[name].to_pylist()
-                for name in table.column_names if not name.startswith('log_')}
-    return columns
+        return rerun_file.read(tmp_path / 'view.rrd')[path]
+    return components
 
 
 @pytest.mark.parametrize(('entity', 'expected'), [
@@ -48,8 +46,8 @@ def read(tmp_path):
         f'Position{places.shape[1]}D': places, 'Color': [0xff0080ff, 0x00ff00ff],
         'Radius': [0.1, 0.2]}) for places in (PLACES[:, :2], PLACES)),
     (Ellipsoids(PLACES, SIZES, QUATERNIONS, COLOURS), {
-        'HalfSize3D': SIZES, 'PoseRotationQuat': QUATERNIONS, 'PoseTranslation3D': PLACES}),
-    (Boxes(PLACES, SIZES, COLOURS, True), {'HalfSize3D': SIZES, 'PoseTranslation3D': PLACES}),
+        'HalfSize3D': SIZES, 'RotationQuat': QUATERNIONS, 'Translation3D': PLACES}),
+    (Boxes(PLACES, SIZES, COLOURS, True), {'HalfSize3D': SIZES, 'Translation3D': PLACES}),
     # A negative radius is in points of the screen.
     (Lines((PLACES, PLACES + 1), (1.0, 0.0, 0.0), 3.0), {
         'LineStrip3D': (PLACES, PLACES + 1), 'Radius': [-1.5]}),
@@ -57,45 +55,45 @@ def read(tmp_path):
     (Mesh(np.stack([PLACES, 0 * PLACES]), (1.0, 1.0, 1.0)), {
         'LineStrip3D': (PLACES, PLACES * [[1], [0]])}),
     (Series('dots', (1.0, 1.0, 1.0), dots=True), {'MarkerSize': [4.0]}),
+    (Series('', (1.0, 1.0, 1.0), dots=True), {'MarkerSize': [0.0]}),
     (Series('line', (1.0, 1.0, 1.0)), {'StrokeWidth': [2.0]})])
 def test_an_entity_keeps_its_numbers(read, entity, expected):
     found = read('a', entity)
-    assert found['cycle'] == [1]
+    assert list(found) == [1]
     for name, values in expected.items():
-        assert np.array(found[name][0]) == pytest.approx(np.array(values))
+        assert np.array(found[1][name]) == pytest.approx(np.array(values))
 
 
 def test_labels_and_texts_are_kept(read):
     found = read('a', Points(PLACES, COLOURS, np.array([0.1, 0.2]), ('one', 'two')))
-    assert found['Text'] == [['one', 'two']]
-    found = read('log', Text('served'), Text('given up', warning=True))
-    assert (found['Text'], found['TextLogLevel']) == ([['served'], ['given up']],
-                                                      [['INFO'], ['WARN']])
+    assert found[1]['Text'] == ['one', 'two']
+    assert read('log', Text('served'), Text('given up', warning=True)) == {
+        1: {'Text': ['served'], 'TextLogLevel': ['INFO']},
+        2: {'Text': ['given up'], 'TextLogLevel': ['WARN']}}
 
 
 def test_boxes_are_filled_or_outlined(read):
-    one, other = (read('a', Boxes(PLACES, SIZES, COLOURS, solid))['FillMode']
+    one, other = (read('a', Boxes(PLACES, SIZES, COLOURS, solid))[1]['FillMode']
                   for solid in (False, True))
     assert one != other
 
 
 def test_numbers_are_on_the_time_line_of_the_cycles(read):
-    found = read('error/user_1', Number(0.5), Number(0.25))
-    assert found['cycle'] == [1, 2]
-    assert found['Scalar'] == [[0.5], [0.25]]
+    assert read('error/user_1', Number(0.5), Number(0.25)) == {
+        1: {'Scalar': [0.5]}, 2: {'Scalar': [0.25]}}
 
 
 def test_a_picture_keeps_its_pixels(read):
     pixels = np.arange(6, dtype=np.uint8).reshape(2, 3)
-    found = read('a', Picture(pixels))
-    assert bytes(found['ImageBuffer'][0][0]) == pixels.tobytes()
-    assert (found['ImageFormat'][0][0]['width'], found['ImageFormat'][0][0]['height']) == (3, 2)
+    found = read('a', Picture(pixels))[1]
+    assert bytes(found['ImageBuffer'][0]) == pixels.tobytes()
+    assert (found['ImageFormat'][0]['width'], found['ImageFormat'][0]['height']) == (3, 2)
 
 
 def test_nothing_ends_what_was_shown(read):
     found = read('a', Number(0.5), Clear(), Number(0.25))
-    assert found['cycle'] == [1, 2, 3]
-    assert found['Scalar'] == [[0.5], [], [0.25]]
+    assert {cycle: row.get('Scalar') or 'none' for cycle, row in found.items()} == {
+        1: [0.5], 2: 'none', 3: [0.25]}
 
 
 def test_an_entry_of_cycle_zero_is_shown_at_all_times(tmp_path):
@@ -103,9 +101,8 @@ def test_an_entry_of_cycle_zero_is_shown_at_all_times(tmp_path):
     stream.save(tmp_path / 'view.rrd')
     stream.write([Entry(0, 'a', Number(1.0)), Entry(1, 'b', Number(1.0))])
     stream.close()
-    schema = rerun.dataframe.load_recording(tmp_path / 'view.rrd').schema()
-    static = {column.entity_path: column.is_static for column in schema.component_columns()}
-    assert (static['/a'], static['/b']) == (True, False)
+    found = rerun_file.read(tmp_path / 'view.rrd')
+    assert (list(found['a']), list(found['b'])) == ([0], [1])
 
 
 def test_the_layout_contains_every_chart_and_the_scene():
@@ -119,12 +116,12 @@ def test_the_layout_contains_every_chart_and_the_scene():
     collect(blueprint().root_container)
     assert sorted(shown) == sorted([
         *network_view.TITLES, network_view.WORLD, network_view.MODES, network_view.POSITIONING,
-        network_view.TRANSMISSION, network_view.LOG])
+        network_view.TRANSMISSION, network_view.LOG, network_view.LEGEND])
 
 
 def test_another_release_is_named_in_one_line(monkeypatch):
-    monkeypatch.setattr(rerun, '__version__', '0.41.0')
-    with pytest.raises(MissingLibraryError, match='needs rerun-sdk 0.22, found 0.41.0'):
+    monkeypatch.setattr(rerun, '__version__', '0.21.0')
+    with pytest.raises(MissingLibraryError, match='needs rerun-sdk 0.22 to 0.41, found 0.21.0'):
         RerunStream()
 
 

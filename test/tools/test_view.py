@@ -21,9 +21,6 @@ SCRIPT = CONFIG.parent / 'scripts' / 'view'
 SCENARIO = Scenario.from_yaml(CONFIG / 'quick.yaml')
 OTHER = dataclasses.replace(SCENARIO, refractive_index=2.0)
 TIMEOUT_S = 120.0
-# Components of the entities that change with the cycles.
-CONTENTS = ('Scalar', 'Position3D', 'HalfSize3D', 'LineStrip2D', 'LineStrip3D', 'ImageBuffer',
-            'Text')
 
 
 def test_without_rerun_one_line_names_the_command_that_installs_it(monkeypatch, capsys):
@@ -61,17 +58,9 @@ def recording(rerun, run):
 @pytest.fixture
 def paths(rerun):
     """Function that returns the paths in a file, each with the number of its cycles."""
-    def of(file):
-        view = rerun.dataframe.load_recording(file).view(index='cycle', contents='/**')
-        table = view.select().read_all()
-        counts = {}
-        for name in table.column_names:
-            path, _, component = name.partition(':')
-            # Styles are static: they fill all rows.
-            if component in CONTENTS:
-                counts[path.lstrip('/')] = sum(map(bool, table[name].to_pylist()))
-        return counts
-    return of
+    rerun_file = pytest.importorskip('rerun_file')
+    return lambda file: {path: len(cycles.keys() - {0})
+                         for path, cycles in rerun_file.read(file).items()}
 
 
 def test_a_running_network_is_shown(spin_until):
@@ -115,7 +104,7 @@ def test_a_recording_is_shown_with_modes(recording, run, paths, tmp_path, capsys
     shown = paths(file)
     n_posteriors = sum(1 for _ in read(recording, ['/posterior']))
     assert shown[f'{network_view.MODES}/found'] == n_posteriors
-    assert shown['error/crlb'] == len(run.cycles) <= n_posteriors
+    assert len(run.cycles) <= shown['error/crlb'] <= n_posteriors
 
 
 def test_a_recording_without_the_namespace_is_an_error(recording, tmp_path, capsys):
