@@ -352,7 +352,7 @@ class UserTopics:
 # Topics that ROS creates for every node, whose quality of service is not examined.
 _FOREIGN = ('/rosout', '/parameter_events')
 # Placeholders of the middleware for the name of a node, which may arrive after its endpoints.
-_UNNAMED = ('_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_')
+UNNAMED = ('_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_')
 # Time after which an endpoint without a name belongs to no node of ROS [s].
 _NAMING_S = 3.0
 
@@ -396,7 +396,7 @@ class Mismatches:
             if full_name(mine) != own:
                 continue
             name = full_name(other)
-            if other.node_name in _UNNAMED:
+            if other.node_name in UNNAMED:
                 gid = bytes(other.endpoint_gid).hex()
                 self._unnamed[gid] = before.get(gid, time.monotonic())
                 if time.monotonic() < self._unnamed[gid] + _NAMING_S:

@@ -272,7 +272,7 @@ def test_an_endpoint_of_another_type_is_named(graph):
                                      'std_msgs/msg/String, expected rhs_isac_msgs/msg/Ack'}
 
 
-@pytest.mark.parametrize('name', endpoints._UNNAMED)
+@pytest.mark.parametrize('name', endpoints.UNNAMED)
 def test_an_endpoint_that_receives_no_name_is_named_by_its_gid(graph, name):
     node, clock = graph
     publishers = [endpoint(name, 171, profile=endpoints.SENSOR), endpoint('user_1')]

@@ -24,7 +24,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.presences import Presence
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES, profile_for
+from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES, UNNAMED, profile_for
 from rhs_isac_ros.ros.processes import Processes
 from system.chaos.mutations import mutate
 from system.chaos.trial import ChaosError, both_served, wait_for_service
@@ -139,6 +139,10 @@ def fuzz(
                   for name, (kind, profile) in types.items()}
     stored = originals(scenario, codebook, rng)
     wait_for_service(observer)
+    # The name of a node may arrive after its endpoints.
+    if not observer.spin_until(lambda: not any(
+            _subscribers(observer, name) & {*UNNAMED} for name in _PROTOCOL), _TIMEOUT_S):
+        raise ChaosError(f'a subscriber without a name after {_TIMEOUT_S:g} s')
     counters = _Counters(observer)
     sent: collections.Counter[str] = collections.Counter()
     malformed: collections.Counter[str] = collections.Counter()
