@@ -22,7 +22,7 @@ user beyond its own region, or in the part of it that is outside of the region o
 
 import functools
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,8 +33,8 @@ from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.alternatives import Outside, log_odds_of, rejection
 from rhs_isac_ros.positioning.estimate import SITE, Estimate, Sighting, regular
 from rhs_isac_ros.positioning.mixture import Mixture, log_volume
-from rhs_isac_ros.positioning.segments import select
-from rhs_isac_ros.positioning.sheets import Inside, move_inside
+from rhs_isac_ros.positioning.segments import concatenate, select
+from rhs_isac_ros.positioning.sheets import Inside, log_values, move_inside
 from rhs_isac_ros.positioning.templates import standard_normal
 from rhs_isac_ros.support.threads import one_blas_thread
 
@@ -124,7 +124,6 @@ class Fuser:
     def _locate(self, sightings: tuple[Sighting, ...]) -> Estimate:
         factors = [self._factor(one) for one in sightings]
         products = self._product(sightings).inside(factors, self._bounds_m)
-        constant = products.constant(factors)
         log_agreement = products.moments.log_mass
         common: dict[str, Any] = {'log_agreement': log_agreement, 'frame': SITE}
         log_ratios = np.array([one.outside_log_ratio for one in sightings])
@@ -141,9 +140,8 @@ class Fuser:
             common['outside_probability'] = probability
             if reason := rejection(Outside, probability, 1 - probability):
                 return Estimate.without_fix(reason, **common)
-        mixture = products.moments.widened(-constant).reduce(_LIMITS.products[1]).normalised()
-        mixture = mixture.shared(np.tensordot(products.moments.probabilities, constant, axes=1))
-        return Estimate(*mixture.moments(), density=mixture, **common)
+        return Estimate(*products.moments.moments(), density=functools.cache(
+            functools.partial(products.mixture, factors)), **common)
 
 
 def _log_share_of(mixture: Mixture, bounds_m: np.ndarray) -> float:
@@ -157,6 +155,37 @@ def _log_share_of(mixture: Mixture, bounds_m: np.ndarray) -> float:
         return float(np.log(mixture.probabilities @ within.mean(axis=1)))
 
 
+class _Rows(NamedTuple):
+    """T sheets or constants of one surface."""
+
+    points: np.ndarray  # Maxima, (r [m], u, v), float64 [T, 3].
+    covariances: np.ndarray  # Float64 [T, 3, 3].
+    curvature: np.ndarray  # Their inverses; 0 for a constant.
+    log_peaks: np.ndarray  # Float64 [T].
+    is_sheet: np.ndarray  # Whether the row is not a constant, bool [T].
+
+
+class _Term(NamedTuple):
+    """The factors of T products that are due to one surface."""
+
+    pose: Pose
+    rows: _Rows
+
+    def logarithm(self, positions: np.ndarray) -> np.ndarray:
+        """Evaluate the factors at positions [T, S, 3] [m], float64 [T, S]."""
+        local, rows = self.pose.to_surface(positions), self.rows
+        values = log_values(local, rows.points, rows.curvature, rows.log_peaks)
+        # No user behind the surface is in sight.
+        return np.where((local[..., 0] <= 0) & rows.is_sheet[:, None], -np.inf, values)
+
+    def expanded(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return gradient [T, 3] and curvature [T, 3, 3] at positions [T, 3] [m]."""
+        points = to_polar(self.pose.to_surface(positions))
+        derivative = polar_derivative(points) @ self.pose.rotation.T
+        slope = derivative.swapaxes(1, 2) @ self.rows.curvature
+        return (slope @ (self.rows.points - points)[..., None])[..., 0], slope @ derivative
+
+
 class _Factor(NamedTuple):
     """The likelihood of one surface: C sheets and, as the last row, a constant.
 
@@ -164,12 +193,10 @@ class _Factor(NamedTuple):
     """
 
     pose: Pose
-    points: np.ndarray  # Maxima, (r [m], u, v), float64 [C + 1, 3].
-    covariances: np.ndarray  # Float64 [C + 1, 3, 3].
-    curvature: np.ndarray  # Their inverses; 0 for the constant.
-    log_peaks: np.ndarray  # Float64 [C + 1].
+    rows: _Rows
     moments: Mixture  # Averages and moments inside the region, in the frame of the site.
     log_share: float  # Logarithm of the surface's probability of the region of the site.
+    thickness: float  # Decreases with the median information about the range.
 
     @classmethod
     def of(cls, sighting: Sighting, bounds_m: np.ndarray) -> '_Factor':
@@ -203,41 +230,20 @@ class _Factor(NamedTuple):
             # Masses of tails are inaccurate, and must not exceed those of other sheets.
             log_peaks += log_share - heights.max() - log_peaks.max()
         return cls(
-            pose, np.append(sheets.means, sheets.means[:1], axis=0),
-            np.append(sheets.covariances, np.eye(3)[None], axis=0),
-            np.append(curvature, np.zeros((1, 3, 3)), axis=0),
-            np.append(log_peaks, np.log(sighting.missing)),
+            pose, concatenate(
+                _Rows(sheets.means, sheets.covariances, curvature, log_peaks,
+                      np.ones(len(kept), bool)),
+                _Rows(sheets.means[:1], np.eye(3)[None], np.zeros((1, 3, 3)),
+                      np.log([sighting.missing]), np.zeros(1, bool))),
             Mixture._make((
                 np.append(inside.log_weights - log_total, np.log(sighting.missing)),
                 np.append(inside.means, centre[None], axis=0),
                 np.append(inside.covariances, regular(np.diag(size**2 / 12))[None], axis=0))),
-            log_share)
+            log_share, -float(np.median(np.append(curvature[:, 0, 0], 0.0))))
 
-    def is_sheet(self, rows: np.ndarray) -> np.ndarray:
-        """Mark the rows [T] that are not the constant, bool [T]."""
-        return rows < len(self.points) - 1
-
-    def logarithm(self, rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Evaluate rows [T] at positions [T, S, 3] [m], float64 [T, S]."""
-        local, curvature = self.pose.to_surface(positions), self.curvature[rows]
-        offsets = to_polar(local) - self.points[rows, None]
-        values = self.log_peaks[rows, None] - np.sum(
-            np.matmul(offsets, curvature) * offsets, axis=-1) / 2
-        # No user behind the surface is in sight.
-        behind = (local[..., 0] <= 0) & self.is_sheet(rows)[:, None]
-        return np.where(behind, -np.inf, values)
-
-    def expanded(self, rows: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return gradient [T, 3] and curvature [T, 3, 3] at positions [T, 3] [m]."""
-        points = to_polar(self.pose.to_surface(positions))
-        derivative = polar_derivative(points) @ self.pose.rotation.T
-        offsets = points - self.points[rows]
-        slope = np.matmul(np.swapaxes(derivative, 1, 2), self.curvature[rows])
-        return -np.matmul(slope, offsets[..., None])[..., 0], np.matmul(slope, derivative)
-
-
-# A factor and the rows in it, int [T], of each surface.
-_Terms: TypeAlias = list[tuple[_Factor, np.ndarray]]
+    def term(self, chosen: np.ndarray) -> _Term:
+        """Return the rows with these indices, int [T], as factors of products."""
+        return _Term(self.pose, select(self.rows, chosen))
 
 
 class _Products(NamedTuple):
@@ -250,7 +256,7 @@ class _Products(NamedTuple):
     @classmethod
     def of(cls, factor: _Factor) -> '_Products':
         """Return the rows of one factor."""
-        return cls(np.arange(len(factor.points))[:, None], factor.moments)
+        return cls(np.arange(len(factor.rows.points))[:, None], factor.moments)
 
     def times(self, factors: Sequence[_Factor], bounds_m: np.ndarray) -> '_Products':
         """Multiply each product by each row of the last factor; keep the heaviest."""
@@ -283,20 +289,21 @@ class _Products(NamedTuple):
     def are_constant(self, factors: Sequence[_Factor]) -> np.ndarray:
         """Mark the products of constants alone, bool [T]."""
         constant: np.ndarray = (
-            self.rows == [len(one.points) - 1 for one in factors]).all(axis=1)
+            self.rows == [len(one.rows.points) - 1 for one in factors]).all(axis=1)
         return constant
 
     def climbed(self, factors: Sequence[_Factor], bounds_m: np.ndarray) -> '_Products':
         """Move to the maxima in the region by Gauss-Newton steps."""
         found, _ = self._single(factors)
+        prior = _LIMITS.narrowing * _prior_information(bounds_m)
         for mine, terms in self._by_reference(factors):
-            around = terms[0][0].pose
+            around = terms[0].pose
             place = np.clip(self.moments.means[mine], *bounds_m)
             for _ in range(_LIMITS.steps):
-                points, gradient, curvature = _expanded(terms, place, bounds_m)
+                points, gradient, curvature = _expanded(terms, place, prior)
                 place = around.to_site(to_positions(move_inside(
                     points + step_to_maximum(curvature, gradient), curvature, bounds_m, around)))
-            points, _, curvature = _expanded(terms, place, bounds_m)
+            points, _, curvature = _expanded(terms, place, prior)
             derivative = polar_derivative(points) @ around.rotation.T
             covariances = np.linalg.inv(np.swapaxes(derivative, 1, 2) @ curvature @ derivative)
             found.means[mine], found.covariances[mine] = place, covariances
@@ -305,25 +312,31 @@ class _Products(NamedTuple):
         return _Products(self.rows, found)
 
     def _by_reference(self, factors: Sequence[_Factor]
-                      ) -> Iterator[tuple[np.ndarray, _Terms]]:
-        """Yield indices of products of several sheets, and their rows in the factors.
+                      ) -> Iterator[tuple[np.ndarray, list[_Term]]]:
+        """Yield indices of products of several sheets, and their factors.
 
         That of the surface with the thinnest sheets comes first.
         """
-        left = np.sum([one.is_sheet(rows) for one, rows in zip(
-            factors, self.rows.T, strict=True)], axis=0) > 1
-        for number in np.argsort([-np.median(one.curvature[:, 0, 0]) for one in factors],
-                                 kind='stable'):
-            mine = np.flatnonzero(left & factors[number].is_sheet(self.rows[:, number]))
+        sheets = self._are_sheets(factors)
+        left = np.count_nonzero(sheets, axis=1) > 1
+        for number in np.argsort([one.thickness for one in factors], kind='stable'):
+            mine = np.flatnonzero(left & sheets[:, number])
             left[mine] = False
             if len(mine):
-                terms = list(zip(factors, self.rows[mine].T, strict=True))
+                terms = self.select(mine)._terms(factors)
                 yield mine, [terms.pop(number), *terms]
+
+    def _terms(self, factors: Sequence[_Factor]) -> list[_Term]:
+        return [one.term(rows) for one, rows in zip(factors, self.rows.T, strict=True)]
+
+    def _are_sheets(self, factors: Sequence[_Factor]) -> np.ndarray:
+        """Mark the factors that are not constants, bool [T, number of factors]."""
+        sheets: np.ndarray = self.rows < [len(one.rows.points) - 1 for one in factors]
+        return sheets
 
     def _single(self, factors: Sequence[_Factor]) -> tuple[Mixture, np.ndarray]:
         """Return the averages and moments of products of at most one sheet, and mark them."""
-        sheets = np.column_stack([
-            one.is_sheet(rows) for one, rows in zip(factors, self.rows.T, strict=True)])
+        sheets = self._are_sheets(factors)
         n_sheets = np.count_nonzero(sheets, axis=1)
         single = n_sheets == 1
         found = Mixture._make(field.copy() for field in self.moments)
@@ -358,6 +371,12 @@ class _Products(NamedTuple):
         kept = np.flatnonzero(_has_mass(mass))
         return _Products(found.rows[kept], select(mass, kept))
 
+    def mixture(self, factors: Sequence[_Factor]) -> Mixture:
+        """Return the normalised density, with the covariance that errors of poses cause."""
+        constant = self.constant(factors)
+        mixture = self.moments.widened(-constant).reduce(_LIMITS.products[1]).normalised()
+        return mixture.shared(np.tensordot(self.moments.probabilities, constant, axes=1))
+
     def constant(self, factors: Sequence[_Factor]) -> np.ndarray:
         """Return the parts of the covariances that errors of poses cause, float64 [T, 3, 3] [m^2].
 
@@ -366,8 +385,8 @@ class _Products(NamedTuple):
         """
         means, covariances = self.moments.means, self.moments.covariances
         pulls = np.zeros_like(covariances)
-        for one, rows in zip(factors, self.rows.T, strict=True):
-            _, curvature = one.expanded(rows, means)
+        for one in self._terms(factors):
+            _, curvature = one.expanded(means)
             pulls += curvature @ one.pose.spread(means) @ curvature
         # Where a product is no Gaussian, its covariance may exceed the inverse of the information.
         roots = np.linalg.cholesky(covariances)
@@ -376,71 +395,71 @@ class _Products(NamedTuple):
         return moves @ np.swapaxes(moves, 1, 2)
 
 
-def _logarithm(terms: _Terms, positions: np.ndarray) -> np.ndarray:
+def _logarithm(terms: Sequence[_Term], positions: np.ndarray) -> np.ndarray:
     """Evaluate products at positions [T, S, 3] [m], float64 [T, S]."""
-    return np.sum([one.logarithm(rows, positions) for one, rows in terms], axis=0)
+    return functools.reduce(np.add, (one.logarithm(positions) for one in terms))
 
 
-def _expanded(terms: _Terms, positions: np.ndarray, bounds_m: np.ndarray
+def _prior_information(bounds_m: np.ndarray) -> np.ndarray:
+    """Return the information of a uniform prior in the region, float64 [3, 3] [1/m^2]."""
+    size = np.ptp(bounds_m, axis=0)
+    return np.diag(12 / np.maximum(size, _LIMITS.extent * size.max())**2)
+
+
+def _expanded(terms: Sequence[_Term], positions: np.ndarray, prior: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (r, u, v) around the first surface, and gradient and curvature with respect to it.
 
-    The curvature includes a part of the information of a uniform prior.
+    The curvature includes the information of a prior in the site, float64 [3, 3] [1/m^2].
     """
-    size = np.ptp(bounds_m, axis=0)
-    size = np.maximum(size, _LIMITS.extent * size.max())
-    pose = terms[0][0].pose
+    pose = terms[0].pose
     points = to_polar(pose.to_surface(positions))
     by_point = pose.rotation @ jacobian(points)
-    gradient, curvature = (np.sum(parts, axis=0) for parts in zip(*(
-        one.expanded(rows, positions) for one, rows in terms), strict=True))
-    transposed = np.swapaxes(by_point, 1, 2)
-    return (points, np.matmul(transposed, gradient[..., None])[..., 0],
-            symmetric(transposed @ (curvature + np.diag(
-                12 * _LIMITS.narrowing / size**2)) @ by_point))
+    gradient, curvature = (functools.reduce(np.add, parts) for parts in zip(
+        *(one.expanded(positions) for one in terms), strict=True))
+    transposed = by_point.swapaxes(1, 2)
+    return (points, (transposed @ gradient[..., None])[..., 0],
+            symmetric(transposed @ (curvature + prior) @ by_point))
 
 
-def _proposal(terms: _Terms, positions: np.ndarray, bounds_m: np.ndarray) -> Inside:
+def _proposal(terms: Sequence[_Term], positions: np.ndarray, bounds_m: np.ndarray) -> Inside:
     """Return Gaussians that are as wide as products around positions [T, 3] [m].
 
     In (r, u, v) of the first surface, the sheets of the others are curved. Over the Gaussian, they
     are thicker by the second differences of their coordinates, and the Gaussian in turn is wider
     if they are thicker.
     """
-    (first, rows), *others = terms
-    pose, size = first.pose, np.ptp(bounds_m, axis=0)
-    size = np.maximum(size, _LIMITS.extent * size.max())
-    curvature, gradient = first.curvature[rows], np.zeros((len(rows), 3))
+    (pose, first), *others = terms
+    prior, centre = _prior_information(bounds_m), bounds_m.mean(axis=0)
+    curvature, gradient = first.curvature, np.zeros((len(first.points), 3))
     points = to_polar(pose.to_surface(positions))
+    by_point = pose.rotation @ jacobian(points)
     for _ in range(_LIMITS.passes):
         # The centre and the width of the Gaussian in the region.
-        by_point = pose.rotation @ jacobian(points)
-        by_site = np.swapaxes(by_point, 1, 2) / size**2 * 12
+        by_site = by_point.swapaxes(1, 2) @ prior
         total = symmetric(curvature + by_site @ by_point)
-        pull = gradient + np.matmul(
-            by_site, (bounds_m.mean(axis=0) - positions)[..., None])[..., 0]
+        pull = gradient + (by_site @ (centre - positions)[..., None])[..., 0]
         positions = np.clip(pose.to_site(to_positions(
             points + step_to_maximum(total, pull))), *bounds_m)
         points = to_polar(pose.to_surface(positions))
-        curvature = first.curvature[rows]
-        gradient = np.matmul(curvature, (first.points[rows] - points)[..., None])[..., 0]
-        axes = np.swapaxes(np.linalg.cholesky(np.linalg.inv(total)), 1, 2)
-        steps = _LIMITS.step * np.concatenate([axes, -axes], axis=1)
-        around = pose.to_site(to_positions(points[:, None] + steps))
         by_point = pose.rotation @ jacobian(points)
-        for one, which in others:
-            here = to_polar(one.pose.to_surface(positions))
-            second = to_polar(one.pose.to_surface(around)) - here[:, None]
+        curvature = first.curvature
+        gradient = (curvature @ (first.points - points)[..., None])[..., 0]
+        axes = _LIMITS.step * np.linalg.cholesky(np.linalg.inv(total)).swapaxes(1, 2)
+        around = pose.to_site(to_positions(
+            points[:, None] + np.concatenate([axes, -axes], axis=1)))
+        for other, rows in others:
+            here = to_polar(other.to_surface(positions))
+            second = to_polar(other.to_surface(around)) - here[:, None]
             second = (second[:, :3] + second[:, 3:]) / _LIMITS.step**2
             thicker = _LIMITS.tails**2 * (
                 np.sum(second**2, axis=1) / 2 + np.sum(second, axis=1)**2 / 4)
-            information = one.is_sheet(which)[:, None, None] * np.linalg.inv(
-                one.covariances[which] + thicker[:, :, None] * np.eye(3))
-            slope = polar_derivative(here) @ one.pose.rotation.T @ by_point
-            by_slope = np.swapaxes(slope, 1, 2) @ information
+            information = rows.is_sheet[:, None, None] * np.linalg.inv(
+                rows.covariances + thicker[:, :, None] * np.eye(3))
+            slope = polar_derivative(here) @ other.rotation.T @ by_point
+            by_slope = slope.swapaxes(1, 2) @ information
             curvature = curvature + by_slope @ slope
-            gradient = gradient + np.matmul(
-                by_slope, (one.points[which] - here)[..., None])[..., 0]
+            gradient = gradient + (by_slope @ (rows.points - here)[..., None])[..., 0]
     wide = 1 / _LIMITS.spread**2
     return Inside.of(points, wide * gradient, wide * symmetric(curvature), bounds_m, pose)
 

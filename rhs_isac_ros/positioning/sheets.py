@@ -192,8 +192,8 @@ class Sheets(Mixture):
         maxima.
         """
         precision = np.linalg.inv(self.covariances[:, :3, :3])
-        positions = to_positions(self.means[:, :3])
         if around is None:
+            positions = to_positions(self.means[:, :3])
             around = positions if pose is None else pose.to_site(positions)
         points = _polar(np.clip(around, *bounds), pose)
         offsets = self.means[:, :3] - points
@@ -260,8 +260,9 @@ class Inside(NamedTuple):
         transposed = np.swapaxes(derivative, 1, 2)
         extent = bounds[1] - bounds[0]
         # Metres per unit of r, u and v.
-        metres = np.column_stack([np.ones(len(points)), points[:, :1], points[:, :1]])
-        known = np.sqrt(np.diagonal(curvature, axis1=1, axis2=2)) / metres
+        metres = np.repeat(points[:, :1], 3, axis=1)
+        metres[:, 0] = 1.0
+        known = np.sqrt(curvature.diagonal(axis1=1, axis2=2)) / metres
         widening = 1 / np.maximum(known * _LIMITS.exact * np.linalg.norm(extent), 1.0)
         gradient = widening * gradient
         curvature = widening[:, :, None] * curvature * widening[:, None]
@@ -354,7 +355,7 @@ class Inside(NamedTuple):
             share = (high_m - low_m)[two_sided] / (self.high_m - self.low_m)[two_sided, 2:]
             log_ratio[two_sided] = np.log(2 * share)
         positions = self._positions(truncated, len(normal), sides)
-        return self._placed(np.moveaxis(positions, 0, 2)), log_ratio
+        return self._placed(positions.transpose(1, 2, 0)), log_ratio
 
     def _is_two_sided(self) -> np.ndarray:
         """Mark Gaussians with samples on either side of the last axis' zero, bool [M].
@@ -389,22 +390,13 @@ class Inside(NamedTuple):
 
     def logarithm(self, positions: np.ndarray) -> np.ndarray:
         """Evaluate the logarithms of the Gaussians at positions [M, S, 3] [m], float64 [M, S]."""
-        if self.pose is not None:
-            positions = self.pose.to_surface(positions)
-        # Contiguous coordinates make these operations several times as fast.
-        range_m = np.sqrt(np.sum(np.moveaxis(positions, 2, 0)**2, axis=0))
-        offsets = [range_m, positions[..., 1] / range_m, positions[..., 2] / range_m]
-        total = np.empty_like(range_m)
-        total[:] = self.log_values[:, None]
-        for first in range(3):
-            offsets[first] -= self.points[:, first, None]
-            slope = self.gradient[:, first, None] - self.curvature[:, first, first, None] / 2 * (
-                offsets[first])
-            for second in range(first):
-                slope -= self.curvature[:, first, second, None] * offsets[second]
-            total += slope * offsets[first]
+        if self.pose is None:
+            return log_values(
+                positions, self.points, self.curvature, self.log_values, self.gradient)
+        positions = self.pose.to_surface(positions)
         # No user behind the surface is in sight.
-        return total if self.pose is None else np.where(positions[..., 0] > 0, total, -np.inf)
+        return np.where(positions[..., 0] > 0, log_values(
+            positions, self.points, self.curvature, self.log_values, self.gradient), -np.inf)
 
     def _positions(self, choose: _Choice, n: int, sides: np.ndarray | None = None) -> np.ndarray:
         """Choose n positions for each Gaussian, axis by axis, float64 [3, M, n] [m].
@@ -474,6 +466,30 @@ class Inside(NamedTuple):
         gradient = np.einsum('mi,imn->mn', self.gradient, slopes) - np.sum(
             through * offsets, axis=0)
         return last + gradient / information, 1 / np.sqrt(information)
+
+
+def log_values(
+        positions: np.ndarray, points: np.ndarray, curvature: np.ndarray, log_peaks: np.ndarray,
+        gradient: np.ndarray | None = None) -> np.ndarray:
+    """Evaluate Gaussians of offsets from points [M, 3] at positions [M, S, 3] [m], [M, S].
+
+    Everything is in the frame of the surface. Without a gradient, [M, 3], the points are maxima.
+    """
+    # Contiguous coordinates make these operations several times as fast.
+    x, y, z = positions.transpose(2, 0, 1)
+    range_m = np.sqrt(x * x + y * y + z * z)
+    offsets, total = [range_m, y / range_m, z / range_m], np.zeros_like(range_m)
+    for first in range(3):
+        offsets[first] = offsets[first] - points[:, first, None]
+        slope = curvature[:, first, first, None] / -2 * offsets[first]
+        if gradient is not None:
+            slope += gradient[:, first, None]
+        for second in range(first):
+            slope -= curvature[:, first, second, None] * offsets[second]
+        slope *= offsets[first]
+        total += slope
+    total += log_peaks[:, None]
+    return total
 
 
 def _is_wide(points: np.ndarray, curvature: np.ndarray, extent: np.ndarray) -> np.ndarray:
