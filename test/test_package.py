@@ -27,7 +27,8 @@ KEYS = {'docutils': 'python3-sphinx', 'threadpoolctl': 'python3-sklearn'} | {
 PIP_ONLY = {
     'adi': None, 'distributed': 'distributed', 'jax': None, 'lz4': 'mcap>=1.6',
     'mcap': 'mcap>=1.6', 'pymoo': 'pymoo', 'rerun': 'rerun-sdk>=0.22.1,<0.42',
-    'rosbags': 'rosbags', 'sigmf': 'sigmf', 'sionna': None, 'zstandard': 'mcap>=1.6',
+    'rosbags': 'rosbags', 'sigmf': 'sigmf', 'sionna': None, 'skrf': 'scikit-rf',
+    'zstandard': 'mcap>=1.6',
 }
 
 

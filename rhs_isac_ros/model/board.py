@@ -14,14 +14,12 @@ import dataclasses
 import functools
 import hashlib
 import json
-from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Protocol, TypeAlias
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import adjoint, numbers, read_only
-from rhs_isac_ros.model.constants import NEPERS_PER_DB, SPEED_OF_LIGHT_MPS
-from rhs_isac_ros.support import plugins
+from rhs_isac_ros.model.arrays import adjoint
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field
 
@@ -174,306 +172,23 @@ class Board(abc.ABC):
         return levels[(gains * interference).real.argmax(axis=0)]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Elementwise(Board):
-    """A board without coupling: coefficients of the elements, times propagation to the feeds.
-
-    A subclass defines `coefficients` and `slopes`.
-    """
-
-    loss_db_per_m: float = 0.0  #: Attenuation of the waves on the board.
-    #: Amplitude gain of each feed, or None if all are 1.
-    feed_gains: tuple[float, ...] | None = None
-
-    def __post_init__(self) -> None:
-        """Raise BoardError unless loss and gains are in range."""
-        self._set('loss_db_per_m', _number('loss_db_per_m', self.loss_db_per_m, 0.0, 1e6))
-        if self.feed_gains is not None:
-            self._set('feed_gains', _numbers('feed_gains', self.feed_gains, 0.0, 1e6))
-
-    def _set(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value)
-
-    def misfit(self, scenario: Any) -> str:
-        """Return the reason why the board does not fit a scenario, or ''."""
-        if self.feed_gains is not None and len(self.feed_gains) != scenario.n_feeds:
-            return (f'feed_gains: {len(self.feed_gains)} numbers, expected n_feeds = '
-                    f'{scenario.n_feeds}')
-        return super().misfit(scenario)
-
-    @abc.abstractmethod
-    def coefficients(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
-        """Return the coefficients of the elements, complex or float [B, 1 or J, Q, N_E]."""
-
-    @abc.abstractmethod
-    def slopes(self, ports: Ports, tunings: np.ndarray) -> np.ndarray | float:
-        """Return the derivative of `coefficients` by the tunings."""
-
-    @functools.lru_cache(maxsize=64)  # noqa: B019 - boards are few, and equal ones share entries
-    def paths(self, ports: Ports) -> np.ndarray:
-        """Compute B_{i,j} below Eq. (9) with loss and gains, [B, J, K, N_E], read-only."""
-        frequencies, feeds = ports.frequencies_hz[:, :, None, None], ports.feeds_m[:, None, :]
-        gains = np.ones(len(feeds)) if self.feed_gains is None else np.array(self.feed_gains)
-        distances = np.linalg.norm(ports.elements_m - feeds, axis=-1)
-        amplitudes = gains[:, None] * np.exp(-self.loss_db_per_m * NEPERS_PER_DB * distances)
-        return read_only(
-            amplitudes * onboard_gain(ports, frequencies, ports.elements_m, feeds))
-
-    def transfer(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
-        """Return the transfer; see `Board.transfer`."""
-        paths = np.swapaxes(self.paths(ports), 2, 3)[:, :, None]
-        return self.coefficients(ports, tunings)[..., None] * paths
-
-    def pullback(
-            self, ports: Ports, tunings: np.ndarray, by_transfer: np.ndarray) -> np.ndarray:
-        """Return the gradient by the tunings; see `Board.pullback`."""
-        through = np.einsum('bjqmk,bjkm->bjqm', np.conj(by_transfer), self.paths(ports))
-        return np.sum((through * self.slopes(ports, tunings)).real, axis=1)
-
-    def radiation(self, ports: Ports, tunings: np.ndarray, digital: np.ndarray,
-                  slope: Factor = 1.0, offset: Factor = 0.0) -> np.ndarray:
-        """Weight every element by combining vectors; see `Board.radiation`."""
-        applied = slope * self.coefficients(ports, tunings) + offset
-        # A beam is a single frame, whose products take less time without matrices.
-        weights = (np.matmul(digital, self.paths(ports)) if digital.shape[2] > 1 else
-                   np.einsum('bjqk,bjkm->bjqm', digital, self.paths(ports)))
-        return applied * weights
-
-    def feeds(self, ports: Ports, tunings: np.ndarray, elements: np.ndarray,
-              slope: Factor = 1.0, offset: Factor = 0.0) -> np.ndarray:
-        """Compute the signals at the feeds; see `Board.feeds`."""
-        applied = slope * self.coefficients(ports, tunings) + offset
-        return np.einsum('bjqm,bjkm->bjqk', applied * elements, self.paths(ports))
-
-    def by_tunings(self, ports: Ports, tunings: np.ndarray, digital: np.ndarray,
-                   by_radiation: np.ndarray) -> np.ndarray:
-        """Pull a gradient back to the tunings; see `Board.by_tunings`."""
-        weights = np.matmul(digital, self.paths(ports)) * self.slopes(ports, tunings)
-        return np.einsum('ijqm,ijqm->iqm', np.conj(by_radiation), weights).real
-
-    def by_digital(self, ports: Ports, tunings: np.ndarray, by_radiation: np.ndarray,
-                   slope: Factor = 1.0, offset: Factor = 0.0) -> np.ndarray:
-        """Pull a gradient back to the combining vectors; see `Board.by_digital`."""
-        applied = np.conj(slope * self.coefficients(ports, tunings) + offset)
-        return np.matmul(by_radiation * applied, adjoint(self.paths(ports)))
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Paper(Elementwise):
-    """The board of the paper, Eqs. (5), (6) and (9): the coefficient is the tuning."""
-
-    kind: str = dataclasses.field(default='paper', init=False)
-    is_amplitude = True
-
-    def coefficients(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
-        """Return the tunings as amplitudes, [B, 1, Q, N_E]."""
-        return tunings[:, None]
-
-    def slopes(self, ports: Ports, tunings: np.ndarray) -> np.ndarray | float:
-        """Return 1."""
-        return 1.0
-
-    def focused(self, ports: Ports, los: np.ndarray, n_levels: int = 0) -> np.ndarray:
-        """Return tunings by the holographic principle; see `matched_configuration`."""
-        return rounded(matched_configuration(los, self.paths(ports)[0]), n_levels)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class PhaseShift(Elementwise):
-    """Elements with an adjustable phase: the coefficient is exp(i phase_range_rad c)."""
-
-    kind: str = dataclasses.field(default='phase', init=False)
-    phase_range_rad: float = 2 * np.pi  #: Phase of the tuning 1, relative to the tuning 0.
-
-    def __post_init__(self) -> None:
-        """Raise BoardError unless the values are in range."""
-        super().__post_init__()
-        self._set('phase_range_rad', _number('phase_range_rad', self.phase_range_rad, 1e-6, 1e3))
-
-    def coefficients(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
-        """Return unit phasors, complex128 [B, 1, Q, N_E]."""
-        return np.exp(1j * self.phase_range_rad * tunings)[:, None]
-
-    def slopes(self, ports: Ports, tunings: np.ndarray) -> np.ndarray | float:
-        """Return the derivative, complex128 [B, 1, Q, N_E]."""
-        return 1j * self.phase_range_rad * self.coefficients(ports, tunings)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Resonant(Elementwise):
-    """Elements with an adjustable resonance, of which amplitude and phase change together.
-
-    The coefficient at the frequency f is the polarisability of a Lorentz oscillator relative to
-    its maximum, 1 / (1 - i Q (f_0 / f - f / f_0)). Over all f_0, it runs through the circle about
-    1/2 with the diameter 1. The tuning c moves the resonance to
-    f_0 = f_r (1 + tuning_range (c - 1/2)).
-
-    References
-    ----------
-    Smith, Yurduseven, Mancera, Bowen and Kundtz, Analysis of a waveguide-fed metasurface antenna,
-    Phys. Rev. Applied 8, 2017.
-    """
-
-    kind: str = dataclasses.field(default='resonant', init=False)
-    #: Resonance f_r of the tuning 1/2 in each band [Hz], or None for the centres of the bands.
-    resonances_hz: tuple[float, ...] | None = None
-    quality_factor: float = 40.0  #: Quality factor Q of an element.
-    tuning_range: float = 0.1  #: Range of f_0 relative to f_r.
-
-    def __post_init__(self) -> None:
-        """Raise BoardError unless the values are in range."""
-        super().__post_init__()
-        self._set('quality_factor', _number('quality_factor', self.quality_factor, 1.0, 1e6))
-        self._set('tuning_range', _number('tuning_range', self.tuning_range, 1e-6, 1.9))
-        if self.resonances_hz is not None:
-            self._set('resonances_hz', _numbers('resonances_hz', self.resonances_hz, 1e6, 1e13))
-
-    def misfit(self, scenario: Any) -> str:
-        """Return the reason why the board does not fit a scenario, or ''."""
-        if self.resonances_hz is not None and len(self.resonances_hz) != scenario.n_bands:
-            return (f'resonances_hz: {len(self.resonances_hz)} numbers, expected one for each of '
-                    f'{scenario.n_bands} bands')
-        return super().misfit(scenario)
-
-    def coefficients(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
-        """Return the relative polarisabilities, complex128 [B, J, Q, N_E]."""
-        return self._curve(ports, tunings)[0]
-
-    def slopes(self, ports: Ports, tunings: np.ndarray) -> np.ndarray | float:
-        """Return the derivative, complex128 [B, J, Q, N_E]."""
-        return self._curve(ports, tunings)[1]
-
-    def _curve(self, ports: Ports, tunings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        frequencies = ports.frequencies_hz[..., None, None]
-        resonances = (frequencies.mean(axis=1, keepdims=True) if self.resonances_hz is None
-                      else np.reshape(self.resonances_hz, (-1, 1, 1, 1)))
-        ratio = resonances * (1 + self.tuning_range * (tunings - 0.5))[:, None] / frequencies
-        curve = 1 / (1 - 1j * self.quality_factor * (ratio - 1 / ratio))
-        by_ratio = 1j * self.quality_factor * (1 + 1 / ratio**2) * curve**2
-        return curve, by_ratio * (self.tuning_range * resonances / frequencies)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class States(Elementwise):
-    """Elements with a table of states, which need not be equally spaced.
-
-    The tuning of state n of L is n / (L - 1). Between two states, where only a search with
-    continuous tunings goes, the coefficient is interpolated linearly. The scenario has as many
-    `amplitude_levels` as there are states.
-    """
-
-    kind: str = dataclasses.field(default='states', init=False)
-    #: Real and imaginary parts of the states: [L, 2] for all bands and elements, [N_B, L, 2], or
-    #: [N_B, N_E, L, 2]. Two states off and on, in all bands, unless given.
-    states: Any = ((0.0, 0.0), (1.0, 0.0))
-
-    def __post_init__(self) -> None:
-        """Raise BoardError unless the values are in range."""
-        super().__post_init__()
-        table = numbers('states', self.states, error=BoardError)
-        if not 2 <= table.ndim <= 4 or table.shape[-1] != 2 or table.shape[-2] < 2:
-            raise BoardError(f'states: shape {table.shape}, expected [L, 2], [N_B, L, 2] or '
-                             '[N_B, N_E, L, 2] with at least two states')
-        self._set('states', _tuples(table.tolist()))
-
-    @functools.cached_property
-    def _table(self) -> np.ndarray:
-        """The states as complex128 [L, B or 1, 1, 1, N_E or 1]."""
-        table = np.array(self.states) @ [1, 1j]
-        table = table.reshape(*[1] * (3 - table.ndim), *table.shape) if table.ndim != 2 else (
-            table[:, None])
-        return np.moveaxis(table, -1, 0)[:, :, None, None]
-
-    def misfit(self, scenario: Any) -> str:
-        """Return the reason why the board does not fit a scenario, or ''."""
-        n_states, n_bands, *_, n_elements = self._table.shape
-        if scenario.amplitude_levels != n_states:
-            return (f'{n_states} states with amplitude_levels = {scenario.amplitude_levels}, '
-                    'expected as many levels as states')
-        if n_bands not in (1, scenario.n_bands) or n_elements not in (1, scenario.n_elements):
-            return (f'states of {n_bands} bands and {n_elements} elements, expected '
-                    f'{scenario.n_bands} and {scenario.n_elements}')
-        return super().misfit(scenario)
-
-    def coefficients(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
-        """Return the interpolated states, complex128 [B, 1, Q, N_E]."""
-        position = tunings[:, None] * (len(self._table) - 1)
-        return np.sum(np.maximum(1 - np.abs(position - self._numbers), 0) * self._table, axis=0)
-
-    def slopes(self, ports: Ports, tunings: np.ndarray) -> np.ndarray | float:
-        """Return the differences between neighbouring states, times L - 1."""
-        last = len(self._table) - 1
-        below = np.clip(np.floor(tunings[:, None] * last), 0, last - 1)
-        steps = np.diff(self._table, axis=0) * last
-        return np.sum((below == self._numbers[:-1]) * steps, axis=0)
-
-    @functools.cached_property
-    def _numbers(self) -> np.ndarray:
-        return np.arange(len(self._table)).reshape(-1, 1, 1, 1, 1)
-
-
-BUILT_IN: Mapping[str, Callable[..., Board]] = {
-    'paper': Paper, 'phase': PhaseShift, 'resonant': Resonant, 'states': States}
-
-
-def board_of(value: Any) -> Board:
-    """Return a board, from its name or a mapping of ``kind`` and the fields of this kind.
-
-    Names other than those of `BUILT_IN` are plug-ins: callables that take the fields and return a
-    `Board`. Raises BoardError if the value does not describe a board.
-    """
-    if isinstance(value, Board):
-        return value
-    fields = {'kind': value} if isinstance(value, str) else value
-    if not isinstance(fields, Mapping) or not isinstance(kind := fields.get('kind'), str):
-        raise BoardError(f'{value!r}, expected the name of a board, or a mapping with kind')
-    options = {str(name): entry for name, entry in fields.items() if name != 'kind'}
-    if (made := BUILT_IN.get(kind)) is None:
-        with translated(plugins.PluginError, BoardError):
-            board = plugins.make(plugins.BOARDS, kind, **options)
-        if not isinstance(board, Board):
-            raise BoardError(f'{plugins.describe(plugins.BOARDS, kind)}: '
-                             f'{type(board).__name__}, expected a Board')
-        board.__dict__['plain'] = value
-        return board
-    known = [field.name for field in dataclasses.fields(made)  # type: ignore[arg-type]
-             if field.init]
-    for name in options:
-        if name not in known:
-            raise BoardError(f'{name}: unknown field of {kind!r}, expected one of {known}')
-    return made(**options)
-
-
 def rounded(tunings: np.ndarray, n_levels: int) -> np.ndarray:
     """Round tunings to equally spaced levels; keep them if the number of levels is 0."""
     return np.rint(tunings * (n_levels - 1)) / (n_levels - 1) if n_levels else tunings
 
 
-def matched_configuration(los: np.ndarray, onboard: np.ndarray) -> np.ndarray:
-    """Compute a configuration by the holographic principle, float64 [N_E], entries in [0, 1].
-
-    Takes line-of-sight gains, complex128 [N_SB, N_E], and B_j, complex128 [N_SB, K, N_E]. The
-    amplitude of an element is high if the phases of its line-of-sight gain and of its propagation
-    on the board cancel. If all gains are 0, all entries are 0.5.
-    """
-    interference = np.einsum('jm,jkm->m', los, onboard).real
-    return (interference / (np.abs(interference).max() or 1.0) + 1) / 2
-
-
-def _number(name: str, value: Any, low: float, high: float) -> float:
+def number_of(name: str, value: Any, low: float, high: float) -> float:
+    """Return a number within limits; raise BoardError if it is none."""
     with translated(ValueError, BoardError):
         number: float = Field(float, low=low, high=high).checked(name, value)
     return number
 
 
-def _numbers(name: str, values: Any, low: float, high: float) -> tuple[float, ...]:
+def numbers_of(name: str, values: Any, low: float, high: float) -> tuple[float, ...]:
+    """Return numbers within limits; raise BoardError if one of them is none."""
     if not isinstance(values, list | tuple | np.ndarray):
         raise BoardError(f'{name}: {values!r}, expected a list of numbers')
-    return tuple(_number(name, value, low, high) for value in values)
-
-
-def _tuples(entry: Any) -> Any:
-    return tuple(map(_tuples, entry)) if isinstance(entry, list) else entry
+    return tuple(number_of(name, value, low, high) for value in values)
 
 
 def _lists(entry: Any) -> Any:

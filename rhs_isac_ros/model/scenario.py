@@ -6,13 +6,16 @@ import hashlib
 import itertools
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rhs_isac_ros.model.arrays import read_only
-from rhs_isac_ros.model.board import Board, Paper, board_of
+from rhs_isac_ros.model.board import Board
+from rhs_isac_ros.model.boards import board_of
+from rhs_isac_ros.model.elementwise import Paper
 from rhs_isac_ros.model.external import ArrayFile, External
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.hall import MultipathEstimate, PathChannel
@@ -301,8 +304,7 @@ class Scenario(Extensions, Table1):
         for key in content:
             if key not in known:
                 raise ScenarioError(f'{path}: {key}: unknown field, expected one of {known}')
-        content |= {name: str(Path(path).parent / content[name])
-                    for name in _FILES if isinstance(content.get(name), str)}
+        content = _with_paths(content, lambda file: str(Path(path).parent / file))
         with translated(ScenarioError, ScenarioError, path):
             return cls(**content)
 
@@ -316,8 +318,8 @@ class Scenario(Extensions, Table1):
         changes = {field.name: _plain(value) for field in dataclasses.fields(self)
                    if (value := getattr(self, field.name)) != field.default}
         if folder is not None:
-            changes |= {name: os.path.relpath(os.path.realpath(path), os.path.realpath(folder))
-                        for name in _FILES if (path := changes.get(name))}
+            changes = _with_paths(changes, lambda file: os.path.relpath(
+                os.path.realpath(file), os.path.realpath(folder)))
         return changes
 
     def fields(self) -> dict[str, Any]:
@@ -337,6 +339,8 @@ class Scenario(Extensions, Table1):
             elif name in _FILES:
                 # The same file has the same identifier on every host.
                 fields[name] = fields[name].rpartition('@')[2]
+            elif name == 'board':
+                fields[name] = self.board.id
         return f'sc{hashlib.sha256(json.dumps(fields).encode()).hexdigest()[:16]}'
 
     @property
@@ -397,6 +401,16 @@ class Scenario(Extensions, Table1):
             return self.channel.users[rng.integers(len(self.channel.users), size=n)]
         low, high = self.roi_bounds_m
         return rng.uniform(low, high, size=(n, 3))
+
+
+def _with_paths(values: dict[str, Any], convert: Callable[[str], str]) -> dict[str, Any]:
+    """Return values of fields with converted paths of files, also of the file of a board."""
+    found: dict[str, Any] = {
+        name: convert(values[name]) for name in _FILES if isinstance(values.get(name), str)}
+    board = values.get('board')
+    if isinstance(board, dict) and isinstance(board.get('file'), str):
+        found['board'] = board | {'file': convert(board['file'])}
+    return values | found
 
 
 def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) -> None:

@@ -5,7 +5,8 @@ from collections.abc import Iterator
 
 # Groups of scripts/setup that install the libraries of extras.
 _GROUPS = {'experiments': 'experiments', 'genetic': 'experiments', 'neural': 'experiments',
-           'recording': 'recording', 'samples': 'samples', 'view': 'view'}
+           'recording': 'recording', 'samples': 'samples', 'touchstone': 'experiments',
+           'view': 'view'}
 
 
 class MissingLibraryError(ImportError):

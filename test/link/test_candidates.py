@@ -10,7 +10,7 @@ from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.link.candidates import candidate_configurations, tables
 from rhs_isac_ros.link.steering import ascend
 from rhs_isac_ros.model import Scenario, multipath
-from rhs_isac_ros.model.board import matched_configuration
+from rhs_isac_ros.model.elementwise import matched_configuration
 from rhs_isac_ros.model.multipath import multipath_covariance
 
 POSITION = np.array([8.0, -2.0, 0.5])

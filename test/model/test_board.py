@@ -7,7 +7,9 @@ import pytest
 
 from rhs_isac_ros.bounds import AverageCrlb
 from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError
-from rhs_isac_ros.model.board import Board, Paper, PhaseShift, Resonant, States, board_of
+from rhs_isac_ros.model.board import Board
+from rhs_isac_ros.model.boards import board_of
+from rhs_isac_ros.model.elementwise import Paper, PhaseShift, Resonant, States
 from rhs_isac_ros.model.surface import AppliedBeams, onboard_matrix, ports_of, radiation_matrix
 from rhs_isac_ros.support import plugins
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.model import Scenario, board, surface
+from rhs_isac_ros.model import Scenario, elementwise, surface
 from rhs_isac_ros.model.los import los_gain
 
 
@@ -67,7 +67,7 @@ def test_the_matched_configuration_follows_the_interference(small):
     scenario = small.scenario
     los = los_gain(scenario, np.array([[8.0, 1.0, 0.2]]), 0)[0]
     onboard = surface.onboard_matrix(scenario)[0]
-    matched = board.matched_configuration(los, onboard)
+    matched = elementwise.matched_configuration(los, onboard)
     interference = [sum(los[j, m] * onboard[j, k, m] for j in range(3) for k in range(2)).real
                     for m in range(16)]
     assert (np.argsort(matched) == np.argsort(interference)).all()
@@ -82,10 +82,10 @@ def test_the_matched_configuration_follows_the_interference(small):
 def test_the_matched_configuration_does_not_depend_on_scale_and_spans_the_range(seed):
     rng = np.random.default_rng(seed)
     los, onboard = complex_array(rng, 3, 9), complex_array(rng, 3, 2, 9)
-    matched = board.matched_configuration(los, onboard)
+    matched = elementwise.matched_configuration(los, onboard)
     assert matched.shape == (9,)
-    np.testing.assert_allclose(board.matched_configuration(1e-4 * los, onboard), matched)
+    np.testing.assert_allclose(elementwise.matched_configuration(1e-4 * los, onboard), matched)
     # A change of sign turns constructive into destructive interference.
-    np.testing.assert_allclose(board.matched_configuration(-los, onboard), 1 - matched)
-    np.testing.assert_allclose(board.matched_configuration(los, -onboard), 1 - matched)
+    np.testing.assert_allclose(elementwise.matched_configuration(-los, onboard), 1 - matched)
+    np.testing.assert_allclose(elementwise.matched_configuration(los, -onboard), 1 - matched)
     assert np.abs(matched - 0.5).max() == pytest.approx(0.5)

@@ -1,0 +1,258 @@
+"""A board with coupled elements: a network whose ports are the feeds and the elements.
+
+A simulation, a measurement or `waveguides` provides the admittances Y of the network. Each element
+is loaded with an admittance that depends on its tuning. The transfer is
+
+    (diag(load) + Y_ss)^-1 Y_st,
+
+where s stands for the ports of the elements and t for those of the feeds.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.model.arrays import adjoint, digest, numbers
+from rhs_isac_ros.model.board import Board, BoardError, Ports, number_of
+from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.files import ArchiveError, read_arrays, read_once
+
+# Relative tolerance of reciprocity and passivity, which simulations meet only approximately.
+_TOLERANCE = 1e-4
+# Largest step between frequencies of the file, relative to the frequency, to interpolate in it.
+_MAX_STEP = 0.02
+# Relative difference of frequencies that count as equal.
+_ROUNDING = 1e-9
+_LOADS = 'load_conductance_s', 'load_susceptance_slope_s'
+
+
+class Admittances(NamedTuple):
+    """Admittances [S] of a network without its loads, at ascending frequencies."""
+
+    frequencies_hz: np.ndarray  # float64 [P].
+    feeds: np.ndarray  # Y_tt, complex128 [P, K, K].
+    between: np.ndarray  # Y_st, complex128 [P, N_E, K].
+    elements: np.ndarray  # Y_ss, complex128 [P, N_E, N_E].
+    # Conductance of the loads, and the change of their susceptance over the range of the tuning,
+    # float64 [N_E] or a number; NaN if the file has none.
+    conductance_s: np.ndarray
+    susceptance_slope_s: np.ndarray
+    digest: str
+
+    @classmethod
+    @read_once
+    def load(cls, path: str | Path) -> 'Admittances':
+        """Read an archive of NumPy's format ``.npz``; raise BoardError if it is invalid."""
+        with translated(ArchiveError, BoardError):
+            arrays = read_arrays(path)
+        with translated(ValueError, BoardError, path):
+            return cls.of(arrays)
+
+    @classmethod
+    def of(cls, content: Mapping[str, Any]) -> 'Admittances':
+        """Convert and check the arrays of a file, [P, ...] or those of a single frequency.
+
+        Raises ValueError unless the network is reciprocal and passive.
+        """
+        if missing := {'frequency_hz', 'y_tt', 'y_st', 'y_ss'} - content.keys():
+            raise BoardError(f'no {", ".join(sorted(missing))}, expected the admittances of '
+                             'a network')
+        frequencies = np.atleast_1d(numbers('frequency_hz', content['frequency_hz']))
+        n, arrays = len(frequencies), []
+        if frequencies.ndim != 1 or not (np.diff(frequencies, prepend=0) > 0).all():
+            raise BoardError(f'frequency_hz: {frequencies}, expected ascending ones above 0')
+        for name in ('y_tt', 'y_st', 'y_ss'):
+            array = numbers(name, content[name], complex)
+            arrays.append(array[None] if array.ndim == 2 else array)
+        conductance, slope = loads = [
+            numbers(name, content.get(name, np.nan), finite=False) for name in _LOADS]
+        n_elements, n_feeds = (*arrays[1].shape, 0, 0)[1:3]
+        for name, array, sizes in zip(('y_tt', 'y_st', 'y_ss'), arrays, (
+                (n_feeds, n_feeds), (n_elements, n_feeds), (n_elements, n_elements)), strict=True):
+            if array.shape != (n, *sizes) or 0 in array.shape:
+                raise BoardError(f'{name}: shape {array.shape}, expected {(n, *sizes)} for '
+                                 f'{n} frequencies, {n_elements} elements and {n_feeds} feeds')
+        for name, load in zip(_LOADS, loads, strict=True):
+            if load.shape not in ((), (n_elements,)):
+                raise BoardError(f'{name}: shape {load.shape}, expected a number or '
+                                 f'[{n_elements}]')
+        feeds, between, elements = arrays
+        network = cls(frequencies, feeds, between, elements, conductance, slope,
+                      digest(*(np.ascontiguousarray(array, array.dtype.newbyteorder('<'))
+                               for array in (frequencies, *arrays, *loads))))
+        network._check()
+        return network
+
+    def _check(self) -> None:
+        """Raise BoardError unless the network is reciprocal and passive."""
+        across = np.concatenate([self.feeds, np.swapaxes(self.between, 1, 2)], axis=2)
+        whole = np.concatenate([
+            across, np.concatenate([self.between, self.elements], axis=2)], axis=1)
+        sizes = np.abs(whole).max(axis=(1, 2))
+        errors = np.abs(whole - np.swapaxes(whole, 1, 2)).max(axis=(1, 2)) / sizes
+        if errors.max() > _TOLERANCE:
+            raise BoardError(
+                f'not reciprocal at {self.frequencies_hz[errors.argmax()]:g} Hz: Y and its '
+                f'transpose differ by {errors.max():.2g} of the largest admittance, expected at '
+                f'most {_TOLERANCE:g}')
+        gains = -np.linalg.eigvalsh((whole + adjoint(whole)) / 2)[:, 0] / sizes
+        if gains.max() > _TOLERANCE:
+            raise BoardError(
+                f'not passive at {self.frequencies_hz[gains.argmax()]:g} Hz: the least eigenvalue '
+                f'of the conductance is {-gains.max():.2g} of the largest admittance, expected at '
+                f'least {-_TOLERANCE:g}')
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CoupledNetwork(Board):
+    """A board of coupled elements, from a file of admittances.
+
+    The load of an element with the tuning c is
+
+        conductance - i Im(Y_mm) + i susceptance_slope (c - 1/2),
+
+    where Y_mm is its own admittance, so that a single element resonates at the tuning 1/2. Between
+    frequencies of the file, the transfer is interpolated linearly.
+    """
+
+    kind: str = dataclasses.field(default='network', init=False)
+    file: str = ''  #: Path of the file, which may be followed by ``@`` and the digest.
+    gain: float = 1.0  #: Factor of the transfer.
+    load_conductance_s: float | None = None  #: Conductance of a load, or None as in the file.
+    load_susceptance_slope_s: float | None = None  #: As in the formula, or None as in the file.
+
+    def __post_init__(self) -> None:
+        """Read the file; raise BoardError if it or a number is invalid."""
+        if not isinstance(self.file, str | Path) or not str(self.file):
+            raise BoardError(f'file: {self.file!r}, expected the path of a file of admittances')
+        path, expected = re.fullmatch(  # type: ignore[union-attr]
+            r'(.*?)(?:@([0-9a-f]{16}))?', str(self.file), re.DOTALL).groups()
+        with translated(BoardError, BoardError, 'file'):
+            network = Admittances.load(path)
+        if expected not in (None, network.digest):
+            raise BoardError(f'file: {path}: digest {network.digest}, expected {expected}: the '
+                             'content has changed')
+        object.__setattr__(self, 'file', f'{path}@{network.digest}')
+        object.__setattr__(self, 'gain', number_of('gain', self.gain, 1e-12, 1e12))
+        for name, own in zip(
+                _LOADS, (network.conductance_s, network.susceptance_slope_s), strict=True):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, number_of(name, value, 0.0, 1e12))
+            elif np.isnan(own).any():
+                raise BoardError(f'{name}: None, expected a number, as {path} has none')
+
+    @functools.cached_property
+    def network(self) -> Admittances:
+        """The admittances without the loads."""
+        network: Admittances = Admittances.load(self.file.rpartition('@')[0])
+        conductance, slope = self.load_conductance_s, self.load_susceptance_slope_s
+        return network._replace(
+            conductance_s=network.conductance_s if conductance is None else np.array(conductance),
+            susceptance_slope_s=network.susceptance_slope_s if slope is None else np.array(slope))
+
+    @functools.cached_property
+    def id(self) -> str:
+        """Hash of the fields and of the content of the file."""
+        fields = self.network.digest, self.gain, self.load_conductance_s, (
+            self.load_susceptance_slope_s)
+        return hashlib.sha256(repr(fields).encode()).hexdigest()[:16]
+
+    def misfit(self, scenario: Any) -> str:
+        """Return the reason why the board does not fit a scenario, or ''."""
+        n_elements, n_feeds = self.network.between.shape[1:]
+        if (n_elements, n_feeds) != (scenario.n_elements, scenario.n_feeds):
+            return (f'{self.file}: {n_elements} elements and {n_feeds} feeds, expected '
+                    f'{scenario.n_elements} and {scenario.n_feeds}')
+        span = (np.arange(scenario.n_subbands) - (scenario.n_subbands - 1) / 2) * (
+            scenario.subband_width_hz)
+        with_bands = np.add.outer(scenario.center_frequencies_hz, span)
+        try:
+            for band in with_bands:
+                _between(self.network.frequencies_hz, band)
+        except BoardError as error:
+            return f'{self.file}: {error}'
+        return super().misfit(scenario)
+
+    def transfer(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
+        """Return the transfer; see `Board.transfer`."""
+        return np.stack([
+            np.tensordot(weights, self._solved(points, frames)[1], axes=1)
+            for (points, weights), frames in zip(self._points(ports), tunings, strict=True)])
+
+    def pullback(
+            self, ports: Ports, tunings: np.ndarray, by_transfer: np.ndarray) -> np.ndarray:
+        """Return the gradient by the tunings; see `Board.pullback`."""
+        from scipy.linalg import lu_solve
+
+        gradients = np.zeros(tunings.shape)
+        for band, (points, weights) in enumerate(self._points(ports)):
+            factors, transfers = self._solved(points, tunings[band])
+            # Y is symmetric, so the adjoint of its inverse is the conjugate.
+            by_point = np.conj(np.tensordot(weights.T, by_transfer[band], axes=1))
+            for point, frame in np.ndindex(transfers.shape[:2]):
+                through = lu_solve(factors[point][frame], by_point[point, frame] * self.gain,
+                                   check_finite=False)
+                gradients[band, frame] += np.sum(
+                    through * transfers[point, frame], axis=1).imag / self.gain
+        return gradients * self.network.susceptance_slope_s
+
+    def _points(self, ports: Ports) -> list[tuple[tuple[int, ...], np.ndarray]]:
+        """Return frequencies of the file for each band, and weights of each sub-band for them."""
+        return [_between(self.network.frequencies_hz, band) for band in ports.frequencies_hz]
+
+    def _solved(self, points: tuple[int, ...], tunings: np.ndarray) -> tuple[Any, np.ndarray]:
+        """Return factors of the loaded network, and the transfer, [P, Q, N_E, K]."""
+        return _solved(self, points, tunings.shape, np.ascontiguousarray(tunings).tobytes())
+
+
+# A gradient needs the factors that the signals needed, for each band.
+@functools.lru_cache(maxsize=8)
+def _solved(board: CoupledNetwork, points: tuple[int, ...], shape: tuple[int, ...], tunings: bytes
+            ) -> tuple[Any, np.ndarray]:
+    from scipy.linalg import lu_factor, lu_solve
+
+    network, frames = board.network, np.frombuffer(tunings).reshape(shape)
+    transfers = np.empty((len(points), len(frames), *network.between.shape[1:]), complex)
+    factors: list[list[Any]] = []
+    for row, point in enumerate(points):
+        admittances = network.elements[point]
+        own = np.diagonal(admittances)
+        # The load cancels the susceptance of the element.
+        loaded = (own.real + network.conductance_s
+                  + 1j * network.susceptance_slope_s * (frames - 0.5))
+        factors.append([])
+        for frame, diagonal in enumerate(loaded):
+            matrix = admittances.copy()
+            np.fill_diagonal(matrix, diagonal)
+            factors[-1].append(lu_factor(matrix, overwrite_a=True, check_finite=False))
+            transfers[row, frame] = board.gain * lu_solve(
+                factors[-1][-1], network.between[point], check_finite=False)
+    return factors, transfers
+
+
+def _between(known_hz: np.ndarray, wanted_hz: np.ndarray) -> tuple[tuple[int, ...], np.ndarray]:
+    """Return indices of known frequencies, and weights [J, P] that interpolate to wanted ones."""
+    above = np.searchsorted(known_hz, wanted_hz * (1 - _ROUNDING))
+    above = np.minimum(above, len(known_hz) - 1)
+    is_known = np.abs(known_hz[above] - wanted_hz) <= _ROUNDING * wanted_hz
+    below = np.where(is_known, above, above - 1)
+    steps = known_hz[above] - known_hz[below]
+    fits = is_known | (below >= 0) & (known_hz[above] > wanted_hz) & (
+        steps <= _MAX_STEP * wanted_hz)
+    if not fits.all():
+        raise BoardError(
+            f'no admittances at {wanted_hz[~fits][0]:.9g} Hz, expected this frequency, or '
+            f'frequencies on both sides that differ by at most {100 * _MAX_STEP:g} %')
+    points, where = np.unique(np.concatenate([below, above]), return_inverse=True)
+    share = np.where(is_known, 1.0, (wanted_hz - known_hz[below]) / np.where(is_known, 1, steps))
+    weights = np.zeros((len(wanted_hz), len(points)))
+    rows, half = np.arange(len(wanted_hz)), len(wanted_hz)
+    weights[rows, where[:half]] += 1 - share
+    weights[rows, where[half:]] += share
+    return tuple(points.tolist()), weights
