@@ -135,7 +135,7 @@ def _expanded(points: np.ndarray, share: float, likelihood: Likelihood, signals:
               ) -> Sheets:
     """Expand the likelihood at points (r, u, v), [C, 3]; each has one sheet."""
     value, gradient, curvature, _ = likelihood.local(
-        points, np.zeros((len(points), 0)), signals)
+        points, np.zeros((len(points), 0)), select(signals, np.zeros(len(points), int)))
     return Sheets.expanded(points, gradient, curvature, value, share)
 
 
