@@ -23,10 +23,10 @@ The modules, in reading order:
   modes; `failures`: modes if elements have failed
 * `posterior`: from modes to samples; `draws`: samples without modes; `alternatives`: users outside
   or blocked; `diagnosis`: tests of the fit between signals and model
-* `prior`: the update of a mixture with signals; `fusion`: several surfaces; `agreement`: surfaces
-  whose pose is wrong; `alignment`: the pose of a surface from common users; `site`: the surfaces
-  of a site in a file
-* `tracking`: moving users; `constant`: errors that are the same in all phases of a track
+* `prior`: the update of a mixture with signals, and errors that all phases share; `fusion`:
+  several surfaces; `agreement`: surfaces whose pose is wrong; `alignment`: the pose of a surface
+  from common users; `site`: the surfaces of a site in a file
+* `tracking`: moving users
 * `neural`: the paper's network; `store`: tables in files
 """
 

@@ -15,7 +15,6 @@ from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.gaussian import share_of_level
 from rhs_isac_ros.model.geometry import jacobian, to_positions
 from rhs_isac_ros.positioning.alternatives import Alternative, Blocked, Outside, rejection
-from rhs_isac_ros.positioning.constant import constant_shares
 from rhs_isac_ros.positioning.diagnosis import FitTest, misfit_log_ratio
 from rhs_isac_ros.positioning.draws import DrawnPosterior
 from rhs_isac_ros.positioning.estimate import (
@@ -44,6 +43,7 @@ from rhs_isac_ros.positioning.prior import (
     PRIOR_MARGIN,
     WRONG,
     cells_of,
+    constant_shares,
     inside,
     is_doubtful,
     multiply,
@@ -213,7 +213,7 @@ class SearchEstimator(abc.ABC):
             Exponent of the likelihood with a mixture as prior; see `independent_share`.
         n_before
             Number of phases in the prior. If it is not 0, the prior is that of a position with the
-            errors that are the same in all phases; see `constant`.
+            errors that are the same in all phases; see `constant_shares`.
         """
         signals = self._likelihood.signals(checked_received(self._likelihood.codebook, received))
         if prior is None:

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from scipy.special import chdtri
 
+from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
-from rhs_isac_ros.model.geometry import to_polar
-from rhs_isac_ros.positioning import BayesEstimator, Mixture
+from rhs_isac_ros.model.elements import draw_surface
+from rhs_isac_ros.model.gaussian import quadratic_form
+from rhs_isac_ros.model.geometry import jacobian, region_information, to_polar
+from rhs_isac_ros.positioning import BayesEstimator, Mixture, Motion, Tracker
 from rhs_isac_ros.positioning.lattice import Resolution, lay_grid
-from rhs_isac_ros.positioning.prior import cells_of, multiply
+from rhs_isac_ros.positioning.prior import cells_of, constant_shares, multiply
 from rhs_isac_ros.positioning.search import Modes
 from rhs_isac_ros.positioning.segments import concatenate
 from rhs_isac_ros.positioning.sheets import Sheets
@@ -194,3 +197,49 @@ def test_signals_without_a_position_have_no_mixture(table1_estimator, model):
     found = table1_estimator.posterior(signals, around(PLACE))
     assert found.mixture is None
     assert 'residual' in found.reason
+
+
+ERRONEOUS = Scenario(elements_per_side=6, n_frames=4, element_error_rms=0.05)
+
+
+@pytest.fixture(scope='module')
+def codebook():
+    return random_codebook(ERRONEOUS, np.random.default_rng(0))
+
+
+def test_without_errors_of_elements_nothing_is_constant(codebook):
+    exact = dataclasses.replace(ERRONEOUS, element_error_rms=0.0)
+    np.testing.assert_array_equal(constant_shares(MeasurementModel(exact, codebook)), np.zeros(3))
+
+
+def test_shares_are_those_of_steps_with_drawn_surfaces(codebook):
+    """The steps are from signals without multipath and noise, with elements of many surfaces."""
+    rng, model = np.random.default_rng(1), MeasurementModel(ERRONEOUS, codebook)
+    positions = ERRONEOUS.sample_positions(40, rng)
+    by_point = jacobian(to_polar(positions))
+    mean, slopes = model.mean_and_jacobian(positions, by_point, whitened=True)
+    slopes = slopes.reshape(len(positions), 3, -1)
+    covariance = np.linalg.inv(quadratic_form(slopes) + np.swapaxes(
+        by_point, 1, 2) @ region_information(ERRONEOUS) @ by_point)
+    steps = []
+    for _ in range(100):
+        surface = draw_surface(ERRONEOUS, rng)
+        exact = MeasurementModel(dataclasses.replace(ERRONEOUS, element_error_rms=0.0), codebook,
+                                 surface)
+        change = model.whiten(exact.mean(positions)) - mean
+        pull = 2 * np.einsum('npr,nr->np', slopes.conj(), change.reshape(len(change), -1)).real
+        steps.append(np.matmul(covariance, pull[..., None])[..., 0])
+    shares = np.mean(np.square(steps), axis=0) / np.diagonal(covariance, axis1=1, axis2=2)
+    np.testing.assert_allclose(constant_shares(model), shares.mean(axis=0), rtol=0.15)
+
+
+def test_a_track_is_no_better_than_the_errors_that_all_phases_share(codebook):
+    estimator = BayesEstimator(System(ERRONEOUS, codebook))
+    rng, place = np.random.default_rng(2), np.array([8.0, 0.5, 0.2])
+    tracker, model = Tracker(estimator, Motion()), MeasurementModel(ERRONEOUS, codebook)
+    for time_s in range(8):
+        found = tracker.update(time_s, model.sample(place[None], rng)[0])
+    constant = found.mixture.constant_covariance
+    assert (np.linalg.eigvalsh(constant) > 0).all()
+    assert (np.linalg.eigvalsh(found.covariance - constant) > 0).all()
+    assert (np.linalg.eigvalsh(tracker.predict(8.0)[1] - constant) > 0).all()
