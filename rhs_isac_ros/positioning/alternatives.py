@@ -9,7 +9,7 @@ alternative, compared with such a user alone, is within the limit of the alterna
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -33,6 +33,7 @@ _LEVEL_REACH = 3.0
 # Standard deviation that represents an unknown gain in the level of a blocked user [dB].
 _UNKNOWN_GAIN_DB = 40.0
 _MIN_PROBABILITY = 1e-12
+_ONE, _ZERO = np.ones(1), np.zeros(1)
 # Smallest probability of an alternative that is reported.
 _MIN_DOUBT = 0.01
 
@@ -201,9 +202,9 @@ class Outside:
         low, high = self._gain_limits(whitened, prior.gain_std)
         gain, step = np.linspace(
             low, high, 3 + int(np.ceil((high - low) / GRID.gain_step)), retstep=True)
-        evidence = self.log_evidence(whitened, np.exp(-gain)) - 2 * whitened.size * gain
-        log_density = -(gain / prior.gain_std)**2 / 2 - np.log(2 * np.pi) / 2
-        return (log_sum(evidence + log_density) + math.log(step / prior.gain_unit) + known)
+        log_density = -(gain / prior.gain_std)**2 / 2 - 2 * whitened.size * gain
+        evidence = self.log_evidence(whitened, np.exp(-gain), log_density)
+        return log_sum(evidence) + math.log(step / prior.gain_unit / math.sqrt(2 * np.pi)) + known
 
     def _gain_limits(self, whitened: np.ndarray, std: float) -> tuple[float, float]:
         """Return limits of the gain [nepers] beyond which its posterior is negligible."""
@@ -216,22 +217,30 @@ class Outside:
         low, high = (math.log(part / n) / 2 for part in (rest, energy))
         return max(min(low - margin, 0.0), -reach), min(max(high + margin, 0.0), reach)
 
-    def log_evidence(self, whitened: np.ndarray, scales: Iterable[float] = (1.0,)) -> np.ndarray:
-        """Return the log of the mean of ``exp(-|s y - t|^2)`` over the prior for each scale s.
+    def log_evidence(self, whitened: np.ndarray, scales: np.ndarray = _ONE,
+                     log_weights: np.ndarray = _ZERO) -> np.ndarray:
+        """Return the log of the weighted mean of ``exp(-|s y - t|^2)`` over the prior.
 
-        The signals y are `whitened`, and t is the whitened mean for a user outside.
+        The signals y are `whitened`, and t is the whitened mean for a user outside. Returns a
+        value for each scale s, up to what is negligible among all of them.
         """
         filtered, energy = self._filter(whitened), float(np.sum(np.abs(whitened)**2))
         # At any range, the log-likelihood is highest if the outputs of all bands are in phase.
         bound = (np.sum(filtered, axis=0)**2 / self._node_energy).max(axis=0)
-        values = []
-        for scale in scales:
-            # Small scales make directions more alike.
-            chosen = np.flatnonzero(bound >= bound.max() - GRID.margin / scale**2)
-            argument = filtered[:, :, chosen][:, self._index] * (np.float32(scale) * self._scale)
-            log_likelihood = np.sum(_log_bessel(argument), axis=0) + self._offset[:, chosen]
-            values.append(log_sum(log_likelihood) - scale**2 * energy)
-        return np.array(values)
+        constants = log_weights - scales**2 * energy
+        least = float((scales**2 * bound.max() + constants).max()) - GRID.margin
+        # Small scales make directions more alike. Those for any scale begin with the best ones.
+        counts = np.count_nonzero(
+            np.multiply.outer(scales**2, bound) >= (least - constants)[:, None], axis=1)
+        order = np.argsort(-bound)[:counts.max()]
+        arguments, offset = (
+            filtered[:, :, order][:, self._index] * self._scale, self._offset[:, order])
+        values = np.full(len(scales), -np.inf)
+        for row in np.flatnonzero(counts):
+            chosen = slice(counts[row])
+            logs = _log_bessel(arguments[..., chosen] * np.float32(scales[row]))
+            values[row] = log_sum(logs.sum(axis=0) + offset[:, chosen]) + constants[row]
+        return values
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some position explains the signals up to this residual energy."""

@@ -23,7 +23,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import adjoint
+from rhs_isac_ros.model.arrays import adjoint, blocks
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
 from rhs_isac_ros.model.gaussian import energy_limit
 from rhs_isac_ros.model.geometry import jacobian, to_positions
@@ -48,6 +48,8 @@ from rhs_isac_ros.positioning.segments import concatenate, select
 _MAX_EXPECTED = 2.0
 # Number of sets whose covariance is kept.
 _MAX_SURFACES = 256
+# Number of places at which all elements are compared at a time.
+_PLACES = 8
 
 
 class FailureLimits(NamedTuple):
@@ -322,7 +324,8 @@ class Place:
         They are the change of `columns`, complex128 [N_E, 4 + Q, N_B, N_SB F], and the derivative
         of the mean with respect to the normalised amplitude, complex128 [N_E, N_B, N_SB F].
         """
-        return self.model.elements_at(self.point)
+        ((changes,), (amplitudes,)) = self.model.elements_at(self.point[None])
+        return changes, amplitudes
 
     def columns_of(self, failed: Failed) -> tuple[np.ndarray, np.ndarray]:
         """Return the columns with failed elements, and the columns for their amplitudes."""
@@ -382,19 +385,20 @@ class FailureModel:
         columns = prior.columns(values, signals.received, mean, slopes)[:, :4 + len(prior)]
         return [Place(self, *each) for each in zip(points, values, columns, strict=True)]
 
-    def elements_at(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute `Place.elements` at a point [3]."""
+    def elements_at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Compute `Place.elements` at points [P, 3]; the arrays begin with an axis of places."""
         scenario, prior = self.likelihood.scenario, self.likelihood.nuisance
         effects, gains = self.surfaces.effects, []
         for band in range(scenario.n_bands):
-            gain, slope = los_and_derivative(scenario, to_positions(point[None]), band)
-            both = np.concatenate([gain, np.tensordot(jacobian(point[None])[0].T, slope[0], 1)])
-            gains.append(np.repeat(both, scenario.n_frames, axis=1))
-        elements = np.moveaxis(np.stack(gains), (0, 1, 2, 3), (2, 1, 3, 0))
+            gain, slope = los_and_derivative(scenario, to_positions(points), band)
+            slope = np.einsum('pxq,pxjm->pqjm', jacobian(points), slope)
+            gains.append(np.concatenate([gain[:, None], slope], axis=1))
+        elements = np.repeat(np.moveaxis(np.stack(gains), (0, 4), (3, 1)), scenario.n_frames, -1)
         changes = elements * effects.shift[:, None]
         fixed = prior.scaled_patterns * ~prior.moves_multipath[:, None, None]
-        changes = np.concatenate([-changes[:, :1], changes[:, 1:], fixed * changes[:, :1]], axis=1)
-        return changes, elements[:, 0] * effects.amplitude
+        changes = np.concatenate(
+            [-changes[:, :, :1], changes[:, :, 1:], fixed * changes[:, :, :1]], axis=2)
+        return changes, elements[:, :, 0] * effects.amplitude
 
     def weigh(self, failed: Failed, places: Sequence[Place]) -> tuple[np.ndarray, np.ndarray]:
         """Return a set's log-probability and deviance, [P] each, after a step at each of P places.
@@ -405,37 +409,52 @@ class FailureModel:
         """
         whitening = self.surfaces.whitening(failed)
         columns = np.stack([np.concatenate(place.columns_of(failed)) for place in places])
-        value = self._predicted(np.stack([place.values for place in places]), columns, whitening,
-                                len(failed))
+        (value,) = self._predicted(np.stack([place.values for place in places]), columns[None],
+                                   whitening, len(failed))
         log_prior = len(failed) * self.surfaces.log_odds
         return log_prior - whitening.factors.log_det + value, -value
 
-    def weigh_extensions(self, failed: Failed, place: Place, remainder: float = 0.0) -> np.ndarray:
-        """Weigh a set, as `weigh` does, with each element added in turn, float64 [N_E].
+    def weigh_extensions(self, failed: Failed, places: Sequence[Place], remainder: float = 0.0
+                         ) -> np.ndarray:
+        """Weigh a set, as `weigh` does, with each element added in turn, float64 [P, N_E].
 
         Further elements are assumed to fail with a probability of `remainder` times the declared
         share; these failures add to the covariance. With a `remainder`, an element that explains
         part of the signals has a higher value than one that imitates the sum of several failures.
         """
-        extended, (columns, own) = (
-            self.surfaces.extensions(failed, remainder), place.columns_of(failed))
-        changes, amplitudes = place.elements
-        own = np.broadcast_to(own, (len(changes), *own.shape))
-        # In the order of the fields of `Columns`. The mean is linear in the amplitudes of failed
-        # elements.
-        parts = np.concatenate([columns + changes, own, amplitudes[:, None]], axis=1)
-        values = np.broadcast_to(place.values, (len(changes), len(place.values)))
-        value = self._predicted(values, parts, extended, len(failed) + 1)
-        return (len(failed) + 1) * self.surfaces.log_odds - extended.factors.log_det + value
+        extended, parts = self.surfaces.extensions(failed, remainder), []
+        # A cached property is in vars() once it is computed.
+        new = [place for place in places if 'elements' not in vars(place)]
+        if new:
+            for place, *effects in zip(
+                    new, *self.elements_at(np.stack([one.point for one in new])), strict=True):
+                place.elements = tuple(effects)
+        for place in places:
+            (changes, amplitudes), (columns, own) = place.elements, place.columns_of(failed)
+            own = np.broadcast_to(own, (len(changes), *own.shape))
+            # In the order of the fields of `Columns`. The mean is linear in the amplitudes of
+            # failed elements.
+            parts.append(np.concatenate([columns + changes, own, amplitudes[:, None]], axis=1))
+        values = np.stack([place.values for place in places])
+        value = self._predicted(values, np.stack(parts, axis=1), extended, len(failed) + 1)
+        return ((len(failed) + 1) * self.surfaces.log_odds
+                - extended.factors.log_det[:, None] + value).T
 
     def _predicted(self, values: np.ndarray, columns: np.ndarray, whitening: Whitening,
                    n_failed: int) -> np.ndarray:
-        """Predict log-likelihoods [H] after a Newton step from columns [H, C, N_B, N_SB F]."""
-        white, prior = whitening.factors.whiten(columns), self.likelihood.nuisance
+        """Predict log-likelihoods [H, P] of H sets after a Newton step at each of P places.
+
+        Takes the parameters, [P, Q], and columns, [H, P, C, N_B, N_SB F].
+        """
+        (n_sets, n_places, n_columns), prior = columns.shape[:3], self.likelihood.nuisance
+        # In one product for each set.
+        white = whitening.factors.whiten(columns.reshape(n_sets, -1, *columns.shape[3:]))
+        noise = whitening.factors.noise
         local = assemble(
-            prior, values, Columns.of(white, len(prior), n_failed), whitening.information,
-            whitening.factors.noise)
-        return predict(local, self.likelihood)
+            prior, np.tile(values, (n_sets, 1)),
+            Columns.of(white.reshape(n_sets * n_places, n_columns, -1), len(prior), n_failed),
+            whitening.information, noise if noise is None else np.repeat(noise, n_places, axis=0))
+        return predict(local, self.likelihood).reshape(n_sets, n_places)
 
 
 class FailureSearch:
@@ -514,11 +533,15 @@ class FailureSearch:
         """Return the hypotheses with one more failed element, the most probable first."""
         children: dict[Key, float] = {}
         # In this order, the covariances of a set are computed once.
-        for failed, index in sorted(parents):
-            values = self._model.weigh_extensions(failed, self.places[index], remainder)
-            for element, value in enumerate(values.tolist()):
-                if element not in failed:
-                    children[tuple(sorted((*failed, element))), index] = value
+        for failed, group in itertools.groupby(sorted(parents), key=lambda key: key[0]):
+            indices = [index for _, index in group]
+            for part in blocks(len(indices), _PLACES):
+                places = [self.places[index] for index in indices[part]]
+                values = self._model.weigh_extensions(failed, places, remainder)
+                for index, of_place in zip(indices[part], values.tolist(), strict=True):
+                    for element, value in enumerate(of_place):
+                        if element not in failed:
+                            children[tuple(sorted((*failed, element))), index] = value
         return sorted(children, key=lambda key: -children[key])
 
 

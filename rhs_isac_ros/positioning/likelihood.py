@@ -191,8 +191,8 @@ class WhiteMeans(NamedTuple):
         prior, whitened = self.likelihood.nuisance, self.likelihood.whitened(values, signals)
         by_point = self.slopes.reshape(*self.slopes.shape[:2], self.mean[0].size)
         by_values, observed = prior.slopes(whitened, self.mean)
-        columns = Columns((whitened - self.mean).reshape(len(values), -1), by_point, by_values,
-                          by_point[:, :0], observed)
+        columns = Columns((whitened - self.mean).reshape(len(self.mean), -1), by_point,
+                          by_values, by_point[:, :0], observed)
         return assemble(
             prior, values, columns, prior.information, self.likelihood.factors.noise)
 

@@ -149,7 +149,7 @@ class NuisancePrior(Exponents):
         """
         # P is the same in all measurements of a band, unless it moves the multipath.
         constants, moves = self.scaled_patterns[:, :, :1], self.moves_multipath
-        observed = constants * whitened[:, None]
+        observed = constants * np.broadcast_to(whitened, mean.shape)[:, None]
         for row in np.flatnonzero(moves):
             observed[:, row] = multiply_rows(self._operators[row], whitened)
         observed = observed.reshape(*observed.shape[:2], mean[0].size)

@@ -157,7 +157,7 @@ def tolerance(model):
 
 def test_a_further_failure_is_weighed_as_the_larger_set(weighing):
     model, site = weighing
-    values = model.weigh_extensions((5, 20), site)
+    values = model.weigh_extensions((5, 20), [site])[0]
     for element in (0, 12, 35):
         larger = tuple(sorted((5, 20, element)))
         (expected,), _ = model.weigh(larger, [site])
@@ -166,7 +166,7 @@ def test_a_further_failure_is_weighed_as_the_larger_set(weighing):
 
 def test_the_remainder_adds_to_the_covariance(weighing, codebook, monkeypatch):
     model, site = weighing
-    values = model.weigh_extensions((5,), site, 0.3)
+    values = model.weigh_extensions((5,), [site], 0.3)[0]
     remainder = 0.3 * DeclaredElements(SCENARIO).error_covariance(SCENARIO, codebook)
     for element in (0, 35):
         failed = tuple(sorted((5, element)))
