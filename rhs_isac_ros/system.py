@@ -1,12 +1,12 @@
 """The system: one surface with its base station, and the file that names its parts.
 
 A `System` answers all questions about a positioning phase: it is the `MeasurementModel` of the
-signals, simulates them and bounds the error. Estimators, sites and beams take a system. The file
-of a system names a scenario, a codebook and, optionally, a calibration, as does each entry of the
-file of a site.
+signals, simulates them, bounds the error and steers beams. Estimators and sites take a system. The
+file of a system names a scenario, a codebook and, optionally, a calibration, as does each entry of
+the file of a site.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +15,9 @@ import numpy as np
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.link import Beamformer, Choice, choose_beam, steer
 from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.measurement import KnownSurface
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.errors import translated
@@ -69,6 +71,21 @@ class System(MeasurementModel):
     def crlb(self, positions: np.ndarray, *, region_prior: bool = False) -> np.ndarray:
         """Compute the Cramer-Rao bound at positions [N, 3] [m], float64 [N] [m^2]; see `crlb`."""
         return crlb_of(self, positions, region_prior=region_prior)
+
+    def steer(self, position: np.ndarray, band: int = 0) -> Beamformer:
+        """Find the beam for a user at a position, float64 [3] [m]; see the function `steer`."""
+        return steer(self.scenario, position, band, self._steered)
+
+    def choose_beam(self, mean: np.ndarray, covariance: np.ndarray | None = None,
+                    bands: Sequence[int] | None = None) -> Choice:
+        """Choose a beam and its band for an estimate; see the function `choose_beam`."""
+        return choose_beam(self.scenario, mean, covariance, bands, self._steered)
+
+    @property
+    def _steered(self) -> SurfaceEstimate | None:
+        if self.surface is None or isinstance(self.surface, SurfaceEstimate):
+            return self.surface
+        raise ValueError('surface: known errors of elements, expected an estimate for steering')
 
     def pairs(self, n: int, seed: int, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Simulate positioning phases at random positions of the region of interest.

@@ -9,7 +9,9 @@ import yaml
 from rhs_isac_ros.bounds import crlb, crlb_of
 from rhs_isac_ros.calibration import Calibration
 from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.link import choose_beam, steer
 from rhs_isac_ros.model import MeasurementModel, Scenario, draw_surface
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.system import System
 
 CONFIG = Path(__file__).parents[1] / 'config'
@@ -48,6 +50,23 @@ def test_a_known_surface_belongs_to_the_model(small):
     parts, positions = (small.scenario, small.codebook, surface), np.array([[8.0, 1.0, 0.2]])
     np.testing.assert_array_equal(
         System(*parts).crlb(positions), crlb_of(MeasurementModel(*parts), positions))
+
+
+def test_beams_are_those_for_the_coefficients_of_an_estimated_surface(small):
+    scenario, place = small.scenario, np.array([8.0, 1.0, 0.2])
+    n = scenario.n_elements
+    estimate = SurfaceEstimate(np.exp(1j * np.arange(n)), np.zeros(n), np.ones(scenario.n_bands),
+                               np.zeros((2 * n + scenario.n_bands, 0)), np.zeros(n))
+    for surface in (None, estimate):
+        system = System(scenario, small.codebook, surface)
+        np.testing.assert_array_equal(
+            system.steer(place).analog, steer(scenario, place, 0, surface).analog)
+        assert system.choose_beam(place, np.eye(3)).expected_bps == choose_beam(
+            scenario, place, np.eye(3), surface=surface).expected_bps
+    drawn = draw_surface(
+        Scenario(**scenario.changes() | {'element_error_rms': 0.1}), np.random.default_rng(1))
+    with pytest.raises(ValueError, match='surface: known errors of elements, expected an estim'):
+        System(scenario, small.codebook, drawn).steer(place)
 
 
 def test_a_codebook_of_other_sizes_is_named(setting, small):
