@@ -13,8 +13,9 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.processes import Processes
-from rhs_isac_ros.ros.recording import CycleObserver, Recorder
+from rhs_isac_ros.ros.recording import CycleObserver, Recorder, schema, type_name
 from rhs_isac_ros.tools.command import Session
 
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -46,6 +47,31 @@ def make_cycles(example):
                 capacity=example(m.Capacity, **about, codebook_id='cb', actual_bps=1e6)))
         return cycles
     return make
+
+
+@pytest.fixture(scope='session')
+def write_recording():
+    """Function that writes messages to a recording of the small scenario, 0.1 s apart."""
+    def write(path, messages, namespace=''):
+        from mcap.writer import Writer
+        names = {**topics.NAMES, convert.CodebookMessage: topics.CODEBOOK}
+        writer, channels = Writer(str(path)), {}
+        writer.start()
+        writer.add_metadata(
+            'scenario', {'yaml': (CONFIG / 'quick.yaml').read_text(encoding='utf-8')})
+        for number, message in enumerate(messages):
+            kind, own = type(message), convert.ros_type(type(message))
+            if kind not in channels:
+                channels[kind] = writer.register_channel(
+                    f'{namespace}/{names[kind]}', 'cdr', writer.register_schema(
+                        type_name(own), 'ros2msg', schema(own).encode()))
+            time_ns = number * 10**8
+            identity = message.sender, message.scenario_id
+            writer.add_message(channels[kind], time_ns, convert.to_bytes(
+                message, time_ns, identity), time_ns)
+        writer.finish()
+        return path
+    return write
 
 
 @pytest.fixture(scope='package')

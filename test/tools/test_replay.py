@@ -15,12 +15,12 @@ from rclpy.node import Node
 from ros_messages import from_ros
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Pose, Scenario
+from rhs_isac_ros.model import Pose, Scenario, simulate_received
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE, OBSERVATION
-from rhs_isac_ros.ros.recording import read, recorded_topics, schema, type_name
+from rhs_isac_ros.ros.recording import read
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.tools import replay
 from rhs_isac_ros.tools.replay import load, locate, main
@@ -28,6 +28,7 @@ from rhs_isac_ros.tools.replay import load, locate, main
 pytest.importorskip('mcap', reason='mcap is not installed')
 CONFIG = Path(__file__).parents[2] / 'config'
 SCRIPTS = CONFIG.parent / 'scripts'
+SCENARIO = Scenario.from_yaml(CONFIG / 'quick.yaml')
 N_MANY = EXCHANGE.depth + 22
 
 
@@ -264,28 +265,17 @@ def test_a_running_positioner_reproduces_the_recorded_estimates(run, received, p
 
 
 @pytest.fixture
-def many(run, tmp_path):
+def many(write_recording, tmp_path):
     """A recording with more signals than the queue of a subscription holds."""
-    from mcap.writer import Writer
-    kinds = recorded_topics()
-    path = tmp_path / 'many.mcap'
-    writer = Writer(str(path))
-    writer.start()
-    writer.add_metadata('scenario', {'yaml': (CONFIG / 'quick.yaml').read_text(encoding='utf-8')})
-    channels = {name: writer.register_channel(f'/{name}', 'cdr', writer.register_schema(
-        type_name(kinds[name][0]), 'ros2msg', schema(kinds[name][0]).encode()))
-        for name in ('codebook', 'received_signals')}
-    codebook = next(found for _, found, _ in read(run.path, ['/codebook']))
-    writer.add_message(channels['codebook'], 0, codebook, 0)
-    signals = convert.from_bytes(m.ReceivedSignals, next(
-        found for _, found, _ in read(run.path, ['/received_signals'])))
-    for number in range(1, N_MANY + 1):
-        time_ns = number * 10**8
-        writer.add_message(channels['received_signals'], time_ns, convert.to_bytes(
-            dataclasses.replace(signals, cycle_id=number), time_ns,
-            (signals.sender, signals.scenario_id), 'rhs_link'), time_ns)
-    writer.finish()
-    return path
+    codebook = Codebook.load(CONFIG / 'codebook_quick.yaml')
+    center = np.array([SCENARIO.roi_center_m])
+    received = simulate_received(SCENARIO, codebook, center, np.random.default_rng(0))
+    signals = m.ReceivedSignals(
+        cycle_id=1, scenario_id=SCENARIO.id, user=1, codebook_id=codebook.id,
+        signals=received.reshape(SCENARIO.n_bands, SCENARIO.n_subbands, SCENARIO.n_frames))
+    return write_recording(tmp_path / 'many.mcap', [
+        convert.CodebookMessage.of(codebook), *(
+            dataclasses.replace(signals, cycle_id=number) for number in range(1, N_MANY + 1))])
 
 
 def test_no_signals_are_lost_at_any_rate(many, publish):
