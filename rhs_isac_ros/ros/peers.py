@@ -22,7 +22,7 @@ from rhs_isac_ros.support.clock_watch import ClockWatch
 
 # Poll period while roles appear or nodes are in conflict, poll period otherwise, and of a node
 # without work that nobody observes [s].
-_POLL_S, _IDLE_POLL_S, _SLOW_POLL_S = 0.1, 1.0, 2.0
+_POLL_S, _IDLE_POLL_S, _SLOW_POLL_S = 0.1, 1.0, 4.0
 # Time after the last message until a node has no work [s].
 _WORK_S = 5.0
 # Number of polls before the first report of missing roles, while discovery is still under way.
