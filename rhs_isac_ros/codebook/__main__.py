@@ -183,11 +183,11 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
         'n_positions': options.positions, 'max_steps': options.steps,
         'max_evaluations': options.evaluations}
     if options.spectrum:
-        with unfinished(options) as workers:
+        with unfinished(options.output, options, options.quiet) as workers:
             plan = _choose_bands(options, scenario, given, workers)
         scenario, result = plan.scenario, plan.result
     elif options.restarts > 1 or options.dask:
-        with unfinished(options) as workers:
+        with unfinished(options.output, options, options.quiet) as workers:
             (result,) = workers.run([restarted(
                 scenario, options.restarts, options.seed, start=start,
                 calibration=options.calibration, **given)])

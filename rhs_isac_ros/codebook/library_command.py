@@ -65,7 +65,7 @@ def _run(options: argparse.Namespace) -> None:
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
     start = Codebook.load(options.start or default_codebook_file())
     start.check(scenario)
-    with unfinished(options) as workers:
+    with unfinished(options.output, options, options.quiet) as workers:
         made = library.make_library(
             scenario, start, options.objective, sorted(options.spreads), options.loss,
             None if options.quiet else _print_loss, workers)

@@ -444,13 +444,14 @@ def add_run_options(parser: argparse.ArgumentParser, output: str = '') -> None:
 
 
 @contextlib.contextmanager
-def unfinished(options: argparse.Namespace) -> Iterator[Workers]:
-    """Yield the workers of options whose results are kept in OUTPUT.jobs until the block succeeds.
+def unfinished(output: Path, options: argparse.Namespace, quiet: bool = False
+               ) -> Iterator[Workers]:
+    """Yield workers whose results are kept in OUTPUT.jobs until the block succeeds.
 
-    The options are ``output``, ``quiet`` and those of `add_run_options`.
+    The options are those of `add_run_options`.
     """
-    folder = options.output.with_name(options.output.name + '.jobs')
-    yield Workers(options.jobs, options.dask, folder, quiet=options.quiet)
+    folder = output.with_name(output.name + '.jobs')
+    yield Workers(options.jobs, options.dask, folder, quiet=quiet)
     shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -10,6 +10,8 @@ over the positions for squared errors.
 --spectrum 2.5e9:3.0e9 --bands 2 --plan two.yaml --output codebook_two.yaml.
 """
 
+from typing import Any
+
 import numpy as np
 from parts import frame
 
@@ -21,28 +23,34 @@ from rhs_isac_ros.positioning import make_estimator
 
 def main() -> None:
     """Run the benchmark."""
-    parser = frame.benchmark_parser('bandplan', __doc__, 10_000)
+    parser = frame.benchmark_parser('bandplan', __doc__, 10_000, has_jobs=True)
     frame.add_plans(parser, [*frame.SYSTEMS])
     parser.add_argument('--only-plans', action='store_true', help='only the plans of --plan')
     options = parser.parse_args()
     print(f'{options.positions} positions, seed {options.seed}, posterior mean\n')
+    plans = {} if options.only_plans else {
+        name: [frame.CONFIG / file for file in files] for name, files in frame.SYSTEMS.items()}
+    plans |= options.plan
+    figures = frame.measured(options, 'bandplan', measure, {
+        name: {'scenario': str(scenario), 'codebook': str(codebook), 'n': options.positions,
+               'seed': options.seed} for name, (scenario, codebook) in plans.items()})
     table = frame.Table(['plan'], {
         'mean squared error [m²]': ('mse_m2', 4), 'median error [m]': ('median_m', 3),
         'average CRLB [m²]': ('average_crlb_m2', 4), 'in the 95 % region [%]': ('covered', 1)})
-    systems = {} if options.only_plans else {
-        name: frame.system(name) for name in frame.SYSTEMS}
-    systems |= {name: (Scenario.from_yaml(scenario), Codebook.load(codebook))
-                for name, (scenario, codebook) in options.plan.items()}
-    figures = {}
-    for name, (scenario, codebook) in systems.items():
-        rng = np.random.default_rng(options.seed)
-        positions = scenario.sample_positions(options.positions, rng)
-        received = simulate_received(scenario, codebook, positions, rng)
-        estimate = make_estimator('bayes', scenario, codebook).estimate(received)
-        figures[name] = table.row(
-            name, **frame.Fixes.of(estimate, positions).figures(), id=codebook.id,
-            average_crlb_m2=crlb(scenario, codebook, positions).mean())
+    for name, row in figures.items():
+        table.row(name, **row)
     frame.write_results(options.json, figures)
+
+
+def measure(scenario: str, codebook: str, n: int, seed: int) -> dict[str, Any]:
+    """Run a job: locate users with a plan."""
+    world, book = Scenario.from_yaml(scenario), Codebook.load(codebook)
+    rng = np.random.default_rng(seed)
+    positions = world.sample_positions(n, rng)
+    received = simulate_received(world, book, positions, rng)
+    estimate = make_estimator('bayes', world, book).estimate(received)
+    return frame.Fixes.of(estimate, positions).figures() | {
+        'id': book.id, 'average_crlb_m2': crlb(world, book, positions).mean()}
 
 
 if __name__ == '__main__':

@@ -18,6 +18,7 @@ over the frames. This is exact except for the decorrelation of the multipath bet
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from parts import frame
@@ -245,23 +246,29 @@ def receivers(scenario: Scenario, seed: int) -> dict[str, Callable[[], ArrayRece
 
 def main() -> None:
     """Run the benchmark."""
-    options = frame.benchmark_parser('baselines', __doc__, 1000).parse_args()
-    scenario = Scenario()
-    positions = scenario.sample_positions(
-        options.positions, np.random.default_rng(options.seed))
+    options = frame.benchmark_parser('baselines', __doc__, 1000, has_jobs=True).parse_args()
     print(f'{options.positions} positions, seed {options.seed}, posterior mean\n')
+    figures = frame.measured(options, 'baselines', measure, {
+        name: {'name': name, 'n': options.positions, 'seed': options.seed}
+        for name in receivers(Scenario(), options.seed)})
     table = frame.Table(['receiver'], {
         'average CRLB [m²]': ('average_crlb_m2', 4), 'mean squared error [m²]': ('mse_m2', 4),
         'standard error': ('standard_error_m2', 4), 'median': ('median_m2', 4)})
-    figures = {}
-    for name, make in receivers(scenario, options.seed).items():
-        receiver = make()
-        received = receiver.simulate(positions, np.random.default_rng(options.seed + 1))
-        errors = np.sum((posterior_means(receiver, received) - positions)**2, axis=1)
-        figures[name] = table.row(
-            name, average_crlb_m2=receiver.crlb(positions).mean(), mse_m2=errors.mean(),
-            standard_error_m2=errors.std() / np.sqrt(len(errors)), median_m2=np.median(errors))
+    for name, row in figures.items():
+        table.row(name, **row)
     frame.write_results(options.json, figures)
+
+
+def measure(name: str, n: int, seed: int) -> dict[str, Any]:
+    """Run a job: locate users with a receiver."""
+    scenario = Scenario()
+    positions = scenario.sample_positions(n, np.random.default_rng(seed))
+    receiver = receivers(scenario, seed)[name]()
+    received = receiver.simulate(positions, np.random.default_rng(seed + 1))
+    errors = np.sum((posterior_means(receiver, received) - positions)**2, axis=1)
+    return {'average_crlb_m2': receiver.crlb(positions).mean(), 'mse_m2': errors.mean(),
+            'standard_error_m2': errors.std() / np.sqrt(len(errors)),
+            'median_m2': np.median(errors)}
 
 
 if __name__ == '__main__':

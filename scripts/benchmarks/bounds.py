@@ -8,9 +8,9 @@ those of `bayes`, and intervals are twice the standard error. The bound and the 
 independent random numbers.
 """
 
-import argparse
+import itertools
 import time
-from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from parts import frame
@@ -30,65 +30,68 @@ STEPS, POSITIONS = {'crlb': 300, 'ambiguity': 150}, {'crlb': 256, 'ambiguity': 6
 
 def main() -> None:
     """Run the benchmark."""
-    parser = frame.benchmark_parser('bounds', __doc__, 2000)
+    parser = frame.benchmark_parser('bounds', __doc__, 2000, has_jobs=True)
     parser.add_argument('--phases', type=integer(2), default=2048,
                         help='positioning phases of the bound')
     options = parser.parse_args()
     print(f'{options.positions} positions, {options.phases} phases for the bound, seed '
           f'{options.seed}\n')
+    pairs = [*(('Table I', name) for name in codebooks(options.seed)),
+             *itertools.product(PLANS, STEPS)]
+    figures = frame.measured(options, 'bounds', compare, {
+        f'{plan}, {name}': {'plan': plan, 'codebook': name, 'n': options.positions,
+                            'n_phases': options.phases, 'seed': options.seed}
+        for plan, name in pairs}).values()
     table = frame.Table(['plan', 'codebook'], {
         'MSE [m²]': ('mse_m2', 3), '± of it': ('mse_interval_m2', 3),
         'CRLB [m²]': ('average_crlb_m2', 4), 'bound [m²]': ('bound_m2', 3),
         '± of the bound': ('bound_interval_m2', 3), 'MSE / CRLB': ('mse_to_crlb', 1),
         'MSE / bound': ('mse_to_bound', 3), 'time of the bound [s]': ('bound_seconds', 1)})
-    figures = [
-        {'plan': plan, 'codebook': name,
-         **table.row(plan, name, **compare(scenario, codebook, options))}
-        for plan, name, scenario, codebook in pairs(options)]
+    for row in figures:
+        table.row(row['plan'], row['codebook'], **row)
     ratios = [entry['mse_to_bound'] for entry in figures]
     print(f'\nMSE / bound from {min(ratios):.3f} to {max(ratios):.3f} over {len(ratios)} pairs')
-    frame.write_results(options.json, figures)
+    frame.write_results(options.json, [*figures])
 
 
-def pairs(options: argparse.Namespace) -> Iterator[tuple[str, str, Scenario, Codebook]]:
-    """Yield the names of plan and codebook, with both."""
+def codebooks(seed: int) -> dict[str, Codebook]:
+    """Return the codebooks for Table I."""
     scenario = Scenario()
-    codebooks = {
+    return {
         'ambiguity': Codebook.load(frame.CONFIG / 'codebook_ambiguity.yaml'),
         'crlb': Codebook.load(frame.CONFIG / 'codebook_crlb.yaml'),
         'directional, width': directional_codebook(scenario),
         'directional, grid': directional_codebook(scenario, scan='grid'),
-        'random': random_codebook(scenario, streams.generator(options.seed, streams.START))}
-    for name, codebook in codebooks.items():
-        yield 'Table I', name, scenario, codebook
-    for plan, centers in PLANS.items():
-        scenario = Scenario(center_frequencies_hz=centers, n_frames=2)
-        for objective, steps in STEPS.items():
-            result = optimize(
-                scenario, objective=objective, max_steps=steps,
-                n_positions=POSITIONS[objective], seed=options.seed)
-            yield plan, objective, scenario, result.codebook
+        'random': random_codebook(scenario, streams.generator(seed, streams.START))}
 
 
-def compare(
-        scenario: Scenario, codebook: Codebook, options: argparse.Namespace
-) -> dict[str, float | str]:
-    """Measure the error and compute the bounds."""
-    system = System(scenario, codebook)
-    positions, received = system.pairs(options.positions, options.seed)
-    means = make_estimator('bayes', scenario, codebook).estimate(received).mean
-    means[~np.isfinite(means).all(axis=1)] = scenario.roi_center_m
+def pair(plan: str, name: str, seed: int) -> System:
+    """Return a plan with a codebook, which is optimised for plans other than Table I."""
+    if plan not in PLANS:
+        return System(Scenario(), codebooks(seed)[name])
+    scenario = Scenario(center_frequencies_hz=PLANS[plan], n_frames=2)
+    return System(scenario, optimize(
+        scenario, objective=name, max_steps=STEPS[name], n_positions=POSITIONS[name],
+        seed=seed).codebook)
+
+
+def compare(plan: str, codebook: str, n: int, n_phases: int, seed: int) -> dict[str, Any]:
+    """Run a job: measure the error and compute the bounds."""
+    system = pair(plan, codebook, seed)
+    positions, received = system.pairs(n, seed)
+    means = make_estimator('bayes', system.scenario, system.codebook).estimate(received).mean
+    means[~np.isfinite(means).all(axis=1)] = system.scenario.roi_center_m
     errors = np.sum((means - positions)**2, axis=1)
     local = float(system.crlb(positions).mean())
     begin = time.process_time()
-    bound = global_bound(system, np.random.default_rng([options.seed, 1]), options.phases)
+    bound = global_bound(system, np.random.default_rng([seed, 1]), n_phases)
     seconds = time.process_time() - begin
     return {
-        'id': codebook.id, 'mse_m2': float(errors.mean()),
-        'mse_interval_m2': 2 * float(errors.std()) / np.sqrt(len(errors)),
+        'plan': plan, 'codebook': codebook, 'id': system.codebook.id, 'mse_m2': errors.mean(),
+        'mse_interval_m2': 2 * errors.std() / np.sqrt(len(errors)),
         'average_crlb_m2': local, 'bound_m2': bound.value,
-        'bound_interval_m2': 2 * bound.standard_error, 'mse_to_crlb': float(errors.mean()) / local,
-        'mse_to_bound': float(errors.mean()) / bound.value, 'bound_seconds': seconds}
+        'bound_interval_m2': 2 * bound.standard_error, 'mse_to_crlb': errors.mean() / local,
+        'mse_to_bound': errors.mean() / bound.value, 'bound_seconds': seconds}
 
 
 if __name__ == '__main__':

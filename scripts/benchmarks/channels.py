@@ -17,6 +17,7 @@ The folder contains empty_test.npz, hall_test.npz and hall_survey.npz with propa
 
 import dataclasses
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -44,7 +45,7 @@ class Received(NamedTuple):
 
 def main() -> None:
     """Run the benchmark."""
-    parser = frame.benchmark_parser('channels', __doc__)
+    parser = frame.benchmark_parser('channels', __doc__, has_jobs=True)
     add = parser.add_argument
     add('folder', type=Path, nargs='?', default=frame.CONFIG.parents[1] / 'shared' / 'channels',
         help='folder of the channel files')
@@ -59,37 +60,80 @@ def main() -> None:
         'fix [%]': ('fix', 1), 'in the 95 % region [%]': ('in_region', 1),
         'range over surveys [%]': ('range', 1), 'confidently wrong [%]': ('wrong', 1),
         'rms error [m]': ('rms_m', 3)})
-    figures: dict[str, dict] = {'hall': {}, 'empty': {}}
+    jobs, rows = {}, []
     for name in frame.SYSTEMS:
         scenario, codebook = frame.system(name)
         rng = np.random.default_rng(options.seed)
-        empty, hall, known = (
-            dataclasses.replace(scenario, channel=options.folder / f'{file}.npz')
-            for file in ('empty_test', 'hall_test', 'hall_survey'))
-        figures['empty'][name] = report(table, 'empty', name, 'none', [
-            measure(scenario, codebook, receive(empty, codebook, rng))])['']
-        figures['hall'][name] = {'shipped': report(table, 'hall', name, 'none', [
-            measure(scenario, codebook, receive(hall, codebook, rng))])['']}
-        for hidden in (0.0, *options.blocked):
-            place = f'hall, {100 * hidden:g} % blocked' if hidden else 'hall'
-            for n in options.positions:
-                results = []
-                for _ in range(options.surveys):
-                    surveyed = receive(known, codebook, rng, n, hidden)
-                    with warnings.catch_warnings():
-                        warnings.simplefilter('ignore', SurveyWarning)
-                        multipath = survey(
-                            scenario, codebook, surveyed.users, surveyed.signals)
-                    measured = dataclasses.replace(
-                        scenario, multipath=multipath,
-                        blocked_probability=PRIOR if hidden else 0.0)
-                    results.append(measure(
-                        measured, codebook, receive(hall, codebook, rng, hidden=hidden)))
-                for users, found in report(
-                        table, place, name, f'{n} positions', results).items():
-                    key = f'{users}, {hidden:g} blocked' if users else 'hall'
-                    figures.setdefault(key, {}).setdefault(name, {})[str(n)] = found
+
+        def add_job(name: str, file: str, survey: tuple[str, int, float] | None,
+                    rng: np.random.Generator, hidden: float = 0.0) -> str:
+            """Add a job that draws from here on, and draw its numbers; return its name."""
+            key = f'{name} {len(jobs)}'
+            jobs[key] = {'system': name, 'folder': str(options.folder), 'file': file,
+                         'known': survey, 'hidden': hidden, 'random': state_of(rng)}
+            draws(name, str(options.folder), file, survey, hidden, rng)
+            return key
+
+        rows += [('empty', name, 'none', [add_job(name, 'empty_test', None, rng)]),
+                 ('hall', name, 'none', [add_job(name, 'hall_test', None, rng)])]
+        rows += [(f'hall, {100 * hidden:g} % blocked' if hidden else 'hall', name, n,
+                  [add_job(name, 'hall_test', ('hall_survey', n, hidden), rng, hidden)
+                   for _ in range(options.surveys)])
+                 for hidden in (0.0, *options.blocked) for n in options.positions]
+    found = frame.measured(options, 'channels', located, jobs)
+    figures: dict[str, dict] = {'hall': {}, 'empty': {}}
+    for place, name, n, keys in rows:
+        results = [{users: frame.Fixes(*map(np.array, fixes))
+                    for users, fixes in found[key].items()} for key in keys]
+        known, hidden = n if n == 'none' else f'{n} positions', jobs[keys[0]]['hidden']
+        for users, figure in report(table, place, name, known, results).items():
+            key = f'{users}, {hidden:g} blocked' if users else place
+            if place == 'empty':
+                figures['empty'][name] = figure
+            else:
+                figures.setdefault(key, {}).setdefault(name, {})[
+                    'shipped' if n == 'none' else str(n)] = figure
     frame.write_results(options.json, figures)
+
+
+def state_of(rng: np.random.Generator) -> dict:
+    """Return the state of a generator as numbers, including that of its next children."""
+    seeds = rng.bit_generator.seed_seq
+    return {'seed': seeds.entropy, 'children': seeds.n_children_spawned,
+            'state': rng.bit_generator.state}
+
+
+def generator_of(state: dict) -> np.random.Generator:
+    """Return a generator with a state."""
+    bits = np.random.PCG64(np.random.SeedSequence(
+        state['seed'], n_children_spawned=state['children']))
+    bits.state = state['state']
+    return np.random.Generator(bits)
+
+
+def draws(system: str, folder: str, file: str, known: Sequence | None, hidden: float,
+          rng: np.random.Generator) -> tuple[Received | None, Received]:
+    """Return the users of a survey, if any, and those to locate."""
+    scenario, codebook = frame.system(system)
+
+    def traced(name: str) -> Scenario:
+        return dataclasses.replace(scenario, channel=Path(folder) / f'{name}.npz')
+    surveyed = receive(traced(known[0]), codebook, rng, *known[1:]) if known else None
+    return surveyed, receive(traced(file), codebook, rng, hidden=hidden)
+
+
+def located(system: str, folder: str, file: str, known: Sequence | None, hidden: float,
+            random: dict) -> dict[str, list]:
+    """Run a job: locate the users of a channel, perhaps after a survey."""
+    scenario, codebook = frame.system(system)
+    surveyed, received = draws(system, folder, file, known, hidden, generator_of(random))
+    if surveyed:
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore', SurveyWarning)
+            multipath = survey(scenario, codebook, surveyed.users, surveyed.signals)
+        scenario = dataclasses.replace(scenario, multipath=multipath,
+                                       blocked_probability=PRIOR if hidden else 0.0)
+    return {users: [*fixes] for users, fixes in measure(scenario, codebook, received).items()}
 
 
 def receive(traced: Scenario, codebook: Codebook, rng: np.random.Generator,

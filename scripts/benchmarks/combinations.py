@@ -18,7 +18,6 @@ position is uncertain. The MSE ratio is the squared error relative to the trace 
 least one surface has in sight; the share of wrong fixes is that of positions of other users. The
 intervals are from resampling the users.
 
-With --json FILE --resume, cells in the file with the same seed and number of positions are kept.
 """
 
 import argparse
@@ -26,9 +25,7 @@ import dataclasses
 import functools
 import inspect
 import itertools
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -341,17 +338,14 @@ def pairs(names: Sequence[str]) -> Iterator[tuple[str, str]]:
 
 def main() -> None:
     """Run the benchmark."""
-    parser = frame.benchmark_parser('combinations', __doc__, positions=800)
+    parser = frame.benchmark_parser('combinations', __doc__, positions=800, has_jobs=True)
     add = parser.add_argument
     add('--only', choices=INGREDIENTS, action='append', default=[],
         help='only cells with this ingredient; may be repeated')
-    add('--resume', action='store_true', help='keep the cells in the file of the results')
     add('--csv', type=output_file, help='CSV file for the table of the documentation')
     options = parser.parse_args()
-    if options.resume and not options.json:
-        parser.error('argument --resume: expected together with --json')
     print(f'{options.positions} positions, seed {options.seed}\n')
-    results = measure(options, kept(options))
+    results = measure(options)
     if options.csv:
         write_whole(options.csv, matrix(results) + '\n')
     for names, refused in reasons(results).items():
@@ -361,40 +355,33 @@ def main() -> None:
 Cells = dict[str, dict[str, dict[str, Any]]]
 
 
-def kept(options: argparse.Namespace) -> Cells:
-    """Return the cells in the file of results that are as requested."""
-    file: Path | None = options.json
-    if not options.resume or file is None or not file.exists():
-        return {}
-    return {one: {other: cell for other, cell in row.items()
-                  if (cell['positions'], cell['seed']) == (options.positions, options.seed)}
-            for one, row in json.loads(file.read_text(encoding='utf-8')).items()}
-
-
-def measure(options: argparse.Namespace, results: Cells) -> Cells:
-    """Measure the requested cells that are not in the results, and write each into the file.
-
-    A cell is stored under both orders of its ingredients.
-    """
+def measure(options: argparse.Namespace) -> Cells:
+    """Measure the requested cells; each is stored under both orders of its ingredients."""
+    chosen = set(pairs(options.only))
+    cells = {(one, other): ' + '.join(dict.fromkeys((one, other)))
+             for one, other in pairs(()) if (one, other) in chosen}
+    found = frame.measured(options, 'combinations', measured_cell, {
+        name: {'one': one, 'other': other, 'n': options.positions, 'seed': options.seed}
+        for (one, other), name in cells.items()})
     table = frame.Table(['ingredients'], {
         'fix [%]': ('fix', 1), 'wrong fix [%]': ('wrong_fix', 1),
         'in the 95 % region [%]': ('in_region', 1), 'NEES': ('nees', 2),
         'dimensions': ('dimensions', 1), 'MSE ratio': ('mse_ratio', 2)})
-    for number, (one, other) in enumerate(pairs(())):
-        if (one, other) not in set(pairs(options.only)):
-            continue
-        known = results.setdefault(one, {})
-        if other not in known:
-            # The random numbers of a cell do not depend on the other cells.
-            rng = streams.generator(options.seed, streams.HELD_OUT, number)
-            known[other] = cell(one, other, options.positions, rng) | {
-                'positions': options.positions, 'seed': options.seed}
-            results.setdefault(other, {})[one] = known[other]
-            frame.write_results(options.json, results)
-        names = ' + '.join(dict.fromkeys((one, other)))
-        table.row(names, **known[other] | {'fix': known[other].get('refused') or
-                                           known[other]['fix']})
+    results: Cells = {}
+    for (one, other), name in cells.items():
+        row = found[name]
+        results.setdefault(one, {})[other] = results.setdefault(other, {})[one] = row
+        table.row(name, **row | {'fix': row.get('refused') or row['fix']})
+    frame.write_results(options.json, results)
     return results
+
+
+def measured_cell(one: str, other: str, n: int, seed: int) -> dict[str, Any]:
+    """Run a job: return the figures of a cell."""
+    # The random numbers of a cell do not depend on the other cells.
+    number = [*pairs(())].index((one, other))
+    return cell(one, other, n, streams.generator(seed, streams.HELD_OUT, number)) | {
+        'positions': n, 'seed': seed}
 
 
 def cell(one: str, other: str, n: int, rng: np.random.Generator) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from rhs_isac_ros.support.arguments import (
 )
 from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import write_whole
-from rhs_isac_ros.support.jobs import add_run_options
+from rhs_isac_ros.support.jobs import Job, JobError, Strand, add_run_options, unfinished
 from rhs_isac_ros.support.pictures import PICTURE_FORMATS, write_picture
 
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -45,8 +45,11 @@ _RESAMPLES = 2000
 
 def benchmark_parser(
         name: str, description: str | None, positions: int = 0, default_seed: int | None = 1,
-        ) -> ArgumentParser:
-    """Return a parser with ``--json`` and, if they have a default, ``--positions``, ``--seed``."""
+        has_jobs: bool = False) -> ArgumentParser:
+    """Return a parser with ``--json`` and, if they have a default, ``--positions``, ``--seed``.
+
+    The options of a benchmark that calls `measured` include those of jobs.
+    """
     parser = ArgumentParser(
         prog=f'scripts/benchmark {name}', description=description, formatter_class=HelpFormatter)
     if positions:
@@ -56,7 +59,22 @@ def benchmark_parser(
         parser.add_argument('--seed', type=seed, default=default_seed,
                             help='seed of all random numbers')
     parser.add_argument('--json', type=output_file, help='JSON file for the results')
+    if has_jobs:
+        add_run_options(parser)
     return parser
+
+
+def measured(options: argparse.Namespace, name: str, function: Callable[..., Mapping[str, Any]],
+             cases: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Run a function for each case of a benchmark as a job; return the results by case.
+
+    Results of an unfinished run are kept in results/benchmarks/NAME.jobs.
+    """
+    def strand(case: str) -> Strand[dict[str, Any]]:
+        return (yield function, [Job.of(re.sub(r'\W+', '-', case), cases[case])])[0]
+
+    with unfinished(Path('results/benchmarks') / name, options) as workers:
+        return dict(zip(cases, workers.run([strand(case) for case in cases]), strict=True))
 
 
 def experiment_options(
@@ -123,7 +141,8 @@ def scenario_of(file: Path | None) -> Scenario:
 
 def run(main: Callable[[], int | None]) -> NoReturn:
     """Run a benchmark and exit; errors in files are one line."""
-    sys.exit(exit_code_of(main, (CodebookError, ModelError, ScenarioError)))
+    sys.exit(exit_code_of(
+        main, (CodebookError, ConnectionError, JobError, ModelError, ScenarioError)))
 
 
 def write_results(path: Path | None, results: Any) -> None:

@@ -1,6 +1,7 @@
 """Combinations of capabilities: which cells there are, what they measure, and what is refused."""
 
 import argparse
+import json
 
 import numpy as np
 import pytest
@@ -51,24 +52,25 @@ def test_users_outside_count_only_for_wrong_fixes():
     assert found['mse_m2'][0] < 1
 
 
-def test_cells_with_the_same_options_are_kept(monkeypatch, tmp_path, capsys):
+def test_finished_cells_are_kept_until_all_are_measured(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
     options = argparse.Namespace(
-        positions=5, seed=1, only=['site'], json=tmp_path / 'cells.json', resume=True)
+        positions=5, seed=1, only=['site'], json=tmp_path / 'cells.json', jobs=1, dask=None)
     measured = []
 
     def counted(one, other, n, rng):
         measured.append((one, other))
+        if len(measured) == 3:
+            raise KeyboardInterrupt
         return {'refused': 'no'}
     monkeypatch.setattr(combinations, 'cell', counted)
-    first = measure(options, combinations.kept(options))
-    assert len(measured) == N
-    assert first['site']['track'] == first['track']['site']
-    again = measure(options, combinations.kept(options))
-    assert (again, len(measured)) == (first, N)
-    options.seed = 2
-    measure(options, combinations.kept(options))
-    assert len(measured) == 2 * N
+    with pytest.raises(KeyboardInterrupt):
+        measure(options)
+    results = measure(options)
+    assert len(measured) == N + 1
+    assert results['site']['track'] == results['track']['site']
     assert '| site + track | no |' in capsys.readouterr().out
+    assert json.loads(options.json.read_text()) == results
 
 
 def test_the_table_has_coverage_and_nees_of_each_pair_once():
