@@ -76,7 +76,7 @@ CALLS = [
     ('tools.replay', ['folder'], 'folder: a directory'),
     pytest.param('tools.replay', ['garbage'], 'garbage: not a complete recording',
                  marks=NEEDS_MCAP),
-    ('tools.replay', ['garbage', '--estimator', 'magic'], "invalid choice: 'magic'"),
+    ('tools.replay', ['garbage', '--estimator', 'magic'], "estimator: 'magic', expected one of"),
     ('tools.replay', ['garbage', '--config', 'good.yaml', '--site', 'good.yaml'], 'with --site'),
     ('tools.replay', ['garbage', '--publish', '--estimator', 'ml'], 'not allowed with'),
     ('tools.replay', ['garbage', '--estimator', 'neural', '--calibration', 'garbage'],

@@ -98,7 +98,7 @@ def _add_options(parser: ArgumentParser) -> None:
     add('--scenario', type=input_file, metavar='FILE',
         help="YAML file of all other fields (default: the paper's Table I)")
     add('--estimator', default='bayes', metavar='NAME',
-        help='bayes, ml or an installed plug-in (default: %(default)s)')
+        help='bayes, ml, an installed plug-in or MODULE:NAME (default: %(default)s)')
     add('--codebook', default=OPTIMIZE, metavar='CODEBOOK',
         help=f'{", ".join(KINDS)} for each setting, or a file for all (default: %(default)s)')
     add('--optimize-for', nargs='*', choices=(*FIELDS,), metavar='FIELD',
@@ -138,7 +138,7 @@ def _check_names(settings: Sequence[Setting]) -> None:
         *plugins.names(plugins.ESTIMATORS)}
     for name, known in ((ESTIMATOR, estimators), (CODEBOOK, {*KINDS})):
         for value in sorted({getattr(setting, name) for setting in settings} - known):
-            if name == ESTIMATOR or not Path(value).is_file():
+            if not (plugins.is_reference(value) if name == ESTIMATOR else Path(value).is_file()):
                 expected = f'{", ".join(sorted(known))}{" or a file" * (name == CODEBOOK)}'
                 raise ValueError(f'{name}: {value!r}, expected {expected}')
 

@@ -13,6 +13,7 @@ from rhs_isac_ros.experiments.resampling import replicate, share_percent
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.scenario import checked
+from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.files import parse_yaml
 from rhs_isac_ros.support.threads import one_blas_thread
 
@@ -184,11 +185,11 @@ def parse_axis(text: str) -> Axis:
 
 
 def settings_of(
-        base: Scenario, axes: Sequence[Axis], codebook: str, estimator: str) -> list[Setting]:
+        base: Scenario, axes: Sequence[Axis], codebook: str, estimator: Any) -> list[Setting]:
     """List all combinations; the last axis varies fastest.
 
-    `codebook` and `estimator` apply unless an axis varies them. Raises ValueError if a field is
-    varied twice, or values contradict each other.
+    `codebook` and `estimator`, a name or a class, apply unless an axis varies them. Raises
+    ValueError if a field is varied twice, or values contradict each other.
     """
     names = [name for axis in axes for name in axis.fields]
     for name in names:
@@ -200,7 +201,7 @@ def settings_of(
         scenario = dataclasses.replace(
             base, **{name: value for name, value in varied.items() if name in FIELDS})
         settings.append(Setting(varied, scenario, varied.get(CODEBOOK, codebook),
-                                varied.get(ESTIMATOR, estimator)))
+                                plugins.name_of(varied.get(ESTIMATOR, estimator))))
     return settings
 
 

@@ -85,7 +85,7 @@ def _make(kind: type, built_in: Mapping[str, Callable[..., Any]], group: str, na
             raise ValueError(f'{name}: {error}') from None
         return built_in[name](*arguments, **options)
     installed = plugins.names(group)
-    if name not in installed:
+    if name not in installed and not plugins.is_reference(name):
         raise ValueError(f'{name!r}, expected one of {sorted({*built_in, *installed})}')
     made = plugins.make(group, name, *arguments, **options)
     if not isinstance(made, kind):

@@ -19,7 +19,8 @@ def board_of(value: Any) -> Board:
     """Return a board, from its name or a mapping of ``kind`` and the fields of this kind.
 
     Names other than those of `BUILT_IN` are plug-ins: callables that take the fields and return a
-    `Board`. Raises BoardError if the value does not describe a board.
+    `Board`, or ``module:name`` of a subclass. Raises BoardError if the value does not describe a
+    board.
     """
     if isinstance(value, Board):
         return value
@@ -29,7 +30,7 @@ def board_of(value: Any) -> Board:
     options = {str(name): entry for name, entry in fields.items() if name != 'kind'}
     if (made := BUILT_IN.get(kind)) is None:
         with translated(plugins.PluginError, BoardError):
-            board = plugins.make(plugins.BOARDS, kind, **options)
+            board = plugins.make(plugins.BOARDS, kind, base=Board, **options)
         if not isinstance(board, Board):
             raise BoardError(f'{plugins.describe(plugins.BOARDS, kind)}: '
                              f'{type(board).__name__}, expected a Board')

@@ -87,7 +87,7 @@ class GainPattern(External):
 
         Raises PatternError or PluginError if there is no valid pattern of this name.
         """
-        source = plugins.load(plugins.GAIN_PATTERNS, origin)
+        source = plugins.load(plugins.GAIN_PATTERNS, origin, GainPattern)
         with translated(
                 PatternError, PatternError, plugins.describe(plugins.GAIN_PATTERNS, origin)):
             if isinstance(source, GainPattern):

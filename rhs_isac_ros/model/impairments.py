@@ -18,7 +18,7 @@ import enum
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -332,12 +332,14 @@ def draw_impairments(
 
 
 def _installed(scenario: Scenario) -> tuple[Impairment, ...]:
-    return tuple(_load(name, strength) for name, strength in scenario.impairments)
+    # An object that was given for a name may have been replaced.
+    return tuple(_load(name, strength, plugins.GIVEN.get(name))
+                 for name, strength in scenario.impairments)
 
 
 @functools.lru_cache(maxsize=16)
-def _load(name: str, strength: float) -> Impairment:
-    made = plugins.make(plugins.IMPAIRMENTS, name, strength)
+def _load(name: str, strength: float, given: Any) -> Impairment:
+    made = plugins.make(plugins.IMPAIRMENTS, name, strength, base=Impairment)
     if not isinstance(made, Impairment):
         raise plugins.PluginError(
             f'{plugins.describe(plugins.IMPAIRMENTS, name)}: returned {made!r}, expected an '

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -178,13 +178,14 @@ class Traced:
 
 
 def make_plugin(
-        name: str, scenario: Scenario, speed_mps: float, rng: np.random.Generator,
+        name: Any, scenario: Scenario, speed_mps: float, rng: np.random.Generator,
         start: Sequence[float] | None = None) -> Mobility:
-    """Create a mobility from a plug-in, an entry point of the group `plugins.MOBILITIES`.
+    """Create a mobility from a plug-in of the group `plugins.MOBILITIES`.
 
-    The plug-in is called with the arguments of `RandomWalk`. If `start` is None, the plug-in
-    chooses the first position. Raises PluginError if there is no such plug-in, it fails, or it
-    does not return a mobility.
+    `name` is that of an entry point, ``module:name``, or the class or callable itself. The plug-in
+    is called with the arguments of `RandomWalk`. If `start` is None, the plug-in chooses the first
+    position. Raises PluginError if there is no such plug-in, it fails, or it does not return a
+    mobility.
     """
     mobility: Mobility = plugins.make(plugins.MOBILITIES, name, scenario, speed_mps, rng, start)
     if not callable(getattr(mobility, 'state', None)):

@@ -498,14 +498,17 @@ def _pose(field: dataclasses.Field[Any], value: Any) -> Any:
 
 
 def _strengths(field: dataclasses.Field[Any], value: Any) -> tuple[tuple[str, float], ...]:
+    # The module imports this one.
+    from rhs_isac_ros.model.impairments import Impairment
+
     try:
-        pairs = sorted(dict(value).items())
+        pairs = sorted((plugins.name_of(name), strength) for name, strength in dict(value).items())
     except (TypeError, ValueError):
         raise ScenarioError(
             f'{field.name}: {value!r}, expected a mapping of names to strengths') from None
     for name, _ in pairs:
         with translated(PluginError, ScenarioError, field.name):
-            plugins.load(plugins.IMPAIRMENTS, name)
+            plugins.load(plugins.IMPAIRMENTS, name, Impairment)
     # An impairment of strength 0 is the same as none.
     checked_pairs = ((name, _number(field, strength)) for name, strength in pairs)
     return tuple(pair for pair in checked_pairs if pair[1])

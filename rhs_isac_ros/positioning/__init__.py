@@ -68,12 +68,13 @@ __all__ = [
 ]
 
 
-def make_estimator(name: str, scenario: Scenario, codebook: Codebook, *,
+def make_estimator(name: Any, scenario: Scenario, codebook: Codebook, *,
                    surface: KnownSurface | None = None, **options: Any) -> Estimator:
-    """Create an estimator of a system by its name; see `EstimatorKind.create`.
+    """Create an estimator of a system; see `EstimatorKind.create`.
 
-    `bayes` and `ml` take the options of `SearchEstimator`. `neural` requires ``model_file``, a
-    `Network` or its file. Plug-ins define their own options.
+    `name` is that of a built-in estimator or of an installed plug-in, ``module:name``, or the
+    class or callable itself. `bayes` and `ml` take the options of `SearchEstimator`. `neural`
+    requires ``model_file``, a `Network` or its file. Plug-ins define their own options.
 
     Raises ValueError if there is no estimator of that name; PluginError if a plug-in cannot be
     loaded, fails, or does not return an estimator; ModelError if a model is missing, cannot be
@@ -94,20 +95,25 @@ def make_estimator(name: str, scenario: Scenario, codebook: Codebook, *,
 class EstimatorKind:
     """The estimators of one name, with what their class or plug-in declares.
 
-    The options are the parameters of the constructor. A class declares with ``uses_tracks`` that a
-    track may be the prior, as in `BayesEstimator`; with ``uses_surface = False`` that it assumes
-    the surface of the scenario; and with ``readers`` the options that are required files, each
-    with the function that reads it. Raises ValueError if there is no estimator of that name, and
-    PluginError if a plug-in cannot be loaded.
+    A class or callable may take the place of its name. The options are the parameters of the
+    constructor. A class declares with ``uses_tracks`` that a track may be the prior, as in
+    `BayesEstimator`; with ``uses_surface = False`` that it assumes the surface of the scenario;
+    and with ``readers`` the options that are required files, each with the function that reads it.
+    Raises ValueError if there is no estimator of that name, and PluginError if a plug-in cannot be
+    loaded.
     """
 
-    def __init__(self, name: str) -> None:
-        self.name, self._is_plugin = name, name not in ESTIMATORS
-        if self._is_plugin and name not in (installed := plugins.names(plugins.ESTIMATORS)):
+    def __init__(self, name: Any) -> None:
+        self.name = plugins.name_of(name)
+        self._is_plugin = self.name not in ESTIMATORS
+        if self._is_plugin and not plugins.is_reference(self.name) and (
+                self.name not in (installed := plugins.names(plugins.ESTIMATORS))):
             raise ValueError(
                 f'estimator: {name!r}, expected one of {sorted({*ESTIMATORS, *installed})}')
-        made: Any = (plugins.load(plugins.ESTIMATORS, name) if self._is_plugin
-                     else ESTIMATORS[name])
+        made: Any = (plugins.load(plugins.ESTIMATORS, self.name) if self._is_plugin
+                     else ESTIMATORS[self.name])
+        if not callable(made):
+            raise plugins.PluginError(f'{self.name}: {made!r}, expected a class or a callable')
         parameters = inspect.signature(made).parameters
         #: Names of the options; a plug-in with ``**options`` takes any others as well.
         self.options = {*parameters} - {'system', 'scenario', 'codebook'}

@@ -116,7 +116,7 @@ class Field:
     def _choice_problem(self, value: str) -> str:
         # Listing the installed plug-ins takes time, and is not necessary for built-in choices.
         installed = plugins.names(self.plugins) if value not in self.choices else ()
-        if value in (*self.choices, *installed):
+        if value in (*self.choices, *installed) or self.plugins and plugins.is_reference(value):
             return ''
         listed = f'; installed: {", ".join(installed) or "none"}' if self.plugins else ''
         return f'{value!r}, expected {self.expected}{listed}'

@@ -25,11 +25,13 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
 from rhs_isac_ros import __version__
+from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import integer, output_folder
 from rhs_isac_ros.support.exits import print_error
 from rhs_isac_ros.support.files import write_whole
@@ -71,8 +73,13 @@ class JobResult(NamedTuple):
 
 
 @one_blas_thread
-def attempt(function: Callable[..., Mapping[str, Any]], job: Job) -> JobResult:
-    """Run a job in this process; return errors as text, because some errors cannot be pickled."""
+def attempt(function: Callable[..., Mapping[str, Any]], job: Job,
+            given: Mapping[str, Any] = MappingProxyType({})) -> JobResult:
+    """Run a job in this process; return errors as text, because some errors cannot be pickled.
+
+    `given` are objects of the process that wants the result, to which names of plug-ins refer.
+    """
+    plugins.GIVEN.update(given)
     try:
         return JobResult(job, text=json.dumps(as_json(function(**job.arguments))))
     except MissingLibraryError as error:
@@ -184,7 +191,9 @@ class Workers:
             return [state.ends[number] for number in range(len(strands))]
 
     def _call(self, function: Function, job: Job) -> tuple[Any, ...]:
-        return _attempt_on_cluster if self.dask else attempt, function, job
+        given = {name: plugin for name, plugin in plugins.GIVEN.items()
+                 if name in json.dumps(job.arguments)}
+        return _attempt_on_cluster if self.dask else attempt, function, job, given
 
     @contextlib.contextmanager
     def _executor(self) -> Iterator[tuple[Executor, int]]:
@@ -333,7 +342,7 @@ class _AbandonedError(BaseException):
     """Nobody waits for a job any more."""
 
 
-def _attempt_on_cluster(function: Function, job: Job) -> JobResult:
+def _attempt_on_cluster(function: Function, job: Job, given: Mapping[str, Any]) -> JobResult:
     """Run a job on a worker of a Dask cluster; end it if its client has ended.
 
     Dask itself only forgets such a job, which would occupy the worker until its end.
@@ -354,7 +363,7 @@ def _attempt_on_cluster(function: Function, job: Job) -> JobResult:
 
     threading.Thread(target=watch, daemon=True).start()
     try:
-        return attempt(function, job)
+        return attempt(function, job, given)
     finally:
         with lock:
             over.set()

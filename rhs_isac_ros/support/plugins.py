@@ -1,6 +1,12 @@
-"""Plug-ins: entry points in the metadata of other installed packages."""
+"""Plug-ins: objects of other code, by entry points of installed packages, by module, or as such.
 
-from importlib import metadata
+The name of a plug-in is that of an entry point, or ``module:name``. An object that a caller gives
+in place of a name also has such a name, under which this process finds it again.
+"""
+
+import sys
+from importlib import import_module, metadata
+from operator import attrgetter
 from typing import Any
 
 # Groups of entry points; the page `extending` of the documentation specifies their objects.
@@ -22,18 +28,65 @@ def names(group: str) -> tuple[str, ...]:
     return tuple(sorted({point.name for point in metadata.entry_points(group=group)}))
 
 
-def describe(group: str, name: str) -> str:
+def describe(group: str, name: Any) -> str:
     """Return a text for errors about a plug-in: group, name, object and package of each match."""
+    if is_reference(name := name_of(name)):
+        return name
     return ' and '.join(sorted(
         f'entry point {group}: {name} = {point.value} of {point.dist.name if point.dist else "?"}'
         for point in metadata.entry_points(group=group, name=name)))
 
 
-def load(group: str, name: str) -> Any:
-    """Import the object of an entry point.
+#: Objects that callers have given in place of names, by ``module:name``.
+GIVEN: dict[str, Any] = {}
 
-    Raises PluginError unless exactly one entry point has that name and its import succeeds.
+
+def is_reference(name: Any) -> bool:
+    """Tell whether a name is ``module:name`` rather than that of an entry point."""
+    return isinstance(name, str) and ':' in name
+
+
+def name_of(plugin: Any) -> str:
+    """Return the name of a plug-in; remember an object that is given in place of a name."""
+    if isinstance(plugin, str):
+        return plugin
+    if not callable(plugin):
+        raise PluginError(f'{plugin!r}, expected a name, a class or a callable')
+    name = (f'{getattr(plugin, "__module__", "?")}:'
+            f'{getattr(plugin, "__qualname__", type(plugin).__qualname__)}')
+    GIVEN[name] = plugin
+    return name
+
+
+def load(group: str, plugin: Any, base: type | None = None) -> Any:
+    """Return the object of a plug-in.
+
+    If `base` is set, files may contain the name: ``module:name`` must then be a subclass of it or
+    an instance, so that a file cannot call other code.
+
+    Raises PluginError unless exactly one entry point has that name, or the module has the object,
+    and its import succeeds.
     """
+    name = name_of(plugin)
+    if name in GIVEN:
+        return GIVEN[name]
+    if not is_reference(name):
+        return _of_entry_point(group, name)
+    module, _, attribute = name.partition(':')
+    if base and module.partition('.')[0] in sys.stdlib_module_names:
+        raise PluginError(f'{name}: expected a module outside of the standard library')
+    try:
+        found = attrgetter(attribute)(import_module(module))
+    # Importing a module of somebody else may raise any exception.
+    except Exception as error:
+        raise PluginError(f'{name}: cannot be loaded: {type(error).__name__}: {error}') from error
+    if base and not isinstance(found, base) and not (
+            isinstance(found, type) and issubclass(found, base)):
+        raise PluginError(f'{name}: {found!r}, expected a subclass of {base.__name__}')
+    return found
+
+
+def _of_entry_point(group: str, name: str) -> Any:
     points = tuple(metadata.entry_points(group=group, name=name))
     if not points:
         installed = ', '.join(names(group)) or 'none'
@@ -49,15 +102,16 @@ def load(group: str, name: str) -> Any:
         ) from error
 
 
-def make(group: str, name: str, *arguments: Any, **options: Any) -> Any:
-    """Import the object of an entry point, call it, and return its result.
+def make(group: str, plugin: Any, *arguments: Any, base: type | None = None, **options: Any
+         ) -> Any:
+    """Call the object of a plug-in, and return its result; `base` is that of `load`.
 
     Raises PluginError if the object cannot be loaded, or the call fails.
     """
-    factory = load(group, name)
+    factory = load(group, plugin, base)
     try:
         return factory(*arguments, **options)
     # The call may raise any exception. Nodes show no traceback, so the message names the plug-in.
     except Exception as error:
         raise PluginError(
-            f'{describe(group, name)}: failed: {type(error).__name__}: {error}') from error
+            f'{describe(group, plugin)}: failed: {type(error).__name__}: {error}') from error

@@ -55,8 +55,8 @@ from rhs_isac_ros.ros.recording import (
     recorded_topics,
 )
 from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.system import System
 from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.command import ToolError
@@ -542,15 +542,20 @@ def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
     return {codebook_id: log.codebooks[codebook_id] for codebook_id in used}
 
 
+def _estimator(text: str) -> str:
+    with translated(ValueError, argparse.ArgumentTypeError):
+        return EstimatorKind(text).name
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog='replay', description='Feed the received signals of a recording to estimators, and '
         'compare their errors with the errors of the recorded network.')
     add = parser.add_argument
     add('file', type=input_file, help='recording')
-    add('--estimator', action='append',
-        choices=(*ESTIMATORS, *plugins.names(plugins.ESTIMATORS)),
-        help='may be repeated (default: bayes)')
+    add('--estimator', action='append', type=_estimator, metavar='NAME',
+        help=f'{", ".join(ESTIMATORS)}, an installed plug-in or MODULE:NAME; may be repeated '
+             '(default: bayes)')
     add('--track', action='store_true', help='also track the users with the estimator bayes')
     add('--track-speed', type=positive_float, metavar='MPS',
         help=f'typical speed of the users (default: {Motion.speed_mps:g} m/s)')

@@ -58,3 +58,37 @@ def test_the_error_for_a_duplicate_name_names_both_packages(install):
     install('ambles', 'def stroll(): return 2', {GROUP: {'stroll': 'stroll'}})
     with pytest.raises(PluginError, match=r"'stroll': .*ambles.* and .*strolls.*, expected one"):
         plugins.load(GROUP, 'stroll')
+
+
+class Stroll:
+    """An object that is given in place of a name."""
+
+    pace = 1
+
+
+def test_an_object_or_its_module_and_name_is_a_plugin(tmp_path, monkeypatch):
+    (tmp_path / 'my_strolls.py').write_text('class Far:\n    class Away: pass\n')
+    monkeypatch.syspath_prepend(tmp_path)
+    away = plugins.load(GROUP, 'my_strolls:Far.Away')
+    assert plugins.name_of(away) == 'my_strolls:Far.Away'
+    assert plugins.load(GROUP, away) is away
+    name = plugins.name_of(Stroll)
+    assert plugins.is_reference(name) and name.endswith(':Stroll')
+    assert plugins.load(GROUP, name) is Stroll
+    assert isinstance(plugins.make(GROUP, Stroll), Stroll)
+    with pytest.raises(PluginError, match=f'^{name}: failed: TypeError'):
+        plugins.make(GROUP, Stroll, 1)
+
+
+@pytest.mark.parametrize(('name', 'words'), [
+    ('no_such_module:x', 'no_such_module:x: cannot be loaded: ModuleNotFoundError'),
+    ('numpy:no_such_name', 'numpy:no_such_name: cannot be loaded: AttributeError')])
+def test_a_name_without_an_object_is_an_error(name, words):
+    with pytest.raises(PluginError, match=words):
+        plugins.load(GROUP, name)
+
+
+@pytest.mark.parametrize('name', ['os:system', 'numpy:load', 'idlelib.idle:x'])
+def test_a_file_can_name_only_subclasses_outside_of_the_standard_library(name):
+    with pytest.raises(PluginError, match=f'^{name}: .*expected a '):
+        plugins.load(GROUP, name, base=Stroll)
