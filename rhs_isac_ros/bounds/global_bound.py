@@ -119,7 +119,7 @@ class _Lattice:
     def _interpolate(self, sight: np.ndarray, ranges: np.ndarray, limits: np.ndarray) -> None:
         """Compute the signals at the nodes, and weights that interpolate them to all ranges."""
         model, scenario = self._model, self._model.scenario
-        span_hz = scenario.n_subbands * scenario.subband_width_hz
+        span_hz = scenario.bandwidth_hz
         turns = span_hz * np.ptp(limits) / SPEED_OF_LIGHT_MPS
         n_nodes = _N_NODES + int(np.ceil(2 * np.pi * turns))
         middle, half = np.mean(limits), max(np.ptp(limits) / 2, np.finfo(float).tiny)

@@ -226,7 +226,7 @@ def _most_likely(scenario: Scenario, model: MeasurementModel, samples: np.ndarra
     """Return the scenario fields and the prior weight with the highest evidence."""
     from scipy.optimize import minimize
 
-    bandwidth_hz = scenario.n_subbands * scenario.subband_width_hz
+    bandwidth_hz = scenario.bandwidth_hz
     low, high = np.array([
         _LEVELS, np.log(_DELAYS) - np.log(bandwidth_hz), np.log(_ANGLES), np.log(_WEIGHTS)]).T
 

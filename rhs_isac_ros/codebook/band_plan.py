@@ -227,8 +227,7 @@ def choose_bands(
         raise ValueError(
             f'bands: {n_bands}, expected a divisor of {scenario.n_bands * scenario.n_frames}, '
             'the number of frames of all bands')
-    gap_hz = (scenario.n_subbands * scenario.subband_width_hz if min_gap_hz is None
-              else min_gap_hz)
+    gap_hz = scenario.bandwidth_hz if min_gap_hz is None else min_gap_hz
     frequencies_hz = raster(spectrum_hz, raster_hz)
     if first_fit(frequencies_hz, n_bands, gap_hz) is None:
         raise ValueError(

@@ -172,6 +172,9 @@ def _check(scenario: Scenario, frame_s: float) -> None:
     """Raise ScenarioError unless a scenario can be measured with frames of a duration [s]."""
     farthest_s = float(np.linalg.norm(
         np.abs(scenario.roi_bounds_m).max(axis=0))) / SPEED_OF_LIGHT_MPS
+    if scenario.spacing_hz != scenario.subband_width_hz:
+        raise ScenarioError(f'subband_spacing_hz: {scenario.subband_spacing_hz:g} Hz, expected 0 '
+                            'with a waveform, whose tones fill the band')
     for name, low, tolerance, unit, reason in (
             ('frame_duration_s', frame_s, 0.0, 's', f': {N_SYMBOLS} symbols of '
              f'1 / subband_width_hz and a prefix of {_PREFIX_SPREADS:g} delay_spread_s'),

@@ -161,7 +161,7 @@ def representative_subbands(
     on_board = np.linalg.norm(elements - feeds[:, None], axis=-1)
     across = np.linalg.norm(np.ptp(elements, axis=0))
     span_m = scenario.refractive_index * np.ptp(on_board) + across
-    span_hz = (scenario.n_subbands - 1) * scenario.subband_width_hz
+    span_hz = (scenario.n_subbands - 1) * scenario.spacing_hz
     drift = 2 * np.pi * span_hz / SPEED_OF_LIGHT_MPS * span_m
     n = int(min(scenario.n_subbands, 1 + drift // max_drift_rad, max_count))
     return ((np.arange(n) + 0.5) * scenario.n_subbands / n).astype(int)

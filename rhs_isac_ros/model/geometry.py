@@ -60,7 +60,7 @@ def subband_frequencies_hz(scenario: Scenario) -> np.ndarray:
     """Compute the sub-bands' centre frequencies f_{i,j}, float64 [N_B, N_SB] [Hz], read-only."""
     centers = np.array(scenario.center_frequencies_hz)[:, None]
     offsets = np.arange(scenario.n_subbands) - (scenario.n_subbands - 1) / 2
-    return read_only(centers + offsets * scenario.subband_width_hz)
+    return read_only(centers + offsets * scenario.spacing_hz)
 
 
 def to_positions(points: np.ndarray) -> np.ndarray:

@@ -28,12 +28,14 @@ import numpy as np
 from rhs_isac_ros.model.arrays import check_arrays, numbers, position_problem, read_only
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.external import ArrayFile
+from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field
 from rhs_isac_ros.support.files import (
     ArchiveError,
     read_archive,
     read_arrays,
+    read_matlab,
     write_archive,
     write_whole,
 )
@@ -44,7 +46,8 @@ FIELDS = ('multipath_to_los_db', 'delay_spread_s', 'angular_spread_deg')
 # Fields on which a measured covariance depends; its file contains their values.
 CONDITIONS = (
     'center_frequencies_hz', 'n_subbands', 'subband_width_hz', 'n_frames', 'elements_per_side',
-    'element_interval_wavelengths', 'multipath_direction_deg', 'roi_center_m', 'roi_size_m')
+    'element_interval_wavelengths', 'multipath_direction_deg', 'roi_center_m', 'roi_size_m',
+    'subband_spacing_hz')
 # Numbers in the record of a survey that estimators use.
 _ABOUT = {'inflation': Field(float, low=0.0, is_open=True), 'level_std_db': Field(float, low=0.0)}
 # Largest ratio between a centre frequency and the frequency of the paths, in either direction.
@@ -59,6 +62,17 @@ _MIN_SHARE = 0.5
 # Types of the arrays of paths in memory; in a file, some have less precision.
 _TYPES = {'users': float, 'a': complex, 'src': float, 'n': int, 'f0': float, 'gains': complex}
 _FILE_TYPES = {'a': np.complex64, 'gains': np.complex64, 'src': np.float32, 'n': np.int8}
+
+
+# Diffuse reflections among the interactions of Sionna RT, and scattering among those of DeepMIMO.
+_DIFFUSE, _SCATTERED = 2, '3'
+_AT_ORIGIN = Pose()
+
+
+def _unit_vectors(elevation: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """Return directions [..., 3] from angles from the z axis and azimuths [rad]."""
+    return np.stack([np.sin(elevation) * np.cos(azimuth), np.sin(elevation) * np.sin(azimuth),
+                     np.cos(elevation)], axis=-1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -113,7 +127,9 @@ class MultipathEstimate(ArrayFile):
         """Return the reason why the covariance does not fit a scenario, or '' if it fits."""
         fields = scenario.fields()
         for name in CONDITIONS:
-            if (own := self.conditions.get(name)) != fields[name]:
+            # Files of earlier versions do not have the spacing.
+            own = self.conditions.get(name, 0.0 if name == CONDITIONS[-1] else None)
+            if own != fields[name]:
                 return f'a survey with {name} {own}, expected {fields[name]} as in the scenario'
         return ''
 
@@ -205,17 +221,25 @@ class PathChannel(ArrayFile):
         axes like the scenario's. Devices must have one isotropic antenna, and reflections must be
         specular. `f0` [Hz] is the scene's frequency. Paths from behind the surface are removed.
         Raises ArchiveError if there are several receivers or antennas, angles are not in radians,
-        or the result is invalid.
+        a path is diffuse, or the result is invalid.
         """
         a = np.array(paths.a[0]) + 1j * np.array(paths.a[1])
         if a.ndim != 5 or (*a.shape[:2], a.shape[3]) != (1, 1, 1):
             raise ArchiveError(f'a: shape {a.shape}, expected [1, 1, N, 1, P] of one receiver and '
                                'N transmitters with one antenna each')
+        n_users, n_paths = a.shape[2], a.shape[4]
         centre = np.array(paths.targets, float).T
         users = np.array(paths.sources, float).T - centre
-        elevation, azimuth, delay = (
-            np.array(angles, float)[0] for angles in (paths.theta_r, paths.phi_r, paths.tau))
-        valid = np.array(paths.valid)[0]
+        # Without synthetic arrays, antennas have axes of their own.
+        elevation, azimuth, delay, valid = (
+            np.reshape(np.array(array), (n_users, n_paths)).astype(kind) for array, kind in (
+                (paths.theta_r, float), (paths.phi_r, float), (paths.tau, float),
+                (paths.valid, bool)))
+        kinds = np.reshape(
+            np.array(paths.interactions), (len(paths.interactions), n_users, n_paths))
+        if (valid & (kinds == _DIFFUSE)).any():
+            raise ArchiveError('interactions: diffuse paths, expected specular ones: Sionna RT '
+                               'gives those of one bounce equal phases')
         for name, angles, low, high in (('theta_r', elevation, 0.0, np.pi),
                                         ('phi_r', azimuth, -2 * np.pi, 2 * np.pi)):
             # Angles of single precision may exceed the limits by rounding.
@@ -223,13 +247,54 @@ class PathChannel(ArrayFile):
             if outside.any():
                 raise ArchiveError(f'{name}: {angles[outside][0]:g}, expected angles of {low:.3g} '
                                    f'to {high:.3g} rad')
-        direction = np.stack([np.sin(elevation) * np.cos(azimuth),
-                              np.sin(elevation) * np.sin(azimuth), np.cos(elevation)], axis=-1)
-        sources = SPEED_OF_LIGHT_MPS * delay[..., None] * direction
-        present = valid & (sources[..., 0] > 0)
-        n = np.sum(np.array(paths.interactions)[:, 0] > 0, axis=0).astype(int)
-        return cls(users, np.where(present, a[0, 0, :, 0], 0),
-                   np.where(present[..., None], sources, 0.0), np.where(present, n, -1), f0)
+        n = np.where(valid, np.sum(kinds > 0, axis=0), -1)
+        return cls._of_rays(
+            users, a[0, 0, :, 0], delay, _unit_vectors(elevation, azimuth), n, f0)
+
+    @classmethod
+    def from_deepmimo(cls, dataset: Any, f0: float, pose: Pose = _AT_ORIGIN) -> 'PathChannel':
+        """Convert the paths of a dataset of DeepMIMO 4: power, phase, delay, angles, interactions.
+
+        The base station, with this pose in the frame of the dataset, is the surface, and receivers
+        are users; antenna patterns and rotations of the dataset do not matter.
+        Powers are for 1 W and isotropic antennas, and phases include that of the delay at `f0`
+        [Hz]. Users without a path and paths from behind the surface are removed. Raises
+        ArchiveError if a path is scattered, or the result is invalid.
+        """
+        power, phase, delay, azimuth, elevation, kinds = (
+            np.atleast_2d(np.array(getattr(dataset, name), float))
+            for name in ('power', 'phase', 'delay', 'aod_az', 'aod_el', 'inter'))
+        # Missing paths are NaN. Digits are interactions, and 0 is a direct path.
+        digits = [str(int(kind)) if kind > 0 else '' for kind in kinds.flat]
+        if any(_SCATTERED in kind for kind in digits):
+            raise ArchiveError('inter: scattered paths, expected reflected ones')
+        present = np.isfinite(power) & np.isfinite(delay) & (kinds >= 0)
+        n = np.where(present, np.reshape([len(kind) for kind in digits], kinds.shape), -1)
+        turn = np.deg2rad(phase) + 2 * np.pi * f0 * delay
+        amplitude = np.where(present, 10 ** (power / 20) * np.exp(1j * turn), 0)
+        # The elevation is the angle from the z axis.
+        directions = pose.vectors_to_surface(
+            _unit_vectors(np.deg2rad(elevation), np.deg2rad(azimuth)))
+        users = pose.to_surface(np.array(dataset.rx_pos, float))
+        served = (present & (directions[..., 0] > 0)).any(axis=1)
+        return cls._of_rays(users[served], amplitude[served], delay[served], directions[served],
+                            n[served], f0)
+
+    @classmethod
+    def _of_rays(cls, users: np.ndarray, a: np.ndarray, delay: np.ndarray,
+                 directions: np.ndarray, n: np.ndarray, f0: float) -> 'PathChannel':
+        """Create a channel from delays [N, P] [s] and directions [N, P, 3] at the surface.
+
+        Paths are missing where `n` is -1 or they come from behind.
+        """
+        # A channel has at least one path, which may be missing.
+        width = (0, 0), (0, not a.shape[1])
+        a, delay, n = np.pad(a, width), np.pad(delay, width), np.pad(n, width, constant_values=-1)
+        directions = np.pad(directions, (*width, (0, 0)))
+        present = (n >= 0) & (directions[..., 0] > 0)
+        sources = SPEED_OF_LIGHT_MPS * delay[..., None] * directions
+        return cls(users, np.where(present, a, 0), np.where(present[..., None], sources, 0.0),
+                   np.where(present, n, -1), f0)
 
     @classmethod
     def joined(cls, parts: Sequence['PathChannel']) -> 'PathChannel':
@@ -298,11 +363,13 @@ class PathChannel(ArrayFile):
 
     @classmethod
     def load(cls, path: str | Path) -> 'PathChannel':
-        """Read paths from a file; arrays with other names are ignored.
+        """Read paths from a file of NumPy or of MATLAB; arrays with other names are ignored.
 
-        Raises ArchiveError if the file cannot be read or its content is invalid.
+        Files of MATLAB have the suffix ``.mat``. Raises ArchiveError if the file cannot be read or
+        its content is invalid, and MissingLibraryError for MATLAB 7.3 without h5py.
         """
-        arrays = read_arrays(path)
+        arrays = (read_matlab(path, {*_TYPES}) if Path(path).suffix == '.mat'
+                  else read_arrays(path))
         with translated((TypeError, ValueError), ArchiveError, path):
             for name in _TYPES:
                 if name not in arrays and name != 'gains':

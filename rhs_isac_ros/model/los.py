@@ -105,7 +105,7 @@ def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *
     inverse, turn = 1 / distances, -2 * np.pi / SPEED_OF_LIGHT_MPS * distances
     minus_square = -inverse**2
     # Sub-bands are equally spaced: two phasors and a running product replace N_SB phasors.
-    step = _phasors(turn * scenario.subband_width_hz)
+    step = _phasors(turn * scenario.spacing_hz)
     offsets = _offsets(scenario, positions) if has_pattern(scenario) else np.zeros(0)
     amplitude = inverse * _amplitude(scenario, offsets)
 

@@ -268,7 +268,7 @@ def measurement_correlation(scenario: Scenario) -> np.ndarray:
     """
     subbands, frames = np.arange(scenario.n_subbands), np.arange(scenario.n_frames)
     over_frequency = frequency_correlation(
-        scenario, (subbands[:, None] - subbands) * scenario.subband_width_hz)
+        scenario, (subbands[:, None] - subbands) * scenario.spacing_hz)
     over_time = time_correlation(scenario, (frames[:, None] - frames) * scenario.frame_duration_s)
     return read_only(np.kron(over_frequency, over_time))
 

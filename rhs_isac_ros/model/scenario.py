@@ -19,6 +19,7 @@ from rhs_isac_ros.model.elementwise import Paper
 from rhs_isac_ros.model.external import ArrayFile, External
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.hall import MultipathEstimate, PathChannel
+from rhs_isac_ros.model.numerology import nr_grid
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.errors import translated
@@ -121,6 +122,12 @@ class Extensions:
     offset once per cycle, and element errors and failures once per surface.
     """
 
+    subband_spacing_hz: float = declare(
+        0.0, 0.0, 1e10,
+        'Distance between the centres of neighbouring sub-bands, at least their width, which is '
+        'that of the noise; 0 for this width. Pilots on a comb have a larger one.', 'Hz',
+        'comb of PRS and SRS, 3GPP TS 38.211, sections 7.4.1.7 and 6.4.1.4',
+        label='spacing of the sub-bands')
     multipath_to_los_db: float = declare(
         0.0, -200.0, 100.0,
         'Power of the multipath at an element, relative to the mean power of the direct path in '
@@ -267,11 +274,16 @@ class Scenario(Extensions, Table1):
         if not any(self.roi_size_m):
             raise ScenarioError(
                 f'roi_size_m: {self.roi_size_m}, expected at least one length above 0')
-        span_hz = self.n_subbands * self.subband_width_hz
+        if self.spacing_hz < self.subband_width_hz:
+            raise ScenarioError(
+                f'subband_spacing_hz: {self.subband_spacing_hz:g} Hz, expected 0 or at least '
+                f'subband_width_hz = {self.subband_width_hz:g} Hz')
+        span_hz = self.bandwidth_hz
         frequencies_hz = sorted(self.center_frequencies_hz)
         if span_hz >= 2 * frequencies_hz[0]:
             raise ScenarioError(
-                f'subband_width_hz: {self.n_subbands} sub-bands span {span_hz:g} Hz, expected '
+                f'{"subband_spacing_hz" if self.subband_spacing_hz else "subband_width_hz"}: '
+                f'{self.n_subbands} sub-bands span {span_hz:g} Hz, expected '
                 'less than twice the lowest centre frequency')
         for low, high in itertools.pairwise(frequencies_hz):
             if high - low < span_hz * (1 - _ROUNDING):
@@ -292,6 +304,8 @@ class Scenario(Extensions, Table1):
     def from_yaml(cls, path: str | Path) -> 'Scenario':
         """Read a scenario from a YAML file that maps field names to values.
 
+        ``grid`` may map the parameters of `nr_grid` to values, in place of the fields that this
+        function returns.
         Fields that the file omits keep their defaults. Paths in the file are relative to its
         folder. Raises ScenarioError if the file is unreadable or invalid.
         """
@@ -300,6 +314,9 @@ class Scenario(Extensions, Table1):
         content = {} if content is None else content
         if not isinstance(content, dict):
             raise ScenarioError(f'{path}: expected a mapping of field names to values')
+        if 'grid' in content:
+            with translated((TypeError, ValueError), ScenarioError, f'{path}: grid'):
+                content = nr_grid(**content.pop('grid')) | content
         known = [field.name for field in dataclasses.fields(cls)]
         for key in content:
             if key not in known:
@@ -331,8 +348,8 @@ class Scenario(Extensions, Table1):
     def id(self) -> str:
         """Hash of the fields: ``sc`` and 16 hex digits, which YAML never parses as a number."""
         changes, fields = self.changes(), self.fields()
-        for name in ('impairments', 'multipath_direction_deg', 'blocked_probability',
-                     'outside_probability', *_FILES, 'pose', 'board'):
+        for name in ('impairments', 'subband_spacing_hz', 'multipath_direction_deg',
+                     'blocked_probability', 'outside_probability', *_FILES, 'pose', 'board'):
             # Existing files contain identifiers from before these fields were introduced.
             if name not in changes:
                 del fields[name]
@@ -374,6 +391,16 @@ class Scenario(Extensions, Table1):
     def n_elements(self) -> int:
         """Number of elements N_E."""
         return self.n_columns * self.n_rows
+
+    @property
+    def spacing_hz(self) -> float:
+        """Distance between the centres of neighbouring sub-bands [Hz]."""
+        return self.subband_spacing_hz or self.subband_width_hz
+
+    @property
+    def bandwidth_hz(self) -> float:
+        """Bandwidth of a band, of which each sub-band occupies one spacing [Hz]."""
+        return self.n_subbands * self.spacing_hz
 
     @property
     def noise_power_w(self) -> float:

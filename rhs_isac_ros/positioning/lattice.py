@@ -80,8 +80,7 @@ class Resolution(NamedTuple):
             wavelength_m=SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz),
             direction=1 / np.maximum(wavenumber * edge_m, 1 / _LIMITS.direction),
             curvature_m=max(wavenumber * np.sum(elements**2, axis=1).max() / 2, 1e-9),
-            delay_m=SPEED_OF_LIGHT_MPS / (
-                np.pi * scenario.n_subbands * scenario.subband_width_hz),
+            delay_m=SPEED_OF_LIGHT_MPS / (np.pi * scenario.bandwidth_hz),
             nearest_m=max(nearest_m, _LIMITS.nearest * farthest_m), farthest_m=farthest_m,
             direction_bounds=np.stack([lowest, highest], axis=1), bounds_m=bounds)
 

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import json
+import math
 import os
 import re
 import secrets
@@ -17,6 +18,7 @@ import numpy as np
 import yaml
 
 from rhs_isac_ros.support.fields import DECIMAL
+from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 _T = TypeVar('_T')
 # Methods by which NumPy stores arrays. Others have errors whose types some Pythons lack.
@@ -209,6 +211,58 @@ def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np
     except (OSError, ValueError, EOFError, RuntimeError, SyntaxError, KeyError, MemoryError,
             OverflowError, zipfile.BadZipFile, zlib.error) as error:
         raise ArchiveError(f'{path}: cannot be read: {_reason(error)}') from error
+
+
+def read_matlab(path: str | Path, names: set[str]) -> dict[str, np.ndarray]:
+    """Read the arrays of these names in a file of MATLAB, of version 5 or 7.3.
+
+    Version 7.3 needs h5py. Raises ArchiveError if the file cannot be read, contains more than 256
+    MiB of these arrays, or one of them has no numbers.
+    """
+    try:
+        with open(path, 'rb') as stream:
+            reader = _read_hdf5 if b'MATLAB 7.3' in stream.read(128) else _read_matlab5
+        found = reader(path, names)
+        for name, array in found.items():
+            if array.dtype.kind not in 'biufc':
+                raise ValueError(f'{name}: {array.dtype}, expected numbers')
+    except MissingLibraryError:
+        raise
+    # The readers raise many kinds of errors for damaged files.
+    except Exception as error:
+        raise ArchiveError(f'{path}: cannot be read: {_reason(error)}') from error
+    return found
+
+
+def _read_matlab5(path: str | Path, names: set[str]) -> dict[str, np.ndarray]:
+    from scipy.io import loadmat, whosmat
+
+    shapes = [shape for name, shape, _ in whosmat(path) if name in names]
+    if sum(16 * math.prod(shape) for shape in shapes) > _MAX_BYTES:
+        raise ValueError('more than 256 MiB of arrays')
+    found = loadmat(path, variable_names=names)
+    return {name: found[name] for name in names & {*found}}
+
+
+def _read_hdf5(path: str | Path, names: set[str]) -> dict[str, np.ndarray]:
+    with optional_import('reading files of MATLAB 7.3'):
+        import h5py
+
+    with h5py.File(path) as file:
+        sets = {name: file[name] for name in names & {*file}}
+        if sum(16 * one.size for one in sets.values()) > _MAX_BYTES:
+            raise ValueError('more than 256 MiB of arrays')
+        # The axes are reversed. An empty array is stored as its shape.
+        return {name: np.empty(one[()].astype(int)) if one.attrs.get('MATLAB_empty')
+                else _complex(one[()]).T for name, one in sets.items()}
+
+
+def _complex(array: np.ndarray) -> np.ndarray:
+    """Return pairs of real and imaginary parts as complex numbers, and other arrays unchanged."""
+    if array.dtype.names != ('real', 'imag'):
+        return array
+    found: np.ndarray = array['real'] + 1j * array['imag']
+    return found
 
 
 def read_archive(path: str | Path, kind: str, version: int, names: set[str]

@@ -136,17 +136,6 @@ def test_first_steps_locate_users(monkeypatch, capsys):
     assert len(capsys.readouterr().out.splitlines()) >= 4
 
 
-def test_own_jobs_are_kept(tmp_path, monkeypatch, capsys):
-    pytest.importorskip('joblib')
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, 'argv', ['own_jobs.py'])
-    for _ in range(2):
-        runpy.run_path(str(EXAMPLES / 'own_jobs.py'), run_name='__main__')
-    bounds = [float(line.split()[0]) for line in capsys.readouterr().out.splitlines()]
-    assert bounds[:6] == bounds[6:] and (np.diff(np.reshape(bounds[:6], (2, 3)), axis=0) > 0).all()
-    assert len([*(tmp_path / 'results' / 'own').iterdir()]) == 6
-
-
 def test_estimators_and_bounds_take_the_impairment_into_account():
     silent = Scenario(n_subbands=4, elements_per_side=5, roi_center_m=(2, 0, 0),
                       roi_size_m=(1, 1, 1))

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 import yaml
 
 from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError, simulate_received
 from rhs_isac_ros.model import multipath as mp
 from rhs_isac_ros.model.hall import CONDITIONS, MultipathEstimate, PathChannel
 from rhs_isac_ros.model.los import direct_gain, los_gain
+from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.support.files import ArchiveError
 
 F0 = 2.75e9
@@ -209,6 +211,115 @@ def test_other_paths_of_sionna_are_refused(traced, name, change, message):
     changed = types.SimpleNamespace(**vars(traced) | {name: change(getattr(traced, name))})
     with pytest.raises(ArchiveError, match=f'^{name}: {message}'):
         PathChannel.from_sionna(changed, F0)
+
+
+def with_antennas(paths):
+    """Return paths as `synthetic_array=False` gives them: antennas have axes of their own."""
+    each = {name: np.array(getattr(paths, name))[:, None, :, None]
+            for name in ('tau', 'theta_r', 'phi_r', 'valid')}
+    return types.SimpleNamespace(**vars(paths) | each | {
+        'interactions': np.array(paths.interactions)[:, :, None, :, None]})
+
+
+def test_one_antenna_of_sionna_is_one_antenna(traced):
+    assert PathChannel.from_sionna(with_antennas(traced), F0) == PathChannel.from_sionna(
+        traced, F0)
+
+
+def test_users_without_paths_have_missing_paths(traced):
+    names = ('tau', 'theta_r', 'phi_r', 'valid', 'interactions')
+    none = types.SimpleNamespace(**vars(traced) | {
+        name: np.array(getattr(traced, name))[..., :0] for name in names} | {
+        'a': [np.array(part)[..., :0] for part in traced.a]})
+    paths = PathChannel.from_sionna(none, F0)
+    assert paths.a.shape == (2, 1) and not paths.a.any()
+    assert (paths.n == -1).all()
+
+
+def test_diffuse_paths_of_sionna_are_refused_by_name(traced):
+    kinds = np.array(traced.interactions)
+    diffuse = types.SimpleNamespace(**vars(traced) | {'interactions': np.where(kinds, 2, 0)})
+    with pytest.raises(ArchiveError, match='^interactions: diffuse paths, '):
+        PathChannel.from_sionna(diffuse, F0)
+
+
+def dataset_of(paths, pose):
+    """Return paths as DeepMIMO describes them, with a base station of a pose."""
+    towards = pose.vectors_to_site(paths.sources)
+    distance = np.linalg.norm(towards, axis=2)
+    missing = np.where(paths.n < 0, np.nan, 1.0)
+    with np.errstate(divide='ignore'):
+        power = 20 * np.log10(np.abs(paths.a)) * missing
+    return types.SimpleNamespace(
+        power=power, delay=distance / SPEED * missing,
+        phase=np.rad2deg(np.angle(paths.a) - 2 * np.pi * F0 * distance / SPEED),
+        aod_az=np.rad2deg(np.arctan2(towards[..., 1], towards[..., 0])),
+        aod_el=np.rad2deg(np.arccos(towards[..., 2] / distance)),
+        inter=np.where(paths.n < 0, np.nan, np.array([0, 1, 11, 111])[paths.n]),
+        rx_pos=pose.to_site(paths.users))
+
+
+@pytest.mark.parametrize('pose', [
+    Pose(), Pose((5.0, -3.0, 2.0), (0.0, 0.0, 0.6, 0.8)),
+    Pose((0.0, 1.0, 0.0), (0.1, 0.2, 0.3, 1.0))])
+def test_paths_of_deepmimo_are_those_of_its_angles(traced, pose):
+    paths = PathChannel.from_sionna(traced, F0)
+    dataset = dataset_of(paths, pose)
+    # A user without a path is a row of NaN.
+    for name, array in vars(dataset).items():
+        setattr(dataset, name, np.concatenate([array, np.full_like(array[:1], np.nan)]))
+    dataset.rx_pos[-1] = pose.to_site(np.array([9.0, 0.0, 0.0]))
+    found = PathChannel.from_deepmimo(dataset, F0, pose)
+    np.testing.assert_allclose(found.users, paths.users, atol=1e-9)
+    np.testing.assert_allclose(found.sources, paths.sources, atol=1e-6)
+    np.testing.assert_allclose(found.a, paths.a, rtol=1e-6, atol=1e-12)
+    np.testing.assert_array_equal(found.n, paths.n)
+
+
+def test_scattered_paths_of_deepmimo_are_refused_by_name(traced):
+    dataset = dataset_of(PathChannel.from_sionna(traced, F0), Pose())
+    dataset.inter[0, 0] = 13
+    with pytest.raises(ArchiveError, match='^inter: scattered paths'):
+        PathChannel.from_deepmimo(dataset, F0)
+
+
+def write_matlab7(path, arrays):
+    """Write arrays as MATLAB 7.3: with reversed axes, and pairs for complex numbers."""
+    h5py = pytest.importorskip('h5py')
+    with h5py.File(path, 'w', userblock_size=512) as file:
+        for name, array in arrays.items():
+            array = np.atleast_2d(array).T
+            if np.iscomplexobj(array):
+                pairs = np.empty(array.shape, [('real', float), ('imag', float)])
+                pairs['real'], pairs['imag'] = array.real, array.imag
+                array = pairs
+            file[name] = array
+    with open(path, 'r+b') as file:
+        file.write(b'MATLAB 7.3 MAT-file, Platform: GLNXA64')
+
+
+@pytest.mark.parametrize('write', [scipy.io.savemat, write_matlab7])
+def test_files_of_matlab_are_channels(mirror, tmp_path, write):
+    arrays = {name: getattr(mirror, name) for name in ('users', 'a', 'src')}
+    write(tmp_path / 'hall.mat', {**arrays, 'n': mirror.n.astype(float), 'f0': F0})
+    assert PathChannel.load(tmp_path / 'hall.mat') == mirror
+    assert Scenario(channel=tmp_path / 'hall.mat').channel == mirror
+    write(tmp_path / 'few.mat', arrays)
+    with pytest.raises(ArchiveError, match='few.mat: n: missing'):
+        PathChannel.load(tmp_path / 'few.mat')
+
+
+@pytest.mark.parametrize('content', [b'', b'MATLAB 5.0 MAT-file' + bytes(200), b'x' * 300])
+def test_a_damaged_file_of_matlab_is_an_error(tmp_path, content):
+    (tmp_path / 'hall.mat').write_bytes(content)
+    with pytest.raises(ArchiveError, match='hall.mat: '):
+        PathChannel.load(tmp_path / 'hall.mat')
+
+
+def test_a_structure_of_matlab_is_no_channel(mirror, tmp_path):
+    scipy.io.savemat(tmp_path / 'hall.mat', {'a': {'re': 1, 'im': 2}})
+    with pytest.raises(ArchiveError, match=r'a: \[.*, expected numbers'):
+        PathChannel.load(tmp_path / 'hall.mat')
 
 
 @pytest.mark.parametrize('shape', [(), (1,), (1, 1)])

@@ -30,7 +30,8 @@ def test_defaults_are_table_1_of_the_paper():
         'noise_psd_dbm_hz': -174.0, 'max_power_w': 1e-3, 'roi_center_m': (10.0, 0.0, 0.0),
         'roi_size_m': (10.0, 10.0, 2.0),
         **dict.fromkeys(
-            ('multipath_to_los_db', 'user_gain_std_db', 'phase_std_rad', 'band_phase_std_rad',
+            ('subband_spacing_hz', 'multipath_to_los_db', 'user_gain_std_db',
+             'phase_std_rad', 'band_phase_std_rad',
              'timing_std_s', 'carrier_offset_std_hz', 'element_error_rms',
              'failed_element_share', 'amplitude_levels'), 0),
         'multipath_direction_deg': (0.0, 0.0), 'impairments': (),
@@ -146,6 +147,8 @@ BAD = [
     ('multipath', 1.0, '1.0', 'expected the path of a file, or null'),
     ('channel', True, 'True', 'expected the path of a file, or null'),
     ('channel', 'none.npz', 'none.npz', 'cannot be read'),
+    ('subband_spacing_hz', 1e5, '100000 Hz', 'expected 0 or at least subband_width_hz = 125000'),
+    ('subband_spacing_hz', 1e9, '8e+09 Hz', 'expected less than twice the lowest centre'),
     ('subband_width_hz', 1e9, '8e+09 Hz', 'expected less than twice the lowest centre frequency'),
     ('pose', [0, 0, 1], '[0, 0, 1]', "expected a mapping of ['position_m', "),
     ('pose', {'position': [0, 0, 1]}, "{'position': ", "expected a mapping of ['position_m', "),
