@@ -323,11 +323,8 @@ class _Products(NamedTuple):
             mine = np.flatnonzero(left & sheets[:, number])
             left[mine] = False
             if len(mine):
-                terms = self.select(mine)._terms(factors)
+                terms = _terms(factors, self.rows[mine])
                 yield mine, [terms.pop(number), *terms]
-
-    def _terms(self, factors: Sequence[_Factor]) -> list[_Term]:
-        return [one.term(rows) for one, rows in zip(factors, self.rows.T, strict=True)]
 
     def _are_sheets(self, factors: Sequence[_Factor]) -> np.ndarray:
         """Mark the factors that are not constants, bool [T, number of factors]."""
@@ -385,7 +382,7 @@ class _Products(NamedTuple):
         """
         means, covariances = self.moments.means, self.moments.covariances
         pulls = np.zeros_like(covariances)
-        for one in self._terms(factors):
+        for one in _terms(factors, self.rows):
             _, curvature = one.expanded(means)
             pulls += curvature @ one.pose.spread(means) @ curvature
         # Where a product is no Gaussian, its covariance may exceed the inverse of the information.
@@ -393,6 +390,11 @@ class _Products(NamedTuple):
         shares, axes = np.linalg.eigh(np.swapaxes(roots, 1, 2) @ pulls @ roots)
         moves = roots @ axes * np.sqrt(np.clip(shares, 0.0, _LIMITS.constant))[:, None]
         return moves @ np.swapaxes(moves, 1, 2)
+
+
+def _terms(factors: Sequence[_Factor], rows: np.ndarray) -> list[_Term]:
+    """Return the factors of products of the given rows, int [T, number of factors]."""
+    return [one.term(chosen) for one, chosen in zip(factors, rows.T, strict=True)]
 
 
 def _logarithm(terms: Sequence[_Term], positions: np.ndarray) -> np.ndarray:

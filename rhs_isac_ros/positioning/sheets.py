@@ -242,6 +242,7 @@ class Inside(NamedTuple):
     std_m: np.ndarray  # Standard deviation of each axis, given those before it, float64 [M, 3].
     coupling: np.ndarray  # Decrease of an axis with those before it, float64 [M, 3, 3].
     direction: np.ndarray  # Unit vector to the point, in this order, float64 [M, 3].
+    wide: np.ndarray  # See `_is_wide`, bool [M].
 
     @classmethod
     def of(cls, points: np.ndarray, gradient: np.ndarray, curvature: np.ndarray,
@@ -286,18 +287,19 @@ class Inside(NamedTuple):
             (pose, log_values, points, gradient, curvature), order, low[order], high[order],
             centre[rows, order],
             precision[rows[..., None], order[:, :, None], order[:, None]],
-            derivative[:, 0][rows, order])
+            derivative[:, 0][rows, order], wide)
 
     @classmethod
     def _in_order(
             cls, gaussians: tuple[Any, ...], order: np.ndarray, low: np.ndarray, high: np.ndarray,
-            centre: np.ndarray, precision: np.ndarray, direction: np.ndarray) -> 'Inside':
+            centre: np.ndarray, precision: np.ndarray, direction: np.ndarray, wide: np.ndarray
+    ) -> 'Inside':
         # With the axes reversed, the Cholesky factor contains the conditional distributions.
         root = np.linalg.cholesky(precision[:, ::-1, ::-1])[:, ::-1, ::-1]
         std = 1 / np.diagonal(root, axis1=1, axis2=2)
         coupling = np.swapaxes(root, 1, 2) * std[:, :, None]
         return cls._make((*gaussians, order, low, high, centre, precision, std, coupling,
-                          direction))
+                          direction, wide))
 
     def nearest(self) -> np.ndarray:
         """Return the most likely position of each Gaussian in the region, float64 [M, 3] [m]."""
@@ -329,7 +331,8 @@ class Inside(NamedTuple):
         low[:, 0] = high[:, 0] = last_m
         return self._in_order(
             self[:5], self.order[:, turn], low, high, self.centre_m[:, turn],
-            self.precision[:, turn][:, :, turn], self.direction[:, turn])
+            self.precision[:, turn][:, :, turn], self.direction[:, turn],
+            _is_wide(self.points, self.curvature, high - low))
 
     def sample(self, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Draw samples in the region, which represent `normal`, points of a Gaussian [S, 3].
@@ -441,8 +444,7 @@ class Inside(NamedTuple):
         if sides is not None:
             on_sphere = np.where(sides < 0, -on_sphere, on_sphere)
         mean, std = mean + by_range / total * (on_sphere - mean), 1 / np.sqrt(total)
-        wide = _is_wide(self.points, self.curvature, self.high_m - self.low_m)
-        if wide.any():
+        if (wide := self.wide).any():
             mean[wide], std[wide] = self.rows(wide)._along(chosen[:, wide], mean[wide])
         return mean, std
 
