@@ -82,20 +82,10 @@ class SurfaceModel:
 
         low, high = scenario.roi_bounds_m
         nodes = low + qmc.Sobol(3, seed=0).random(2**_LOG2_NODES) * (high - low)
-        return np.mean([
-            self.error_covariance_at(scenario, beams, block).mean(axis=0)
-            for block in np.split(nodes, len(nodes) // _BLOCK)], axis=0)
-
-    def error_covariance_at(
-            self, scenario: Scenario, beams: Beamforming, positions: np.ndarray) -> np.ndarray:
-        """Compute `error_covariance` at each position [N, 3]; return [N, N_B, N_SB F, N_SB F]."""
         scattered, direct = self.errors(scenario, beams)
-        covariance = np.repeat(scattered[None], len(positions), axis=0)
-        for band in range(scenario.n_bands):
-            for block in blocks(len(positions), _BLOCK):
-                errors = direct(band, positions[block])
-                covariance[block, band] += np.matmul(errors, adjoint(errors))
-        return covariance
+        return np.mean([
+            with_direct_errors(scattered, direct, block).mean(axis=0)
+            for block in np.split(nodes, len(nodes) // _BLOCK)], axis=0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -219,6 +209,20 @@ class SurfaceEstimate(SurfaceModel):
                 design @ of_elements + mean[..., None] * of_bands[band])
 
         return scattered * np.abs(self.band_gains[:, None, None])**2, direct
+
+
+def with_direct_errors(
+        covariance: np.ndarray, direct: DirectErrors, positions: np.ndarray) -> np.ndarray:
+    """Add the errors of the direct path at positions [N, 3] to a covariance [N_B, N_SB F, N_SB F].
+
+    Returns complex128 [N, N_B, N_SB F, N_SB F].
+    """
+    total = np.repeat(covariance[None], len(positions), axis=0)
+    for band in range(len(covariance)):
+        for block in blocks(len(positions), _BLOCK):
+            errors = direct(band, positions[block])
+            total[block, band] += np.matmul(errors, adjoint(errors))
+    return total
 
 
 def has_errors(scenario: Scenario) -> bool:

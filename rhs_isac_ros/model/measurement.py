@@ -12,9 +12,11 @@ import numpy as np
 from rhs_isac_ros.model.arrays import blocks, checked_positions, multiply_rows, read_only
 from rhs_isac_ros.model.elements import (
     DeclaredElements,
+    DirectErrors,
     ElementErrors,
     SurfaceEstimate,
     SurfaceModel,
+    with_direct_errors,
 )
 from rhs_isac_ros.model.gaussian import covariance_root
 from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
@@ -187,13 +189,16 @@ class MeasurementModel:
 
         It depends on the position only if errors of the elements are unknown.
         """
-        positions = checked_positions(positions)
-        covariance = np.repeat(
-            signal_covariance(self.scenario, self.radiation)[None], len(positions), axis=0)
-        if not self.elements.is_exact:
-            covariance += self.elements.error_covariance_at(
-                self.scenario, self.beams, positions)
-        return covariance
+        return with_direct_errors(*self._constant, checked_positions(positions))
+
+    @functools.cached_property
+    def _constant(self) -> tuple[np.ndarray, DirectErrors]:
+        """The part of `covariance_at` that is the same everywhere, and errors of the rest."""
+        covariance = signal_covariance(self.scenario, self.radiation)
+        if self.elements.is_exact:
+            return covariance, lambda band, positions: np.zeros((1, self.shape[1], 1))
+        scattered, direct = self.elements.errors(self.scenario, self.beams)
+        return covariance + scattered, direct
 
     @functools.cached_property
     def root(self) -> np.ndarray:

@@ -19,7 +19,7 @@ from rhs_isac_ros.model.arrays import blocks, log_sum
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
 from rhs_isac_ros.model.geometry import element_positions, to_positions
-from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers
+from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers, whiten
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.segments import Segments
 from rhs_isac_ros.support.threads import map_blocks
@@ -134,12 +134,13 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
     points = _points(nodes, directions).reshape(-1, 3)
     n_bands, n_rows = model.shape
     filters = np.empty((n_bands, len(points), n_rows), np.complex64)
+    whitener = model.whitener.astype(np.complex64)
     energy = np.empty(len(points), np.float32)
 
     def fill(block: slice) -> None:
         part = points[block]
         carrier = np.exp(1j * carrier_wavenumbers(scenario) * part[:, :1]) * part[:, :1]
-        templates = model.whiten(model.mean(to_positions(part)))
+        templates = whiten(whitener, model.mean(to_positions(part)).astype(np.complex64))[:, 0]
         templates *= carrier[..., None]
         filters[:, block] = np.swapaxes(templates, 0, 1).conj()
         energy[block] = np.sum(np.abs(templates)**2, axis=(1, 2))
