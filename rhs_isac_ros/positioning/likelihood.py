@@ -159,7 +159,12 @@ class Likelihood(Conditional):
         """Divide signals by the factors of parameters [M, Q]; whiten them, [M, N_B, N_SB F]."""
         if not len(self.nuisance):
             return signals.whitened
-        return self.model.whiten(self.nuisance.divide(signals.received, values))
+        moves, whitened = self.nuisance.moves_multipath, signals.whitened
+        if moves.any():
+            whitened = self.model.whiten(self.nuisance.divide(signals.received, values * moves))
+        # All other parameters multiply whole bands.
+        exponents = (values * ~moves) @ self.nuisance.scaled_patterns[:, :, 0]
+        return whitened * np.exp(-exponents)[..., None]
 
     def weights_at(self, gains: np.ndarray) -> np.ndarray:
         """Return the factors of whitened measurements, [M, N_B, N_SB F]; without a gain, 1.
