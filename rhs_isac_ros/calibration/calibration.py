@@ -227,6 +227,8 @@ def report(calibration: Calibration, scenario: Scenario) -> str:
 
 
 def _place(scenario: Scenario, element: int) -> str:
+    if scenario.element_positions_m is not None:
+        return f'element {element}'
     row, column = divmod(element, scenario.n_columns)
     return f'element {element} (row {row}, column {column})'
 

@@ -19,7 +19,7 @@ from rhs_isac_ros.codebook.cell import REGION, Prior
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import checked_positions
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
-from rhs_isac_ros.model.geometry import element_intervals_m
+from rhs_isac_ros.model.geometry import surface_sides_m
 
 # Relative error of the rows (see `bounds.rows`) of an objective. The error of the objective is
 # then below 0.1 %, far less than the sampling error. The gradient is exact for the value returned.
@@ -219,5 +219,4 @@ def _lag_density(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 def _beam_width(scenario: Scenario) -> float:
     """Return the width of the narrowest beam that the surface can form, at most 1 [rad]."""
     shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
-    sides = np.array([scenario.n_columns, scenario.n_rows]) * element_intervals_m(scenario)
-    return float(min(shortest / sides.max(), 1.0))
+    return float(min(shortest / surface_sides_m(scenario).max(), 1.0))

@@ -157,7 +157,8 @@ def _initialise_sobol() -> None:
 
 
 # Fields that decide whether a codebook fits a scenario.
-_STRUCTURE = ('center_frequencies_hz', 'n_subbands', 'n_frames', 'elements_per_side', 'n_feeds',
+_STRUCTURE = ('center_frequencies_hz', 'n_subbands', 'n_frames', 'elements_per_side',
+              'element_positions_m', 'n_feeds',
               'feed_positions_m', 'amplitude_levels')
 
 

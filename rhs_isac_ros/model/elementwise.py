@@ -19,6 +19,7 @@ from rhs_isac_ros.model.board import (
     rounded,
 )
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
+from rhs_isac_ros.support.errors import translated
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,12 +32,17 @@ class Elementwise(Board):
     loss_db_per_m: float = 0.0  #: Attenuation of the waves on the board.
     #: Amplitude gain of each feed, or None if all are 1.
     feed_gains: tuple[float, ...] | None = None
+    #: Indices of elements that have no effect, whatever their tuning, as those outside of a disc.
+    masked: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raise BoardError unless loss and gains are in range."""
+        """Raise BoardError unless loss, gains and indices are in range."""
         self._set('loss_db_per_m', number_of('loss_db_per_m', self.loss_db_per_m, 0.0, 1e6))
         if self.feed_gains is not None:
             self._set('feed_gains', numbers_of('feed_gains', self.feed_gains, 0.0, 1e6))
+        with translated(ValueError, BoardError):
+            masked = numbers('masked', self.masked, int)
+        self._set('masked', tuple(sorted({*masked.ravel().tolist()})))
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -46,6 +52,9 @@ class Elementwise(Board):
         if self.feed_gains is not None and len(self.feed_gains) != scenario.n_feeds:
             return (f'feed_gains: {len(self.feed_gains)} numbers, expected n_feeds = '
                     f'{scenario.n_feeds}')
+        if self.masked and not 0 <= self.masked[0] <= self.masked[-1] < scenario.n_elements:
+            return (f'masked: {self.masked[0]} to {self.masked[-1]}, expected 0 to '
+                    f'{scenario.n_elements - 1}')
         return super().misfit(scenario)
 
     @abc.abstractmethod
@@ -63,6 +72,7 @@ class Elementwise(Board):
         gains = np.ones(len(feeds)) if self.feed_gains is None else np.array(self.feed_gains)
         distances = np.linalg.norm(ports.elements_m - feeds, axis=-1)
         amplitudes = gains[:, None] * np.exp(-self.loss_db_per_m * NEPERS_PER_DB * distances)
+        amplitudes[:, list(self.masked)] = 0.0
         return read_only(
             amplitudes * onboard_gain(ports, frequencies, ports.elements_m, feeds))
 
@@ -165,7 +175,7 @@ class Resonant(Elementwise):
     #: Resonance f_r of the tuning 1/2 in each band [Hz], or None for the centres of the bands.
     resonances_hz: tuple[float, ...] | None = None
     quality_factor: float = 40.0  #: Quality factor Q of an element.
-    tuning_range: float = 0.1  #: Range of f_0 relative to f_r.
+    tuning_range: float = 0.3  #: Range of f_0 relative to f_r.
 
     def __post_init__(self) -> None:
         """Raise BoardError unless the values are in range."""

@@ -29,16 +29,26 @@ def element_intervals_m(scenario: Scenario) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def element_positions(scenario: Scenario) -> np.ndarray:
-    """Compute the positions of the elements in the plane x = 0, centred on the origin.
+    """Return the positions of the elements, float64 [N_E, 3] [m], read-only.
 
-    Returns float64 [N_E, 3] [m], read-only. The index of an element is row * n_columns + column;
-    a row runs along y, a column along z.
+    Unless the scenario specifies them, they form a grid in the plane x = 0, centred on the origin.
+    The index of an element is then row * n_columns + column; a row runs along y, a column along z.
     """
+    if scenario.element_positions_m is not None:
+        return read_only(np.array(scenario.element_positions_m))
     y, z = ((np.arange(n) - (n - 1) / 2) * interval_m for n, interval_m in zip(
         (scenario.n_columns, scenario.n_rows), element_intervals_m(scenario), strict=True))
     lattice = np.zeros((scenario.n_rows, scenario.n_columns, 3))
     lattice[..., 1], lattice[..., 2] = y, z[:, None]
     return read_only(lattice.reshape(-1, 3))
+
+
+def surface_sides_m(scenario: Scenario) -> np.ndarray:
+    """Return the lengths of the surface along y and z, float64 [2] [m]."""
+    intervals_m = element_intervals_m(scenario)
+    if scenario.element_positions_m is not None:
+        return np.ptp(element_positions(scenario)[:, 1:], axis=0) + intervals_m
+    return intervals_m * (scenario.n_columns, scenario.n_rows)
 
 
 def feed_positions(scenario: Scenario) -> np.ndarray:
@@ -49,7 +59,7 @@ def feed_positions(scenario: Scenario) -> np.ndarray:
     if scenario.feed_positions_m is not None:
         return np.array(scenario.feed_positions_m)
     n_feeds = scenario.n_feeds
-    length = scenario.n_columns * element_intervals_m(scenario)[0]
+    length = surface_sides_m(scenario)[0]
     positions = np.zeros((n_feeds, 3))
     positions[:, 1] = ((np.arange(n_feeds) + 0.5) / n_feeds - 0.5) * length
     return positions

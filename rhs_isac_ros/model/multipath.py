@@ -15,14 +15,14 @@ import numpy as np
 from rhs_isac_ros.model.arrays import adjoint, blocks, gauss_legendre, read_only
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.geometry import element_intervals_m
+from rhs_isac_ros.model.geometry import element_intervals_m, element_positions
 from rhs_isac_ros.model.hall import MultipathEstimate
 from rhs_isac_ros.model.scenario import Scenario
 
-# Gauss-Legendre nodes in each interval of angles, and the largest change of phase over the surface
-# that they resolve.
-_ANGLE_NODES = 160
-_PANEL_PHASE_RAD = 400.0
+# Gauss-Legendre nodes in each interval of angles, on a grid of elements or at any positions, and
+# the largest change of phase over the surface that a node resolves.
+_ANGLE_NODES, _FEW_NODES = 160, 64
+_PHASE_PER_NODE_RAD = 2.5
 # Number of elements above which products with V_i are computed as convolutions.
 _MAX_MATRIX = 1024
 # Target number of complex numbers to process at a time.
@@ -40,6 +40,8 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
     open. The power gain of the elements then weights the profile. Returns V_i, complex128
     [N_B, N_E, N_E], read-only; for many elements, `declared_covariance` needs less memory.
     """
+    if scenario.element_positions_m is not None:
+        return _of_positions(scenario)
     return _matrix(_lattice(scenario), scenario)
 
 
@@ -124,6 +126,10 @@ def spatial_covariance(scenario: Scenario) -> SpatialCovariance:
 @functools.lru_cache(maxsize=16)
 def declared_covariance(scenario: Scenario) -> SpatialCovariance:
     """Return V_i of all bands as the fields declare it; it is the same in all measurements."""
+    if scenario.element_positions_m is not None:
+        matrix = _of_positions(scenario)
+        return SpatialCovariance((1, scenario.n_elements), False, np.diagonal(
+            matrix, axis1=1, axis2=2).real.copy(), matrix)
     lattice, shape = _lattice(scenario), (scenario.n_rows, scenario.n_columns)
     is_real = not lattice.imag.any()
     power = np.repeat(lattice[:, shape[0] - 1, shape[1] - 1, None].real, scenario.n_elements, 1)
@@ -169,6 +175,36 @@ def _lattice(scenario: Scenario) -> np.ndarray:
     return lattice
 
 
+@functools.lru_cache(maxsize=16)
+def _of_positions(scenario: Scenario) -> np.ndarray:
+    """Compute V_i for elements at any positions, complex128 [N_B, N_E, N_E], read-only."""
+    elements = element_positions(scenario)
+    matrices = np.zeros((scenario.n_bands, len(elements), len(elements)), complex)
+    extent_m = np.linalg.norm(np.ptp(elements, axis=0))
+    for band, matrix in enumerate(matrices):
+        wavenumber = 2 * np.pi * scenario.center_frequencies_hz[band] / SPEED_OF_LIGHT_MPS
+        (azimuth, azimuth_weights), (elevations, elevation_weights) = (
+            _profile_quadrature(scenario.angular_spread_deg, mean, False, wavenumber * extent_m,
+                                _FEW_NODES) for mean in scenario.multipath_direction_deg)
+        for elevation, weight in zip(elevations, elevation_weights, strict=True):
+            directions = np.stack([
+                np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
+                np.full(len(azimuth), np.sin(elevation))], axis=1)
+            amplitudes = np.sqrt(weight * azimuth_weights) * _element_gain(
+                scenario, directions[:, 0])
+            waves = amplitudes[:, None] * np.exp(1j * wavenumber * directions @ elements.T)
+            matrix += waves.T @ np.conj(waves)
+        matrix *= _mean_power(scenario, band)
+    return read_only(matrices)
+
+
+def _element_gain(scenario: Scenario, cosine: np.ndarray) -> np.ndarray:
+    """Return the gain of an element for cosines of the angle from the boresight."""
+    if isinstance(scenario.element_gain, GainPattern):
+        return scenario.element_gain.amplitude(np.arccos(cosine))
+    return np.full(cosine.shape, scenario.element_gain)
+
+
 class _PlaneWaves(NamedTuple):
     """Plane waves from E elevations and A azimuths."""
 
@@ -202,12 +238,10 @@ def _plane_waves(
         elevation = elevations[block]
         # Direction (cos el cos az, cos el sin az, sin el).
         across = np.cos(elevation)[:, None] * np.sin(azimuth)
-        if isinstance(scenario.element_gain, GainPattern):
-            # The cosine of the angle from the boresight is cos el cos az.
-            gain = scenario.element_gain.amplitude(
-                np.arccos(np.cos(elevation)[:, None] * np.cos(azimuth)))
-        else:
-            gain = np.full((1, 1), scenario.element_gain)
+        # The cosine of the angle from the boresight is cos el cos az.
+        cosine = np.cos(elevation)[:, None] * np.cos(azimuth)
+        gain = _element_gain(scenario, cosine if isinstance(
+            scenario.element_gain, GainPattern) else cosine[:1, :1])
         yield _PlaneWaves(
             elevation_weights[block], azimuth_weights, gain,
             phasors[1](wavenumber * np.sin(elevation)[:, None] * rows),
@@ -369,17 +403,17 @@ def _fields(scenario: Scenario) -> Scenario | MultipathEstimate:
     return scenario.multipath or scenario
 
 
-def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase: float
-                        ) -> tuple[np.ndarray, np.ndarray]:
+def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase: float,
+                        n_nodes: int = _ANGLE_NODES) -> tuple[np.ndarray, np.ndarray]:
     """Return angles [rad] and weights of sum 1 for a Laplacian or, if even, its positive half."""
-    nodes, weights = gauss_legendre(_ANGLE_NODES)
+    nodes, weights = gauss_legendre(n_nodes)
     mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)
     angles, density = [], []
     signs = (1,) if is_even else (-1, 1)
     # Each side of the cusp at the mean ends at 90 degrees, or earlier for a narrow profile.
     reaches = [min(1 - sign * mean / (np.pi / 2), 30 * spread / (np.pi / 2)) for sign in signs]
     for sign, reach in zip(signs, reaches, strict=True):
-        panels = math.ceil(phase * reach / _PANEL_PHASE_RAD) or 1
+        panels = math.ceil(phase * reach / (n_nodes * _PHASE_PER_NODE_RAD)) or 1
         for panel in range(panels):
             distance = (nodes + 1 + 2 * panel) * (np.pi / 4) * (reach / panels)
             share = reach / panels / sum(reaches)

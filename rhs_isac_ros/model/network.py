@@ -170,7 +170,7 @@ class CoupledNetwork(Board):
             return (f'{self.file}: {n_elements} elements and {n_feeds} feeds, expected '
                     f'{scenario.n_elements} and {scenario.n_feeds}')
         span = (np.arange(scenario.n_subbands) - (scenario.n_subbands - 1) / 2) * (
-            scenario.subband_width_hz)
+            scenario.spacing_hz)
         with_bands = np.add.outer(scenario.center_frequencies_hz, span)
         try:
             for band in with_bands:

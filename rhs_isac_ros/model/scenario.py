@@ -27,6 +27,8 @@ from rhs_isac_ros.support.fields import UNKNOWN, Field, to_number
 from rhs_isac_ros.support.files import read_yaml
 from rhs_isac_ros.support.plugins import PluginError
 
+# Largest number of elements at given positions, whose covariances are computed one by one.
+_MAX_ELEMENTS = 1024
 # Relative tolerance for differences between frequencies.
 _ROUNDING = 1e-9
 
@@ -189,6 +191,11 @@ class Extensions:
         'amplitudes are continuous.', '',
         'Smith, Yurduseven, Mancera, Bowen and Kundtz, Analysis of a waveguide-fed metasurface '
         'antenna, Phys. Rev. Applied 8, 2017', label='amplitude levels $L$')
+    element_positions_m: tuple[tuple[float, float, float], ...] | None = declare(
+        None, -1e3, 1e3,
+        'Positions of the elements, such as those of a disc or of a curved panel, all of which '
+        'face along x; if null, they form the grid of elements_per_side.', 'm',
+        label='element positions')
     board: Board = declare(
         Paper(), 0.0, 0.0,
         'How tunings of the elements determine the transfer from elements to feeds: the name of a '
@@ -290,6 +297,7 @@ class Scenario(Extensions, Table1):
                 raise ScenarioError(
                     f'center_frequencies_hz: {low:g} and {high:g} Hz, expected at least '
                     f'{span_hz:g} Hz apart, the width of a band of {self.n_subbands} sub-bands')
+        self._check_elements()
         if self.amplitude_levels == 1:
             raise ScenarioError(
                 'amplitude_levels: 1, expected 0 for continuous amplitudes, or at least 2')
@@ -299,6 +307,21 @@ class Scenario(Extensions, Table1):
             arrays = getattr(self, name)
             if arrays is not None and (misfit := arrays.misfit(self)):
                 raise ScenarioError(f'{name}: {misfit}')
+
+    def _check_elements(self) -> None:
+        """Raise ScenarioError if positions of the elements contradict other fields."""
+        if self.element_positions_m is None:
+            return
+        n, foremost = len(self.element_positions_m), max(x for x, _, _ in self.element_positions_m)
+        if n > _MAX_ELEMENTS:
+            raise ScenarioError(f'element_positions_m: {n} positions, expected at most '
+                                f'{_MAX_ELEMENTS}; more only in a grid')
+        if self.roi_center_m[0] - self.roi_size_m[0] / 2 <= foremost:
+            raise ScenarioError(
+                f'element_positions_m: x up to {foremost:g} m, expected all elements in front of '
+                'the region of interest')
+        if self.multipath is not None:
+            raise ScenarioError('element_positions_m: with a file multipath, expected a grid')
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> 'Scenario':
@@ -349,7 +372,8 @@ class Scenario(Extensions, Table1):
         """Hash of the fields: ``sc`` and 16 hex digits, which YAML never parses as a number."""
         changes, fields = self.changes(), self.fields()
         for name in ('impairments', 'subband_spacing_hz', 'multipath_direction_deg',
-                     'blocked_probability', 'outside_probability', *_FILES, 'pose', 'board'):
+                     'blocked_probability', 'outside_probability', *_FILES, 'pose',
+                     'element_positions_m', 'board'):
             # Existing files contain identifiers from before these fields were introduced.
             if name not in changes:
                 del fields[name]
@@ -372,13 +396,17 @@ class Scenario(Extensions, Table1):
 
     @property
     def n_columns(self) -> int:
-        """Number of elements along y."""
+        """Number of elements along y; all of them if they do not form a grid."""
+        if self.element_positions_m is not None:
+            return len(self.element_positions_m)
         sides = self.elements_per_side
         return sides if isinstance(sides, int) else sides[0]
 
     @property
     def n_rows(self) -> int:
-        """Number of elements along z."""
+        """Number of elements along z; 1 if they do not form a grid."""
+        if self.element_positions_m is not None:
+            return 1
         sides = self.elements_per_side
         return sides if isinstance(sides, int) else sides[1]
 
@@ -463,7 +491,7 @@ def _plain(value: Any) -> Any:
 def checked(field: dataclasses.Field[Any], value: Any) -> Any:
     """Convert a field's value to its declared type; raise ScenarioError if it is invalid."""
     name = field.name
-    if name == 'feed_positions_m':
+    if name in ('feed_positions_m', 'element_positions_m'):
         return None if value is None else tuple(
             _numbers(field, row, 3) for row in _entries(field, value, '[x, y, z]'))
     if name == 'impairments':

@@ -116,6 +116,8 @@ def board_of_guides(
     scaled so that the coefficients of single elements at resonance have the RMS 1. Raises
     ValueError if the guides carry no wave.
     """
+    if scenario.element_positions_m is not None:
+        raise ValueError('element_positions_m: not null, expected a grid of elements')
     elements, shape = element_positions(scenario), (scenario.n_rows, scenario.n_columns)
     spacing = np.ptp(elements[:, 1:], axis=0) / np.maximum(np.array(shape[::-1]) - 1, 1)
     width = float(spacing[1])

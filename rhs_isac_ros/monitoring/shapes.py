@@ -18,7 +18,11 @@ import numpy as np
 from rhs_isac_ros.link import Beamformer, BeamPattern, beam_pattern
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import mixture_weights
-from rhs_isac_ros.model.geometry import element_intervals_m, element_positions
+from rhs_isac_ros.model.geometry import (
+    element_intervals_m,
+    element_positions,
+    surface_sides_m,
+)
 from rhs_isac_ros.protocol import messages as m
 
 Colour: TypeAlias = tuple[float, float, float]
@@ -193,8 +197,7 @@ def board(scenario: Scenario, configuration: np.ndarray | None, enlarged: bool =
     """
     positions, intervals_m = element_positions(scenario), element_intervals_m(scenario)
     if enlarged:
-        sides_m = intervals_m * (scenario.n_columns, scenario.n_rows)
-        scale = _BOARD_SIZE * math.hypot(*scenario.roi_center_m) / sides_m.max()
+        scale = _BOARD_SIZE * math.hypot(*scenario.roi_center_m) / surface_sides_m(scenario).max()
         positions, intervals_m = scale * positions, scale * intervals_m
     half_y_m, half_z_m = 0.45 * intervals_m
     level = (np.full(len(positions), 0.5) if configuration is None
@@ -207,7 +210,8 @@ def configurations(scenario: Scenario, bands: Iterable[np.ndarray]) -> Picture:
     """Return configurations as a picture from the front, with y to the right and z up.
 
     `bands` contains the configuration of each band, float64 [F, N_E] in [0, 1]. Each band is a row
-    of the picture and each frame a column, with black lines between them.
+    of the picture and each frame a column, with black lines between them. Elements that do not
+    form a grid are shown in one line, in their order.
     """
     rows = []
     for analog in bands:

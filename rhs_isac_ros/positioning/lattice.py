@@ -73,7 +73,8 @@ class Resolution(NamedTuple):
         """Derive the lengths from a scenario."""
         elements = element_positions(scenario)
         wavenumber = subband_wavenumbers(scenario).max()
-        edge_m = np.abs(elements[:, 1:]).max(axis=0)
+        # The direction also changes the phases of elements in front of the plane or behind it.
+        edge_m = np.abs(elements[:, 1:]).max(axis=0) + np.abs(elements[:, 0]).max()
         bounds = scenario.roi_bounds_m
         (nearest_m, *lowest), (farthest_m, *highest) = polar_bounds(bounds).tolist()
         return cls(

@@ -9,7 +9,7 @@ import numpy as np
 
 from rhs_isac_ros.link import BeamPattern
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import element_intervals_m, feed_positions
+from rhs_isac_ros.model.geometry import element_positions, feed_positions, surface_sides_m
 from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
 from rhs_isac_ros.monitoring.network_state import SceneState, SceneUser
@@ -234,14 +234,19 @@ def _draw_user(axes: Any, plane: list[int], user: SceneUser) -> None:
 def _draw_surface(axes: Any, message: m.RhsConfiguration | None, scenario: Scenario) -> None:
     """Draw the configuration of the surface from the front: y to the right, z up."""
     shape = scenario.n_rows, scenario.n_columns
-    half_y_cm, half_z_cm = 50 * element_intervals_m(scenario) * shape[::-1]
-    amplitudes = np.full(shape, np.nan) if message is None else message.analog.mean(axis=0)
-    image = axes.imshow(
-        amplitudes.reshape(shape), origin='lower', vmin=0, vmax=1,
-        extent=(-half_y_cm, half_y_cm, -half_z_cm, half_z_cm))
+    half_y_cm, half_z_cm = 50 * surface_sides_m(scenario)
+    tunings = np.full(shape, np.nan) if message is None else message.analog.mean(axis=0)
+    if scenario.element_positions_m is None:
+        image = axes.imshow(
+            tunings.reshape(shape), origin='lower', vmin=0, vmax=1,
+            extent=(-half_y_cm, half_y_cm, -half_z_cm, half_z_cm))
+    else:
+        image = axes.scatter(*(100 * element_positions(scenario)[:, 1:]).T, s=12,
+                             c=tunings.ravel(), vmin=0, vmax=1)
+        axes.set(aspect='equal')
     axes.plot(*(100 * feed_positions(scenario)[:, 1:]).T, 'D', color='white',
               markeredgecolor='black', markersize=4)
-    axes.figure.colorbar(image, ax=axes, location='bottom', label='amplitude', shrink=0.8,
+    axes.figure.colorbar(image, ax=axes, location='bottom', label='tuning', shrink=0.8,
                          ticks=(0, 0.5, 1))
     text = 'not known yet'
     if message is not None:

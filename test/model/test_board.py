@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import AverageCrlb
+from rhs_isac_ros.codebook import optimize
+from rhs_isac_ros.link import steer
 from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError
 from rhs_isac_ros.model.board import Board
 from rhs_isac_ros.model.boards import board_of
@@ -108,6 +110,20 @@ def test_loss_and_gains_of_feeds_act_on_the_propagation():
     np.testing.assert_allclose(lossy / plain, np.broadcast_to(expected, plain.shape))
 
 
+def test_masked_elements_have_no_effect_and_stay_masked_when_others_are_optimised():
+    masked = [0, 3, 12, 15]
+    scenario = scenario_with({'kind': 'paper', 'masked': [15, 0, 3, 12, 3]})
+    assert scenario.board.masked == tuple(masked)
+    assert Scenario(**scenario.changes()) == scenario
+    best = optimize(scenario, n_positions=8, max_steps=3).codebook
+    radiation = MeasurementModel(scenario, best).radiation
+    assert not radiation[..., masked].any()
+    others = np.delete(np.arange(16), masked)
+    assert radiation[..., others].any(axis=(0, 1)).all()
+    beam = steer(scenario, np.array(scenario.roi_center_m))
+    assert beam.analog.shape == (16,)
+
+
 def test_coefficients_follow_their_curves():
     tunings = np.linspace(0, 1, 5).reshape(1, 1, 5).repeat(2, axis=0)
     phase = PhaseShift(phase_range_rad=np.pi).coefficients(PORTS, tunings)
@@ -157,6 +173,8 @@ def test_a_focused_beam_is_in_phase_at_its_point(kind):
     ({'board': {'kind': 'phase', 'range': 1}}, "range: unknown field of 'phase', expected one of"),
     ({'board': {'kind': 'paper', 'loss_db_per_m': -1}}, 'loss_db_per_m: -1.0, expected 0 to 1e'),
     ({'board': {'kind': 'paper', 'feed_gains': [1]}}, 'feed_gains: 1 numbers, expected n_feeds'),
+    ({'board': {'kind': 'paper', 'masked': [100]}}, 'masked: 100 to 100, expected 0 to 99'),
+    ({'board': {'kind': 'paper', 'masked': [0.5]}}, 'masked: 0.5, expected integers'),
     ({'board': {'kind': 'paper', 'feed_gains': 1}}, 'feed_gains: 1, expected a list of numbers'),
     ({'board': {'kind': 'resonant', 'resonances_hz': [1e9]}}, 'resonances_hz: 1 numbers'),
     ({'board': 'states'}, '2 states with amplitude_levels = 0, expected as many levels'),

@@ -141,6 +141,7 @@ def test_a_network_that_does_not_fit_is_refused_by_name(coupled):
     for changes, expected in (
             ({'elements_per_side': 5}, '16 elements and 2 feeds, expected 25 and 2'),
             ({'center_frequencies_hz': [2.5e9, 3.1e9]}, 'no admittances at 3.0'),
+            ({'subband_spacing_hz': 1e6}, 'no admittances at 2.499'),
             ({'failed_element_share': 0.1}, "'network' with failed_element_share = 0.1")):
         with pytest.raises(ScenarioError, match='^board: ') as caught:
             dataclasses.replace(coupled, **changes)
