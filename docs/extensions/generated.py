@@ -44,17 +44,26 @@ def code(text):
 
 
 def parameter_table():
-    """Return a table of all ROS parameters, from their declarations."""
+    """Return a table of the ROS parameters of each node, and one of those that several share."""
     owners = {}
     for executable, group in parameters.NODES.items():
         for parameter in group:
             owners.setdefault(parameter.name, (parameter, []))[1].append(executable)
-    rows = []
+    sections = {}
     for name, (parameter, nodes_) in owners.items():
-        rows.append((code(name), parameter.type, parameter.default_text, parameter.range,
-                     'yes' if parameter.dynamic else '', ', '.join(nodes_), parameter.text))
-    return table(('parameter', 'type', 'default', 'range', 'dynamic', 'nodes', 'description'),
-                 rows, '18 8 9 14 8 15 28')
+        row = (code(name), parameter.type, parameter.default_text, parameter.range,
+               'yes' if parameter.dynamic else '')
+        if len(nodes_) == 1:
+            sections.setdefault(nodes_[0], []).append((*row, parameter.text))
+        else:
+            sections.setdefault('', []).append((*row, f'{parameter.text} ({", ".join(nodes_)})'))
+    # Shared parameters come first.
+    return '\n\n'.join(
+        f'{title}\n{"-" * len(title)}\n\n' + table(
+            ('parameter', 'type', 'default', 'range', 'dynamic', 'description'), rows,
+            '20 9 11 17 9 34')
+        for title, rows in ((code(node) or 'Several nodes', sections[node])
+                            for node in sorted(sections)))
 
 
 def scenario_table(kind):

@@ -252,14 +252,16 @@ class PathChannel(ArrayFile):
             users, a[0, 0, :, 0], delay, _unit_vectors(elevation, azimuth), n, f0)
 
     @classmethod
-    def from_deepmimo(cls, dataset: Any, f0: float, pose: Pose = _AT_ORIGIN) -> 'PathChannel':
+    def from_deepmimo(cls, dataset: Any, f0: float, pose: Pose = _AT_ORIGIN,
+                      has_delay_phase: bool = True) -> 'PathChannel':
         """Convert the paths of a dataset of DeepMIMO 4: power, phase, delay, angles, interactions.
 
         The base station, with this pose in the frame of the dataset, is the surface, and receivers
-        are users; antenna patterns and rotations of the dataset do not matter.
-        Powers are for 1 W and isotropic antennas, and phases include that of the delay at `f0`
-        [Hz]. Users without a path and paths from behind the surface are removed. Raises
-        ArchiveError if a path is scattered, or the result is invalid.
+        are users; antenna patterns and rotations of the dataset do not matter. Powers are for 1 W
+        and isotropic antennas. `has_delay_phase` tells whether phases include that of the delay at
+        `f0` [Hz]; those converted from Sionna RT do not. Users without a path and paths from
+        behind the surface are removed. Raises ArchiveError if a path is scattered, or the result
+        is invalid.
         """
         power, phase, delay, azimuth, elevation, kinds = (
             np.atleast_2d(np.array(getattr(dataset, name), float))
@@ -270,7 +272,7 @@ class PathChannel(ArrayFile):
             raise ArchiveError('inter: scattered paths, expected reflected ones')
         present = np.isfinite(power) & np.isfinite(delay) & (kinds >= 0)
         n = np.where(present, np.reshape([len(kind) for kind in digits], kinds.shape), -1)
-        turn = np.deg2rad(phase) + 2 * np.pi * f0 * delay
+        turn = np.deg2rad(phase) + has_delay_phase * 2 * np.pi * f0 * delay
         amplitude = np.where(present, 10 ** (power / 20) * np.exp(1j * turn), 0)
         # The elevation is the angle from the z axis.
         directions = pose.vectors_to_surface(

@@ -274,6 +274,9 @@ def test_paths_of_deepmimo_are_those_of_its_angles(traced, pose):
     np.testing.assert_allclose(found.sources, paths.sources, atol=1e-6)
     np.testing.assert_allclose(found.a, paths.a, rtol=1e-6, atol=1e-12)
     np.testing.assert_array_equal(found.n, paths.n)
+    dataset.phase = np.rad2deg(np.angle(np.concatenate([paths.a, paths.a[:1]])))
+    found = PathChannel.from_deepmimo(dataset, F0, pose, has_delay_phase=False)
+    np.testing.assert_allclose(found.a, paths.a, rtol=1e-6, atol=1e-12)
 
 
 def test_scattered_paths_of_deepmimo_are_refused_by_name(traced):
