@@ -367,6 +367,10 @@ class Scenario(Extensions, Table1):
         return {field.name: _plain(getattr(self, field.name))
                 for field in dataclasses.fields(self)}
 
+    def __hash__(self) -> int:
+        """Return the hash of `id`; that of all fields would take part of every estimate."""
+        return hash(self.id)
+
     @functools.cached_property
     def id(self) -> str:
         """Hash of the fields: ``sc`` and 16 hex digits, which YAML never parses as a number."""
