@@ -14,7 +14,8 @@ from rhs_isac_ros.system import System
 CONFIG = Path(__file__).parents[1] / 'config'
 CODEBOOKS = {path.stem for path in CONFIG.glob('codebook*.yaml')}
 SCENARIOS = {name: Scenario.from_yaml(CONFIG / f'{name}.yaml')
-             for name in ('table1', 'quick', 'wideband', 'bandplan', 'hall', 'lab')}
+             for name in (
+                 'table1', 'quick', 'wideband', 'bandplan', 'hall', 'lab', 'resonant', 'coupled')}
 
 
 def test_every_file_is_a_scenario_a_codebook_a_site_or_one_of_parameters():
@@ -24,7 +25,8 @@ def test_every_file_is_a_scenario_a_codebook_a_site_or_one_of_parameters():
 
 @pytest.mark.parametrize(('name', 'changed'), [
     ('table1', set()), ('wideband', {'center_frequencies_hz'}), ('hall', {'multipath', 'channel'}),
-    ('bandplan', {'center_frequencies_hz', 'n_frames'})])
+    ('bandplan', {'center_frequencies_hz', 'n_frames'}), ('resonant', {'board'}),
+    ('coupled', {'board'})])
 def test_scenarios_change_only_what_their_names_promise(name, changed):
     assert SCENARIOS[name].changes().keys() == changed
 

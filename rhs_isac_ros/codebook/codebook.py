@@ -89,11 +89,12 @@ class Codebook:
         digest.update(self.digital.astype('<c16').tobytes())
         return f'cb{digest.hexdigest()[:16]}'
 
-    def check(self, scenario: Scenario) -> None:
+    def check(self, scenario: Scenario, *, discrete: bool = True) -> None:
         """Raise CodebookError if the codebook does not fit a scenario.
 
         The sizes must be those of the scenario, and every frame must have the power `max_power_w`.
-        If the scenario has amplitude levels, every amplitude must equal one of them.
+        If `discrete`, and the scenario has amplitude levels, every amplitude must equal one of
+        them.
         """
         with translated(ValueError, CodebookError):
             check_shape('analog', self.analog, 'N_B F N_E', scenario)
@@ -105,7 +106,7 @@ class Codebook:
                 f'digital: a frame has power {worst:g} W, expected max_power_w = '
                 f'{scenario.max_power_w:g} W')
         errors = np.abs(self.analog - on_levels(scenario, self.analog))
-        if errors.max() > _LEVEL_TOLERANCE:
+        if discrete and errors.max() > _LEVEL_TOLERANCE:
             raise CodebookError(
                 f'analog: {self.analog.flat[errors.argmax()]:g}, expected one of '
                 f'amplitude_levels = {scenario.amplitude_levels} levels from 0 to 1')

@@ -249,7 +249,7 @@ def check_start(codebook: Codebook, scenario: Scenario) -> None:
 
     Amplitudes may be continuous, because even a search over levels begins with such amplitudes.
     """
-    codebook.check(dataclasses.replace(scenario, amplitude_levels=0))
+    codebook.check(scenario, discrete=False)
 
 
 def _determined(value_m2: float) -> float:

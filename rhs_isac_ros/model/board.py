@@ -24,7 +24,7 @@ from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field
 
 # Number of tunings among which a focused beam chooses if tunings are continuous.
-_N_TUNINGS = 257
+_N_TUNINGS = 65
 # A number for all elements, or an array [N_E].
 Factor: TypeAlias = np.ndarray | complex
 

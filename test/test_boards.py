@@ -1,0 +1,134 @@
+"""Every board with everything that depends on it: each combination runs, or is refused by name."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.calibration import Pilots, calibrate, known_states
+from rhs_isac_ros.codebook import optimize
+from rhs_isac_ros.codebook.cell import Cell
+from rhs_isac_ros.codebook.unoptimised import directional_codebook, random_codebook
+from rhs_isac_ros.link import capacity_report, choose_beam
+from rhs_isac_ros.model import Pose, Scenario
+from rhs_isac_ros.model.waveguides import board_of_guides
+from rhs_isac_ros.positioning import BayesEstimator
+from rhs_isac_ros.positioning.site import Site, SiteEstimator
+from rhs_isac_ros.system import System
+
+GRID = Scenario(n_subbands=2, n_frames=3, elements_per_side=4, n_feeds=2,
+                roi_center_m=(4, 0, 0), roi_size_m=(1, 1, 0.5))
+BOARDS = {
+    'lossy': {'kind': 'paper', 'loss_db_per_m': 9.0, 'masked': [0]}, 'phase': 'phase',
+    'resonant': 'resonant', 'states': {'kind': 'states', 'states': [[0.5, 0.5], [-1, 0]]},
+    'network': {'kind': 'network'}}
+USER = np.array([[4.1, 0.2, 0.1]])
+
+
+@pytest.fixture(scope='module')
+def network_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp('boards') / 'board.npz'
+    np.savez(path, **board_of_guides(GRID))
+    return str(path)
+
+
+@pytest.fixture(params=BOARDS)
+def system(request, network_file):
+    board = BOARDS[request.param]
+    if request.param == 'network':
+        board = board | {'file': network_file}
+    scenario = dataclasses.replace(
+        GRID, board=board, amplitude_levels=2 * (request.param == 'states'))
+    return System(scenario, random_codebook(scenario, np.random.default_rng(0)))
+
+
+def optimised(system):
+    scenario = Scenario(**json.loads(json.dumps(system.scenario.changes())))
+    assert scenario == system.scenario
+    result = optimize(scenario, n_positions=8, max_steps=3)
+    assert result.history[-1].value_m2 < result.history[0].value_m2
+
+
+def of_a_library(system):
+    cell = Cell((4.0, 0.0, 0.0), 0.2)
+    codebook = optimize(system.scenario, n_positions=4, max_steps=2, objective='error',
+                        start=system.codebook, prior=cell).codebook
+    codebook.check(system.scenario)
+
+
+def located(system):
+    estimate = BayesEstimator(system).estimate(system.sample(USER, np.random.default_rng(1)))
+    assert np.isfinite(estimate.mean).all()
+
+
+def bounded(system):
+    assert (crlb(system.scenario, system.codebook, USER) > 0).all()
+
+
+def steered(system):
+    choice = choose_beam(system.scenario, USER[0], 0.01 * np.eye(3))
+    assert choice.expected_bps > 0
+    assert capacity_report(system.scenario, choice.beam, USER[0]).actual_bps > 0
+
+
+def calibrated(system):
+    rng = np.random.default_rng(2)
+    positions = system.scenario.sample_positions(40, rng)
+    pilots = Pilots(system.codebook, positions, system.sample(positions, rng))
+    found = calibrate(system.scenario, [pilots]).surface
+    known = System(system.scenario, system.codebook, found)
+    assert np.isfinite(known.crlb(USER)).all()
+
+
+def focused(system):
+    directional_codebook(system.scenario).check(system.scenario)
+
+
+def with_states(system):
+    known_states(system.scenario, 1, -1)
+
+
+def with_failures(system):
+    dataclasses.replace(system.scenario, failed_element_share=0.02)
+
+
+def at_a_site(system):
+    moved = dataclasses.replace(system.scenario, pose=Pose((4, -4, 0), (0, 0, 1, 1)))
+    site = Site({'front': system, 'side': System(moved, system.codebook)},
+                np.array([[3.5, -0.5, -0.25], [4.5, 0.5, 0.25]]))
+    received = site.sample(USER, np.random.default_rng(3))
+    assert np.isfinite(SiteEstimator(site).estimate(received).mean).all()
+
+
+def impaired(system):
+    scenario = dataclasses.replace(
+        system.scenario, band_phase_std_rad=1.0, user_gain_std_db=3.0, timing_std_s=1e-8,
+        element_error_rms=0.03)
+    other = System(scenario, system.codebook)
+    assert (other.crlb(USER) > system.crlb(USER)).all()
+    located(other)
+
+
+CELLS = [optimised, of_a_library, located, bounded, steered, calibrated, focused, with_states,
+         with_failures, at_a_site, impaired]
+COUPLED = "'network' couples its elements"
+REFUSED = {
+    (calibrated, 'network'): COUPLED, (focused, 'network'): COUPLED,
+    **{(with_states, kind): f"board: '{kind}' with states of elements"
+       for kind in ('phase', 'resonant', 'states', 'network')},
+    **{(with_failures, kind): f"'{kind}' with failed_element_share = 0.02"
+       for kind in ('phase', 'resonant', 'states', 'network')}}
+
+
+@pytest.mark.filterwarnings('ignore::rhs_isac_ros.calibration.CalibrationWarning')
+@pytest.mark.parametrize('cell', CELLS, ids=lambda cell: cell.__name__)
+def test_every_combination_runs_or_is_refused_by_name(cell, system):
+    expected = REFUSED.get((cell, system.scenario.board.kind))
+    if expected is None:
+        cell(system)
+        return
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - compared below
+        cell(system)
+    assert expected in str(caught.value)
