@@ -62,6 +62,9 @@ LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 # Names with a meaning for launch itself.
 OF_LAUNCH = ('launch-prefix', 'launch-prefix-filter', 'emulate_tty', 'sigterm_timeout',
              'sigkill_timeout')
+# Names that Nav2 passes to what it includes, each with the argument of which it sets the default.
+OF_NAV2 = {'use_composition': 'composed', 'use_respawn': 'respawn', 'autostart': '',
+           'container_name': ''}
 RESPAWN_DELAY_S = 1.0
 # Exit code for invalid parameters, arguments or files: a restart would fail again.
 INVALID = 2
@@ -87,6 +90,13 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """
     _refuse_unknown(context)
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
+    for other, name in OF_NAV2.items():
+        if name and given[name] == ARGUMENTS[name][0]:
+            given[name] = context.launch_configurations.get(other, given[name])
+    # A parent may push a namespace, and pass it, too.
+    pushed = context.launch_configurations.get('ros_namespace', '')
+    if given['namespace'].strip('/') == pushed.strip('/'):
+        given['namespace'] = ''
     users = _integer('users', given, 1)
     values = {'seed': _integer('seed', given, 0), 'codebook_file': given['codebook'],
               'estimator': given['estimator']}
@@ -124,7 +134,7 @@ def _refuse_unknown(context: LaunchContext) -> None:
         if Path(include.launch_description_source.location).resolve().parent == FOLDER:
             for name, _ in include.launch_arguments:
                 text = perform_substitutions(context, normalize_to_list_of_substitutions(name))
-                if text not in (*ARGUMENTS, *OF_LAUNCH):
+                if text not in (*ARGUMENTS, *OF_LAUNCH, *OF_NAV2):
                     raise ValueError(f'{text}: unknown argument{hint(text, ARGUMENTS)}')
 
 

@@ -110,6 +110,9 @@ SITE = str(ROOT / 'config' / 'site.yaml')
 @pytest.mark.parametrize(('values', 'expected'), [
     ({'composed': 'False'}, [*ONE_EACH, 'user', 'user', 'bs']),
     ({'composed': '0', 'users': '1', 'record': 'run.mcap'}, ['record', *ONE_EACH, 'user', 'bs']),
+    # The name of this argument in launch files of Nav2.
+    ({'use_composition': 'False', 'users': '1'}, [*ONE_EACH, 'user', 'bs']),
+    ({'use_composition': 'True', 'composed': 'false', 'users': '1'}, [*ONE_EACH, 'user', 'bs']),
     ({'composed': 'false', 'users': '16'}, [*ONE_EACH, *['user'] * 16, 'bs']),
     ({'composed': ' FALSE ', 'users': '1000'}, [*ONE_EACH, 'LogInfo', 'user', 'bs']),
     ({}, ['network']), ({'users': '1000'}, ['network']), ({'site': SITE}, ['network']),
@@ -165,6 +168,15 @@ def test_parameters_are_declared(composed):
         names = {word.partition(':=')[0] for flag, word in itertools.pairwise(words)
                  if flag == '-p'}
         assert {'scenario_file', 'site_file'} <= names <= declared
+
+
+@needs_launch
+@pytest.mark.parametrize(('pushed', 'passed', 'expected'), [
+    ('/robot', 'robot', ''), ('/robot', '/robot', ''), ('', 'robot', 'robot'),
+    ('/fleet', 'robot', 'robot'), ('/robot', '', '')])
+def test_a_namespace_that_a_parent_pushes_and_passes_counts_once(pushed, passed, expected):
+    ((_, node),) = started(namespace=passed, ros_namespace=pushed)
+    assert node._Node__node_namespace == expected
 
 
 @needs_launch
