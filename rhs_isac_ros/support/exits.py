@@ -47,8 +47,8 @@ def exit_code_of(
     """Run a main function and return the exit code, even if a standard stream is closed or fails.
 
     The code is the result of `main` (0 for None); 0 if the reader of the output closes it early,
-    as ``head`` does; 1 if the output cannot be written; or 2 if `main` raises one of the `errors`.
-    In the last two cases, the error is printed. Other exceptions propagate.
+    as ``head`` does; 1 if the output or a file cannot be written; or 2 if `main` raises one of the
+    `errors`. In the last two cases, the error is printed. Other exceptions propagate.
     """
     # If a standard stream is closed, the next file to be opened would take its descriptor.
     for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):
@@ -69,9 +69,6 @@ def exit_code_of(
         print_error(error, program)
         return 2
     except OSError as error:
-        # Errors about a file have a file name; errors about the output do not.
-        if error.filename is not None:
-            raise
         discard_stdout()
         print_error(error, program)
         return 1

@@ -10,7 +10,7 @@ import secrets
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Hashable, Mapping, Set
+from collections.abc import Callable, Hashable, Iterator, Mapping, Set
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
@@ -99,7 +99,7 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
     temporary = path.with_name(f'.{path.name}.{secrets.token_hex(4)}')
     stream = open(temporary, 'xb')
     try:
-        with stream:
+        with writing(path), stream:
             if callable(content):
                 content(stream)
             else:
@@ -107,6 +107,17 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
         os.replace(temporary, path)
     except BaseException:
         os.unlink(temporary)
+        raise
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Let an error of the system in a block that writes a file, such as a full disk, name it."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno and error.filename is None:
+            error.filename = str(path)
         raise
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.monitoring import network_view, shapes
+from rhs_isac_ros.support.files import writing
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 # Releases 0.N of rerun.
@@ -26,6 +27,8 @@ _DOT_SIZE, _LINE_WIDTH, _OUTLINE_WIDTH = 4.0, 2.0, 1.2
 # visible.
 _MESH_WIDTH, _MESH_STEP, _MESH_DIM = 0.6, 2, 0.45
 _BACKGROUND = (16, 18, 22)
+# Number of bytes whose writing shows whether a disk is full.
+_PROBE = 2**16
 # Maximum time for the server of the viewer to start, and period of checking [s].
 _START_S, _POLL_S = 20.0, 0.05
 
@@ -130,10 +133,17 @@ class RerunStream:
                 path, _archetype(self._rerun, entity), static=not cycle, recording=self._stream)
 
     def close(self) -> None:
-        """Complete the file, or stop the server."""
+        """Complete the file, or stop the server; raise OSError if the disk is full."""
         self._disconnect()
         if self._files:
-            os.replace(*self._files)
+            partial, path = self._files
+            # Rerun only prints this error; it occurs again.
+            with writing(partial), partial.open('r+b') as file:
+                size = file.seek(0, os.SEEK_END)
+                file.write(bytes(_PROBE))
+                file.flush()
+                file.truncate(size)
+            partial.replace(path)
 
     def discard(self) -> None:
         """Remove the incomplete file, or stop the server."""

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import resource
 import zipfile
 
 import numpy as np
@@ -46,6 +47,18 @@ def test_a_failing_write_leaves_only_the_old_file(tmp_path, monkeypatch, failing
             write_whole(path, fail if failing == 'content' else 'new')
     assert path.read_text(encoding='utf-8') == 'old'
     assert os.listdir(tmp_path) == ['file']
+
+
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path):
+    path = tmp_path / 'file'
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, limits[1]))
+    try:
+        with pytest.raises(OSError, match=f"too large: '{path}'"):
+            write_whole(path, bytes(2048))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_file_in_a_missing_folder_is_not_writable(tmp_path):

@@ -184,7 +184,7 @@ def test_another_codebook_is_assumed_with_a_warning(replayed, random_beams, tmp_
 
 
 @pytest.mark.parametrize('arguments, error', [
-    (['--namespace', '/lab'], 'with a true position in the namespace /lab; see --namespace'),
+    (['--namespace', '/lab'], 'with a true position in the namespace /lab; see --namespace and'),
     (['--codebook', CONFIG / 'codebook.yaml'], 'analog: shape'),
     (['--config', CONFIG / 'table1.yaml'], 'shape'),
     (['--estimator', 'neural'], 'model'),

@@ -1,5 +1,7 @@
 """The entries of a view in a file of Rerun, read back with its own reader."""
 
+import resource
+
 import numpy as np
 import pytest
 
@@ -128,6 +130,22 @@ def test_another_release_is_named_in_one_line(monkeypatch):
 def test_a_file_that_cannot_be_written_is_an_error(tmp_path):
     with pytest.raises(OSError, match='missing'):
         RerunStream().save(tmp_path / 'missing' / 'view.rrd')
+
+
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path):
+    stream, place = RerunStream(), np.zeros((100, 3))
+    stream.save(tmp_path / 'view.rrd')
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, limits[1]))
+    try:
+        with pytest.raises(OSError, match='too large.*view.rrd.part'):
+            stream.write(Entry(cycle, 'a', Points(place, place, place[:, 0]))
+                         for cycle in range(1, 100))
+            stream.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    stream.discard()
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_discarded_file_leaves_nothing(tmp_path):
