@@ -165,6 +165,8 @@ class NuisancePrior(Exponents):
     def log_evidence_of_aligned(self, aligned: np.ndarray) -> float:
         """Return the log of Laplace's integral over the parameters that `Alignment` estimates."""
         (moves,) = np.nonzero(self.moves_multipath)
+        if not len(moves):
+            return 0.0
         curvature = self.information[np.ix_(moves, moves)] + np.diag(self.precision[moves])
         return float(-self.precision @ aligned**2 - np.linalg.slogdet(curvature)[1]) / 2
 
