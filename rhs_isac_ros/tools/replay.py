@@ -302,7 +302,7 @@ def _first_codebook(options: argparse.Namespace) -> Codebook:
             used = used or convert.from_bytes(m.ReceivedSignals, content).codebook_id
     if not used:
         raise RecordingError(f'{options.file}: no {_SIGNALS} in the namespace '
-                             f'{options.namespace}; see --namespace and --site')
+                             f'{options.namespace}; see --namespace')
     if options.codebook:
         codebook = Codebook.load(options.codebook)
         if codebook.id != used:
@@ -353,7 +353,7 @@ class Recording:
             del self.truths[last]
         if not self.truths:
             raise RecordingError(f'{path}: no received signals with a true position in the '
-                                 f'namespace {namespace}; see --namespace')
+                                 f'namespace {namespace}; see --namespace and --site')
 
     def live(self, name: str = '') -> _Positions:
         """Return the recorded positions."""
