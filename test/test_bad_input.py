@@ -134,8 +134,6 @@ PROCESSES = [
     (['board', 'show', 'nothing'], 'scripts/board: error: nothing: the port cannot be used'),
     (['run', '../setup'], 'no executable named ../setup'),
     (['reproduce', 'fig5'], 'no experiment named fig5'),
-    (['benchmark', 'combinations', '--resume'],
-     'combinations: error: argument --resume: expected together with --json'),
     (['benchmark', 'channels', '--blocked', '2'],
      "argument --blocked: 2.0, expected 0 to 1"),
 ]
