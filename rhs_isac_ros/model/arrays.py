@@ -48,7 +48,7 @@ def multiply_rows(matrices: np.ndarray, rows: np.ndarray) -> np.ndarray:
     padded.reshape(-1, *flat.shape[1:])[:len(flat)] = flat
     products = np.matmul(np.swapaxes(padded, 1, 2), np.swapaxes(matrices, 1, 2))
     found = np.swapaxes(products, 1, 2).reshape(-1, *products.shape[1::2])[:len(flat)]
-    return found.reshape(*rows.shape[:-1], -1)
+    return found.reshape(*rows.shape[:-1], matrices.shape[-2])
 
 
 def mixture_weights(log_weights: np.ndarray, axis: int | tuple[int, ...] = -1

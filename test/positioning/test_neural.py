@@ -181,7 +181,9 @@ def files(tmp_path, scenario, codebook):
     return tmp_path
 
 
-def test_the_command_writes_the_network_that_train_returns(files, scenario, codebook, capsys):
+def test_the_command_writes_the_network_that_train_returns(
+        files, scenario, codebook, capsys, monkeypatch):
+    monkeypatch.setattr('rhs_isac_ros.support.progress._LINE_S', 0.0)
     arguments = ['--codebook', files / 'codebook.yaml', '--scenario', files / 'scenario.yaml',
                  '--pairs', 600, '--hidden', 8, '--epochs', 2, '--seed', 4, '--output',
                  files / 'model.npz']
@@ -192,7 +194,7 @@ def test_the_command_writes_the_network_that_train_returns(files, scenario, code
     assert written.about == expected.about
     out, err = capsys.readouterr()
     assert f'{expected.about["test_mse_m2"]:.3f} m^2 in the test' in out
-    assert '2/2' in err or 'epoch 2' in err
+    assert 'epoch 2 of 2' in err
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
