@@ -229,7 +229,7 @@ def _plane_waves(
     lengths = columns[-1], math.hypot(columns[-1], rows[-1])
     (azimuth, azimuth_weights), (elevations, elevation_weights) = (
         _profile_quadrature(
-            _fields(scenario).angular_spread_deg, mean, even, wavenumber * length)
+            _fields(scenario).angular_spread_deg, mean, even, wavenumber * length, _ANGLE_NODES)
         for mean, even, length in zip(
             scenario.multipath_direction_deg, is_even, lengths, strict=True))
     phasors = [np.cos if even else lambda phase: np.exp(1j * phase) for even in is_even]
@@ -404,7 +404,7 @@ def _fields(scenario: Scenario) -> Scenario | MultipathEstimate:
 
 
 def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase: float,
-                        n_nodes: int = _ANGLE_NODES) -> tuple[np.ndarray, np.ndarray]:
+                        n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Return angles [rad] and weights of sum 1 for a Laplacian or, if even, its positive half."""
     nodes, weights = gauss_legendre(n_nodes)
     mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)
