@@ -9,7 +9,7 @@ folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 python3 -m venv "$folder/venv"
 "$folder/venv/bin/python" -m pip install --quiet --disable-pip-version-check \
-  'deepmimo==4.0.5'
+  'deepmimo==4.0.5' 'numpy==2.2.6'
 cat > "$folder/observe.py" <<'PYTHON'
 from importlib.metadata import version
 
