@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rhs_isac_ros.model.network import Admittances
+from rhs_isac_ros.model.network import Admittances, read_touchstone
 from rhs_isac_ros.model.scenario import Scenario
-from rhs_isac_ros.model.touchstone import read_touchstone
 from rhs_isac_ros.model.waveguides import board_of_guides
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,

@@ -22,6 +22,7 @@ from rhs_isac_ros.model.arrays import adjoint, digest, numbers
 from rhs_isac_ros.model.board import Board, BoardError, Ports, number_of
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import ArchiveError, read_arrays, read_once
+from rhs_isac_ros.support.optional import optional_import
 
 # Relative tolerance of reciprocity and passivity, which simulations meet only approximately.
 _TOLERANCE = 1e-4
@@ -29,6 +30,8 @@ _TOLERANCE = 1e-4
 _MAX_STEP = 0.02
 # Relative difference of frequencies that count as equal.
 _ROUNDING = 1e-9
+# A comment in a Touchstone file.
+_COMMENT = re.compile(r'!.*')
 _LOADS = 'load_conductance_s', 'load_susceptance_slope_s'
 
 
@@ -107,6 +110,44 @@ class Admittances(NamedTuple):
                 f'not passive at {self.frequencies_hz[gains.argmax()]:g} Hz: the least eigenvalue '
                 f'of the conductance is {-gains.max():.2g} of the largest admittance, expected at '
                 f'least {-_TOLERANCE:g}')
+
+
+def read_touchstone(path: str | Path, n_feeds: int) -> dict[str, np.ndarray]:
+    """Read a Touchstone file with the ports of the feeds, and then those of the elements.
+
+    Returns arrays of a file of this module, without the loads. Raises BoardError if the file
+    cannot be read, or its meaning is uncertain, and MissingLibraryError without scikit-rf.
+    """
+    with optional_import('Touchstone', extra='touchstone'):
+        import skrf
+    try:
+        lines = [_COMMENT.sub('', line).strip().lower()
+                 for line in Path(path).read_text(encoding='utf-8', errors='replace').splitlines()]
+        _check_dialect(lines)
+        network = skrf.Network(str(path))
+        admittances = numbers('Y', network.y, complex)
+    # The library raises various exceptions for malformed files.
+    except Exception as error:
+        raise BoardError(f'{path}: cannot be read: {error}') from error
+    n_ports = admittances.shape[1]
+    if not 0 < n_feeds < n_ports:
+        raise BoardError(f'{path}: {n_ports} ports with {n_feeds} feeds, expected more ports than '
+                         'feeds')
+    return {'frequency_hz': np.array(network.f), 'y_tt': admittances[:, :n_feeds, :n_feeds],
+            'y_st': admittances[:, n_feeds:, :n_feeds], 'y_ss': admittances[:, n_feeds:, n_feeds:]}
+
+
+def _check_dialect(lines: list[str]) -> None:
+    """Raise BoardError for files that scikit-rf 2.2.0 misreads without an error."""
+    options = next((line[1:].split() for line in lines if line.startswith('#')), [])
+    version = next((line for line in lines if line.startswith('[version]')), '')
+    kind = next((option for option in options if option in ('s', 'y', 'z', 'h', 'g')), 's')
+    if not version and kind not in ('s', 'z'):
+        raise BoardError(f'parameter {kind.upper()} of version 1, expected S or Z, or version 2: '
+                         'the normalisation is ambiguous')
+    formats = [line for line in lines if line.startswith('[matrix format]')]
+    if any('full' not in line for line in formats):
+        raise BoardError('a lower or upper matrix, expected full matrices')
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
