@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from rhs_isac_ros.frontend.waveform import N_SYMBOLS, Waveform
+from rhs_isac_ros.model.geometry import frame_times_s
 from rhs_isac_ros.model.multipath import complex_normal
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.support.fields import finite
@@ -170,7 +171,8 @@ class WaveformRadio:
         self.modem = Waveform(scenario)
         self._drift = 1e-6 * finite('clock_ppm', clock_ppm)
         self._air = air
-        self._n_frames, self._frame_s = scenario.n_frames, scenario.frame_duration_s
+        times_s = frame_times_s(scenario)
+        self._times_s = times_s - times_s[0, 0]
         self._centers_hz = scenario.center_frequencies_hz
         # The mean over the samples of the symbols has the noise of a feed.
         self._noise_w = (scenario.noise_power_w * scenario.n_subbands / scenario.max_power_w
@@ -187,7 +189,7 @@ class WaveformRadio:
             self._offsets = n * air.rng.uniform(0, 2), std_hz * air.rng.normal()
         delay, carrier_hz = self._offsets
         if self._drift:
-            self.time_s = (band * self._n_frames + air.frame) * self._frame_s
+            self.time_s = float(self._times_s[band, air.frame])
         drift_hz = self._drift * self._centers_hz[band]
         delay, carrier_hz = delay - self._drift * self.time_s * rate_hz, carrier_hz + drift_hz
         sent = np.arange(-modem.n_prefix, len(pilot) - modem.n_prefix)

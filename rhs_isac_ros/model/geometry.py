@@ -1,4 +1,4 @@
-"""Positions of the elements and feeds, frequencies of the sub-bands, and polar coordinates.
+"""Positions of elements and feeds, frequencies of sub-bands, times of frames, polar coordinates.
 
 The polar coordinates (r, u, v) of a position in front of the surface are its range r and its
 direction cosines u along y and v along z: it is at r (w, u, v) with w = sqrt(1 - u^2 - v^2).
@@ -71,6 +71,26 @@ def subband_frequencies_hz(scenario: Scenario) -> np.ndarray:
     centers = np.array(scenario.center_frequencies_hz)[:, None]
     offsets = np.arange(scenario.n_subbands) - (scenario.n_subbands - 1) / 2
     return read_only(centers + offsets * scenario.spacing_hz)
+
+
+@functools.lru_cache(maxsize=16)
+def frame_lags_s(scenario: Scenario) -> np.ndarray:
+    """Return the times of the frames of a band after its first one, float64 [F] [s], read-only."""
+    return read_only(np.arange(scenario.n_frames) * scenario.frame_duration_s)
+
+
+@functools.lru_cache(maxsize=16)
+def frame_times_s(scenario: Scenario) -> np.ndarray:
+    """Return the times of the frames of a cycle, float64 [N_B, F] [s], read-only.
+
+    The bands follow each other in the order of the scenario, with `retune_s` between them. Times
+    are relative to the *reference time* of the cycle, the mean of all of them. The position of a
+    user is that at the reference time: its error is then nearly uncorrelated with that of the
+    velocity.
+    """
+    band_s = scenario.n_frames * scenario.frame_duration_s + scenario.retune_s
+    times = np.arange(scenario.n_bands)[:, None] * band_s + frame_lags_s(scenario)
+    return read_only(times - times.mean())
 
 
 def to_positions(points: np.ndarray) -> np.ndarray:

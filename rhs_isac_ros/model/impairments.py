@@ -25,7 +25,7 @@ import numpy as np
 from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.elements import ElementErrors, draw_surface, has_errors
-from rhs_isac_ros.model.geometry import subband_frequencies_hz
+from rhs_isac_ros.model.geometry import frame_lags_s, subband_frequencies_hz
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.support import plugins
 
@@ -214,9 +214,8 @@ def _independent(scaled: np.ndarray, precision: np.ndarray) -> np.ndarray:
 
 
 def _carrier_offset(scenario: Scenario) -> np.ndarray:
-    frames = np.arange(scenario.n_frames) * scenario.frame_duration_s
     return 2j * np.pi * np.broadcast_to(
-        np.tile(frames, scenario.n_subbands), (1, *_shape(scenario)))
+        np.tile(frame_lags_s(scenario), scenario.n_subbands), (1, *_shape(scenario)))
 
 
 def _timing_offset(scenario: Scenario) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from rhs_isac_ros.model.arrays import adjoint, blocks, gauss_legendre, read_only
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.geometry import element_intervals_m, element_positions
+from rhs_isac_ros.model.geometry import element_intervals_m, element_positions, frame_lags_s
 from rhs_isac_ros.model.hall import MultipathEstimate
 from rhs_isac_ros.model.scenario import Scenario
 
@@ -303,7 +303,8 @@ def measurement_correlation(scenario: Scenario) -> np.ndarray:
     subbands, frames = np.arange(scenario.n_subbands), np.arange(scenario.n_frames)
     over_frequency = frequency_correlation(
         scenario, (subbands[:, None] - subbands) * scenario.spacing_hz)
-    over_time = time_correlation(scenario, (frames[:, None] - frames) * scenario.frame_duration_s)
+    over_time = time_correlation(scenario, frame_lags_s(scenario))[
+        :, np.abs(frames[:, None] - frames)]
     return read_only(np.kron(over_frequency, over_time))
 
 

@@ -172,6 +172,13 @@ class Extensions:
         'Moose, A technique for orthogonal frequency division multiplexing frequency offset '
         'correction, IEEE Trans. Commun. 42 (10), 1994',
         label='carrier offset, standard deviation', has_unknown=True)
+    retune_s: float = declare(
+        0.0, 0.0, 1e3, 'Time between the last frame of a band and the first one of the next.', 's',
+        label='time to retune')
+    user_speed_std_mps: float = declare(
+        0.0, 0.0, 1e4, 'Standard deviation of each component of the velocity of a user, along the '
+        'axes with an extent of the region; 0 for users who stand still in a cycle.', 'm/s',
+        label='user velocity, standard deviation')
     element_error_rms: float = declare(
         0.0, 0.0, 1.0,
         'RMS of the complex error of an element coefficient relative to its value; the error is '
@@ -377,7 +384,7 @@ class Scenario(Extensions, Table1):
         changes, fields = self.changes(), self.fields()
         for name in ('impairments', 'subband_spacing_hz', 'multipath_direction_deg',
                      'blocked_probability', 'outside_probability', *_FILES, 'pose',
-                     'element_positions_m', 'board'):
+                     'element_positions_m', 'board', 'retune_s', 'user_speed_std_mps'):
             # Existing files contain identifiers from before these fields were introduced.
             if name not in changes:
                 del fields[name]

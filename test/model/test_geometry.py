@@ -47,6 +47,22 @@ def test_positions_and_frequencies_match_the_definition(scenario, plain):
         rtol=1e-14)
 
 
+def test_bands_follow_each_other_with_time_to_retune():
+    scenario = Scenario(n_frames=3, frame_duration_s=0.01, retune_s=0.1,
+                        center_frequencies_hz=(2e9, 1e9))
+    expected = np.array([[0.0, 0.01, 0.02], [0.13, 0.14, 0.15]])
+    np.testing.assert_allclose(g.frame_times_s(scenario), expected - expected.mean(), atol=1e-16)
+
+
+def test_frame_times_are_relative_to_the_reference_time():
+    scenario = Scenario(n_frames=7, frame_duration_s=0.015, center_frequencies_hz=(1e9, 2e9, 3e9))
+    times = g.frame_times_s(scenario)
+    assert times.shape == (3, 7)
+    assert times.mean() == pytest.approx(0, abs=1e-16)
+    np.testing.assert_allclose(np.diff(times.ravel()), 0.015)
+    np.testing.assert_allclose(times - times[:, :1], [g.frame_lags_s(scenario)] * 3)
+
+
 def test_given_feed_positions_are_used():
     positions = ((0.0, -0.1, 0.2), (0.01, 0.1, 0.0), (0.0, 0.0, 0.3))
     scenario = dataclasses.replace(Scenario(), feed_positions_m=positions)

@@ -32,7 +32,8 @@ def test_defaults_are_table_1_of_the_paper():
         **dict.fromkeys(
             ('subband_spacing_hz', 'multipath_to_los_db', 'user_gain_std_db',
              'phase_std_rad', 'band_phase_std_rad',
-             'timing_std_s', 'carrier_offset_std_hz', 'element_error_rms',
+             'timing_std_s', 'carrier_offset_std_hz', 'retune_s', 'user_speed_std_mps',
+             'element_error_rms',
              'failed_element_share', 'amplitude_levels'), 0),
         'multipath_direction_deg': (0.0, 0.0), 'impairments': (),
         'blocked_probability': 0.0, 'outside_probability': 0.5, 'multipath': None, 'channel': None,
@@ -284,7 +285,7 @@ def test_the_id_is_a_hash_of_the_content():
 
 @pytest.mark.parametrize(('changes', 'expected'), [
     ({}, 'sc337b8b24c90a1923'),
-    ({'multipath_direction_deg': (0, 0)}, 'sc337b8b24c90a1923'),
+    ({'multipath_direction_deg': (0, 0), 'retune_s': 0}, 'sc337b8b24c90a1923'),
     ({'n_feeds': 2, 'user_gain_std_db': 2.0}, 'scc86c2bbf127e1ffd'),
     ({'center_frequencies_hz': [28e9]}, 'scd6c6596ccd3b8041')], ids=str)
 def test_without_impairments_the_id_is_that_of_existing_files(changes, expected):
