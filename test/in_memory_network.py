@@ -19,7 +19,7 @@ from rhs_isac_ros.frontend import Air, EmulatedRadio, EmulatedSurface, FrontEnd,
 from rhs_isac_ros.link import Beamformer, CapacityReport
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.measurement import receive_feeds, received_signal
+from rhs_isac_ros.model.measurement import direct_signal, receive_feeds, received_signal
 from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
 from rhs_isac_ros.model.surface import radiation_matrix
 from rhs_isac_ros.positioning import Estimate, ModelError
@@ -461,7 +461,8 @@ class Network:
             rng = streams.generator(self.seed, streams.CHANNEL, user, cycle_id, band)
             gains = draw_multipath(scenario, band, 1, rng)
             los = los_gain(scenario, position[None], band)
-            signals[band] = received_signal(los, gains, pattern, 0.0).reshape(shape[1:])
+            signals[band] = received_signal(
+                direct_signal(los, pattern), gains, pattern, 0.0).reshape(shape[1:])
         return signals + noise
 
     @staticmethod

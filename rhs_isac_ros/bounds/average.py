@@ -29,7 +29,11 @@ from rhs_isac_ros.model.elements import (
     error_terms,
 )
 from rhs_isac_ros.model.gaussian import quadratic_form
-from rhs_isac_ros.model.geometry import region_information
+from rhs_isac_ros.model.geometry import (
+    measurement_times_s,
+    region_information,
+    velocity_std_mps,
+)
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import los_and_derivative
 from rhs_isac_ros.model.multipath import (
@@ -180,14 +184,18 @@ class AverageCrlb(Average):
             raise ValueError('positions: none given, expected at least one')
         self._prior = region_information(scenario) if region_prior else np.zeros((3, 3))
         patterns, combination = _structure(scenario)
+        moving = np.flatnonzero(velocity_std_mps(scenario))
+        n_gains = len(patterns) - (len(moving) > 0)
+        n_rows = 3 + max(n_gains, 0) + len(moving)
 
         def source(block: slice, band: int) -> np.ndarray:
             gain, derivative = los_and_derivative(scenario, self.positions[block], band)
-            return np.concatenate([derivative, *[gain[:, None]] * len(patterns)], axis=1)
+            return np.concatenate([
+                derivative, *[gain[:, None]] * n_gains, derivative[:, moving]], axis=1)
 
         super().__init__(
-            RowSource(scenario, source, len(self.positions), 3 + len(patterns), patterns or PLAIN,
-                      tick), self._bounds, tolerance, combination)
+            RowSource(scenario, source, len(self.positions), n_rows, patterns or PLAIN, tick),
+            self._bounds, tolerance, combination)
 
     def _bounds(self, _: slice, joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the bounds [n] and their negative derivatives with respect to the forms."""
@@ -208,12 +216,15 @@ class AverageCrlb(Average):
 def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
     """Return patterns of the source rows, and their combination into rows of all parameters."""
     # If a parameter's pattern is constant in each band, its row is a multiple of the gain. Others
-    # have their own source rows. Without nuisance parameters, the derivative suffices.
+    # have their own source rows. Without nuisance parameters, the derivative suffices. Rows of the
+    # velocity are those of the position times the times of the measurements, and come last.
     scaled = nuisance_of(scenario).scaled_patterns
-    if not len(scaled):
+    n_moving = np.count_nonzero(velocity_std_mps(scenario))
+    if not len(scaled) and not n_moving:
         return [], None
     patterns: list[Pattern] = [(slice(0, 4), None)]
-    index, scale = [0, 1, 2], np.ones((scenario.n_bands, 3 + len(scaled)), complex)
+    index = [0, 1, 2]
+    scale = np.ones((scenario.n_bands, 3 + len(scaled) + n_moving), complex)
     for row, pattern in enumerate(scaled, 3):
         if np.ptp(pattern, axis=1).any():
             index.append(3 + len(patterns))
@@ -221,6 +232,10 @@ def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
         else:
             index.append(3)
             scale[:, row] = pattern[:, 0]
+    if n_moving:
+        rows = slice(3 + len(patterns), 3 + len(patterns) + n_moving)
+        index.extend(range(rows.start, rows.stop))
+        patterns.append((rows, scenario.user_speed_std_mps * measurement_times_s(scenario)))
     return patterns, Combination(np.array(index), scale)
 
 

@@ -8,9 +8,13 @@ from collections.abc import Iterable
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import blocks, checked_positions
+from rhs_isac_ros.model.arrays import blocks, checked_states
 from rhs_isac_ros.model.gaussian import Marginal, marginalise, quadratic_form
-from rhs_isac_ros.model.geometry import region_information
+from rhs_isac_ros.model.geometry import (
+    measurement_times_s,
+    region_information,
+    velocity_std_mps,
+)
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
@@ -28,10 +32,12 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
 
     Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2], infinite where the
     information is singular. Declared nuisance parameters are unknown, with their distributions as
-    priors; the result is then the hybrid bound. Errors of the elements add their covariance,
-    averaged over the region. The prior of a phase is that of the wrapped density, and an unknown
-    parameter has none. `region_prior` adds a Gaussian prior that has the variances of the
-    region, size^2 / 12. Raises ValueError if `positions` is not a finite [N, 3] array.
+    priors; the result is then the hybrid bound. So is a declared velocity; the bound is then that
+    for a user who happens to stand still, or, for positions with velocities, [N, 6], for one who
+    moves. Errors of the elements add their covariance, averaged over the region. The prior of a
+    phase is that of the wrapped density, and an unknown parameter has none. `region_prior` adds a
+    Gaussian prior that has the variances of the region, size^2 / 12. Raises
+    ValueError if `positions` is not a finite array [N, 3] or [N, 6].
 
     Examples
     --------
@@ -55,8 +61,10 @@ def crlb_of(model: MeasurementModel, positions: np.ndarray, *,
 
 def without_nuisance(joint: np.ndarray, scenario: Scenario) -> Marginal:
     """Integrate `joint_information_of` over nuisance parameters with their priors."""
-    prior = np.diag(np.concatenate([np.zeros(3), nuisance_of(scenario).precision]))
-    return marginalise(joint + prior, np.zeros(joint.shape[:2]))
+    prior = np.ones(joint.shape[1])
+    prior[:3], precision = 0.0, nuisance_of(scenario).precision
+    prior[3:3 + len(precision)] = precision
+    return marginalise(joint + np.diag(prior), np.zeros(joint.shape[:2]))
 
 
 def inverse_information(information: np.ndarray) -> np.ndarray:
@@ -101,15 +109,20 @@ def fisher_information(model: MeasurementModel, positions: np.ndarray) -> np.nda
 def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
     """Compute the information about position and nuisance parameters, without any prior.
 
-    Returns float64 [N, 3 + Q, 3 + Q], for Q nuisance parameters scaled to unit variance.
+    Returns float64 [N, 3 + Q, 3 + Q], for Q nuisance parameters scaled to unit variance. Those of
+    the velocity come last; users of positions without velocities stand still.
     """
-    positions = checked_positions(positions)
-    patterns = nuisance_of(model.scenario).scaled_patterns
-    information = np.empty((len(positions), *[3 + len(patterns)] * 2))
+    states, std = checked_states(positions), velocity_std_mps(model.scenario)
+    patterns, moving = nuisance_of(model.scenario).scaled_patterns, std > 0
+    times_s = measurement_times_s(model.scenario)
+    information = np.empty((len(states), *[3 + len(patterns) + np.count_nonzero(moving)] * 2))
 
     def fill(block: slice) -> None:
-        mean, slopes = model.mean_and_jacobian(positions[block])
-        rows = np.concatenate([slopes, patterns * mean[:, None]], axis=1)
+        mean, slopes = model.mean_and_jacobian(states[block])
+        by_velocity = slopes[:, 3:] if slopes.shape[1] > 3 else slopes * times_s
+        rows = np.concatenate([
+            slopes[:, :3], patterns * mean[:, None],
+            std[moving, None, None] * by_velocity[:, moving]], axis=1)
         whitened = np.matmul(np.swapaxes(rows, 1, 2), np.swapaxes(model.whitener, 1, 2))
         information[block] = np.sum([
             quadratic_form(whitened[:, band]) for band in range(len(model.whitener))], axis=0)

@@ -68,7 +68,7 @@ def misspecified(
     if assumed.shape != true.shape:
         raise ValueError(f'true: N_B, N_SB F = {true.shape}, expected {assumed.shape}')
     for name, model in (('assumed', assumed), ('true', true)):
-        if len(nuisance_of(model.scenario)):
+        if len(nuisance_of(model.scenario)) or model.scenario.user_speed_std_mps:
             raise ValueError(f'{name}: a scenario with nuisance parameters, expected none')
     target = assumed.whiten(true.mean(positions))
     places = _pseudo_true(assumed, positions, target)

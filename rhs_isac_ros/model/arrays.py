@@ -150,6 +150,16 @@ def checked_positions(positions: ArrayLike) -> np.ndarray:
     return _checked('positions', positions, 2, '[N, 3]')
 
 
+def checked_states(states: ArrayLike) -> np.ndarray:
+    """Return positions, or positions and velocities, as float64 [N, 3] or [N, 6] [m, m/s].
+
+    Raises ValueError as `checked_positions`, and if a velocity is not finite.
+    """
+    array = numbers('positions', states)
+    checked_positions(array[:, :3] if array.ndim == 2 and array.shape[1] == 6 else array)
+    return array
+
+
 def checked_position(position: ArrayLike, name: str = 'positions') -> np.ndarray:
     """Return a position in front of the surface as float64 [3] [m], or raise ValueError."""
     return _checked(name, position, 1, '[3]')

@@ -93,6 +93,19 @@ def frame_times_s(scenario: Scenario) -> np.ndarray:
     return read_only(times - times.mean())
 
 
+def measurement_times_s(scenario: Scenario) -> np.ndarray:
+    """Return the times of all measurements of a cycle, sub-band-major, float64 [N_B, N_SB F]."""
+    return np.tile(frame_times_s(scenario), scenario.n_subbands)
+
+
+def velocity_std_mps(scenario: Scenario) -> np.ndarray:
+    """Return the standard deviations of the components of a user's velocity, float64 [3] [m/s].
+
+    They are 0 along axes without an extent of the region.
+    """
+    return scenario.user_speed_std_mps * (np.array(scenario.roi_size_m) > 0)
+
+
 def to_positions(points: np.ndarray) -> np.ndarray:
     """Convert points (r [m], u, v), float64 [..., 3], to positions, float64 [..., 3] [m].
 

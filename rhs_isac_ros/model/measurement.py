@@ -3,13 +3,23 @@
 The signals of band i are complex Gaussian with a mean that depends on the user's position and a
 covariance Lambda_i that does not. Bands are independent of each other. Errors of the elements add
 a covariance, which depends on the position; `impairments` adds unknown gains and phases.
+
+A *state* is a position, [3] [m], or a position and a velocity, [6] [m, m/s]. The position is then
+that at the reference time of the cycle, and frame q of band i has the mean of a user who stands
+still at p + v t_iq. See `frame_times_s`.
 """
 
 import functools
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import blocks, checked_positions, multiply_rows, read_only
+from rhs_isac_ros.model.arrays import (
+    blocks,
+    checked_positions,
+    checked_states,
+    multiply_rows,
+    read_only,
+)
 from rhs_isac_ros.model.elements import (
     DeclaredElements,
     DirectErrors,
@@ -19,9 +29,15 @@ from rhs_isac_ros.model.elements import (
     with_direct_errors,
 )
 from rhs_isac_ros.model.gaussian import covariance_root
-from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
+from rhs_isac_ros.model.geometry import (
+    element_positions,
+    frame_times_s,
+    subband_frequencies_hz,
+    velocity_std_mps,
+)
 from rhs_isac_ros.model.impairments import draw_impairments, nuisance_of
 from rhs_isac_ros.model.los import (
+    Waves,
     direct_gain,
     draw_blocked,
     has_pattern,
@@ -48,15 +64,27 @@ _ARRAY_BYTES = 3 << 18
 _MIN_BLOCK = 8
 
 
+def direct_signal(los: np.ndarray, radiation: np.ndarray) -> np.ndarray:
+    """Combine line-of-sight gains H^LoS of one band, complex128 [..., N_SB, N_E].
+
+    They are the same in all F frames. Returns the signals without multipath and noise of Eq. (8),
+    complex128 [..., N_SB F].
+    """
+    frames = radiation.reshape(los.shape[-2], -1, radiation.shape[-1])
+    # Only the diagonal of H T^T is needed: for each sub-band, its gains times its F rows of T.
+    direct = np.matmul(los[..., None, :], np.swapaxes(frames, -1, -2))
+    return direct.reshape(*los.shape[:-2], -1)
+
+
 def received_signal(
-        los: np.ndarray, multipath: np.ndarray | float, radiation: np.ndarray,
+        direct: np.ndarray, multipath: np.ndarray | float, radiation: np.ndarray,
         noise: np.ndarray | float, symbol: complex | np.ndarray = 1.0) -> np.ndarray:
     """Implements Eq. (8). Received signals y_i of one band, complex128 [..., N_SB F].
 
     Parameters
     ----------
-    los
-        Line-of-sight gains H^LoS, complex128 [..., N_SB, N_E], the same in all F frames.
+    direct
+        Signals of the line of sight, complex128 [..., N_SB F]; see `direct_signal`.
     multipath
         Multipath gains H^MP, complex128 [..., N_SB F, N_E] (sub-band-major), or 0.
     radiation
@@ -66,14 +94,9 @@ def received_signal(
     symbol
         The user's symbol x, or one for each measurement, complex128 [..., N_SB F].
     """
-    n_subbands = los.shape[-2]
-    frames = radiation.reshape(n_subbands, -1, radiation.shape[-1])
-    # Only the diagonal of H T^T is needed: for each sub-band, its gains times its F rows of T.
-    direct = np.matmul(los[..., None, :], np.swapaxes(frames, -1, -2))
-    combined = direct.reshape(*los.shape[:-2], -1)
     if np.ndim(multipath):
-        combined = combined + np.einsum('...rm,rm->...r', multipath, radiation)
-    return combined * symbol + noise
+        direct = direct + np.einsum('...rm,rm->...r', multipath, radiation)
+    return direct * symbol + noise
 
 
 @one_blas_thread
@@ -82,11 +105,13 @@ def simulate_received(
         rng: np.random.Generator, surface: ElementErrors | None = None) -> np.ndarray:
     """Simulate the signals of independent positioning phases by Eq. (8), element by element.
 
-    The user's position in each phase is a row of `positions`, float64 [N, 3] [m]. Returns
-    complex128 [N, N_B, N_SB F], sub-band-major. Declared impairments are drawn too: a new user and
-    a new cycle for each position, and one surface for all positions unless `surface` is given.
-    With a channel file, the nearest user of the file replaces each position. Raises ValueError if
-    `positions` is not a finite [N, 3] array, or a size differs from the scenario's.
+    The user's position in each phase is a row of `positions`, float64 [N, 3] [m]; with columns for
+    the velocity, [N, 6], the user moves. Returns complex128 [N, N_B, N_SB F], sub-band-major.
+    Declared impairments are drawn too: a new user and a new cycle for each position, and one
+    surface for all positions unless `surface` is given. So are declared velocities that are not
+    given. With a channel file, the nearest user of the file replaces each position. Raises
+    ValueError if `positions` is not a finite array [N, 3] or [N, 6], or a size differs from the
+    scenario's.
 
     Examples
     --------
@@ -94,21 +119,43 @@ def simulate_received(
     >>> simulate_received(Scenario(), Codebook.default(), users, rng).shape
     (2, 2, 32)
     """
-    positions = checked_positions(positions)
-    drawn, factors = draw_impairments(scenario, len(positions), rng)
-    blocked = draw_blocked(scenario, len(positions), rng)
+    states = _moving(scenario, positions, rng)
+    drawn, factors = draw_impairments(scenario, len(states), rng)
+    blocked = draw_blocked(scenario, len(states), rng)
     surface = surface or drawn
     radiation = radiation_matrix(scenario, codebook, surface.response if surface else NOMINAL)
     n_bands, n_measurements, _ = radiation.shape
-    received = np.empty((len(positions), n_bands, n_measurements), complex)
-    for block in blocks(len(positions), _BLOCK):
+    received = np.empty((len(states), n_bands, n_measurements), complex)
+    for block in blocks(len(states), _BLOCK):
         for band in range(n_bands):
-            los = direct_gain(scenario, positions[block], band, blocked[block])
-            gains = 0.0 if scenario.channel else draw_multipath(scenario, band, len(los), rng)
-            noise = _thermal_noise(scenario, (len(los), n_measurements), rng)
+            direct = _direct(scenario, states[block], band, blocked[block], radiation[band])
+            gains = 0.0 if scenario.channel else draw_multipath(scenario, band, len(direct), rng)
+            noise = _thermal_noise(scenario, direct.shape, rng)
             symbol = 1.0 if factors is None else factors[block, band]
-            received[block, band] = received_signal(los, gains, radiation[band], noise, symbol)
+            received[block, band] = received_signal(direct, gains, radiation[band], noise, symbol)
     return received
+
+
+def _moving(scenario: Scenario, states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Check states, and draw the declared velocities of positions."""
+    states, std = checked_states(states), velocity_std_mps(scenario)
+    if states.shape[1] > 3 or not std.any():
+        return states
+    return np.hstack([states, std * rng.standard_normal(states.shape)])
+
+
+def _direct(scenario: Scenario, states: np.ndarray, band: int, blocked: np.ndarray,
+            radiation: np.ndarray) -> np.ndarray:
+    """Compute the signals of the direct paths of a band, complex128 [N, N_SB F]."""
+    if states.shape[1] == 3:
+        return direct_signal(direct_gain(scenario, states, band, blocked), radiation)
+    frames = radiation.reshape(scenario.n_subbands, scenario.n_frames, -1)
+    signals = np.empty((len(states), *frames.shape[:2]), complex)
+    for frame, time_s in enumerate(frame_times_s(scenario)[band].tolist()):
+        places = states[:, :3] + time_s * states[:, 3:]
+        signals[:, :, frame] = direct_signal(
+            direct_gain(scenario, places, band, blocked), frames[:, frame])
+    return signals.reshape(len(states), -1)
 
 
 def receive_feeds(
@@ -145,9 +192,10 @@ class MeasurementModel:
     first use computes the factors of the covariance and the weights of the mean signals.
 
     Methods that take positions of the user, float64 [N, 3] [m], raise ValueError if the shape is
-    wrong or a value is not finite. Measurements are sub-band-major. Only `sample` includes
-    impairments, blocked users and channel files. The constructor raises ValueError if the
-    beamforming or the surface does not have the sizes of the scenario.
+    wrong or a value is not finite. `mean`, `mean_and_jacobian` and `sample` also take states with
+    velocities, float64 [N, 6] [m, m/s]. Measurements are sub-band-major. Only `sample` includes
+    impairments, blocked users, channel files and declared velocities. The constructor raises
+    ValueError if the beamforming or the surface does not have the sizes of the scenario.
 
     Parameters
     ----------
@@ -227,38 +275,42 @@ class MeasurementModel:
 
     def mean(self, positions: np.ndarray) -> np.ndarray:
         """Compute the mean signals, complex128 [N, N_B, N_SB F]: Eq. (8) for the direct path."""
-        positions = checked_positions(positions)
-        return self.mean_and_jacobian(positions, np.zeros((len(positions), 3, 0)))[0]
+        states = checked_states(positions)
+        return self.mean_and_jacobian(states, np.zeros((*states.shape, 0)))[0]
 
     def mean_and_jacobian(
             self, positions: np.ndarray, by_coordinate: np.ndarray | None = None, *,
             whitened: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the mean and its derivative, complex128 [N, 3, N_B, N_SB F] [1/m]: Eq. (13).
+        """Compute the mean and its derivative, complex128 [N, D, N_B, N_SB F] [1/m]: Eq. (13).
 
-        With `whitened`, both results are whitened. `by_coordinate`, float64 [N, 3, Q], contains
-        derivatives of the positions with respect to Q other coordinates; the derivative of the
-        mean, [N, Q, N_B, N_SB F], is then with respect to these coordinates.
+        D is 3, or 6 with velocities, whose columns are in s/m. With `whitened`, both results are
+        whitened. `by_coordinate`, float64 [N, D, Q], contains derivatives of the states with
+        respect to Q other coordinates; the derivative of the mean, [N, Q, N_B, N_SB F], is then
+        with respect to these coordinates.
         """
-        positions, weights = checked_positions(positions), self._weights
-        n, (n_bands, n_rows) = len(positions), self.shape
-        by_term = weights.weights(positions)
-        if by_coordinate is not None:
-            by_term = np.matmul(np.swapaxes(by_coordinate, 1, 2), by_term)
-        slopes = by_term.shape[1] > 0
+        states, weights = checked_states(positions), self._weights
+        n, (n_bands, n_rows), moving = len(states), self.shape, states.shape[1] > 3
+        if by_coordinate is None:
+            by_coordinate = np.broadcast_to(np.eye(states.shape[1]), (n, *states.shape[1:] * 2))
+        n_slopes = by_coordinate.shape[2]
         mean = np.empty((n, n_bands, n_rows), complex)
-        jacobian = np.empty((n, by_term.shape[1], n_bands, n_rows), complex)
+        jacobian = np.empty((n, n_slopes, n_bands, n_rows), complex)
+        by_term = np.zeros((n, 0, 0)) if moving else np.matmul(
+            np.swapaxes(by_coordinate, 1, 2), weights.weights(states))
 
         def fill(block: slice) -> None:
-            terms = weights.terms(positions[block], slopes)
+            terms = (weights.moving(states[block], by_coordinate[block]) if moving
+                     else weights.terms(states[block], n_slopes > 0))
             if whitened:
                 shape = terms.shape
                 terms = np.matmul(terms.reshape(n_bands, -1, n_rows),
                                   np.swapaxes(self.whitener, 1, 2)).reshape(shape)
             mean[block] = np.swapaxes(terms[:, :, 0], 0, 1)
-            if not slopes:
+            if not n_slopes:
                 return
-            parts = np.matmul(by_term[block], terms[:, :, 1:].view(float))
-            jacobian[block] = np.moveaxis(parts.view(complex), 0, 2)
+            parts = terms[:, :, 1:] if moving else np.matmul(
+                by_term[block], terms[:, :, 1:].view(float)).view(complex)
+            jacobian[block] = np.moveaxis(parts, 0, 2)
 
         map_blocks(fill, blocks(n, weights.block))
         return mean, jacobian
@@ -271,23 +323,23 @@ class MeasurementModel:
         impairments and channel files. The multipath is drawn from the covariance of its signals,
         which is a hundred times as fast as drawing the gain of every element.
         """
-        positions, scenario = checked_positions(positions), self.scenario
-        surface, factors = draw_impairments(scenario, len(positions), rng)
-        blocked = draw_blocked(scenario, len(positions), rng)
+        scenario, states = self.scenario, _moving(self.scenario, positions, rng)
+        surface, factors = draw_impairments(scenario, len(states), rng)
+        blocked = draw_blocked(scenario, len(states), rng)
         model = self
         if surface is not None and self.surface is None:
             model = MeasurementModel(scenario, self.beams, surface)
         if scenario.channel:
-            signals = np.empty((len(positions), *self.shape), complex)
+            signals = np.empty((len(states), *self.shape), complex)
 
             def fill(block: slice) -> None:
                 for band, radiation in enumerate(model.radiation):
-                    los = direct_gain(scenario, positions[block], band, blocked[block])
-                    signals[block, band] = received_signal(los, 0.0, radiation, 0.0)
+                    signals[block, band] = _direct(
+                        scenario, states[block], band, blocked[block], radiation)
 
-            map_blocks(fill, blocks(len(positions), self._weights.block))
+            map_blocks(fill, blocks(len(states), self._weights.block))
         else:
-            signals = model.mean(positions)
+            signals = model.mean(states)
             signals[blocked] = 0
             white = complex_normal(signals.shape, rng)
             # Factors act on the multipath, but not on the noise.
@@ -339,16 +391,46 @@ class ElementSums:
         n_terms = 2 + len(self._axes) + self._has_pattern if slopes else 1
         terms = np.empty((n_bands, n, n_terms, n_subbands, n_frames), complex)
         waves = los_waves(self._scenario, positions, range(n_bands), slopes=slopes)
-        for band, (gain, radial, boresight_term) in enumerate(waves):
-            frames, rows = self._frames[band], np.moveaxis(terms[band], 2, 0)
-            rows[:, :, 0] = np.matmul(gain, frames)
-            if not slopes:
-                continue
-            sums = np.matmul(radial, self._moments[band])
-            rows[:, :, 1:2 + len(self._axes)] = sums.reshape(n_subbands, n, -1, n_frames)
-            if boresight_term is not None:
-                rows[:, :, -1] = np.matmul(boresight_term, frames)
+        for band, of_band in enumerate(waves):
+            self._add_up(of_band, self._frames[band], self._moments[band], terms[band])
         return terms.reshape(n_bands, n, n_terms, -1)
+
+    def moving(self, states: np.ndarray, by_coordinate: np.ndarray) -> np.ndarray:
+        """Compute mean and derivatives for states with velocities, [N_B, N, 1 + Q, N_SB F].
+
+        `by_coordinate`, float64 [N, 6, Q], is that of `MeasurementModel.mean_and_jacobian`.
+        """
+        n, (n_bands, n_subbands, n_elements, n_frames) = len(states), self._frames.shape
+        n_slopes = by_coordinate.shape[2]
+        n_terms = 2 + len(self._axes) + self._has_pattern if n_slopes else 1
+        rows = np.empty((n_bands, n, 1 + n_slopes, n_subbands, n_frames), complex)
+        terms = np.empty((n, n_terms, n_subbands, 1), complex)
+        moments = self._moments.reshape(n_bands, n_subbands, n_elements, -1, n_frames)
+        for (band, frame), time_s in np.ndenumerate(frame_times_s(self._scenario)):
+            places = states[:, :3] + time_s * states[:, 3:]
+            (waves,) = los_waves(self._scenario, places, [band], slopes=n_slopes > 0)
+            self._add_up(
+                waves, self._frames[band, :, :, [frame]].transpose(1, 2, 0),
+                moments[band, ..., frame], terms)
+            rows[band, :, 0, :, frame] = terms[:, 0, :, 0]
+            if n_slopes:
+                by_place = by_coordinate[:, :3] + time_s * by_coordinate[:, 3:]
+                weights = np.matmul(np.swapaxes(by_place, 1, 2), self.weights(places))
+                rows[band, :, 1:, :, frame] = np.matmul(weights, terms[:, 1:, :, 0])
+        return rows.reshape(n_bands, n, 1 + n_slopes, -1)
+
+    def _add_up(self, waves: Waves, frames: np.ndarray, moments: np.ndarray, terms: np.ndarray
+                ) -> None:
+        """Write the sums for some frames of one band to `terms`, [N, 1 + G, N_SB, F]."""
+        (gain, radial, boresight_term), rows = waves, np.moveaxis(terms, 2, 0)
+        rows[:, :, 0] = np.matmul(gain, frames)
+        if rows.shape[2] == 1:
+            return
+        sums = np.matmul(radial, moments)
+        rows[:, :, 1:2 + len(self._axes)] = sums.reshape(
+            *gain.shape[:2], -1, frames.shape[2])
+        if boresight_term is not None:
+            rows[:, :, -1] = np.matmul(boresight_term, frames)
 
     def weights(self, positions: np.ndarray) -> np.ndarray:
         """Compute the weights of the terms for each coordinate's derivative, float64 [N, 3, G]."""

@@ -15,7 +15,7 @@ from rhs_isac_ros.bounds import (
     site_information,
 )
 from rhs_isac_ros.codebook import random_codebook
-from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
+from rhs_isac_ros.model import MeasurementModel, Pose, Scenario, geometry
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.scenario import ScenarioError
 from rhs_isac_ros.positioning import make_estimator
@@ -110,25 +110,33 @@ def test_nothing_declared_gives_the_plain_bound(case):
         crlb(tiny, case.codebook, positions), case.vectors['crlb'], rtol=1e-8)
 
 
-def test_the_bound_is_that_of_the_joint_information(uncertain, uncertain_codebook):
-    """Position and nuisance parameters by finite differences of the mean, and the whole
-    matrix inverted."""
+@pytest.mark.parametrize('velocity', [(), (20.0, -30.0, 10.0)], ids=['rests', 'moves'])
+def test_the_bound_is_that_of_the_joint_information(uncertain, uncertain_codebook, velocity):
+    """Position, velocity and nuisance parameters by finite differences of the mean, and the whole
+    matrix inverted. In a region without height, the user does not move up or down."""
+    uncertain = dataclasses.replace(uncertain, roi_size_m=(2, 3, 0) if velocity else (2, 3, 2))
     model = MeasurementModel(uncertain, uncertain_codebook)
     position = uncertain.sample_positions(1, np.random.default_rng(1))
-    nuisance = nuisance_of(uncertain)
-    n_parameters = 3 + len(nuisance)
+    nuisance, n_moving = nuisance_of(uncertain), np.count_nonzero(uncertain.roi_size_m)
+    n_parameters = 3 + len(nuisance) + n_moving
+    state = np.zeros((1, 6))
+    state[:, :3], state[:, 3:3 + len(velocity)] = position, velocity
+    position = state[:, :3 + len(velocity)]
 
     def mean(values):
-        factors = np.exp(np.tensordot(values[3:], nuisance.scaled_patterns, axes=1))
-        return model.whiten(model.mean(position + values[:3]) * factors).ravel()
+        offset = np.zeros(6)
+        offset[:3], offset[3:3 + n_moving] = values[:3], 30 * values[n_parameters - n_moving:]
+        factors = np.exp(np.tensordot(
+            values[3:3 + len(nuisance)], nuisance.scaled_patterns, axes=1))
+        return model.whiten(model.mean(state + offset) * factors).ravel()
 
     steps = 1e-5 * np.eye(n_parameters)
     slopes = np.stack([(mean(step) - mean(-step)) / 2e-5 for step in steps])
     information = 2 * (slopes @ slopes.conj().T).real
-    information[3:, 3:] += np.diag(nuisance.precision)
+    information[3:, 3:] += np.diag([*nuisance.precision, *[1.0] * n_moving])
     expected = np.trace(np.linalg.inv(information)[:3, :3])
     assert crlb_of(model, position)[0] == pytest.approx(expected, rel=1e-5)
-    information[:3, :3] += np.diag(12 / np.array(uncertain.roi_size_m)**2)
+    information[:3, :3] += geometry.region_information(uncertain)
     expected = np.trace(np.linalg.inv(information)[:3, :3])
     assert crlb_of(model, position, region_prior=True)[0] == pytest.approx(expected, rel=1e-5)
 

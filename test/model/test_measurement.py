@@ -11,8 +11,9 @@ from rhs_isac_ros.model import (
     Scenario,
     simulate_received,
 )
+from rhs_isac_ros.model.geometry import frame_times_s
 from rhs_isac_ros.model.los import los_and_derivative
-from rhs_isac_ros.model.measurement import receive_feeds, received_signal
+from rhs_isac_ros.model.measurement import direct_signal, receive_feeds, received_signal
 from rhs_isac_ros.model.multipath import multipath_covariance
 
 POSITION_METHODS = ('mean', 'mean_and_jacobian')
@@ -192,6 +193,51 @@ def test_prepare_leaves_nothing_to_compute(case):
     assert {'root', 'whitener', '_weights'} <= before.keys()
 
 
+@pytest.mark.parametrize('pattern', [
+    1.0, GainPattern(lambda angles: np.maximum(np.cos(angles), 0.1))], ids=['constant', 'pattern'])
+def test_each_frame_of_a_moving_user_is_that_of_a_user_who_stands_there(faded, pattern):
+    scenario, codebook = faded
+    scenario = dataclasses.replace(scenario, element_gain=pattern, retune_s=0.02)
+    model, rng = MeasurementModel(scenario, codebook), np.random.default_rng(1)
+    states = np.hstack([scenario.sample_positions(4, rng), 20 * rng.standard_normal((4, 3))])
+    mean, slopes = model.mean_and_jacobian(states)
+    simulated = simulate_received(
+        dataclasses.replace(scenario, multipath_to_los_db=-200, noise_psd_dbm_hz=-390),
+        codebook, states, rng)
+    shape = 4, 3, 2, 3
+    for (band, frame), time_s in np.ndenumerate(frame_times_s(scenario)):
+        places = states[:, :3] + time_s * states[:, 3:]
+        still, by_place = model.mean_and_jacobian(places)
+        expected = still.reshape(shape)[:, band, :, frame]
+        for signals, tolerance in ((mean, 1e-12), (simulated, 1e-6)):
+            np.testing.assert_allclose(
+                signals.reshape(shape)[:, band, :, frame], expected, rtol=tolerance)
+        by_place = by_place.reshape(4, 3, *shape[1:])[:, :, band, :, frame]
+        np.testing.assert_allclose(
+            slopes.reshape(4, 6, *shape[1:])[:, :, band, :, frame],
+            np.concatenate([by_place, time_s * by_place], axis=1),
+            rtol=1e-9, atol=1e-9 * np.abs(by_place).max())
+    white, white_slopes = model.mean_and_jacobian(states, np.ones((4, 6, 1)), whitened=True)
+    np.testing.assert_allclose(white, model.whiten(mean), atol=1e-9 * np.abs(white).max())
+    np.testing.assert_allclose(white_slopes[:, 0], model.whiten(slopes.sum(axis=1)),
+                               atol=1e-9 * np.abs(white_slopes).max())
+
+
+def test_declared_velocities_are_drawn(faded):
+    """Only along axes with an extent of the region."""
+    scenario, codebook = faded
+    scenario = dataclasses.replace(
+        scenario, user_speed_std_mps=20.0, roi_size_m=(2, 4, 0), multipath_to_los_db=-200,
+        noise_psd_dbm_hz=-390)
+    positions = scenario.sample_positions(3, np.random.default_rng(0))
+    velocities = np.random.default_rng(1).standard_normal((3, 3)) * [20, 20, 0]
+    model = MeasurementModel(scenario, codebook)
+    expected = model.mean(np.hstack([positions, velocities]))
+    for signals in (model.sample(positions, np.random.default_rng(1)), simulate_received(
+            scenario, codebook, positions, np.random.default_rng(1))):
+        np.testing.assert_allclose(signals, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
 def test_no_positions_have_no_signals(model):
     empty = np.zeros((0, 3))
     assert model.mean(empty).shape == (0, *model.shape)
@@ -214,8 +260,8 @@ def test_received_signal_is_the_sum_over_the_elements():
     multipath = rng.normal(size=(2, n_subbands * n_frames, n_elements, 2)) @ [1, 1j]
     radiation = rng.normal(size=(n_subbands * n_frames, n_elements, 2)) @ [1, 1j]
     noise = rng.normal(size=(2, n_subbands * n_frames, 2)) @ [1, 1j]
-    received = received_signal(los, multipath, radiation, noise, symbol)
-    direct = received_signal(los, 0.0, radiation, 0.0)
+    received = received_signal(direct_signal(los, radiation), multipath, radiation, noise, symbol)
+    direct = direct_signal(los, radiation)
     for n in range(2):
         for j in range(n_subbands):
             for q in range(n_frames):
