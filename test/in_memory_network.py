@@ -18,8 +18,9 @@ from rhs_isac_ros.codebook.library import EMPTY
 from rhs_isac_ros.frontend import Air, EmulatedRadio, EmulatedSurface, FrontEnd, Surface
 from rhs_isac_ros.link import Beamformer, CapacityReport
 from rhs_isac_ros.model import Scenario, mobility
+from rhs_isac_ros.model.geometry import frame_times_s
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.measurement import direct_signal, receive_feeds, received_signal
+from rhs_isac_ros.model.measurement import receive_feeds, received_signal
 from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
 from rhs_isac_ros.model.surface import radiation_matrix
 from rhs_isac_ros.positioning import Estimate, ModelError
@@ -416,7 +417,7 @@ class Network:
         for _, sender, message in self.log:
             match message:
                 case m.GroundTruth():
-                    truths[message.cycle_id, message.user, message.sender] = message.position
+                    truths[message.cycle_id, message.user, message.sender] = message
                 case m.ReceivedSignals() if sender != 'external':
                     truth = truths[message.cycle_id, message.user, message.user_instance]
                     expected = self.expected_signals(
@@ -448,7 +449,7 @@ class Network:
         return checker
 
     def expected_signals(
-            self, cycle_id: int, user: int, codebook_id: str, position: np.ndarray) -> np.ndarray:
+            self, cycle_id: int, user: int, codebook_id: str, truth: m.GroundTruth) -> np.ndarray:
         """Return the received signals by the matrix form of the model, [N_B, N_SB, F]."""
         scenario = self.scenario
         shape = (scenario.n_bands, scenario.n_subbands, scenario.n_frames)
@@ -460,9 +461,11 @@ class Network:
         for band, pattern in enumerate(patterns):
             rng = streams.generator(self.seed, streams.CHANNEL, user, cycle_id, band)
             gains = draw_multipath(scenario, band, 1, rng)
-            los = los_gain(scenario, position[None], band)
+            places = truth.position + frame_times_s(scenario)[band][:, None] * truth.velocity
+            of_frame = pattern.reshape(*shape[1:], -1)
+            direct = np.einsum('fjm,jfm->jf', los_gain(scenario, places, band), of_frame)
             signals[band] = received_signal(
-                direct_signal(los, pattern), gains, pattern, 0.0).reshape(shape[1:])
+                direct.reshape(1, -1), gains, pattern, 0.0).reshape(shape[1:])
         return signals + noise
 
     @staticmethod
@@ -492,7 +495,8 @@ class Network:
             case 'user':
                 return user_role.User(
                     self._mobilities[name], step_s, BEACON_TIMEOUT_S,
-                    self.instances[name], self.world_s, scenario.pose)
+                    self.instances[name], self.world_s, scenario.pose,
+                    -frame_times_s(scenario)[0, 0])
             case 'channel':
                 # Two channels differ in their multipath. Without memory, the expected signals
                 # depend on the seed alone.

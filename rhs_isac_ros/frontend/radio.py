@@ -29,7 +29,10 @@ class Sounding:
     symbols: np.ndarray  #: Symbols of the pilots, complex128 [F].
     arriving: np.ndarray  #: Signals of the emulated air, complex128 [F, N_SB, K].
     user: int
-    position_m: np.ndarray  #: True position of the user in the frame of the site, float64 [3].
+    #: True position of the user at the reference time of the cycle, and velocity, in the frame of
+    #: the site, float64 [3].
+    position_m: np.ndarray
+    velocity_mps: np.ndarray
     stamp_ns: int = 0  #: Time of the pilots.
 
 

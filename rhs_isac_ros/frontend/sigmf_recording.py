@@ -111,7 +111,8 @@ class SampleRecorder:
                 'rhs_isac:configuration': number, 'rhs_isac:time_s': times_s[frame],
                 'rhs_isac:symbol': [symbol.real, symbol.imag],
                 'rhs_isac:user': sounding.user,
-                'rhs_isac:position_m': sounding.position_m.tolist()})
+                'rhs_isac:position_m': sounding.position_m.tolist(),
+                'rhs_isac:velocity_mps': sounding.velocity_mps.tolist()})
             found.n_samples += samples.shape[1]
         found.n_soundings, found.cycle_id = found.n_soundings + 1, sounding.cycle_id
 

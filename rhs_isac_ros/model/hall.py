@@ -55,6 +55,8 @@ _MAX_FREQUENCY_RATIO = 1.5
 # Largest amplitude relative to free space, and largest distance between a user and the source of
 # the user's direct path.
 _MAX_COEFFICIENT, _MAX_OFFSET_M = 2.0, 0.01
+# Smallest distance of a moved source from the plane of the surface [m].
+_NEAREST_M = 1e-3
 # Largest number of reflections, as files store it in 8 bits.
 _MAX_REFLECTIONS = 127
 # Minimum share of the users in the region of interest.
@@ -331,6 +333,20 @@ class PathChannel(ArrayFile):
         """Return the index of the user nearest to each position [M, 3] [m], int64 [M]."""
         squares = np.sum((positions[:, None] - self.users)**2, axis=2)
         return np.argmin(squares, axis=1)
+
+    def moved(self, user: int, shift: np.ndarray) -> np.ndarray:
+        """Return the sources of a user who has moved by [3] [m], float64 [P, 3] [m].
+
+        Mirror images move as in the wall halfway between user and source. With more reflections
+        than one, this is one of the movements that the positions allow. Amplitudes are those of
+        the user's position.
+        """
+        ways = self.sources[user] - self.users[user]
+        squares = np.maximum(np.sum(ways**2, axis=1), np.finfo(float).tiny)
+        sources = self.sources[user] + shift - 2 * (ways @ shift / squares)[:, None] * ways
+        # Sources are in front of the surface.
+        sources[:, 0] = np.maximum(sources[:, 0], _NEAREST_M)
+        return sources
 
     def content(self) -> tuple[np.ndarray, ...]:
         """Return the arrays that the digest covers."""

@@ -40,17 +40,19 @@ def draw_blocked(scenario: Scenario, n: int, rng: np.random.Generator) -> np.nda
 
 
 def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
-                blocked: np.ndarray | None = None) -> np.ndarray:
+                blocked: np.ndarray | None = None, shifts: np.ndarray | None = None) -> np.ndarray:
     """Compute the gains without random multipath, complex128 [N, N_SB, N_E].
 
     Without a channel file, these are the gains of `los_gain`. With one, the gain at a position is
     the sum over the paths of the nearest user in the file. `blocked`, bool [N], marks users whose
-    direct path is left out.
+    direct path is left out. `shifts`, float64 [N, 3] [m], are how far users have moved from the
+    positions; with a channel file, their paths move with them (see `PathChannel.moved`).
     """
     channel = scenario.channel
     blocked = np.zeros(len(positions), bool) if blocked is None else blocked
     if not channel:
-        gains = los_gain(scenario, positions, band)
+        gains = los_gain(
+            scenario, positions if shifts is None else positions + shifts, band)
         gains[blocked] = 0
         return gains
     total = np.zeros((len(positions), scenario.n_subbands, scenario.n_elements), complex)
@@ -60,7 +62,9 @@ def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
         weights = channel.coefficients[user, present, None]
         if channel.gains is not None:
             weights = weights * channel.gains[user, present]
-        paths = los_gain(scenario, channel.sources[user, present], band)
+        sources = channel.sources[user, present] if shifts is None else channel.moved(
+            user, shifts[row])[present]
+        paths = los_gain(scenario, sources, band)
         total[row] = np.sum(paths * weights[:, None], axis=0)
     return total
 

@@ -152,9 +152,8 @@ def _direct(scenario: Scenario, states: np.ndarray, band: int, blocked: np.ndarr
     frames = radiation.reshape(scenario.n_subbands, scenario.n_frames, -1)
     signals = np.empty((len(states), *frames.shape[:2]), complex)
     for frame, time_s in enumerate(frame_times_s(scenario)[band].tolist()):
-        places = states[:, :3] + time_s * states[:, 3:]
-        signals[:, :, frame] = direct_signal(
-            direct_gain(scenario, places, band, blocked), frames[:, frame])
+        signals[:, :, frame] = direct_signal(direct_gain(
+            scenario, states[:, :3], band, blocked, time_s * states[:, 3:]), frames[:, frame])
     return signals.reshape(len(states), -1)
 
 

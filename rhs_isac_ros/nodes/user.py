@@ -1,5 +1,6 @@
 """The executable ``user``: one or many users of the network."""
 
+import dataclasses
 import functools
 import time
 from collections.abc import Callable
@@ -7,11 +8,13 @@ from typing import Any
 
 import numpy as np
 from nav_msgs.msg import Odometry
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.time import Time
 
 from rhs_isac_ros.model import Pose, mobility
 from rhs_isac_ros.model.arrays import position_problem
+from rhs_isac_ros.model.geometry import frame_times_s
 from rhs_isac_ros.model.pose import rotation_matrix
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user import User
@@ -192,9 +195,10 @@ class UserNode(RoleNode[User]):
         super().__init__('user', name, **node_options)
         values = self.values
         mobilities = self._mobilities()
+        self._reference_s = float(-frame_times_s(self.scenario)[0, 0])
         self.start(User(
             mobilities, values.step_timeout_s, values.beacon_timeout_s, self.instance,
-            self.clocks.world_s, self.scenario.pose))
+            self.clocks.world_s, self.scenario.pose, self._reference_s))
         self._true_odometry = endpoints.UserTopics(
             self, {topics.TRUE_ODOMETRY: Odometry}, values.user_topics)
         # On the clock of ROS, like the mobilities.
@@ -280,6 +284,13 @@ class UserNode(RoleNode[User]):
                 f'{name}: {given.tolist()}: outside of the region of interest, {low.tolist()} to '
                 f'{high.tolist()} in the frame of the surface; a user there gets no position')
         return points
+
+    def publish(self, message: m.Message) -> bool:
+        """Publish a message; a true position in a cycle has the stamp of the reference time."""
+        if isinstance(message, m.GroundTruth) and message.cycle_id:
+            stamp = self.get_clock().now() + Duration(seconds=self._reference_s)
+            message = dataclasses.replace(message, stamp_ns=stamp.nanoseconds)
+        return super().publish(message)
 
     def _publish_ground_truth(self) -> None:
         if self._robot and self._robot.lack:

@@ -16,6 +16,7 @@ from rhs_isac_ros.frontend import FrontEnd, RadioFault, Sounding, SurfaceFault
 from rhs_isac_ros.link import Beamformer, actual_capacity
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import DeclaredElements, SurfaceEstimate, draw_surface
+from rhs_isac_ros.model.geometry import frame_times_s
 from rhs_isac_ros.model.impairments import draw_factors
 from rhs_isac_ros.model.los import direct_gain, draw_blocked
 from rhs_isac_ros.model.multipath import draw_multipath, time_correlation
@@ -113,14 +114,16 @@ class Delivery:
 
 @dataclasses.dataclass
 class _Cycle:
-    """The true position of the user in a cycle, and the resulting channel."""
+    """The movement of the user in a cycle, and the resulting channel."""
 
     truth: m.GroundTruth
-    position: np.ndarray         # in the frame of the surface, float64 [1, 3]
+    # Position at the reference time, in the frame of the surface, float64 [1, 3].
+    position: np.ndarray
     multipath: list[np.ndarray]  # of each band, complex128 [N_SB, F, N_E]
     # Whether the user has no direct path, bool [1].
     blocked: np.ndarray
-    # Gains of the direct path, or of the paths in a channel file, by band: complex128 [N_SB, N_E].
+    # Gains of the direct path, or of the paths in a channel file, of each band: complex128
+    # [N_SB, F, N_E].
     los: list[np.ndarray]
     # Factors that multiply all signals, complex128 [N_B, N_SB, F]; None if all are 1.
     factors: np.ndarray | None
@@ -172,9 +175,10 @@ class Channel(Role):
     for the band. It answers data once it has received the position, the beam and its
     configuration. Before each answer, the surface shows the configurations of the frames, and the
     radio measures pilots. If one of these fails, there is no answer: the base station asks again,
-    and finally gives the cycle up. The position applies to the whole cycle, because the user
-    hardly moves during the emulated signals. Changed impairments take effect with the next cycle.
-    If `states` are given, the elements have the coefficients that this estimate expects.
+    and finally gives the cycle up. The user moves straight during the emulated frames, which have
+    the times of `frame_times_s`, however long surface and radio take. Changed impairments take
+    effect with the next cycle. If `states` are given, the elements have the coefficients that this
+    estimate expects.
     """
 
     SENDS = (m.FeedSignals, m.Data)
@@ -267,14 +271,16 @@ class Channel(Role):
             self.log(changes)
             self._use(self._settings.in_use)
         position = self._pose.to_surface(truth.position[None])
-        if position[0, 0] <= 0:
+        shifts = frame_times_s(self._scenario)[..., None] * self._pose.vectors_to_surface(
+            truth.velocity)
+        if position[0, 0] + min(shifts[..., 0].min(), 0.0) <= 0:
             # Another surface of the site may have the user in sight.
             self.count(Outcome.BEHIND)
             return
         multipath = self._fading.gains(
             truth.user, truth.cycle_id, truth.time_s(self.now_s),
             memory=self._settings.in_use.multipath_memory)
-        self._cycle = self._draw(truth, position, multipath)
+        self._cycle = self._draw(truth, position, shifts, multipath)
         self.count(Outcome.STALE, sum(key[0] != truth.cycle_id for key in self._pending))
         stores: tuple[NewestDict[Any, Any], ...] = (
             self._pending, self._configurations, self._beams)
@@ -283,9 +289,12 @@ class Channel(Role):
                 del store[stale]
         self._cycle.rate_bps = self._rate_bps(self._cycle)
 
-    def _draw(self, truth: m.GroundTruth, position: np.ndarray, multipath: list[np.ndarray]
-              ) -> _Cycle:
-        """Draw the channel of a cycle in advance, so that answers to pilots are not delayed."""
+    def _draw(self, truth: m.GroundTruth, position: np.ndarray, shifts: np.ndarray,
+              multipath: list[np.ndarray]) -> _Cycle:
+        """Draw the channel of a cycle in advance, so that answers to pilots are not delayed.
+
+        `shifts`, [N_B, F, 3] [m], are the distances from the position in each frame.
+        """
         scenario, seed, user = self._scenario, self._seed, truth.user
         blocked = draw_blocked(
             self._deviating, 1, streams.generator(seed, streams.BLOCKAGE, user))
@@ -294,8 +303,10 @@ class Channel(Role):
             streams.generator(seed, streams.CYCLE_DEVIATION, user, truth.cycle_id))
         if factors is not None:
             factors = factors.reshape(scenario.n_bands, scenario.n_subbands, scenario.n_frames)
-        los = [direct_gain(scenario, position, band, blocked)[0]
-               for band in range(scenario.n_bands)]
+        los = [np.swapaxes(direct_gain(
+            scenario, np.repeat(position, len(of_band), axis=0), band,
+            np.repeat(blocked, len(of_band)), of_band), 0, 1)
+            for band, of_band in enumerate(shifts)]
         return _Cycle(truth, position, multipath, blocked, los, factors)
 
     def _answer_pending(self, cycle: _Cycle) -> None:
@@ -377,13 +388,13 @@ class Channel(Role):
         if isinstance(event, m.Data):
             return None
         band = event.band
-        elements = element_signals(cycle.los[band][:, None], cycle.multipath[band], 1.0)
+        elements = element_signals(cycle.los[band], cycle.multipath[band], 1.0)
         feeds = feed_signals(self._scenario, band, configurations, elements.swapaxes(0, 1),
                              self._response(band))
         if cycle.factors is not None:
             feeds = feeds * cycle.factors[band].T[:, :, None]
         return Sounding(event.cycle_id, band, event.symbols, feeds, event.user,
-                        cycle.truth.position, event.stamp_ns)
+                        cycle.truth.position, cycle.truth.velocity, event.stamp_ns)
 
     def _rate_bps(self, cycle: _Cycle) -> float | None:
         """Return the true capacity [bit/s]; None until the beam and its configuration arrive."""

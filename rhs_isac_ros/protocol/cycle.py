@@ -9,6 +9,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.geometry import frame_times_s
 from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome
@@ -42,18 +43,21 @@ class Reception:
     channel: int = 0
     # Feed signals by band, complex128 [F, N_SB, K].
     signals: dict[int, np.ndarray] = dataclasses.field(default_factory=dict)
-    stamp_ns: int = 0  # time of the first feed signals [ns]; 0 if unknown
+    stamp_ns: int = 0  # reference time [ns]; 0 if unknown
 
     @property
     def codebook_id(self) -> str:
         """Id of the codebook; empty if there is none."""
         return self.codebook.id if self.codebook else ''
 
-    def store(self, event: m.FeedSignals) -> None:
-        """Store the signals of a band, and the instances of user and channel if still unknown."""
+    def store(self, event: m.FeedSignals, reference_ns: int) -> None:
+        """Store the signals of a band, and the instances of user and channel if still unknown.
+
+        `reference_ns` is the time from the first frame to the reference time of the cycle [ns].
+        """
         self.user_instance = self.user_instance or event.user_instance
         self.channel = self.channel or event.sender
-        self.stamp_ns = self.stamp_ns or event.stamp_ns
+        self.stamp_ns = self.stamp_ns or event.stamp_ns and event.stamp_ns + reference_ns
         self.signals[event.band] = event.signals
 
     def combined(self, combine: Combine, noise: bool) -> m.ReceivedSignals:
@@ -73,6 +77,7 @@ class SignalCollector(StateMachine):
         super().__init__(initial)
         self._combine, self._cycle = combine, cycle
         self._bands = frozenset(range(scenario.n_bands))
+        self._reference_ns = round(-1e9 * frame_times_s(scenario)[0, 0])
 
     def _silent_bands(self) -> list[int]:
         """Return the bands whose signals are missing, in ascending order."""
@@ -95,7 +100,7 @@ class SignalCollector(StateMachine):
         return self._silent_bands() == [event.band]
 
     def _store_signals(self, event: m.FeedSignals) -> None:
-        self._cycle.store(event)
+        self._cycle.store(event, self._reference_ns)
 
     # Conditions under which a message of a cycle is dropped.
     _OF_CYCLE: Drops = {_wrong_cycle: Outcome.WRONG_CYCLE}

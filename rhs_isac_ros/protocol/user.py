@@ -49,6 +49,9 @@ class User(StateMachine):
         to `handle`.
     pose
         Pose of the surface.
+    reference_s
+        Time from the grant to the reference time of the cycle [s], to which positions in cycles
+        apply: users move straight until then.
     """
 
     SENDS = (m.Ack, m.GroundTruth, m.GroundTruths, m.Pilot, m.Data)
@@ -59,13 +62,14 @@ class User(StateMachine):
     def __init__(
             self, mobilities: Mapping[int, Mobility], step_s: float, beacon_s: float,
             instance: int = 0, world_s: Callable[[], float] | None = None,
-            pose: Pose | None = None) -> None:
+            pose: Pose | None = None, reference_s: float = 0.0) -> None:
         super().__init__(UserState.DISCONNECTED)
         self._step_s, self._beacon_s = step_s, beacon_s
         self.users, self._instance = tuple(sorted(mobilities)), instance
         # Description of another node that is served under the same number, by user.
         self._conflicts: dict[int, str] = {}
         self._mobilities, self._world_s, self._pose = mobilities, world_s, pose or Pose()
+        self._reference_s = reference_s
         self._crowd = Crowd([mobilities[user] for user in self.users])
         self._cycle_id = 0
         self._was_connected = False
@@ -194,7 +198,9 @@ class User(StateMachine):
         if truth is None:
             position, velocity = self._in_site(
                 *self._mobilities[event.user].state(self._time_s(self.now_s)))
-            truth = m.derive(m.GroundTruth, event, position=position, velocity=velocity)
+            truth = m.derive(
+                m.GroundTruth, event, position=position + self._reference_s * velocity,
+                velocity=velocity)
         self._truths.put(key, truth)
         self.send(truth)
 

@@ -52,7 +52,8 @@ def front_end(surface, radio):
 def sound(parts):
     """Measure a band with a surface and radio."""
     return front_end(parts, parts).sound(
-        CONFIGURATIONS, Sounding(1, 0, np.arange(3), np.ones((3, 2, 1)), 1, np.zeros(3)))
+        CONFIGURATIONS, Sounding(1, 0, np.arange(3), np.ones((3, 2, 1)), 1, np.zeros(3),
+                                 np.zeros(3)))
 
 
 def test_each_frame_is_measured_while_its_configuration_is_shown():

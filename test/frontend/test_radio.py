@@ -52,7 +52,7 @@ def recording(folder):
     recorder = SampleRecorder(folder, SCENARIO, radio.modem, pytest.fail)
     FrontEnd(EmulatedSurface(SCENARIO.n_elements), radio, air, recorder).sound(
         np.zeros((3, SCENARIO.n_elements)), Sounding(
-            1, 0, np.ones(3), flat(np.random.default_rng(1)), 1, np.ones(3)))
+            1, 0, np.ones(3), flat(np.random.default_rng(1)), 1, np.ones(3), np.zeros(3)))
     recorder.close()
     return str(folder)
 

@@ -55,7 +55,8 @@ def sounding(rng, cycle_id, band):
     return Sounding(
         cycle_id, band, symbols=np.exp(2j * np.pi * rng.random(4)),
         arriving=rng.normal(size=(4, 4, 2, 2)) @ [1, 1j],
-        user=7, position_m=rng.normal(size=3), stamp_ns=1_700_000_000_000_000_001)
+        user=7, position_m=rng.normal(size=3), velocity_mps=rng.normal(size=3),
+        stamp_ns=1_700_000_000_000_000_001)
 
 
 def record(folder, order, radio=WaveformRadio, scenario=SCENARIO):
@@ -145,6 +146,7 @@ def test_frames_are_annotated(tmp_path):
     assert {name: frame[f'rhs_isac:{name}'] for name in ('cycle_id', 'band', 'frame', 'user')} == {
         'cycle_id': 2, 'band': 0, 'frame': 1, 'user': 7}
     assert frame['rhs_isac:position_m'] == sent[2].position_m.tolist()
+    assert frame['rhs_isac:velocity_mps'] == sent[2].velocity_mps.tolist()
     assert complex(*frame['rhs_isac:symbol']) == sent[2].symbols[1]
     assert meta['captures'][4] == {
         'core:sample_start': meta['annotations'][4]['core:sample_start'], 'core:frequency': 6e9,

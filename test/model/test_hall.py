@@ -88,6 +88,21 @@ def test_factors_of_elements_multiply_a_path(mirror, users):
         partial[..., 50:], direct_gain(Scenario(channel=mirror), users, 0)[..., 50:])
 
 
+@pytest.mark.parametrize('shift', [(0.3, -0.2, 0.1), (0.0, 0.0, 0.0)])
+def test_paths_of_a_single_wall_move_with_the_user(mirror, users, shift):
+    """The reflection of a user who goes towards the wall comes closer, too."""
+    shift = np.array(shift)
+    expected = np.stack([users[3] + shift, mirror.src[3, 1] + shift * [1, -1, 1]])
+    np.testing.assert_allclose(mirror.moved(3, shift), expected, atol=1e-12)
+    moved = direct_gain(
+        Scenario(channel=mirror), users[2:4], 1, shifts=np.array([[0, 0, 0], shift]))
+    np.testing.assert_allclose(
+        moved[0], direct_gain(Scenario(channel=mirror), users[2:3], 1)[0], rtol=1e-12)
+    paths = los_gain(Scenario(), expected, 1)
+    np.testing.assert_allclose(
+        moved[1], np.tensordot(mirror.coefficients[3], paths, 1), rtol=1e-9)
+
+
 def test_both_simulations_follow_the_paths(mirror, users, shipped):
     scenario = Scenario(channel=mirror)
     signals = [simulate_received(scenario, shipped, users, np.random.default_rng(1)),

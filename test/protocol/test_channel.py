@@ -12,6 +12,7 @@ from rhs_isac_ros.calibration import known_states
 from rhs_isac_ros.frontend import EmulatedSurface, RadioFault, Sounding, SurfaceFault
 from rhs_isac_ros.link import Beamformer, capacity
 from rhs_isac_ros.model import Pose
+from rhs_isac_ros.model.geometry import frame_times_s
 from rhs_isac_ros.model.hall import PathChannel
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.surface import onboard_matrix
@@ -248,7 +249,7 @@ def test_the_first_fault_ends_a_series_of_configurations(scenario, error, kind, 
     surface = Faulty(16, {2}, error)
     front_end = emulated_front_end(scenario, surface)
     request = ApplyPatterns((1, 2), np.eye(16)[:3], Sounding(
-        1, 0, np.ones(3), np.ones((3, 3, 2)), 1, np.zeros(3)) if measured else None)
+        1, 0, np.ones(3), np.ones((3, 3, 2)), 1, np.zeros(3), np.zeros(3)) if measured else None)
     assert apply_patterns(front_end, request) == FrontEndFailed((1, 2), kind, text)
     assert (surface.n, np.argmax(surface.applied)) == (2, 0)
     done = apply_patterns(front_end, request)
@@ -344,6 +345,36 @@ def test_a_channel_file_takes_the_place_of_fading(scenario, configuration):
     expected = np.einsum('jm,fm,jkm->fjk', los_gain(scenario, users[:1], 0)[0],
                          configuration.analog, onboard_matrix(scenario)[0])
     np.testing.assert_allclose(signals[0], expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize('pose', [Pose(), Pose((3.0, 1.0, 0.0), (0.0, 0.0, 0.6, 0.8))])
+def test_the_user_moves_during_a_cycle(scenario, codebooks, pose):
+    """Each frame has the signals of a user who stands at the position of this time."""
+    slow = dataclasses.replace(scenario, frame_duration_s=0.015, retune_s=0.1, pose=pose)
+    start, velocity = pose.to_site(PLACE), pose.vectors_to_site(np.array([0.6, -0.7, 0.3]))
+
+    def signals(band, position, velocity):
+        truth = m.GroundTruth(cycle_id=3, user=1, position=position, velocity=velocity)
+        analog = codebooks[0].analog[band]
+        ((feeds,),) = feed(Channel(slow, 0), [
+            truth, dataclasses.replace(configured(3, analog), band=band),
+            dataclasses.replace(pilots_of(3), band=band)])[-1:]
+        return feeds.signals
+
+    for band, times_s in enumerate(frame_times_s(slow)):
+        moving = signals(band, start, velocity)
+        for frame, time_s in enumerate(times_s):
+            still = signals(band, start + time_s * velocity, np.zeros(3))
+            np.testing.assert_allclose(moving[frame], still[frame], rtol=1e-9)
+        assert not np.isclose(moving, signals(band, start, np.zeros(3))).any()
+
+
+def test_a_user_who_walks_behind_the_surface_has_no_signals(scenario):
+    channel = Channel(dataclasses.replace(scenario, frame_duration_s=0.1), 0)
+    behind = m.GroundTruth(cycle_id=3, user=1, position=np.array([0.1, 0.0, 0.0]),
+                           velocity=np.array([1.0, 0.0, 0.0]))
+    assert feed(channel, [behind, configured(3, np.ones((2, 16))), pilots_of(3)]) == [[], [], []]
+    assert channel.counters == {'behind': 1}
 
 
 def test_a_user_behind_the_surface_has_no_signals(scenario):

@@ -42,10 +42,11 @@ def test_a_grant_of_another_surface_commands_the_own_surface(receiver, scenario,
 @pytest.mark.parametrize('adds_noise', [True, False])
 def test_the_signals_of_all_bands_are_combined_with_the_own_codebook(
         receiver, scenario, codebooks, signals, adds_noise):
+    """Their stamp is the middle of four frames of 4 us."""
     settings = SettingsOffered(ReceiverSettings(receiver_noise=adds_noise))
     *_, (received,) = feed(receiver, [settings, grant(), signals(1), signals(0)])
     assert (received.cycle_id, received.user, received.user_instance, received.codebook_id,
-            received.stamp_ns) == (5, 2, 7, codebooks[0].id, 9)
+            received.stamp_ns) == (5, 2, 7, codebooks[0].id, 9 + 6000)
     feeds = np.stack([signals(band).signals for band in range(scenario.n_bands)])
     noiseless = receive_feeds(scenario, codebooks[0], feeds, None)
     noise = np.abs(received.signals - noiseless).max()

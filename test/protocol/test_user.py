@@ -127,6 +127,17 @@ def test_a_connected_user_keeps_its_state(user, state):
     assert user.state is state
 
 
+def test_the_true_position_of_a_cycle_is_that_at_its_reference_time():
+    made = User({4: mobility.Waypoints([(6.0, 0.0, 0.0), (8.0, 0.0, 0.0)], 0.5)}, step_s=2.0,
+                beacon_s=math.inf, reference_s=0.25)
+    made.handle(PeersChanged(()), 0.0)
+    made.ground_truths(9.0)
+    answers(made, beacon(), 10.0)
+    (truth,) = answers(made, grant(), 10.0)
+    np.testing.assert_allclose(truth.position, [6.0 + 0.5 * (1 + 0.25), 0, 0])
+    np.testing.assert_allclose(truth.velocity, [0.5, 0, 0])
+
+
 @pytest.fixture
 def users():
     """Users 4 to 6 of one node, connected."""
