@@ -1,5 +1,6 @@
 """The scenarios and codebooks in config/."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,13 @@ CONFIG = Path(__file__).parents[1] / 'config'
 CODEBOOKS = {path.stem for path in CONFIG.glob('codebook*.yaml')}
 SCENARIOS = {name: Scenario.from_yaml(CONFIG / f'{name}.yaml')
              for name in (
-                 'table1', 'quick', 'wideband', 'bandplan', 'hall', 'lab', 'resonant', 'coupled')}
+                 'table1', 'quick', 'wideband', 'bandplan', 'hall', 'lab', 'lab_walk',
+                 'resonant', 'coupled')}
 
 
 def test_every_file_is_a_scenario_a_codebook_a_site_or_one_of_parameters():
     assert {path.stem for path in CONFIG.glob('*.yaml')} == {
-        *SCENARIOS, *CODEBOOKS, 'lab_system', 'site', 'parameters'}
+        *SCENARIOS, *CODEBOOKS, 'lab_system', 'lab_walk_system', 'site', 'parameters'}
 
 
 @pytest.mark.parametrize(('name', 'changed'), [
@@ -55,6 +57,15 @@ def test_the_lab_has_the_elements_and_the_times_of_its_board():
     surface = system.surface
     np.testing.assert_array_equal(surface.applied(np.eye(256)), 1 - 2 * np.eye(256))
     assert surface.is_exact
+
+
+def test_users_walk_in_the_same_lab():
+    walk = System.from_yaml(CONFIG / 'lab_walk_system.yaml')
+    rest = System.from_yaml(CONFIG / 'lab_system.yaml')
+    assert walk.scenario == SCENARIOS['lab_walk']
+    assert dataclasses.replace(
+        walk.scenario, user_speed_std_mps=0.0, max_user_speed_mps=0.01) == rest.scenario
+    np.testing.assert_array_equal(walk.radiation, rest.radiation)
 
 
 def test_the_band_plan_has_the_spectrum_and_the_pilots_of_table1():

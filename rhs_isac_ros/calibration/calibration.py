@@ -51,7 +51,7 @@ class Calibration:
     """
 
     surface: SurfaceEstimate  #: The estimate, as used by estimators, bounds and beams.
-    scenario_id: str  #: `Scenario.id` without pose, channel and multipath files.
+    scenario_id: str  #: `Scenario.id` without pose, files of the hall and movement of users.
     #: Record of the calibration: ``pilots``, their number; ``codebooks``, their ids; ``prior`` of
     #: the elements; ``scenario``, the fields that differ from Table I; ``rounds`` of the
     #: estimation, and whether it ``converged``; ``warnings``; ``version``. The record of known
@@ -81,7 +81,7 @@ class Calibration:
 
     def check(self, scenario: Scenario) -> None:
         """Raise CalibrationError unless the calibration applies to a scenario."""
-        expected_id = _without_hall(scenario).id
+        expected_id = _of_surface(scenario).id
         if self.scenario_id != expected_id:
             raise CalibrationError(
                 f'scenario_id: {self.scenario_id}, a calibration for the scenario '
@@ -133,7 +133,7 @@ def calibrate(scenario: Scenario, pilots: Sequence[Pilots],
     if texts:
         warnings.warn('; '.join(texts), CalibrationWarning, stacklevel=2)
     codebooks = sorted({str(getattr(group.beams, 'id', '')) for group in pilots} - {''})
-    return Calibration(surface, _without_hall(scenario).id, {
+    return Calibration(surface, _of_surface(scenario).id, {
         'pilots': sum(len(group.positions) for group in pilots), 'codebooks': codebooks,
         'prior': dataclasses.asdict(prior), 'scenario': scenario.changes(),
         'rounds': len(changes), 'converged': not changes or changes[-1] < TOLERANCE,
@@ -153,7 +153,7 @@ def known_states(scenario: Scenario, off: complex, on: complex) -> Calibration:
     surface = SurfaceEstimate(
         np.full(n, on - off), np.full(n, off), np.ones(n_bands),
         np.zeros((2 * n + n_bands, 0)), np.zeros(n))
-    return Calibration(surface, _without_hall(scenario).id, {
+    return Calibration(surface, _of_surface(scenario).id, {
         'pilots': 0, 'states': [str(off), str(on)], 'scenario': scenario.changes(),
         'version': __version__})
 
@@ -173,9 +173,13 @@ def _warnings(
             f'shifted, expected at most {100 * MAX_UNEXPLAINED:.0f} %']
 
 
-def _without_hall(scenario: Scenario) -> Scenario:
-    """Return a scenario without pose and files of the hall, which do not affect a surface."""
-    return dataclasses.replace(scenario.unplaced, multipath=None, channel=None)
+def _of_surface(scenario: Scenario) -> Scenario:
+    """Return a scenario without what does not affect a surface.
+
+    These are its pose, files of the hall, and the movement of users in a cycle.
+    """
+    return dataclasses.replace(scenario.unplaced, multipath=None, channel=None, retune_s=0.0,
+                               user_speed_std_mps=0.0)
 
 
 def load_surface(path: str, scenario: Scenario) -> SurfaceEstimate | None:

@@ -14,6 +14,8 @@ from rhs_isac_ros.model.scenario import Scenario
 
 # Lower limit of x in conversions [m]; the model is not defined at x = 0.
 _MIN_X_M = 1e-15
+# Change of the phase in a cycle below which users are taken for users at rest [rad].
+_AT_REST_RAD = 1.0
 # Lower limit of a region's extent [wavelengths]; the information for an extent of 0 is infinite.
 _NO_EXTENT = 1e-5
 
@@ -91,6 +93,22 @@ def frame_times_s(scenario: Scenario) -> np.ndarray:
     band_s = scenario.n_frames * scenario.frame_duration_s + scenario.retune_s
     times = np.arange(scenario.n_bands)[:, None] * band_s + frame_lags_s(scenario)
     return read_only(times - times.mean())
+
+
+def undeclared_movement(scenario: Scenario) -> str:
+    """Return a warning if users may move too far in a cycle to be taken for users at rest, or ''.
+
+    There is none if a velocity is declared, or if the phase of the direct path changes by less
+    than `_AT_REST_RAD` from the first frame to the last one.
+    """
+    speed_mps, duration_s = scenario.max_user_speed_mps, float(np.ptp(frame_times_s(scenario)))
+    turn = 2 * np.pi * max(scenario.center_frequencies_hz) / SPEED_OF_LIGHT_MPS
+    phase = turn * speed_mps * duration_s
+    if scenario.user_speed_std_mps or phase < _AT_REST_RAD:
+        return ''
+    return (f'user_speed_std_mps: 0, but users of max_user_speed_mps = {speed_mps:g} m/s move by '
+            f'{phase:.1f} rad in a cycle of {duration_s:.2g} s, and positions assume that they '
+            f'stand still; declare about {speed_mps / 3**0.5:.2g} m/s for each component')
 
 
 def measurement_times_s(scenario: Scenario) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 from rhs_isac_ros import positioning
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
+from rhs_isac_ros.model.geometry import undeclared_movement
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
@@ -35,6 +36,8 @@ class PositionerNode(LocatingNode[Positioner]):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('positioner', **node_options)
+        if text := undeclared_movement(self.scenario):
+            self.get_logger().warning(text)  # type: ignore[no-untyped-call]
         settings = self.make_settings(self.values)
         self._worker, self._table = endpoints.BackgroundWorker(self), ''
         self.endings.callback(self._worker.close)

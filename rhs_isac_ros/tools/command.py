@@ -23,6 +23,7 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.calibration import CalibrationError
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model.geometry import undeclared_movement
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning import ModelError, Site, SiteError
 from rhs_isac_ros.protocol import messages as m
@@ -172,12 +173,16 @@ def choose_scenario(config: Path | None, recording: Path | None = None,
                     namespace: str | None = None, site: Site | None = None) -> Scenario:
     """Return the scenario in a file, or else in a recording, or else the paper's Table I.
 
-    In a recording of a site, each surface has its own scenario in its own namespace.
+    In a recording of a site, each surface has its own scenario in its own namespace. If users may
+    move too far in a cycle for it, a line on stderr says so.
     """
-    if config:
-        return Scenario.from_yaml(config)
-    found = read_networks(recording, site).of(namespace or '') if recording else None
-    return found or Scenario()
+    found = Scenario.from_yaml(config) if config else None
+    if not config and recording:
+        found = read_networks(recording, site).of(namespace or '')
+    scenario = found or Scenario()
+    if text := undeclared_movement(scenario):
+        print(f'warning: {text}', file=sys.stderr)
+    return scenario
 
 
 def topic_prefix(namespace: str) -> str:

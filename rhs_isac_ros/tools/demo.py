@@ -86,7 +86,8 @@ def add_network_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--config', '--scenario', type=input_file, metavar='FILE',
                         help="scenario file; by default the paper's Table I")
     parser.add_argument('--codebook', type=input_file, metavar='FILE',
-                        help='codebook file; by default the codebook of the package')
+                        help='codebook file; by default codebook_NAME beside the scenario file '
+                             'NAME, or else the codebook of the package')
 
 
 def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Path]:
@@ -95,6 +96,9 @@ def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Pa
     Raises ScenarioError or CodebookError if a file is invalid or the codebook does not fit.
     """
     scenario = choose_scenario(config)
+    beside = config and config.with_name(f'codebook_{config.name}')
+    if beside and beside.is_file():
+        codebook = codebook or beside
     codebook_file = Path(codebook or default_codebook_file()).resolve()
     Codebook.load(codebook_file, scenario)
     return scenario, codebook_file

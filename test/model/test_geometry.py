@@ -63,6 +63,19 @@ def test_frame_times_are_relative_to_the_reference_time():
     np.testing.assert_allclose(times - times[:, :1], [g.frame_lags_s(scenario)] * 3)
 
 
+@pytest.mark.parametrize(('changes', 'is_named'), [
+    ({}, False), ({'retune_s': 1e-3}, False), ({'retune_s': 5e-3}, True),
+    ({'frame_duration_s': 0.015, 'max_user_speed_mps': 0.05}, False),
+    ({'frame_duration_s': 0.015}, True),
+    ({'frame_duration_s': 0.015, 'user_speed_std_mps': 1e-3}, False)])
+def test_undeclared_movement_is_named_if_the_phase_changes_by_a_radian_in_a_cycle(
+        changes, is_named):
+    """Table I has 3 GHz and 5.6 m/s: 0.35 rad in a millisecond."""
+    text = g.undeclared_movement(Scenario(**changes))
+    assert text.startswith('user_speed_std_mps: 0, but users of max_user_speed_mps') is is_named
+    assert ('declare about 3.2 m/s' in text) is is_named
+
+
 def test_given_feed_positions_are_used():
     positions = ((0.0, -0.1, 0.2), (0.01, 0.1, 0.0), (0.0, 0.0, 0.3))
     scenario = dataclasses.replace(Scenario(), feed_positions_m=positions)

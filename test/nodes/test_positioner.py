@@ -39,6 +39,13 @@ def node(bench, bench_files, tmp_path, values):
         **values})
 
 
+def test_a_scenario_with_long_frames_and_without_a_velocity_is_named(bench, tmp_path, capfd):
+    path = tmp_path / 'slow.yaml'
+    path.write_text('frame_duration_s: 0.015')
+    bench.add(PositionerNode, values={'scenario_file': path})
+    assert capfd.readouterr().err.count('user_speed_std_mps: 0, but users of max_user') == 1
+
+
 @pytest.fixture
 def send(bench, node, codebooks):
     """Return a function that sends valid signals of a cycle and returns them."""

@@ -15,6 +15,7 @@ from rhs_isac_ros.ros.roster import FOLLOWING, ROSTER
 from rhs_isac_ros.tools import demo
 from rhs_isac_ros.tools.demo import (
     SiteObserver,
+    load_files,
     main,
     site_lines,
     start_network,
@@ -84,6 +85,26 @@ def test_samples_that_cannot_be_written_have_an_exit_code(tmp_path, monkeypatch,
         ('config', 'lab.yaml'), ('codebook', 'codebook_lab.yaml'))]
     assert main([*lab, '--radio', 'waveform', '--samples', 'samples']) == 1
     assert capsys.readouterr().err == f'demo: error: {error}\n'
+
+
+@pytest.mark.parametrize(('config', 'codebook', 'expected'), [
+    ('lab_walk.yaml', None, 'codebook_lab_walk.yaml'), ('table1.yaml', None, 'codebook.yaml'),
+    ('quick.yaml', None, 'codebook_quick.yaml'), (None, None, 'codebook.yaml'),
+    ('table1.yaml', 'codebook_crlb.yaml', 'codebook_crlb.yaml')])
+def test_the_default_codebook_lies_beside_the_scenario(config, codebook, expected):
+    config, codebook = (name and SITE.parent / name for name in (config, codebook))
+    assert load_files(config, codebook)[1].samefile(SITE.parent / expected)
+
+
+@pytest.mark.parametrize(('speed_mps', 'declared_mps', 'lines'), [
+    (0.01, 0.0, 0), (1.5, 0.0, 1), (1.5, 1.0, 0)])
+def test_undeclared_movement_is_one_line(speed_mps, declared_mps, lines, tmp_path, capsys):
+    path = tmp_path / 'mine.yaml'
+    path.write_text(f'frame_duration_s: 0.015\nmax_user_speed_mps: {speed_mps}\n'
+                    f'user_speed_std_mps: {declared_mps}\n')
+    load_files(path, None)
+    found = capsys.readouterr().err.splitlines()
+    assert [line.partition(',')[0] for line in found] == lines * ['warning: user_speed_std_mps: 0']
 
 
 class Started(dict):
