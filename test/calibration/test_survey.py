@@ -224,10 +224,10 @@ def test_a_walk_is_divided_into_places(shipped, monkeypatch):
 
 
 @pytest.mark.slow
-def test_shifted_positions_cause_a_warning(shipped):
-    positions, received = send(Scenario(), shipped, 60)
+def test_shifted_positions_cause_a_warning(beams):
+    positions, received = send(HALL, beams, 60)
     with pytest.warns(SurveyWarning, match=r'positions: \d+ of 60 do not fit a direct path'):
-        survey(Scenario(), shipped, positions + [0.0, 1.0, 0.0], received)
+        survey(DECLARED, beams, positions + [0.0, 1.0, 0.0], received)
 
 
 @pytest.mark.slow

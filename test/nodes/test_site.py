@@ -362,7 +362,10 @@ def test_a_surface_that_has_moved_is_named_and_its_pose_is_found(
         running, built_scripts, tmp_path):
     reports = []
     subscribe_reports(running.fused.node, lambda name, report: reports.append(report.details))
+    # The fusion draws them between cycles.
+    assert running.front.set_parameters('bs', {'rest_s': 0.5}).successful
     running.until(lambda: reports and 'agreement.front.side' in reports[-1], 'the references')
+    assert running.front.set_parameters('bs', {'rest_s': 0.02}).successful
     assert 'warning.poses' not in reports[-1]
     assert running.side.set_parameters('channel', {'surface_shift_m': 0.3}).successful
     running.until_fused(BOTH, 2)

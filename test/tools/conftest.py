@@ -79,7 +79,8 @@ def network(tmp_path_factory):
     """A running network of the small scenario, two users in one process."""
     logs = tmp_path_factory.mktemp('logs')
     with Processes(logs, {'ROS_LOG_DIR': str(logs)}) as processes:
-        processes.start('network', scenario_file=CONFIG / 'quick.yaml',
+        # Most tests need no new cycles.
+        processes.start('network', scenario_file=CONFIG / 'quick.yaml', rest_s=0.3,
                         codebook_file=CONFIG / 'codebook_quick.yaml')
         yield processes
 

@@ -212,24 +212,24 @@ def content(plain):
             plain.covariance_m2.tobytes(), plain.crlb_m2, plain.estimator)
 
 
+@pytest.fixture(scope='module')
+def positioner(module_processes):
+    """A positioner, alone in its namespace."""
+    return module_processes.start(
+        'positioner', namespace='/again', scenario_file=CONFIG / 'quick.yaml')
+
+
 @pytest.fixture
-def received(built_scripts, shared_session):
-    """The contents of the estimates of a positioner, alone in its namespace, by cycle."""
+def received(built_scripts, shared_session, positioner):
+    """The contents of the estimates of the positioner by cycle."""
     found = {}
     subscription = shared_session.node.create_subscription(
         convert.ros_type(m.PositionEstimate), '/again/position_estimate',
         lambda message: found.update({
             message.cycle_id: content(from_ros(m.PositionEstimate, message))}), OBSERVATION)
-    with subprocess.Popen(
-            [SCRIPTS / 'run', 'positioner', '--ros-args', '-r', '__ns:=/again', '-p',
-             f'scenario_file:={CONFIG}/quick.yaml'], stderr=subprocess.DEVNULL) as process:
-        try:
-            # The replay awaits the positioner, but not this observer.
-            assert shared_session.spin_until(
-                lambda: subscription.get_publisher_count() > 0, 60)
-            yield found
-        finally:
-            process.send_signal(signal.SIGINT)
+    # The replay awaits the positioner, but not this observer.
+    assert shared_session.spin_until(lambda: subscription.get_publisher_count() > 0, 60)
+    yield found
     shared_session.node.destroy_subscription(subscription)
 
 
@@ -289,7 +289,7 @@ def test_signals_that_nobody_answers_are_counted(many, bench):
     probe.create_subscription(
         convert.ros_type(m.ReceivedSignals), 'received_signals', signals.append, OBSERVATION)
     probe.create_publisher(convert.ros_type(m.PositionEstimate), 'position_estimate', EXCHANGE)
-    with publishing(many, '--rate', '100000', '--timeout', '10', namespace='/silent') as process:
+    with publishing(many, '--rate', '100000', '--timeout', '5', namespace='/silent') as process:
         # The rest would take a minute.
         bench.until(lambda: process.poll() is not None or len(
             {message.cycle_id for message in signals}) > 1, 'the signals')
