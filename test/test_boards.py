@@ -11,8 +11,9 @@ from rhs_isac_ros.calibration import Pilots, calibrate, known_states
 from rhs_isac_ros.codebook import optimize
 from rhs_isac_ros.codebook.cell import Cell
 from rhs_isac_ros.codebook.unoptimised import directional_codebook, random_codebook
-from rhs_isac_ros.link import capacity_report, choose_beam
+from rhs_isac_ros.link import applied_beam, capacity, capacity_report, choose_beam
 from rhs_isac_ros.model import Pose, Scenario
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.waveguides import board_of_guides
 from rhs_isac_ros.positioning import BayesEstimator
 from rhs_isac_ros.positioning.site import Site, SiteEstimator
@@ -67,10 +68,24 @@ def bounded(system):
     assert (crlb(system.scenario, system.codebook, USER) > 0).all()
 
 
-def steered(system):
-    choice = choose_beam(system.scenario, USER[0], 0.01 * np.eye(3))
+def steered(system, surface=None):
+    """The beam that is designed is the best one of what is applied."""
+    scenario = system.scenario
+    choice = choose_beam(scenario, USER[0], 0.01 * np.eye(3), surface=surface)
     assert choice.expected_bps > 0
-    assert capacity_report(system.scenario, choice.beam, USER[0]).actual_bps > 0
+    report = capacity_report(scenario, choice.beam, USER[0], surface=surface)
+    assert report.actual_bps > 0
+    step = 1.0 if scenario.amplitude_levels or scenario.board.is_amplitude else 0.02
+    for change in step * np.concatenate([np.eye(16), -np.eye(16)]):
+        analog = np.clip(choice.beam.analog + change, 0, 1)
+        other = applied_beam(dataclasses.replace(choice.beam, analog=analog), surface)
+        assert capacity(scenario, other, USER)[0] <= (1 + 1e-4) * report.actual_bps
+
+
+def steered_with_offsets(system):
+    gains = 1 + 0.2 * np.random.default_rng(4).normal(size=(16, 2)) @ [1, 1j]
+    steered(system, SurfaceEstimate(
+        gains, 0.5 * gains[::-1], [0.9, 1.1j], np.zeros((34, 0)), np.zeros(16)))
 
 
 def calibrated(system):
@@ -111,11 +126,11 @@ def impaired(system):
     located(other)
 
 
-CELLS = [optimised, of_a_library, located, bounded, steered, calibrated, focused, with_states,
-         with_failures, at_a_site, impaired]
+CELLS = [optimised, of_a_library, located, bounded, steered, steered_with_offsets,
+         calibrated, focused, with_states, with_failures, at_a_site, impaired]
 COUPLED = "'network' couples its elements"
 REFUSED = {
-    (calibrated, 'network'): COUPLED, (focused, 'network'): COUPLED,
+    **{(cell, 'network'): COUPLED for cell in (calibrated, focused, steered_with_offsets)},
     **{(with_states, kind): f"board: '{kind}' with states of elements"
        for kind in ('phase', 'resonant', 'states', 'network')},
     **{(with_failures, kind): f"'{kind}' with failed_element_share = 0.02"

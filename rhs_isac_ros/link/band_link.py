@@ -8,12 +8,13 @@ import numpy as np
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import checked_position, read_only
+from rhs_isac_ros.model.board import Factor
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.geometry import element_positions, feed_positions
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
-from rhs_isac_ros.model.surface import onboard_matrix
+from rhs_isac_ros.model.surface import NOMINAL, onboard_matrix
 
 # Gains above this limit have finite reciprocals.
 _MIN_GAIN = 1e-300
@@ -57,33 +58,34 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
 class BandLink:
     """The link between the surface and a user in one band, or the links in several bands.
 
-    For several bands, all arrays except `fixed` have a leading axis for the band, and methods take
-    configurations, float64 [N_B, n, N_E]. For one band, methods take float64 [..., N_E].
+    For several bands, all arrays except `slope` and `offset` have a leading axis for the band, and
+    methods take configurations, float64 [N_B, n, N_E]. For one band, methods take float64
+    [..., N_E].
     """
 
-    onboard: np.ndarray  #: B_j, complex128 [N_SB, K, N_E].
+    onboard: np.ndarray  #: B_j with the gain of the band, complex128 [N_SB, K, N_E].
     los: np.ndarray  #: Line-of-sight gains, complex128 [N_SB, N_E].
     spatial: SpatialCovariance  #: V_i.
     noise_power_w: float  #: Noise power of a sub-band [W].
     power_w: float  #: Power of the digital part, summed over sub-bands [W].
-    fixed: np.ndarray  #: Elements whose configuration is always 1, bool [N_E].
+    slope: Factor  #: Slope of the coefficients in the configuration, [N_E] or a number.
+    offset: Factor  #: Coefficients for the configuration 0, [N_E] or a number.
 
     @classmethod
     def to(cls, scenario: Scenario, position: np.ndarray, bands: int | Sequence[int],
            surface: SurfaceEstimate | None = None) -> 'BandLink':
         """Return the links to a position, float64 [3] [m], in the given bands, counted from 0.
 
-        Coefficients and band gains of an estimated surface are included in `onboard`. Raises
-        ValueError if the position is not a finite [3] array.
+        Raises ValueError if the position is not a finite [3] array.
         """
-        onboard, fixed = arrays(scenario, surface)
+        onboard, slope, offset = arrays(scenario, surface)
         listed, place = np.atleast_1d(bands).tolist(), checked_position(position)[None]
         los = np.concatenate([los_gain(scenario, place, band) for band in listed])
         if isinstance(bands, int):
             los = los[0]
         index = band_index(bands)
         return cls(onboard[index], los, spatial_covariance(scenario)[index],
-                   scenario.noise_power_w, scenario.max_power_w, fixed)
+                   scenario.noise_power_w, scenario.max_power_w, slope, offset)
 
     def at_subbands(self, subbands: np.ndarray) -> 'BandLink':
         """Return the links in a subset of the sub-bands, with their share of the power."""
@@ -112,13 +114,13 @@ class BandLink:
     def feeds(self, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the channels between the feeds and the air for configurations [..., N_E].
 
-        Returns B_j diag(c), complex128 [..., N_SB, K, N_E], its product with V_i, and its product
-        with the line-of-sight gains, complex128 [..., N_SB, K, 1].
+        Returns B_j times the coefficients, complex128 [..., N_SB, K, N_E], its product with V_i,
+        and its product with the line-of-sight gains, complex128 [..., N_SB, K, 1].
         """
         onboard, los = self.onboard, self.los[..., None]
         if onboard.ndim == 4:
             onboard, los = onboard[:, None], los[:, None]
-        configured = onboard * analog[..., None, None, :]
+        configured = onboard * (self.slope * analog + self.offset)[..., None, None, :]
         return configured, self.spatial.scatter(configured), np.matmul(configured, los)
 
     @staticmethod
@@ -139,14 +141,10 @@ def band_index(bands: int | Sequence[int]) -> int | slice | list[int]:
 
 @functools.lru_cache(maxsize=16)
 def arrays(scenario: Scenario, surface: SurfaceEstimate | None
-           ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute `BandLink.onboard` of all bands, and `BandLink.fixed`, both read-only."""
-    onboard, fixed = onboard_matrix(scenario), np.zeros(scenario.n_elements, bool)
-    if surface:
-        fixed = surface.failed
-        coefficients = np.where(fixed, surface.offsets, surface.gains)
-        onboard = surface.band_gains[:, None, None, None] * coefficients * onboard
-    return read_only(onboard), read_only(fixed)
+           ) -> tuple[np.ndarray, Factor, Factor]:
+    """Return `BandLink.onboard` of all bands, read-only, and slope and offset of the elements."""
+    slope, offset, gains = surface.response if surface else NOMINAL
+    return read_only(np.reshape(gains, (-1, 1, 1, 1)) * onboard_matrix(scenario)), slope, offset
 
 
 @functools.lru_cache(maxsize=16)

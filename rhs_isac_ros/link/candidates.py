@@ -1,4 +1,9 @@
-"""Search for configurations from which the ascent of `steering` starts, in all bands at once."""
+"""Search for configurations from which the ascent of `steering` starts, in all bands at once.
+
+The coefficient of an element is its slope times its configuration, plus its offset. If there are
+offsets, their gains are added up to those of one further element, whose configuration is always 1.
+N elements therefore are N_E elements, or N_E + 1.
+"""
 
 import functools
 from typing import NamedTuple
@@ -44,15 +49,16 @@ class Tables(NamedTuple):
     """The arrays of the search that do not depend on the position, for all bands."""
 
     subbands: np.ndarray  # Indices of the representative sub-bands, int [J].
-    onboard: np.ndarray  # Gains on the board, complex64 [N_B, N_E, J, K].
-    # Gains from each feed via each element to each wave in the air, complex64 [N_B, N_E, J, K, L].
+    onboard: np.ndarray  # Gains on the board with the slopes, complex64 [N_B, N_E, J, K].
+    resting: np.ndarray  # Gains on the board with the offsets, complex64 [N_B, 0 or N_E, J, K].
+    # Gains from each feed via each element to each wave in the air, complex64 [N_B, N, J, K, L].
     # The first wave, the line of sight, is zero here. The others are the strongest modes of the
     # multipath, the columns of G with G G^H close to V_i.
     paths: np.ndarray
     starts: np.ndarray  # Waves on the board with which the search starts, float32 [S, 2 J K].
     peaks: np.ndarray  # Upper limits of the amplitude of a mode at a feed, float64 [N_B].
-    scattered: np.ndarray  # Good configurations for the multipath alone, float32 [N_B, n, N_E].
-    fixed: np.ndarray  # Elements whose configuration is always 1, bool [N_E].
+    scattered: np.ndarray  # Good configurations for the multipath alone, float32 [N_B, n, N].
+    fixed: np.ndarray  # Elements whose configuration is always 1, bool [N].
 
 
 def candidate_configurations(
@@ -72,7 +78,8 @@ def candidate_configurations(
     particular order, and some may be equal.
     """
     los = np.swapaxes(link.los[:, tables.subbands], 1, 2)[..., None]
-    direct = tables.onboard[index] * los
+    resting = tables.resting[index]
+    direct = _with_rest(tables.onboard[index] * los, resting * los[:, :resting.shape[1]])
     # The power is divided evenly among the sub-bands. The amplitudes are limited to the range of
     # single precision, which hardly changes the result.
     peak = np.maximum(np.abs(direct).sum(axis=1).max(axis=(1, 2)), tables.peaks[index])
@@ -82,7 +89,8 @@ def candidate_configurations(
     paths = tables.paths[index] * scale[..., None].astype(np.float32)
     paths[..., 0] = direct
     interference = direct.real.sum(axis=(2, 3))[:, None]
-    loudest = np.abs(interference).max(axis=-1, keepdims=True) + np.float32(_MIN_NORM)
+    loudest = np.abs(interference[..., ~tables.fixed]).max(axis=-1, keepdims=True) + np.float32(
+        _MIN_NORM)
     matched = np.where(tables.fixed, np.float32(1), (interference / loudest + 1) / 2)
     analog = np.concatenate([
         _direct_configurations(tables, direct), tables.scattered[index], matched], axis=1)
@@ -91,18 +99,22 @@ def candidate_configurations(
     for _ in range(_N_STEPS):
         waves = waves.improved(gains, gains, tables.fixed)
     waves = waves.best(_N_KEPT).improved(gains, paths, tables.fixed)
-    return waves.best(n).analog.astype(float)
+    return waves.best(n).analog[..., ~tables.fixed].astype(float)
 
 
 @functools.lru_cache(maxsize=16)
 def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
     """Compute the tables for a scenario and a calibrated surface, if any."""
-    onboard, fixed = band_link.arrays(scenario, surface)
+    onboard, slope, offset = band_link.arrays(scenario, surface)
     subbands = band_link.representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS)
-    on_board = np.moveaxis(onboard[:, subbands], -1, 1)
-    modes = _modes(scenario)
-    paths = np.zeros((*on_board.shape, 1 + modes.shape[2]), np.complex64)
-    paths[..., 1:] = on_board[..., None] * modes[:, :, None, None]
+    on_board, resting = (
+        np.moveaxis(factor * onboard[:, subbands], -1, 1) for factor in (slope, offset))
+    resting = resting[:, :resting.shape[1] * bool(np.any(offset))]
+    modes = _modes(scenario)[:, :, None, None]
+    gains = _with_rest(*(one[..., None] * modes[:, :one.shape[1]] for one in (on_board, resting)))
+    paths = np.zeros((*gains.shape[:-1], 1 + gains.shape[-1]), np.complex64)
+    paths[..., 1:] = gains
+    fixed = np.arange(len(gains[0])) >= scenario.n_elements
     rng = np.random.default_rng(0)
     n_subbands, n_feeds = len(subbands), scenario.n_feeds
     starts = np.zeros((_N_STARTS, n_subbands, 2 * n_feeds), np.float32)
@@ -112,8 +124,14 @@ def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
     peaks = np.abs(paths).sum(axis=1).max(axis=(1, 2, 3)).astype(float) + _MIN_NORM
     scaled = paths * (_AMPLITUDES[1] / peaks)[:, None, None, None, None].astype(np.float32)
     return Tables(
-        subbands, on_board.astype(np.complex64, order='C'), paths, starts.reshape(_N_STARTS, -1),
-        peaks, _scattered_configurations(scaled, fixed, rng), fixed)
+        subbands, on_board.astype(np.complex64, order='C'), resting.astype(np.complex64), paths,
+        starts.reshape(_N_STARTS, -1), peaks, _scattered_configurations(scaled, fixed, rng), fixed)
+
+
+def _with_rest(gains: np.ndarray, resting: np.ndarray) -> np.ndarray:
+    """Append the sum of the gains of offsets [N_B, 0 or N_E, ...] to gains [N_B, N_E, ...]."""
+    rest = [resting.sum(axis=1, keepdims=True)] * bool(resting.shape[1])
+    return np.concatenate([gains, *rest], axis=1)
 
 
 def _modes(scenario: Scenario, max_modes: int = _MAX_MODES) -> np.ndarray:
@@ -167,7 +185,7 @@ def _complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndar
 
 
 def _direct_configurations(tables: Tables, direct: np.ndarray) -> np.ndarray:
-    """Search for configurations [N_B, n, N_E] for line-of-sight gains [N_B, N_E, J, K]."""
+    """Search for configurations [N_B, n, N] for line-of-sight gains [N_B, N, J, K]."""
     n_bands, n_elements, n_subbands, n_feeds = direct.shape
     # Real arithmetic suffices, because configurations are real and only the real part of the
     # product of the waves matters.
@@ -184,7 +202,7 @@ def _direct_configurations(tables: Tables, direct: np.ndarray) -> np.ndarray:
 
 
 class _Waves(NamedTuple):
-    """Configurations, float32 [N_B, n, N_E], each with its capacity and a pair of waves."""
+    """Configurations, float32 [N_B, n, N], each with its capacity and a pair of waves."""
 
     analog: np.ndarray
     rate: np.ndarray  # Capacities [nat/symbol], float32 [N_B, n].

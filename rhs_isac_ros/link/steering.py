@@ -48,7 +48,7 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     is_new = np.ones(point.rate.shape, bool)
     for _ in range(_MAX_ROUNDS):
         to_vertex = is_new & (point.vertex != point.analog).any(axis=-1)
-        by_element, gain = point.element_step(link)
+        by_element, gain = point.element_step()
         done = ~to_vertex & (gain <= _MIN_GAIN * point.rate)
         if done.all():
             break
@@ -83,20 +83,20 @@ class _Point(NamedTuple):
         snr = gain * power
         amplitude = np.sqrt(power / link.noise_power_w)
         digital = (np.conj(directions[..., -1]) * amplitude[..., None])[..., None, :]
-        weights = np.matmul(digital, link.onboard[:, None])[..., 0, :]
+        weights = link.slope * np.matmul(digital, link.onboard[:, None])[..., 0, :]
         received = np.conj(np.matmul(digital, direct)[..., 0])
         towards = received * link.los[:, None]
         towards += np.conj(np.matmul(digital, scattered)[..., 0, :])
         slope = 2 * (weights * towards).real
         curvature = (weights.real**2 + weights.imag**2) * spread
         ascending = np.sum(slope / (1 + snr)[..., None], axis=-2) > 0
-        vertex = np.where(link.fixed, 1.0, ascending)
-        return cls(analog, np.log1p(snr).sum(axis=-1), vertex, snr, slope, curvature)
+        return cls(analog, np.log1p(snr).sum(axis=-1), ascending.astype(float), snr, slope,
+                   curvature)
 
-    def element_step(self, link: BandLink) -> tuple[np.ndarray, np.ndarray]:
+    def element_step(self) -> tuple[np.ndarray, np.ndarray]:
         """Return configurations after the best change of one element, and the rate gains [nat]."""
         # Axes: end, band, start, sub-band, element.
-        steps = np.stack([-self.analog, 1 - self.analog])[:, :, :, None] * ~link.fixed
+        steps = np.stack([-self.analog, 1 - self.analog])[:, :, :, None]
         # The power is quadratic in each element, so this is exact; only rounding can make it
         # negative.
         snr = self.snr[..., None] + steps * (self.slope + steps * self.curvature)

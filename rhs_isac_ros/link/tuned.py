@@ -39,7 +39,7 @@ def tuned_beam(scenario: Scenario, position: np.ndarray, band: int,
     whole = TunedLink.to(scenario, position, band, surface)
     link = whole.at_subbands(representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS))
     try:
-        start = scenario.board.focused(whole.ports, whole.los)
+        start = scenario.board.focused(whole.ports, whole.response[0] * whole.los)
     except BoardError:
         # With coupling, no element has a best tuning of its own.
         start = np.full(scenario.n_elements, 0.5)

@@ -127,7 +127,7 @@ def long_optimisation(
 def negative_capacity(link: BandLink) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
     """Return the negative capacity [nat] with its gradient, from the explicit channels."""
     factor = np.linalg.cholesky(
-        link.spatial.matrix + 1e-12 * np.trace(link.spatial.matrix) * np.eye(len(link.fixed)))
+        link.spatial.matrix + 1e-12 * np.trace(link.spatial.matrix) * np.eye(link.los.shape[-1]))
     # LoS channel and modes of the multipath, [N_SB, N_E, 1 + N_E].
     modes = np.concatenate([
         link.los[:, :, None], np.broadcast_to(factor, (len(link.los), *factor.shape))], axis=2)

@@ -1,7 +1,5 @@
 """Ascent from configurations to maxima nearby."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -76,16 +74,6 @@ def test_no_single_element_at_an_end_of_its_range_increases_the_capacity(scenari
                 other = found.copy()
                 other[element] = end
                 assert rate(scenario, other, digital, band) <= best * (1 + 1e-8)
-
-
-def test_fixed_elements_stay(table1):
-    fixed = np.zeros(100, bool)
-    fixed[[3, 44]] = True
-    link = dataclasses.replace(BandLink.to(table1.scenario, POSITION, range(2)), fixed=fixed)
-    before = starts(table1.scenario, 3)
-    before[..., fixed] = 1.0
-    found, _ = ascend(link, before)
-    assert (found[..., fixed] == 1).all()
 
 
 def test_a_surface_that_is_off_still_uses_the_full_power(scenario, link):

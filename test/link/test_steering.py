@@ -167,13 +167,13 @@ def test_the_relative_loss_of_no_capacity_is_nan():
 
 @pytest.fixture(scope='module')
 def damaged(table1):
-    """A surface with errors and three failed elements, as an exact estimate."""
+    """A surface with errors, offsets and three failed elements, as an exact estimate."""
     scenario, rng = table1.scenario, np.random.default_rng(0)
     failed = np.zeros(scenario.n_elements, bool)
     failed[[3, 44, 90]] = True
     gains = 1 + 0.2 * rng.normal(size=(scenario.n_elements, 2)) @ [1, 1j]
     return SurfaceEstimate(
-        np.where(failed, 0, gains), np.where(failed, 0.8 * gains, 0),
+        np.where(failed, 0, gains), np.where(failed, 0.8 * gains, 0.3 - 0.2j),
         np.array([0.9, 1.1j]), np.zeros((2 * scenario.n_elements + 2, 0), complex),
         failed.astype(float))
 
@@ -185,14 +185,13 @@ def test_a_beam_for_a_calibrated_surface_has_the_capacity_of_the_search(table1, 
     best = capacity(scenario, applied_beam(beam, damaged), POSITION[None])[0]
     plain = steer(scenario, POSITION)
     assert capacity(scenario, applied_beam(plain, damaged), POSITION[None])[0] < best
-    np.testing.assert_array_equal(beam.analog[damaged.failed], 1.0)
-    for element in (0, 17, 44):
+    for element in range(scenario.n_elements):
         changed = beam.analog.copy()
         changed[element] = 1 - changed[element]
         other = applied_beam(Beamformer(changed, beam.digital), damaged)
         change = capacity(scenario, other, POSITION[None])[0] - best
         # A failed element does not follow.
-        assert change == 0 if element == 44 else change < 0
+        assert change == 0 if damaged.failed[element] else change < 0
 
 
 def test_a_report_is_about_the_calibrated_surface(table1, damaged):
