@@ -173,7 +173,7 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
     objective = options.objective or ('error' if options.spectrum else 'crlb')
     calibration = Calibration.load(options.calibration) if options.calibration else None
-    start = _start(options.start, scenario, options.seed)
+    start = _start(options.start, scenario, options.seed, calibration)
     resumed = Codebook.load(partial if partial.exists() else output) if options.resume else None
     for codebook in filter(None, (start, resumed)):
         check_start(codebook, scenario)
@@ -252,11 +252,13 @@ def _start_name(text: str) -> str:
     return text if text in STARTS else str(input_file(text))
 
 
-def _start(name: str | None, scenario: Scenario, seed: int) -> Codebook | None:
+def _start(name: str | None, scenario: Scenario, seed: int,
+           calibration: Calibration | None) -> Codebook | None:
     if name is None:
         return None
     if name in STARTS:
-        return STARTS[name](scenario, streams.generator(seed, streams.START))
+        return STARTS[name](scenario, streams.generator(seed, streams.START),
+                            calibration.surface if calibration else None)
     return Codebook.load(name)
 
 

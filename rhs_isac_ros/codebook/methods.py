@@ -215,8 +215,9 @@ def _sweep(search: Search, variables: np.ndarray, max_exchanges: int
     value, gradient = search.value_and_gradient(variables)
     by_analog = gradient[:search.n_analog]
     target = variables[:search.n_analog] - np.sign(by_analog) / top
-    # There is no level outside [0, 1].
-    allowed = np.flatnonzero((target > -0.5 / top) & (target < 1 + 0.5 / top))
+    # There is no level outside [0, 1], and no direction for an element without effect.
+    allowed = np.flatnonzero(
+        (by_analog != 0) & (target > -0.5 / top) & (target < 1 + 0.5 / top))
     exchanged = failures = 0
     for entry in allowed[np.argsort(-np.abs(by_analog[allowed]))]:
         if failures == _MAX_FAILURES or exchanged == max_exchanges:

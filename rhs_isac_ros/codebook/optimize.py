@@ -20,11 +20,11 @@ from rhs_isac_ros.codebook.methods import (
 )
 from rhs_isac_ros.codebook.objective import OBJECTIVES, SAMPLINGS
 from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Progress, Search
-from rhs_isac_ros.codebook.unoptimised import STARTS, random_codebook
+from rhs_isac_ros.codebook.unoptimised import STARTS
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import checked_positions
 from rhs_isac_ros.model.elements import SurfaceEstimate
-from rhs_isac_ros.model.surface import on_levels
+from rhs_isac_ros.model.surface import on_levels, ports_of
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.threads import one_blas_thread
 
@@ -100,6 +100,7 @@ def optimize(
         Seed of the samples, the start and the method.
     start
         Codebook to start from; by default random, or directional with the method ``directional``.
+        Elements that are off in all frames of all bands stay off.
     resume
         Codebook of an earlier call with the same arguments, to continue from; the earlier steps
         and evaluations count towards the limits.
@@ -136,7 +137,7 @@ def optimize(
         average = design.average(report.tick)
     except KeyboardInterrupt:
         return _unsearched(design, report, INTERRUPTED)
-    problem = Problem(scenario, average)
+    problem = Problem(scenario, average, design.used)
     search = design.search(problem, report)
     if keep:
         report.keep = lambda: keep(
@@ -158,6 +159,7 @@ class _Design:
     max_steps: int
     max_evaluations: int | None
     prior: Prior
+    used: np.ndarray  # Elements that the search changes, bool [N_E].
 
     @classmethod
     def of(cls, scenario: Scenario, positions: np.ndarray | None, method: str, objective: str,
@@ -190,14 +192,15 @@ class _Design:
             positions=len(positions), scenario=scenario.changes(),
             calibration=calibration.id if calibration else '')
         done = provenance.resumed(resume.provenance) if resume else provenance
-        first = resume or start or STARTS.get(method, random_codebook)(
-            scenario, streams.generator(seed, streams.START))
-        check_start(first, scenario)
         if calibration:
             calibration.check(scenario)
-        return cls(scenario, positions, first, calibration.surface if calibration else None,
-                   provenance, done, max_steps or METHODS[method].steps, max_evaluations,
-                   prior)
+        surface = calibration.surface if calibration else None
+        first = resume or start or STARTS[method if method in STARTS else 'random'](
+            scenario, streams.generator(seed, streams.START), surface)
+        check_start(first, scenario)
+        return cls(scenario, positions, first, surface, provenance, done,
+                   max_steps or METHODS[method].steps, max_evaluations, prior,
+                   used_elements(scenario, resume or start))
 
     def average(self, tick: Callable[[], None]) -> Average:
         """Set up the objective."""
@@ -250,6 +253,18 @@ def check_start(codebook: Codebook, scenario: Scenario) -> None:
     Amplitudes may be continuous, because even a search over levels begins with such amplitudes.
     """
     codebook.check(scenario, discrete=False)
+
+
+def used_elements(scenario: Scenario, start: Codebook | None) -> np.ndarray:
+    """Return the elements that a search changes, bool [N_E]; without a given start, all.
+
+    An element is masked if its tuning is 0 in all frames of all bands, and has no effect there.
+    """
+    if start is None:
+        return np.ones(scenario.n_elements, bool)
+    off = np.zeros((scenario.n_bands, 1, scenario.n_elements))
+    in_effect = scenario.board.transfer(ports_of(scenario), off).any(axis=(0, 1, 2, 4))
+    return np.logical_or(in_effect, start.analog.any(axis=(0, 1)))
 
 
 def _determined(value_m2: float) -> float:

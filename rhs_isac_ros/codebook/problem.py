@@ -18,11 +18,13 @@ class Problem:
 
     Solvers operate on one real vector: the configurations, then the real and the imaginary parts
     of unscaled combining vectors. `unpack` scales those of each frame to the power P_max, which
-    eliminates the power constraint. Solvers must keep the configurations in [0, 1].
+    eliminates the power constraint. Solvers must keep the configurations in [0, 1]. Elements that
+    are not `used`, bool [N_E], are 0 whatever their variables.
     """
 
-    def __init__(self, scenario: Scenario, objective: Average) -> None:
-        self.scenario = scenario
+    def __init__(self, scenario: Scenario, objective: Average,
+                 used: np.ndarray | bool = True) -> None:
+        self.scenario, self._used = scenario, used
         self.objective = objective
         sizes = scenario.sizes
         self._analog_shape = tuple(sizes[s] for s in ('N_B', 'F', 'N_E'))
@@ -61,7 +63,8 @@ class Problem:
         """Return the problem with a sample of its pairs; see `PairwiseErrorCost.sample`."""
         cost = self.objective
         assert isinstance(cost, PairwiseErrorCost)
-        return Problem(self.scenario, cost.sample(self.unpack(variables), n_pairs, rng))
+        sample = cost.sample(self.unpack(variables), n_pairs, rng)
+        return Problem(self.scenario, sample, self._used)
 
     def value(self, variables: np.ndarray) -> float:
         """Return the objective [m^2] for variables ordered as in `pack`."""
@@ -76,11 +79,12 @@ class Problem:
         radial = np.sum((np.conj(raw) * by_digital).real, axis=(1, 3), keepdims=True)
         by_raw = np.sqrt(self.scenario.max_power_w) / norm * (by_digital - raw * radial / norm**2)
         return value, np.concatenate(
-            [by_analog.ravel(), by_raw.real.ravel(), by_raw.imag.ravel()])
+            [(self._used * by_analog).ravel(), by_raw.real.ravel(), by_raw.imag.ravel()])
 
     def _split(self, variables: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return configurations, unscaled combining vectors, and their norm in each frame."""
-        analog = np.clip(variables[:self.n_analog], 0.0, 1.0).reshape(self._analog_shape)
+        analog = self._used * np.clip(variables[:self.n_analog], 0.0, 1.0).reshape(
+            self._analog_shape)
         real, imag = np.split(variables[self.n_analog:], 2)
         raw = (real + 1j * imag).reshape(self._digital_shape)
         norm = np.sqrt(np.sum(np.abs(raw)**2, axis=(1, 3), keepdims=True))

@@ -12,8 +12,9 @@ import numpy as np
 
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.surface import feed_signals, on_levels, ports_of
+from rhs_isac_ros.model.surface import NOMINAL, feed_signals, on_levels, ports_of
 
 
 def random_codebook(scenario: Scenario, rng: np.random.Generator) -> Codebook:
@@ -31,26 +32,27 @@ def random_codebook(scenario: Scenario, rng: np.random.Generator) -> Codebook:
 
 def directional_codebook(
         scenario: Scenario, rng: np.random.Generator | None = None,
-        scan: str = 'width') -> Codebook:
+        scan: str = 'width', surface: SurfaceEstimate | None = None) -> Codebook:
     """Focus each of the N_B F frames on a point of a scan: the paper's `Directional`.
 
     The configuration is that of `Board.focused`: on the board of the paper, by the holographic
     principle. The weights of each sub-band are the matched filter of the resulting feed signals,
-    with equal power in all sub-bands. The codebook is deterministic, so `rng` is unused. `scan` is
-    one of `SCANS`. Raises ValueError if it is unknown, no element has a gain at a focal point, or
-    the elements of the board are coupled.
+    with equal power in all sub-bands. Both include the response of a calibrated surface. The
+    codebook is deterministic, so `rng` is unused. `scan` is one of `SCANS`. Raises ValueError if
+    it is unknown, no element has a gain at a focal point, or the elements of the board are
+    coupled.
     """
     if scan not in SCANS:
         raise ValueError(f'scan: {scan!r}, expected one of {sorted(SCANS)}')
     sizes = scenario.sizes
     analog = np.empty([sizes[s] for s in ('N_B', 'F', 'N_E')])
     digital = np.empty([sizes[s] for s in ('N_B', 'N_SB', 'F', 'K')], complex)
-    points = SCANS[scan](scenario)
+    points, response = SCANS[scan](scenario), surface.response if surface else NOMINAL
     for band in range(scenario.n_bands):
         for frame, los in enumerate(los_gain(scenario, points[:, band], band)):
             analog[band, frame] = scenario.board.focused(
-                ports_of(scenario, band), los, scenario.amplitude_levels)
-            feeds = feed_signals(scenario, band, analog[band, frame], los)
+                ports_of(scenario, band), response[0] * los, scenario.amplitude_levels)
+            feeds = feed_signals(scenario, band, analog[band, frame], los, (*response[:2], 1.0))
             if not los.any():
                 raise ValueError(
                     f'element_gain, user_gain: no gain at {points[frame, band].tolist()} m, '
@@ -108,5 +110,8 @@ def _alternating(n_frames: int) -> np.ndarray:
     return np.where(np.arange(n_frames) % 2, 0.75, 0.25)
 
 
-STARTS: Mapping[str, Callable[[Scenario, np.random.Generator], Codebook]] = {
-    'random': random_codebook, 'directional': directional_codebook}
+STARTS: Mapping[
+    str, Callable[[Scenario, np.random.Generator, SurfaceEstimate | None], Codebook]] = {
+        'random': lambda scenario, rng, _: random_codebook(scenario, rng),
+        'directional': lambda scenario, _, surface: directional_codebook(
+            scenario, surface=surface)}

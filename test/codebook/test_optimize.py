@@ -251,6 +251,26 @@ def test_returns_the_best_point_of_a_method_that_ends_elsewhere(small, monkeypat
     assert by_default.reason == 'drifted, of 9'
 
 
+@pytest.mark.parametrize(
+    ('method', 'levels'), [('lbfgs', 0), ('lbfgs', 2), ('direct', 0), ('alternating', 0)])
+def test_elements_that_are_off_in_all_frames_of_a_given_start_stay_off(
+        scenario, positions, method, levels):
+    start, masked = random_codebook(scenario, np.random.default_rng(0)), [0, 3, 5]
+    on = np.ones(start.analog.shape, bool)
+    on[..., masked] = on[0, 0, 7] = False
+    start = dataclasses.replace(start, analog=on * start.analog)
+    scenario = dataclasses.replace(scenario, amplitude_levels=levels)
+    result = optimize(
+        scenario, positions, method, start=start, max_steps=FEW_STEPS[method] + 10 * levels)
+    assert result.history[-1].value_m2 < result.history[0].value_m2
+    analog = result.codebook.analog
+    assert not analog[..., masked].any()
+    assert analog[..., 7].any()
+    again = optimize(scenario, positions, method, start=start, resume=result.codebook,
+                     max_steps=2 * FEW_STEPS[method] + 10 * levels)
+    assert not again.codebook.analog[..., masked].any()
+
+
 @pytest.mark.parametrize('max_steps', [None, 5])
 @pytest.mark.parametrize('method', ['random', 'directional'])
 def test_methods_without_a_search_return_the_start_and_set_up_no_objective(
@@ -262,7 +282,7 @@ def test_methods_without_a_search_return_the_start_and_set_up_no_objective(
     assert len(result.history) == 1
     assert result.history[0].evaluations == 0
     assert result.history[0].value_m2 == result.codebook.average_crlb_m2
-    expected = STARTS[method](scenario, np.random.default_rng(0))
+    expected = STARTS[method](scenario, np.random.default_rng(0), None)
     np.testing.assert_allclose(result.codebook.digital, expected.digital, rtol=1e-12)
     if method == 'directional':
         np.testing.assert_array_equal(result.codebook.analog, expected.analog)

@@ -6,6 +6,7 @@ import pytest
 from rhs_isac_ros.codebook import directional_codebook, random_codebook
 from rhs_isac_ros.codebook.unoptimised import SCANS, width_points
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.elements import SurfaceEstimate
 
 SCENARIOS = [
     Scenario(max_power_w=0.3),
@@ -43,6 +44,22 @@ def test_the_other_scans_have_the_same_points_in_each_band(scenario, scan):
 def test_the_grid_of_table_1_has_two_points_across_width_and_height():
     points = SCANS['grid'](Scenario())[:, 0, 1:]
     np.testing.assert_allclose(points, [[-2.5, -0.5], [2.5, -0.5], [-2.5, 0.5], [2.5, 0.5]])
+
+
+def test_beams_are_focused_with_the_response_of_a_calibrated_surface():
+    scenario = Scenario(n_frames=1)
+    phases = np.exp(2j * np.pi * np.random.default_rng(0).uniform(size=100))
+    surface = SurfaceEstimate(phases, 0.1 * phases, [1, 1], np.zeros((202, 0)), np.zeros(100))
+    strength = []
+    for known in (None, surface):
+        codebook = directional_codebook(scenario, surface=known)
+        model = MeasurementModel(scenario, codebook, surface)
+        mean = np.stack([model.mean(points)[0, band]
+                         for band, points in enumerate(np.swapaxes(width_points(scenario), 0, 1))])
+        strength.append(np.abs(mean).mean())
+    assert strength[1] > 2 * strength[0]
+    # The combining vectors are matched filters, so that all sub-bands are in phase.
+    np.testing.assert_allclose(np.angle(mean), 0, atol=1e-9)
 
 
 def test_an_unknown_scan_is_an_error():

@@ -13,7 +13,7 @@ BOARDS = [('phase', 0), ('resonant', 0), ({'kind': 'states', 'states': [[1, 0], 
 
 
 @pytest.mark.parametrize(('board', 'levels'), BOARDS)
-def test_no_single_tuning_increases_the_capacity_by_more_than_a_thousandth(board, levels):
+def test_no_single_tuning_increases_the_capacity_by_more_than_a_ten_thousandth(board, levels):
     scenario = Scenario(elements_per_side=5, board=board, amplitude_levels=levels)
     beam = steer(scenario, POSITION, 1)
     assert beam.band == 1
@@ -27,7 +27,7 @@ def test_no_single_tuning_increases_the_capacity_by_more_than_a_thousandth(board
         for step in steps:
             changed = beam.analog.copy()
             changed[element] = step if levels else np.clip(changed[element] + step, 0, 1)
-            assert link.rates(changed[None])[0] <= best * (1 + 1e-3)
+            assert link.rates(changed[None])[0] <= best * (1 + 1e-4)
 
 
 def test_the_gradient_is_a_limit_of_differences_also_with_a_known_surface():
