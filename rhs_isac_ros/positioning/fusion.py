@@ -8,7 +8,8 @@ The maximum of a product is found by Gauss-Newton steps. Weighted samples around
 direction cosines of the surface with the thinnest sheet, yield the moments in the region. Two
 sheets of opposite curvature that touch have a product along a rim, which may be far from the
 maximum. Samples are therefore as wide as if the other sheets were thicker by what they bend over
-the samples, and there are more of them where few carry the weight.
+the samples. Where few of them carry the weight, or where two sheets meet again elsewhere, the
+region is halved, and each half has a proposal of its own.
 
 To each likelihood, a constant is added: the user may be blocked from the surface, the search may
 have missed a mode, or the surface may be elsewhere. A surface that disagrees with the others thus
@@ -47,12 +48,11 @@ class _Limits(NamedTuple):
     margins: tuple[float, float] = (25.0, 12.0)
     products: tuple[int, int] = (4000, 512)
     steps: int = 2
-    # Number of samples of a sheet. Numbers of samples of a product, and of all products together,
-    # at first, and where too few of these carry the weight. Factor by which samples are wider than
-    # a Gaussian.
+    # Numbers of samples of a sheet, of a part of a product, and of all parts together that are
+    # computed at a time. Factor by which samples are wider than a Gaussian.
     of_sheet: int = 64
-    of_product: tuple[int, int] = (128, 1024)
-    samples: tuple[int, int] = (1 << 13, 1 << 15)
+    of_product: int = 128
+    samples: int = 1 << 13
     spread: float = 1.2
     # Information of a uniform prior in the region that narrows Gaussians, as a share of it, and
     # smallest extent of the region along an axis, relative to the largest one.
@@ -63,10 +63,18 @@ class _Limits(NamedTuple):
     passes: int = 3
     step: float = 1.5
     tails: float = 3.0
-    # Share of the samples that have to be effective in products whose weight is within a margin of
-    # the best.
-    effective: float = 0.5
+    # Largest distance of another place where two sheets meet, in standard deviations of the first
+    # one, and smallest distance of the sheets between both places, in those of the second one.
+    reach: float = 3.5
+    apart: float = 2.0
+    # Share of the way to this place that has to be inside the part of the region.
+    within: float = 0.75
+    # Share of the samples that have to be effective in parts whose weight is within a margin of
+    # the best. Others are halved, this many at a time and so often.
+    effective: float = 0.25
     margin: float = 5.0
+    parts: int = 32
+    halvings: int = 8
     # Largest share of a variance that is the same in all phases.
     constant: float = 0.98
     # Logarithm of a likelihood of 0.
@@ -303,12 +311,14 @@ class _Products(NamedTuple):
                 points, gradient, curvature = _expanded(terms, place, prior)
                 place = around.to_site(to_positions(move_inside(
                     points + step_to_maximum(curvature, gradient), curvature, bounds_m, around)))
-            points, _, curvature = _expanded(terms, place, prior)
+            points, gradient, curvature = _expanded(terms, place, prior)
             derivative = polar_derivative(points) @ around.rotation.T
             covariances = np.linalg.inv(np.swapaxes(derivative, 1, 2) @ curvature @ derivative)
             found.means[mine], found.covariances[mine] = place, covariances
+            # Where the steps have not converged, the next one still raises the value.
+            rise = np.sum(gradient * step_to_maximum(curvature, gradient), axis=1) / 2
             found.log_weights[mine] = (
-                _logarithm(terms, place[:, None])[:, 0] + log_volume(covariances))
+                _logarithm(terms, place[:, None])[:, 0] + rise + log_volume(covariances))
         return _Products(self.rows, found)
 
     def _by_reference(self, factors: Sequence[_Factor]
@@ -346,27 +356,32 @@ class _Products(NamedTuple):
         return found, n_sheets < 2
 
     def inside(self, factors: Sequence[_Factor], bounds_m: np.ndarray) -> '_Products':
-        """Return the products with averages over the region and moments in it."""
+        """Return the products with averages over the region and moments in it.
+
+        The region of a product is halved where few of the samples carry the weight.
+        """
         found = self.select(~self.are_constant(factors))
         mass, single = found._single(factors)
-        chosen = np.flatnonzero(~single)
-        for number, total in zip(_LIMITS.of_product, _LIMITS.samples, strict=True):
-            if not len(chosen):
+        owners, moments = np.flatnonzero(single), select(mass, single)
+        parts = _Parts(np.flatnonzero(~single), mass.means[~single], *np.repeat(
+            bounds_m[:, None], np.count_nonzero(~single), axis=1))
+        for left in reversed(range(_LIMITS.halvings + 1)):
+            if not len(parts.owners):
                 break
-            n = min(max(total // len(chosen), 16), number)
-            normal, part = standard_normal(1 << (n.bit_length() - 1)), found.select(chosen)
-            poor = np.zeros(len(chosen), bool)
-            for mine, terms in part._by_reference(factors):
-                positions, log_ratio = _proposal(
-                    terms, part.moments.means[mine], bounds_m).sample(normal)
-                logs = log_ratio + _logarithm(terms, positions)
-                poor[mine] = _effective(logs) < _LIMITS.effective
-                for old, new in zip(mass, _moments(positions, logs), strict=True):
-                    old[chosen[mine]] = new
-            heavy = mass.log_weights >= mass.log_weights.max() - _LIMITS.margin
-            chosen = chosen[poor & heavy[chosen]]
-        kept = np.flatnonzero(_has_mass(mass))
-        return _Products(found.rows[kept], select(mass, kept))
+            samples = parts.sampled(found.select(parts.owners), factors, bounds_m)
+            inside = _moments(samples.positions, samples.logs)
+            best = max(inside.log_weights.max(), moments.log_weights.max(initial=-np.inf))
+            poor = (inside.log_weights >= best - _LIMITS.margin) & (np.isfinite(
+                samples.beyond[:, 0]) | (_effective(samples.logs) < _LIMITS.effective))
+            order = np.argsort(-np.where(poor, inside.log_weights, -np.inf), kind='stable')
+            halved = order[:min(np.count_nonzero(poor), _LIMITS.parts)] if left else order[:0]
+            kept = np.delete(np.arange(len(poor)), halved)
+            owners = np.append(owners, parts.owners[kept])
+            moments = concatenate(moments, select(inside, kept))
+            parts = select(parts, halved).halved(select(samples, halved))
+        kept = np.flatnonzero(_has_mass(moments))
+        names, groups = np.unique(owners[kept], return_inverse=True)
+        return _Products(found.rows[names], select(moments, kept)._merged(groups))
 
     def mixture(self, factors: Sequence[_Factor]) -> Mixture:
         """Return the normalised density, with the covariance that errors of poses cause."""
@@ -392,6 +407,58 @@ class _Products(NamedTuple):
         return moves @ np.swapaxes(moves, 1, 2)
 
 
+class _Samples(NamedTuple):
+    """Samples of P parts, S each."""
+
+    positions: np.ndarray  # Float64 [P, S, 3] [m].
+    logs: np.ndarray  # Logarithms of weights for averages over the region, float64 [P, S].
+    beyond: np.ndarray  # Of `_proposal`, float64 [P, 3] [m]; NaN if there is none.
+
+
+class _Parts(NamedTuple):
+    """P products, each in a box that is a part of the region."""
+
+    owners: np.ndarray  # Index of the product, int [P].
+    starts_m: np.ndarray  # Positions near the maxima in the boxes, float64 [P, 3].
+    low_m: np.ndarray  # Corners of the boxes, float64 [P, 3].
+    high_m: np.ndarray
+
+    def sampled(self, products: _Products, factors: Sequence[_Factor], bounds_m: np.ndarray
+                ) -> _Samples:
+        """Draw samples of products in the boxes."""
+        n = min(max(_LIMITS.samples // len(self.owners), 16), _LIMITS.of_product)
+        normal = standard_normal(1 << (n.bit_length() - 1))
+        positions = np.empty((len(self.owners), *normal.shape))
+        logs, beyond = np.empty(positions.shape[:2]), np.empty_like(self.starts_m)
+        for mine, terms in products._by_reference(factors):
+            gaussians, beyond[mine] = _proposal(
+                terms, self.starts_m[mine], np.stack([self.low_m[mine], self.high_m[mine]]))
+            positions[mine], logs[mine] = gaussians.sample(normal)
+            logs[mine] += _logarithm(terms, positions[mine])
+        size = np.ptp(bounds_m, axis=0)
+        shares = (self.high_m - self.low_m)[:, size > 0] / size[size > 0]
+        return _Samples(positions, logs + np.log(shares).sum(axis=1)[:, None], beyond)
+
+    def halved(self, samples: _Samples) -> '_Parts':
+        """Halve boxes in front of `beyond`, or among the samples, where these are widest."""
+        rows, (positions, logs, beyond) = np.arange(len(self.owners)), samples
+        apart, best = np.isfinite(beyond[:, 0]), positions[rows, np.argmax(logs, axis=1)]
+        axis = np.argmax(np.where(
+            apart[:, None], np.abs(beyond - best), positions.std(axis=1)), axis=1)
+        along = positions[rows, :, axis]
+        middle = np.where(
+            apart, (best + beyond)[rows, axis] / 2, np.median(along, axis=1))
+        low_m, high_m = self.low_m.copy(), self.high_m.copy()
+        low_m[rows, axis] = high_m[rows, axis] = middle
+        halves = []
+        for half, side in ((self._replace(high_m=high_m), along <= middle[:, None]),
+                           (self._replace(low_m=low_m), along > middle[:, None])):
+            best = positions[rows, np.argmax(np.where(side, logs, -np.inf), axis=1)]
+            is_here = np.all((beyond >= half.low_m) & (beyond <= half.high_m), axis=1)
+            halves.append(half._replace(starts_m=np.where(is_here[:, None], beyond, best)))
+        return concatenate(*halves)
+
+
 def _terms(factors: Sequence[_Factor], rows: np.ndarray) -> list[_Term]:
     """Return the factors of products of the given rows, int [T, number of factors]."""
     return [one.term(chosen) for one, chosen in zip(factors, rows.T, strict=True)]
@@ -403,9 +470,10 @@ def _logarithm(terms: Sequence[_Term], positions: np.ndarray) -> np.ndarray:
 
 
 def _prior_information(bounds_m: np.ndarray) -> np.ndarray:
-    """Return the information of a uniform prior in the region, float64 [3, 3] [1/m^2]."""
+    """Return the information of uniform priors in boxes [2, ..., 3] [m], [..., 3, 3] [1/m^2]."""
     size = np.ptp(bounds_m, axis=0)
-    return np.diag(12 / np.maximum(size, _LIMITS.extent * size.max())**2)
+    smallest = _LIMITS.extent * size.max(axis=-1, keepdims=True)
+    return 12 / np.maximum(size, smallest)[..., None]**2 * np.eye(3)
 
 
 def _expanded(terms: Sequence[_Term], positions: np.ndarray, prior: np.ndarray
@@ -424,19 +492,32 @@ def _expanded(terms: Sequence[_Term], positions: np.ndarray, prior: np.ndarray
             symmetric(transposed @ (curvature + prior) @ by_point))
 
 
-def _proposal(terms: Sequence[_Term], positions: np.ndarray, bounds_m: np.ndarray) -> Inside:
-    """Return Gaussians that are as wide as products around positions [T, 3] [m].
+def _proposal(terms: Sequence[_Term], positions: np.ndarray, bounds_m: np.ndarray
+              ) -> tuple[Inside, np.ndarray]:
+    """Return Gaussians that are as wide as products around positions [T, 3] [m], and `beyond`.
 
     In (r, u, v) of the first surface, the sheets of the others are curved. Over the Gaussian, they
     are thicker by the second differences of their coordinates, and the Gaussian in turn is wider
-    if they are thicker.
+    if they are thicker. A sheet may meet that of the first surface again, `beyond` a place where
+    both are apart, [T, 3] [m]; NaN where none does.
     """
     (pose, first), *others = terms
     prior, centre = _prior_information(bounds_m), bounds_m.mean(axis=0)
     curvature, gradient = first.curvature, np.zeros((len(first.points), 3))
+    positions, beyond = np.clip(positions, *bounds_m), np.full_like(positions, np.nan)
+    (free,) = np.nonzero((bounds_m[1] > bounds_m[0]).any(axis=0))
+    if len(free) == 1:
+        # A sphere meets a line at two points.
+        sight = positions - pose.origin
+        along_m2 = first.points[:, 0]**2 - np.sum(np.delete(sight, free, axis=1)**2, axis=1)
+        along_m = np.copysign(np.sqrt(np.maximum(along_m2, 0.0))[:, None], sight[:, free])
+        mirrored = positions.copy()
+        positions[:, free], mirrored[:, free] = pose.origin[free] + [along_m, -along_m]
+        found = np.all((mirrored >= bounds_m[0]) & (mirrored <= bounds_m[1]), axis=1)
+        beyond[found] = mirrored[found]
     points = to_polar(pose.to_surface(positions))
     by_point = pose.rotation @ jacobian(points)
-    for _ in range(_LIMITS.passes):
+    for number in range(_LIMITS.passes):
         # The centre and the width of the Gaussian in the region.
         by_site = by_point.swapaxes(1, 2) @ prior
         total = symmetric(curvature + by_site @ by_point)
@@ -452,8 +533,17 @@ def _proposal(terms: Sequence[_Term], positions: np.ndarray, bounds_m: np.ndarra
             points[:, None] + np.concatenate([axes, -axes], axis=1)))
         for other, rows in others:
             here = to_polar(other.to_surface(positions))
-            second = to_polar(other.to_surface(around)) - here[:, None]
-            second = (second[:, :3] + second[:, 3:]) / _LIMITS.step**2
+            change = to_polar(other.to_surface(around)) - here[:, None]
+            second = (change[:, :3] + change[:, 3:]) / _LIMITS.step**2
+            if not number:
+                slopes = (change[:, :3, 0] - change[:, 3:, 0]) / (2 * _LIMITS.step)
+                turns, chosen = _turns(slopes, second[:, :, 0], rows)
+                places = pose.to_site(to_positions(
+                    points + axes[chosen] * turns[:, None] / _LIMITS.step))
+                nearest = np.clip(places, *bounds_m)
+                found = (np.linalg.norm(nearest - positions, axis=1)
+                         > _LIMITS.within * np.linalg.norm(places - positions, axis=1))
+                beyond[found] = nearest[found]
             thicker = _LIMITS.tails**2 * (
                 np.sum(second**2, axis=1) / 2 + np.sum(second, axis=1)**2 / 4)
             information = rows.is_sheet[:, None, None] * np.linalg.inv(
@@ -463,7 +553,22 @@ def _proposal(terms: Sequence[_Term], positions: np.ndarray, bounds_m: np.ndarra
             curvature = curvature + by_slope @ slope
             gradient = gradient + (by_slope @ (rows.points - here)[..., None])[..., 0]
     wide = 1 / _LIMITS.spread**2
-    return Inside.of(points, wide * gradient, wide * symmetric(curvature), bounds_m, pose)
+    return Inside.of(
+        points, wide * gradient, wide * symmetric(curvature), bounds_m, pose), beyond
+
+
+def _turns(slopes: np.ndarray, second: np.ndarray, rows: _Rows
+           ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Return the farthest places at which ranges are the same again, [T], and their axes.
+
+    Takes the derivatives of the ranges along the axes of the first sheet, [T, 3]. Places are in
+    standard deviations of it; NaN if the sheet does not leave that of `rows` in between.
+    """
+    turns = -2 * slopes / np.where(second == 0, np.inf, second)
+    apart = np.abs(slopes * turns) / 4 / np.sqrt(rows.covariances[:, :1, 0])
+    apart[(np.abs(turns) > _LIMITS.reach) | ~rows.is_sheet[:, None]] = 0.0
+    chosen = np.arange(len(turns)), np.argmax(apart, axis=1)
+    return np.where(apart[chosen] > _LIMITS.apart, turns[chosen], np.nan), chosen
 
 
 def _effective(logs: np.ndarray) -> np.ndarray:

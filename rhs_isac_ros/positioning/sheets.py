@@ -248,7 +248,7 @@ class Inside(NamedTuple):
     def of(cls, points: np.ndarray, gradient: np.ndarray, curvature: np.ndarray,
            bounds: np.ndarray, pose: Pose | None = None, log_values: np.ndarray | None = None
            ) -> 'Inside':
-        """Restrict Gaussians to the region between the bounds [2, 3] [m].
+        """Restrict Gaussians to the region between the bounds, [2, 3] or [2, M, 3] [m].
 
         Takes the first four fields; `log_values` are 0 by default.
         """
@@ -259,17 +259,19 @@ class Inside(NamedTuple):
             positions, derivative = pose.vectors_to_site(positions), derivative @ pose.rotation.T
             bounds = bounds - pose.origin
         transposed = np.swapaxes(derivative, 1, 2)
-        extent = bounds[1] - bounds[0]
+        low, high = (np.broadcast_to(limit, points.shape) for limit in bounds)
+        extent = high - low
         # Metres per unit of r, u and v.
         metres = np.repeat(points[:, :1], 3, axis=1)
         metres[:, 0] = 1.0
         known = np.sqrt(curvature.diagonal(axis1=1, axis2=2)) / metres
-        widening = 1 / np.maximum(known * _LIMITS.exact * np.linalg.norm(extent), 1.0)
+        widening = 1 / np.maximum(
+            known * _LIMITS.exact * np.linalg.norm(extent, axis=1)[:, None], 1.0)
         gradient = widening * gradient
         curvature = widening[:, :, None] * curvature * widening[:, None]
         precision = np.matmul(np.matmul(transposed, curvature), derivative)
-        precision += np.diag(
-            12 * _LIMITS.floor / np.maximum(extent, _LIMITS.extent * extent.max())**2)
+        smallest = _LIMITS.extent * extent.max(axis=1)[:, None]
+        precision += 12 * _LIMITS.floor / np.maximum(extent, smallest)[..., None]**2 * np.eye(3)
         centre = positions + step_to_maximum(
             precision, np.matmul(transposed, gradient[..., None])[..., 0])
         known = np.diagonal(precision, axis1=1, axis2=2)
@@ -282,10 +284,9 @@ class Inside(NamedTuple):
             last = np.argmax(untied(extent * np.sqrt(by_range)), axis=1)
             kept = order != last[:, None]
             order[wide] = np.column_stack([order[kept].reshape(-1, 2), last])[wide]
-        low, high = bounds
         return cls._in_order(
-            (pose, log_values, points, gradient, curvature), order, low[order], high[order],
-            centre[rows, order],
+            (pose, log_values, points, gradient, curvature), order, low[rows, order],
+            high[rows, order], centre[rows, order],
             precision[rows[..., None], order[:, :, None], order[:, None]],
             derivative[:, 0][rows, order], wide)
 
@@ -501,7 +502,7 @@ def _is_wide(points: np.ndarray, curvature: np.ndarray, extent: np.ndarray) -> n
     large part of the sphere, which no plane approximates.
     """
     least = np.diagonal(curvature, axis1=1, axis2=2)[:, 1:].min(axis=1)
-    limit_m2 = _LIMITS.wide**2 * np.sum(np.atleast_2d(extent)**2, axis=1)
+    limit_m2 = _LIMITS.wide**2 * np.sum(extent**2, axis=1)
     wide: np.ndarray = points[:, 0]**2 > limit_m2 * least
     return wide
 

@@ -31,30 +31,31 @@ def sheets(pose, places, log_weights=(0.0,), std=STD, missing=1e-12):
                     missing)
 
 
-def log_likelihood(sighting, positions):
+def log_likelihood(sighting, positions, std=STD):
     """Evaluate modes with weight 1 at positions [N, 3], by their definition around the surface."""
     points = to_polar(sighting.pose.to_surface(positions))
     centres = to_polar(sighting.pose.to_surface(sighting.mixture.means))
-    squares = np.sum(((points[:, None] - centres) / STD)**2, axis=2)
+    squares = np.sum(((points[:, None] - centres) / std)**2, axis=2)
     volumes = np.linalg.slogdet(sighting.mixture.covariances)[1] / 2
     return np.logaddexp.reduce(sighting.mixture.log_weights - volumes - squares / 2, axis=1)
 
 
-def integrated(sightings, bounds=BOUNDS, n=400_000):
+def integrated(sightings, bounds=BOUNDS, n=400_000, std=STD):
     """Return mean and covariance of the product by importance sampling in the region."""
     rng = np.random.default_rng(0)
     # Positions in the region of each mode of the first surface.
     first = sightings[0]
     means = to_polar(first.pose.to_surface(first.mixture.means))
     chosen = rng.integers(len(means), size=n)
-    points = means[chosen] + STD * rng.standard_normal((n, 3))
+    points = means[chosen] + std * rng.standard_normal((n, 3))
+    points = points[np.hypot(points[:, 1], points[:, 2]) < 1]
     r, u, v = points.T
     local = r[:, None] * np.stack([np.sqrt(1 - u**2 - v**2), u, v], axis=1)
     positions = first.pose.to_site(local)
-    squares = np.sum(((points[:, None] - means) / STD)**2, axis=2)
+    squares = np.sum(((points[:, None] - means) / std)**2, axis=2)
     log_proposal = np.logaddexp.reduce(-squares / 2, axis=1)
     # The density of a position is that of (r, u, v) divided by the volume element.
-    log_weights = sum(log_likelihood(one, positions) for one in sightings) - log_proposal
+    log_weights = sum(log_likelihood(one, positions, std) for one in sightings) - log_proposal
     log_weights += 2 * np.log(r) - np.log(np.sqrt(1 - u**2 - v**2))
     log_weights[~((positions >= bounds[0]) & (positions <= bounds[1])).all(axis=1)] = -np.inf
     weights = np.exp(log_weights - log_weights.max())
@@ -98,6 +99,33 @@ def test_the_order_of_the_surfaces_does_not_matter():
     np.testing.assert_allclose(one.log_agreement, other.log_agreement, atol=0.02)
 
 
+HIGH = Pose((20.0, 0.0, 2.0), (0.0, 0.0, 1.0, 0.0), EXACT)
+TURNED = Pose((5.0, -75**0.5, 0.0), (0.0, 0.0, 0.5, 0.75**0.5), EXACT)
+
+
+@pytest.mark.parametrize(('others', 'std', 'places', 'wide'), [
+    ([OPPOSITE], [0.02, 0.1, 0.2], [[8.0, 1.0, 0.2]] * 2, 'z'),
+    ([OPPOSITE], [0.005, 0.1, 0.1], [[13.36, -1.73, 0.41], [13.33, 0.53, 0.83]], 'y'),
+    # The spheres meet in two arcs, several metres apart.
+    ([OPPOSITE], [0.02, 0.4, 0.02], [[6.397, -2.57, 0.08], [6.816, 2.59, 0.24]], 'y'),
+    ([HIGH], [0.02, 0.4, 0.02], [[11.96, -0.797, 0.687], [11.22, 2.498, 0.599]], 'y'),
+    ([TURNED], [0.005, 0.1, 0.1], [[9.8, -3.0, -0.5]] * 2, 'z'),
+    ([OPPOSITE, SIDE], [0.02, 0.1, 0.2], [[8.0, 1.0, 0.2]] * 3, 'z'),
+], ids=['rim', 'apart', 'two arcs', 'other height', '60 degrees', 'three'])
+def test_sheets_that_are_broad_across_have_the_moments_of_their_product(
+        others, std, places, wide):
+    std = np.array(std)
+    sightings = [sheets(pose, place, std=std)
+                 for pose, place in zip([FRONT, *others], places, strict=True)]
+    mean, covariance = integrated(sightings, std=std, n=500_000)
+    fused = fuse(sightings, BOUNDS)
+    offset = fused.mean - mean
+    assert offset @ np.linalg.solve(covariance, offset) < 0.03
+    axis = 'xyz'.index(wide)
+    assert covariance[axis, axis] > 0.02
+    np.testing.assert_allclose(np.diag(fused.covariance) / np.diag(covariance), 1.0, atol=0.2)
+
+
 def test_positions_are_inside_the_region():
     # The mode has its maximum 0.3 m above the region.
     sightings = [sheets(FRONT, [8.0, 1.0, 1.3])]
@@ -112,6 +140,23 @@ def test_a_region_without_height_keeps_its_height():
     mean, covariance = fused.mixture.moments()
     np.testing.assert_allclose(mean[2], 0.0, atol=0.005)
     assert covariance[2, 2] < 0.005**2
+
+
+def test_a_line_meets_two_sheets_on_either_side():
+    """Seen values of a line across: surfaces that face each other see both sides alike."""
+    std, x, z = np.array([0.05, 0.3, 0.3]), 6.718, 0.208
+    line = np.array([[x, -5.0, z], [x, 5.0, z]])
+    sightings = [sheets(FRONT, [6.89, -1.74, -2.17], std=std),
+                 sheets(OPPOSITE, [9.37, 6.75, 5.09], std=std)]
+    y = np.linspace(-5.0, 5.0, 20_001)
+    logs = sum(log_likelihood(one, np.column_stack([0 * y + x, y, 0 * y + z]), std)
+               for one in sightings)
+    weights = np.exp(logs - logs.max()) / np.exp(logs - logs.max()).sum()
+    mean, fused = weights @ y, fuse(sightings, line)
+    deviation = np.sqrt(weights @ (y - mean)**2)
+    assert deviation > 3
+    np.testing.assert_allclose(fused.mean, [x, mean, z], atol=0.05)
+    np.testing.assert_allclose(np.sqrt(fused.covariance[1, 1]), deviation, rtol=0.02)
 
 
 def test_an_uncertain_pose_widens_the_posterior_by_its_covariance():
