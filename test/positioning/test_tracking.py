@@ -273,6 +273,7 @@ def test_a_track_finds_a_user_that_is_suddenly_elsewhere(tracker, sample):
     assert error(estimate, elsewhere) < 0.7
 
 
+@pytest.mark.slow
 def test_estimates_are_inside_the_region(tracker, sample):
     scenario = Scenario()
     low, high = scenario.roi_bounds_m
@@ -313,6 +314,7 @@ def test_a_track_makes_a_user_outside_less_probable(random_beams):
     assert (track[1:] < single[1:] / 10).all()
 
 
+@pytest.mark.slow
 def test_an_estimator_of_another_codebook_continues_the_track(table1, tracker, follow):
     assert follow(np.arange(10) * PERIOD_S).n_phases == 10
     tracker.estimator = make_estimator('bayes', table1.scenario, table1.codebook)
@@ -359,6 +361,7 @@ def test_correlated_multipath_does_not_narrow_the_covariance(table1_estimator, s
     assert again.n_phases == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('bad_s', [np.nan, np.inf, -np.inf, 1j, None])
 def test_a_time_that_is_not_finite_is_an_error_and_does_not_change_the_track(
         table1, table1_estimator, bad_s):
@@ -403,6 +406,7 @@ def test_the_movement_decides_between_the_modes_of_mixtures(mixture_tracker):
     assert np.trace(estimate.covariance) < 0.03
 
 
+@pytest.mark.slow
 def test_the_covariances_of_tracks_of_mixtures_match_their_errors():
     """Of users who move as assumed."""
     rng, motion, squares = np.random.default_rng(5), Motion(turn_s=1e6), []
