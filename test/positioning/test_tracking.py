@@ -443,6 +443,38 @@ def test_an_error_that_all_phases_share_is_counted_once():
     np.testing.assert_allclose(found.velocity_covariance, joint[1, 1] * np.eye(3), atol=0.001)
 
 
+def test_velocities_that_are_measured_are_those_of_the_track():
+    """The result is that of conditioning on all phases together, for a user without turns.
+
+    A phase contains the velocity, for users whose velocities have a standard deviation of 2 m/s.
+    """
+    motion, std = Motion(1.0, 1e9, 1e9), np.array([0.1, 0.3])
+    scenario = Scenario(user_speed_std_mps=2.0)
+    tracker = MixtureTracker(scenario, scenario.roi_bounds_m, motion)
+    rng, times_s = np.random.default_rng(8), np.arange(6) / 4
+    seen = [np.concatenate([START, VELOCITY]) + np.repeat(std, 3) * rng.standard_normal(6)
+            for _ in times_s]
+    own = std[1]**2 * 4 / (4 + std[1]**2)
+    for time_s, state in zip(times_s, seen, strict=True):
+        state[:3] += time_s * VELOCITY
+        mean, covariance = state.copy(), np.diag(np.repeat([std[0]**2, own], 3))
+        # The posterior of the velocity, for the likelihood around the value that was measured.
+        mean[3:] *= own / std[1]**2
+        found = tracker.update(time_s, Mixture(np.zeros(1), mean[None], covariance[None]), 1e-9)
+    # Along one axis: the position at the end, which may be anywhere, and the velocity.
+    n = len(times_s)
+    slopes = np.column_stack([np.ones(2 * n), np.concatenate([times_s - times_s[-1], np.ones(n)])])
+    slopes[n:, 0] = 0
+    weights = np.repeat(1 / std**2, n)
+    # The first phase has the density of velocities of its scenario.
+    joint = np.linalg.inv(slopes.T @ (weights[:, None] * slopes) + np.diag([0, 1 / 4]))
+    values = np.concatenate([[one[:3] for one in seen], [one[3:] for one in seen]])
+    expected = joint @ slopes.T @ (weights[:, None] * values)
+    np.testing.assert_allclose(found.mean, expected[0], atol=1e-3)
+    np.testing.assert_allclose(found.velocity, expected[1], atol=1e-3)
+    np.testing.assert_allclose(found.velocity_covariance, joint[1, 1] * np.eye(3), atol=1e-3)
+
+
 def test_late_phases_do_not_change_a_track_of_mixtures(mixture_tracker):
     mixture_tracker.update(1.0, likelihood(START), MISSING)
     assert mixture_tracker.update(1.0, likelihood(PLACE[0]), MISSING) is None
