@@ -10,7 +10,6 @@ from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.gaussian import (
     covariance_root,
 )
-from rhs_isac_ros.model.geometry import jacobian, to_positions
 from rhs_isac_ros.positioning.likelihood import (
     Columns,
     Conditional,
@@ -69,9 +68,11 @@ class DispersedLikelihood(Conditional):
                 return None
         return cls(likelihood)
 
-    def at(self, points: np.ndarray, *, moves: bool = True) -> 'LocatedStates':
+    def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True
+           ) -> 'LocatedStates':
         """Return the likelihood at points; see `Conditional.at`."""
-        positions, by_point = to_positions(points), jacobian(points)[:, :, :3 * moves]
+        users, by_unknown = self._base.nuisance.states(points, values, moves)
+        positions = users[:, :3]
         intact = self._intact.covariance_at(positions)
         excess = (self._average.covariance_at(positions) - intact if any(self._scales)
                   else np.zeros(1))
@@ -80,7 +81,7 @@ class DispersedLikelihood(Conditional):
                 self._scales, self._offsets, self._information, strict=True):
             factors = Factors.of(self._base.nuisance, intact + scale * excess)
             states.append((factors, offset - factors.log_det, information))
-        mean, slopes = self._average.mean_and_jacobian(positions, by_point)
+        mean, slopes = self._average.mean_and_jacobian(users, by_unknown)
         return LocatedStates(self._base.nuisance, mean, slopes, slopes[:, :0], states)
 
 
@@ -89,7 +90,8 @@ class LocatedStates(NamedTuple):
 
     prior: NuisancePrior
     mean: np.ndarray  # Complex128 [M, N_B, N_SB F].
-    slopes: np.ndarray  # Derivatives of `mean` with respect to the point, [M, P, N_B, N_SB F].
+    # Derivatives of `mean` with respect to point and velocity, [M, P + D, N_B, N_SB F].
+    slopes: np.ndarray
     linear: np.ndarray  # Those of `Columns.linear`, [M, L, N_B, N_SB F].
     # For each state: factors of the covariance, constant of the log-likelihood, [M] or [1], and
     # information of the covariance about the parameters.
@@ -100,9 +102,10 @@ class LocatedStates(NamedTuple):
         prior, found = self.prior, []
         columns = prior.columns(
             values, signals.received, self.mean, self.slopes, self.linear)
+        n_points = self.slopes.shape[1] - prior.velocity.shape[1]
         for factors, offset, information in self.states:
             white = Columns.of(
-                factors.whiten(columns), len(prior), self.linear.shape[1], self.slopes.shape[1])
+                factors.whiten(columns), len(prior), self.linear.shape[1], n_points)
             local = assemble(prior, values, white, information, factors.noise)
             found.append(local._replace(value=local.value + offset))
         return _average_of(found)

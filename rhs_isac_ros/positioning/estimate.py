@@ -10,7 +10,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.arrays import numbers, position_problem
 from rhs_isac_ros.model.gaussian import symmetric
-from rhs_isac_ros.positioning.mixture import Mixture, with_velocities
+from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.support.fields import finite
 
@@ -38,8 +38,8 @@ class Sighting:
 
     pose: Pose
     #: Likelihood as a density with moments in the frame of the site, D = 3, as if the pose were
-    #: exact; D = 6, with the declared density of velocities, if users move. With `sheets`, the
-    #: moments are those in the region. Without, its Gaussians touch the sheets at their maxima.
+    #: exact. With `sheets`, the moments are those in the region. Without, its Gaussians touch the
+    #: sheets at their maxima.
     mixture: Mixture
     #: Probability that the mixture does not contain the position of the user.
     missing: float = MISS_PROBABILITY
@@ -59,7 +59,7 @@ class Sighting:
     @property
     def likelihood(self) -> Sheets:
         """The sheets; raises ValueError if those of the mixture are behind the surface."""
-        return self.sheets or Sheets.tangent(self.mixture.position(), self.pose)
+        return self.sheets or Sheets.tangent(self.mixture, self.pose)
 
     @classmethod
     def of(cls, estimate: 'Estimate', pose: Pose | None = None) -> 'Sighting | None':
@@ -102,9 +102,12 @@ class Estimate:
     #: Logarithm of the density of the signals of several surfaces for one user, relative to that
     #: for a different user at each surface, float64 [] or [N]; NaN for one surface.
     log_agreement: float | np.ndarray = np.nan
-    #: Velocity, float64 [..., 3] [m/s], and its covariance, [..., 3, 3]; NaN without a track.
+    #: Velocity, float64 [..., 3] [m/s], its covariance, [..., 3, 3], and its covariance with the
+    #: position (rows), [..., 3, 3] [m^2/s]; NaN unless users move or a track returns the estimate.
     velocity: np.ndarray = dataclasses.field(default_factory=lambda: np.full(3, np.nan))
     velocity_covariance: np.ndarray = dataclasses.field(
+        default_factory=lambda: np.full((3, 3), np.nan))
+    cross_covariance: np.ndarray = dataclasses.field(
         default_factory=lambda: np.full((3, 3), np.nan))
     #: Number of phases of the track in the estimate, int [] or [N]; 0 without a track.
     n_phases: int | np.ndarray = 0
@@ -152,7 +155,7 @@ class Estimate:
     def of_each(cls, estimates: Sequence['Estimate'], frame: str = SURFACE) -> 'Estimate':
         """Combine the estimates of N shots."""
         shapes = {name: (3, 3)[:2 - (name in ('mean', 'velocity'))] for name in (
-            'mean', 'covariance', 'velocity', 'velocity_covariance')}
+            'mean', 'covariance', 'velocity', 'velocity_covariance', 'cross_covariance')}
         found: dict[str, Any] = {}
         for field in dataclasses.fields(cls):
             values = [getattr(one, field.name) for one in estimates]
@@ -170,23 +173,18 @@ class Estimate:
             if field.name != 'frame'}, frame=self.frame)
 
     @property
+    def joint_covariance(self) -> np.ndarray:
+        """Covariance of position and velocity, float64 [..., 6, 6] [m, m/s]."""
+        cross = self.cross_covariance
+        return np.concatenate([
+            np.concatenate([self.covariance, cross], axis=-1),
+            np.concatenate([np.swapaxes(cross, -1, -2), self.velocity_covariance], axis=-1)],
+            axis=-2)
+
+    @property
     def fix(self) -> np.ndarray:
         """Whether there is a position, bool [] or [N]."""
         return np.isfinite(self.mean).all(axis=-1)
-
-    def with_velocities(self, others: Sequence[Mixture], variance: np.ndarray) -> 'Estimate':
-        """Add those of the mixtures that have velocities; see the function `with_velocities`."""
-        moving = [one for one in others if one.means.shape[1] > 3]
-        if not moving or self.mixture is None:
-            return self
-        return self.moving(with_velocities(self.mixture, moving, variance))
-
-    def moving(self, mixture: Mixture) -> 'Estimate':
-        """Return the estimate with the moments of a mixture with velocities."""
-        mean, covariance = mixture.moments()
-        return dataclasses.replace(
-            self, mean=mean[:3], covariance=covariance[:3, :3], velocity=mean[3:],
-            velocity_covariance=covariance[3:, 3:], density=mixture)
 
     def to_site(self, pose: Pose) -> 'Estimate':
         """Convert from the frame of a surface to that of the site, with the errors of its pose.
@@ -203,7 +201,8 @@ class Estimate:
             return self.mixture.shared(spread)
         return dataclasses.replace(
             self, mean=mean, covariance=pose.covariances_to_site(self.covariance) + spread,
-            velocity=velocity, velocity_covariance=pose.covariances_to_site(
+            velocity=velocity, cross_covariance=pose.covariances_to_site(self.cross_covariance),
+            velocity_covariance=pose.covariances_to_site(
                 self.velocity_covariance) + pose.spread_of_vectors(velocity),
             density=self.density and widened, frame=SITE)
 

@@ -13,7 +13,7 @@ import numpy as np
 from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.gaussian import share_of_level
-from rhs_isac_ros.model.geometry import jacobian, to_positions
+from rhs_isac_ros.model.geometry import jacobian
 from rhs_isac_ros.positioning.alternatives import Alternative, Blocked, Outside, rejection
 from rhs_isac_ros.positioning.diagnosis import FitTest, misfit_log_ratio
 from rhs_isac_ros.positioning.draws import DrawnPosterior
@@ -31,6 +31,7 @@ from rhs_isac_ros.positioning.grid import TemplateTable
 from rhs_isac_ros.positioning.lattice import Grid, lay_grid
 from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
 from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.moving import MovingTable
 from rhs_isac_ros.positioning.offsets import Alignment
 from rhs_isac_ros.positioning.posterior import (
     BandPhases,
@@ -67,6 +68,7 @@ class _Limits(NamedTuple):
     # the first case, the density has several peaks within a mode, and a few of the samples carry
     # most of the weight.
     informative: int = 512
+    moving: int = 128
     narrow: int = 64
     # Total probability of the alternatives above which residuals are not compared with the
     # scenario.
@@ -91,7 +93,8 @@ class SearchScope(NamedTuple):
            ) -> 'SearchScope':
         """Take the templates of a grid, which may be part of the region's."""
         scenario = likelihood.scenario
-        table = TemplateTable(scenario, arrays, grid=grid)
+        kind = MovingTable if scenario.user_speed_std_mps else TemplateTable
+        table = kind(scenario, arrays, grid=grid)
         alternatives = [Blocked(scenario)] if scenario.blocked_probability else []
         return cls(table, Alignment(likelihood, table.spread), alternatives, np.zeros(1, bool))
 
@@ -150,7 +153,8 @@ class SearchEstimator(abc.ABC):
         # Points that represent a standard Gaussian, float64 [128, 3].
         self.normal = standard_normal(N_NORMAL) if lazy else self._region.table.normal
         self._mode_normal = (
-            standard_normal(_LIMITS.informative) if self._phases.is_informative
+            standard_normal(_LIMITS.moving, 6) if prior.velocity.size
+            else standard_normal(_LIMITS.informative) if self._phases.is_informative
             else self.normal if prior.is_coarse else self.normal[:_LIMITS.narrow])
 
     @functools.cached_property
@@ -397,14 +401,17 @@ class SearchEstimator(abc.ABC):
                 alternatives, probabilities[1:], strict=True)}}
         if reason:
             return Estimate.without_fix(reason, **statistics), log_ratios
-        return Estimate(fit.mean, self._scale(fit) * fit.covariance, reason, **statistics
-                        ), log_ratios
+        covariance = self._scale(fit) * fit.covariance
+        if len(covariance) > 3:
+            statistics.update(velocity=fit.mean[3:], velocity_covariance=covariance[3:, 3:],
+                              cross_covariance=covariance[:3, 3:])
+        return Estimate(fit.mean[:3], covariance[:3, :3], reason, **statistics), log_ratios
 
     def _scale(self, fit: Fit) -> float:
         """Return the factor of the covariance for the multipath level that the residual shows."""
         relative = max(fit.residual, 1e-9) / (self._level * max(fit.expected, 0.5))
         # The scaled covariance does not exceed the prior's, unless the original one does.
-        largest = max(self._prior_m2 / float(fit.covariance.trace()), 1.0)
+        largest = max(self._prior_m2 / float(fit.covariance[:3, :3].trace()), 1.0)
         return float(min(relative**self._level_share, largest))
 
     def _reason(self, alternatives: Sequence[Alternative], whitened: np.ndarray, residual: float,
@@ -441,7 +448,8 @@ class MlEstimator(SearchEstimator):
 
     def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
         mean, covariance = samples.moments()
-        best = to_positions(samples.of_shot.first(modes.points))
+        best = self._likelihood.nuisance.states(
+            samples.of_shot.first(modes.points), samples.of_shot.first(modes.values))[0]
         offsets = best - mean
         return best, regular(covariance + offsets[:, :, None] * offsets[:, None])
 

@@ -352,12 +352,12 @@ class FailedSet(Conditional):
         self._offset = len(failed) * surfaces.log_odds + intact + likelihood.log_det
         self._amplitudes = surfaces.effects.amplitude[[*failed]]
 
-    def at(self, points: np.ndarray, *, moves: bool = True) -> LocatedStates:
+    def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True) -> LocatedStates:
         """Return the likelihood at points; see `Conditional.at`."""
         surfaces, scenario = self._surfaces, self._surfaces.likelihood.scenario
         positions, failed = to_positions(points), [*self._failed]
         mean, slopes = self._mean_model.mean_and_jacobian(
-            positions, jacobian(points)[:, :, :3 * moves])
+            *surfaces.likelihood.nuisance.states(points, values, moves))
         gains = np.stack([
             np.repeat(los_gain(scenario, positions, band)[:, :, failed],
                       scenario.n_frames, axis=1) for band in range(scenario.n_bands)])
@@ -380,8 +380,7 @@ class FailureModel:
     def places(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> list[Place]:
         """Return places at points [P, 3] with parameters [P, Q], for the signals of one shot."""
         prior = self.likelihood.nuisance
-        mean, slopes = self.surfaces.intact.mean_and_jacobian(
-            to_positions(points), jacobian(points))
+        mean, slopes = self.surfaces.intact.mean_and_jacobian(*prior.states(points, values))
         columns = prior.columns(values, signals.received, mean, slopes)[:, :4 + len(prior)]
         return [Place(self, *each) for each in zip(points, values, columns, strict=True)]
 

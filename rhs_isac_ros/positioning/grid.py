@@ -330,8 +330,9 @@ def separate(shots: np.ndarray, points: np.ndarray, radii: np.ndarray,
     """Mark the points that do not belong to the mode of a better point, bool [M].
 
     `shots`, int [M], are in ascending order. The `points` (r [m], u, v), float64 [M, 3], of each
-    shot begin with the best one. An ellipsoid with the `radii` [3] around a mode contains no
-    other mode. Given the curvature [M, 3, 3] of the log-likelihood, broad modes extend further.
+    shot begin with the best one; they may have further coordinates. An ellipsoid with the `radii`
+    [3] around a mode contains no other mode. Given the curvature [M, 3, 3] of the log-likelihood,
+    broad modes extend further.
     """
     from scipy.spatial import cKDTree
 
@@ -339,7 +340,7 @@ def separate(shots: np.ndarray, points: np.ndarray, radii: np.ndarray,
     if not len(points):
         return chosen
     if curvature is not None:
-        variance = np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2) / radii**2
+        variance = np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2) / radii[:3]**2
         reach = float(np.clip(np.sqrt(_LIMITS.same_mode * variance.max()), 1.0, _LIMITS.reach))
     # Move points of different shots far away from each other.
     scaled[:, 0] += shots * (2 * reach + np.ptp(scaled[:, 0]))
@@ -348,6 +349,7 @@ def separate(shots: np.ndarray, points: np.ndarray, radii: np.ndarray,
     if curvature is not None:
         offset = points[worse] - points[better]
         close = np.sum((offset / radii)**2, axis=1) < 1
+        offset = offset[:, :3]
         close |= np.einsum('kp,kpq,kq->k', offset, curvature[worse], offset) < _LIMITS.same_mode
         worse, better = worse[close], better[close]
     previous = ~chosen

@@ -15,6 +15,7 @@ from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.geometry import (
     element_positions,
+    frame_times_s,
     jacobian,
     polar_bounds,
     subband_frequencies_hz,
@@ -38,6 +39,9 @@ class _Limits(NamedTuple):
     separation: tuple[float, float] = (0.37, 0.57)
     # Range component of both, in range bins, if phases of the bands do not constrain the range.
     coarse_bins: float = 0.75
+    # Phases by which neighbouring hypotheses of a rate differ [rad]: of the range at the ends of
+    # the frames of a band, and of u and v at the edge of the aperture at the ends of the cycle.
+    rate: tuple[float, float] = (1.1, 1.7)
     # Largest value of `Resolution.direction`. It applies to apertures below one wavelength, where
     # the gains of elements and of the user also change with the direction.
     direction: float = 0.4
@@ -66,6 +70,8 @@ class Resolution(NamedTuple):
     farthest_m: float
     direction_bounds: np.ndarray  # Extent of the region in u and in v, float64 [2, 2].
     bounds_m: np.ndarray  # Lower and upper vertex of the region, float64 [2, 3].
+    # Changes of the rates of (r [m], u, v) over which the signals of a cycle change, [3] [1/s].
+    rate_steps: np.ndarray
 
     @classmethod
     @functools.lru_cache(maxsize=16)
@@ -76,14 +82,21 @@ class Resolution(NamedTuple):
         # The direction also changes the phases of elements in front of the plane or behind it.
         edge_m = np.abs(elements[:, 1:]).max(axis=0) + np.abs(elements[:, 0]).max()
         bounds = scenario.roi_bounds_m
+        direction = 1 / np.maximum(wavenumber * edge_m, 1 / _LIMITS.direction)
+        times_s = frame_times_s(scenario)
+        # Even a single frame has a duration.
+        band_s = np.ptp(times_s[0]) + scenario.frame_duration_s
         (nearest_m, *lowest), (farthest_m, *highest) = polar_bounds(bounds).tolist()
         return cls(
             wavelength_m=SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz),
-            direction=1 / np.maximum(wavenumber * edge_m, 1 / _LIMITS.direction),
+            direction=direction,
             curvature_m=max(wavenumber * np.sum(elements**2, axis=1).max() / 2, 1e-9),
             delay_m=SPEED_OF_LIGHT_MPS / (np.pi * scenario.bandwidth_hz),
             nearest_m=max(nearest_m, _LIMITS.nearest * farthest_m), farthest_m=farthest_m,
-            direction_bounds=np.stack([lowest, highest], axis=1), bounds_m=bounds)
+            direction_bounds=np.stack([lowest, highest], axis=1), bounds_m=bounds,
+            rate_steps=np.append(
+                _LIMITS.rate[0] / (wavenumber * band_s / 2),
+                _LIMITS.rate[1] / (times_s.max() + scenario.frame_duration_s) * direction))
 
     def bin_width_m(self, range_m: float) -> float:
         """Return the width of a range bin, in which delays and amplitudes hardly change [m]."""

@@ -23,7 +23,6 @@ from rhs_isac_ros.model.gaussian import (
     marginalise,
     quadratic_form,
 )
-from rhs_isac_ros.model.geometry import jacobian, to_positions
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.nuisance import UNIFORM_EQUIVALENT, NuisancePrior
 from rhs_isac_ros.system import System
@@ -60,13 +59,16 @@ class Located(Protocol):
 class Conditional(Protocol):
     """The likelihood for one state of the surface, or averaged over several."""
 
-    def at(self, points: np.ndarray, *, moves: bool = True) -> Located:
-        """Return the likelihood at points [M, 3]; unless `moves`, without derivatives there."""
+    def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True) -> Located:
+        """Return the likelihood at points [M, 3]; unless `moves`, without derivatives there.
+
+        Of the parameters `values`, [M, Q], only the velocity counts, and is that of the result.
+        """
         ...
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate the likelihood at points [M, 3] and parameters [M, Q] for one or M shots."""
-        return self.at(points).local(values, signals)
+        return self.at(points, values).local(values, signals)
 
 
 class Columns(NamedTuple):
@@ -177,11 +179,10 @@ class Likelihood(Conditional):
         weights, _ = self.nuisance.noise_weights(gains, self.factors.noise)
         return weights.reshape(len(gains), *self.model.shape)
 
-    def at(self, points: np.ndarray, *, moves: bool = True) -> 'WhiteMeans':
+    def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True) -> 'WhiteMeans':
         """Return the likelihood at points; see `Conditional.at`."""
-        by_point = jacobian(points)[:, :, :3 * moves]
         return WhiteMeans(self, *self.model.mean_and_jacobian(
-            to_positions(points), by_point, whitened=True))
+            *self.nuisance.states(points, values, moves), whitened=True))
 
 
 class WhiteMeans(NamedTuple):
@@ -189,13 +190,18 @@ class WhiteMeans(NamedTuple):
 
     likelihood: Likelihood
     mean: np.ndarray  # Whitened, complex128 [M, N_B, N_SB F].
-    slopes: np.ndarray  # Derivatives of `mean` with respect to the point, [M, P, N_B, N_SB F].
+    # Derivatives of `mean` with respect to point and velocity, [M, P + D, N_B, N_SB F].
+    slopes: np.ndarray
 
     def local(self, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate the likelihood; see `Located.local`."""
         prior, whitened = self.likelihood.nuisance, self.likelihood.whitened(values, signals)
-        by_point = self.slopes.reshape(*self.slopes.shape[:2], self.mean[0].size)
+        slopes = self.slopes.reshape(*self.slopes.shape[:2], self.mean[0].size)
+        n_moving = prior.velocity.shape[1]
+        by_point, by_velocity = np.split(slopes, [slopes.shape[1] - n_moving], axis=1)
         by_values, observed = prior.slopes(whitened, self.mean)
+        if n_moving:
+            by_values[:, :n_moving] = observed[:, :n_moving] = by_velocity
         columns = Columns((whitened - self.mean).reshape(len(self.mean), -1), by_point,
                           by_values, by_point[:, :0], observed)
         return assemble(

@@ -6,6 +6,12 @@ import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.arrays import adjoint, multiply_rows
+from rhs_isac_ros.model.geometry import (
+    jacobian,
+    polar_derivative,
+    to_positions,
+    velocity_std_mps,
+)
 from rhs_isac_ros.model.impairments import (
     UNIFORM_STD_RAD,
     Exponents,
@@ -29,8 +35,14 @@ class NuisancePrior(Exponents):
 
     A uniform phase has a flat prior and the unit `UNIFORM_EQUIVALENT`. If the relative phases of
     bands vary by `COARSE_STD_RAD` or more, uniform phases of all bands replace the parameters that
-    rotate whole bands; the range then follows from delays, amplitudes and wavefronts only.
+    rotate whole bands; the range then follows from delays, amplitudes and wavefronts only. So they
+    do if users move: the range changes by wavelengths within a cycle.
+
+    The velocity of a user who moves is one of the parameters, and its components come first. It
+    has no exponents; see `states`.
     """
+
+    velocity: np.ndarray  #: Velocity [m/s] per unit of the first D parameters, float64 [3, D].
 
     phase_covariance: np.ndarray  #: Of the declared phases of the bands, float64 [N_B, N_B].
     relative_phase_std_rad: float  #: Largest standard deviation relative to their mean.
@@ -49,22 +61,28 @@ class NuisancePrior(Exponents):
         self.scenario, declared = model.scenario, nuisance_of(model.scenario)
         self.phase_covariance = declared.phases @ declared.phases.T
         self.relative_phase_std_rad = _relative_std(self.phase_covariance)
-        self.is_coarse = self.relative_phase_std_rad >= COARSE_STD_RAD
+        std = np.diag(velocity_std_mps(self.scenario))
+        self.velocity = std[:, std.any(axis=0)]
+        n_moving = self.velocity.shape[1]
+        self.is_coarse = self.relative_phase_std_rad >= COARSE_STD_RAD or n_moving > 0
         kept = ~(declared.phases.any(axis=0) & self.is_coarse)
         _, n_bands, n_rows = declared.scaled_patterns.shape
         turns = UNIFORM_EQUIVALENT * np.eye(n_bands)[:n_bands * self.is_coarse]
         patterns = np.concatenate([
-            declared.scaled_patterns[kept], 1j * turns[:, :, None] * np.ones(n_rows)])
-        phases = np.hstack([declared.phases[:, kept], turns.T])
+            np.zeros((n_moving, n_bands, n_rows)), declared.scaled_patterns[kept],
+            1j * turns[:, :, None] * np.ones(n_rows)])
+        phases = np.hstack([np.zeros((n_bands, n_moving)), declared.phases[:, kept], turns.T])
+        around = (n_moving, len(turns))
         self.needs_search, self.moves_multipath = (
-            np.append(flags[kept], np.zeros(len(turns), bool))
+            np.pad(flags[kept], around)
             for flags in (declared.needs_search, declared.moves_multipath))
         largest = np.abs(phases).max(axis=0, initial=0.0)
         uniform = largest > UNIFORM_STD_RAD
         scale = np.where(uniform, UNIFORM_EQUIVALENT / np.where(uniform, largest, 1.0), 1.0)
         self.scaled_patterns, self.phases = patterns * scale[:, None, None], phases * scale
-        precision, period = (np.append(values[kept], np.zeros(len(turns)))
-                             for values in (declared.precision, declared.period))
+        precision, period = (
+            np.pad(values[kept], around, constant_values=(of_velocity, 0.0))
+            for values, of_velocity in ((declared.precision, 1.0), (declared.period, np.inf)))
         if (self.scenario.timing_std_s == np.inf and self.scenario.n_subbands % 2 == 0
                 and not np.isinf(self.phase_std_rad).all()):
             raise ScenarioError(
@@ -130,16 +148,47 @@ class NuisancePrior(Exponents):
         """Compute W P W^-1, which applies P to whitened signals, [Q, N_B, N_SB F, N_SB F]."""
         return np.matmul(whitener * self.scaled_patterns[:, :, None], root)
 
+    def states(self, points: np.ndarray, values: np.ndarray, moves: bool = True
+               ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the states of users at points [M, 3] with parameters [M, Q], and derivatives.
+
+        The derivatives, float64 [M, 3 or 6, P + D], are those with respect to the points, unless
+        not `moves`, and to the D components of the velocity.
+        """
+        positions, by_point = to_positions(points), jacobian(points)[:, :, :3 * moves]
+        n_moving, n_points = self.velocity.shape[1], by_point.shape[2]
+        if not n_moving:
+            return positions, by_point
+        derivatives = np.zeros((len(points), 6, n_points + n_moving))
+        derivatives[:, :3, :n_points], derivatives[:, 3:, n_points:] = by_point, self.velocity
+        return np.hstack([positions, values[:, :n_moving] @ self.velocity.T]), derivatives
+
+    def carried(self, values: np.ndarray, points: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Return parameters [M, Q] at target points for those at points, with equal polar rates.
+
+        Signals determine these rates, so they hardly change within a mode.
+        """
+        n_moving = self.velocity.shape[1]
+        if not n_moving:
+            return values
+        velocities = values[:, :n_moving] @ self.velocity.T
+        rates = np.matmul(polar_derivative(points), velocities[..., None])
+        velocities = np.matmul(jacobian(target), rates)[..., 0]
+        return np.hstack([
+            velocities @ np.linalg.pinv(self.velocity).T, values[:, n_moving:]])
+
     def columns(self, values: np.ndarray, received: np.ndarray, mean: np.ndarray,
                 slopes: np.ndarray, *linear: np.ndarray) -> np.ndarray:
         """Stack the fields of `Columns`, before whitening, complex128 [M, C, N_B, N_SB F].
 
-        `slopes` are the derivatives of the mean with respect to the point.
+        `slopes` are the derivatives of the mean with respect to point and velocity.
         """
-        divided = self.divide(received, values)
+        divided, n_moving = self.divide(received, values), self.velocity.shape[1]
+        n_points = slopes.shape[1] - n_moving
         return np.concatenate([
-            (divided - mean)[:, None], slopes, self.derivatives(divided, mean), *linear,
-            self.scaled_patterns * divided[:, None]], axis=1)
+            (divided - mean)[:, None], slopes, self.derivatives(divided, mean)[:, n_moving:],
+            *linear, slopes[:, n_points:], (self.scaled_patterns * divided[:, None])[:, n_moving:]
+        ], axis=1)
 
     def slopes(self, whitened: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Multiply whitened signals and means, [M, N_B, N_SB F], by W P W^-1.

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model.arrays import mixture_weights
-from rhs_isac_ros.model.gaussian import moments
+from rhs_isac_ros.model.gaussian import marginalise, moments, symmetric
 from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD
 from rhs_isac_ros.positioning.estimate import regular
@@ -52,7 +52,8 @@ _SAMPLING = _Sampling()
 class Samples(NamedTuple):
     """The samples of the posteriors of N shots in the region, S samples for each of M modes."""
 
-    positions: np.ndarray  # Float64 [M, S, 3] [m].
+    # Float64 [M, S, 3] [m], or [M, S, 6] [m, m/s] with velocities.
+    positions: np.ndarray
     weights: np.ndarray  # Float64 [M, S]; their sum is 1 for each shot.
     of_shot: Segments  # The modes of each shot.
     log_evidence: np.ndarray  # Logarithms of the likelihood averaged over the region, [N].
@@ -110,7 +111,7 @@ class Samples(NamedTuple):
         mixture = Mixture._make((
             log_shares, means, regular(covariances * (1 + self._few[n]))))
         return mixture, modes.sheets() if modes else Sheets.of_density(
-            log_shares, *moments(weights, to_polar(positions)), bounds)
+            log_shares, *moments(weights, to_polar(positions[..., :3])), bounds)
 
 
 def draw_samples(modes: Modes, normal: np.ndarray, bounds: np.ndarray) -> Samples:
@@ -130,22 +131,27 @@ def draw_broad_samples(
     """Represent the posterior of one shot by weighted samples of its widened modes.
 
     `conditionals` contains the likelihood for each state of the surface. Returns the positions,
-    float64 [M, S, 3] [m], and the logarithms of their weights, [M, S].
+    float64 [M, S, 3] [m], with columns for a velocity, [M, S, 6] [m, m/s], and the logarithms of
+    their weights, [M, S].
     """
-    bounds, widening = likelihood.resolution.bounds_m, _SAMPLING.spread**2
+    prior, bounds = likelihood.nuisance, likelihood.resolution.bounds_m
+    n_moving, widening = prior.velocity.shape[1], _SAMPLING.spread**2
     positions, log_weights = Inside.of(
         modes.points, modes.gradient / widening, modes.curvature / widening, bounds
     ).sample(normal)
+    velocities = np.zeros((*log_weights.shape, 3 * (n_moving > 0)))
     for state in np.unique(modes.state):
         (rows,) = np.nonzero(modes.state == state)
         points = to_polar(positions[rows]).reshape(-1, 3)
-        values = np.repeat(modes.values[rows], len(normal), axis=0)
-        evidence, values = marginal_at(
+        centres, values = (
+            np.repeat(each[rows], len(normal), axis=0) for each in (modes.points, modes.values))
+        values = prior.carried(values, centres, points)
+        evidence, values, information = marginal_at(
             conditionals[state], likelihood, points, values, signals)
         evidence += _log_share(points.reshape(len(rows), -1, 3), select(modes, rows)).ravel()
         if phases.is_informative:
             likely = evidence >= evidence.max() - _SAMPLING.margin
-            outputs = likelihood.at(points[likely], moves=False).outputs(
+            outputs = likelihood.at(points[likely], values[likely], moves=False).outputs(
                 values[likely], signals)
             turns = np.exp(1j * (likelihood.nuisance.phases @ values[likely].T))
             log_factors, shares = phases.factors(outputs.T * turns)
@@ -154,7 +160,13 @@ def draw_broad_samples(
             positions[rows] = np.clip(
                 to_positions(points), *bounds).reshape(len(rows), -1, 3)
         log_weights[rows] += evidence.reshape(len(rows), -1)
-    return positions, log_weights
+        if n_moving:
+            among = marginalise(information, np.zeros(values.shape), n_moving).information
+            roots = np.linalg.cholesky(symmetric(np.linalg.inv(among)))
+            white = np.tile(normal[:, 3:3 + n_moving], (len(rows), 1))
+            drawn = values[:, :n_moving] + np.matmul(roots, white[..., None])[..., 0]
+            velocities[rows] = (drawn @ prior.velocity.T).reshape(len(rows), -1, 3)
+    return np.concatenate([positions, velocities], axis=2), log_weights
 
 
 def _log_share(points: np.ndarray, modes: Modes) -> np.ndarray:

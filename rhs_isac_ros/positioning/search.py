@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from rhs_isac_ros.model.gaussian import Marginal, likelihood_loss, marginalise, step_to_maximum
-from rhs_isac_ros.model.geometry import to_polar, to_positions
+from rhs_isac_ros.model.geometry import polar_derivative, to_polar, to_positions
 from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable, heaviest, separate
 from rhs_isac_ros.positioning.likelihood import (
@@ -208,28 +208,31 @@ def _halve(modes: Modes, origins: Starts, gain: np.ndarray, rows: np.ndarray) ->
 
 
 def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
-                values: np.ndarray, signals: Signals) -> tuple[np.ndarray, np.ndarray]:
+                values: np.ndarray, signals: Signals
+                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the marginal log-likelihood at M points, [M], and the best parameters, [M, Q].
 
-    Newton steps start from the approximate parameters `values`, [M, Q].
+    Newton steps start from the approximate parameters `values`, [M, Q]. Also returns the
+    information about the parameters, [M, Q, Q].
     """
     located, values = _settled(conditional, likelihood, points, values, signals, moves=False)
-    for _ in range(2 if values.shape[1] else 1):
+    for _ in range(2 if values.shape[1] and not likelihood.nuisance.velocity.size else 1):
         local = located.local(values, signals)
         marginal = marginalise(local.information, local.gradient, 0)
         values = values + marginal.offset
     rise = np.sum(local.gradient * marginal.offset, axis=1) / 2
-    return local.value + rise + marginal.log_volume, values
+    return local.value + rise + marginal.log_volume, values, local.information
 
 
 def _settled(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
              values: np.ndarray, signals: Signals, moves: bool = True
              ) -> tuple[Located, np.ndarray]:
     """Return the likelihood at points, and parameters [M, Q] with the most likely phases."""
-    located = conditional.at(points, moves=moves)
+    located = conditional.at(points, values, moves=moves)
     # A step in range rotates uniform phases of bands by many turns.
     if likelihood.nuisance.is_coarse:
-        white = located if isinstance(located, WhiteMeans) else likelihood.at(points, moves=False)
+        white = located if isinstance(located, WhiteMeans) else likelihood.at(
+            points, values, moves=False)
         values = white.settled(values, signals)
     return located, values
 
@@ -305,6 +308,10 @@ def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float
     best = np.minimum(of_shot.first(modes.log_likelihood[order]), of_shot.max(known))
     relative = value[order] - of_shot.repeat(best)
     order = order[heaviest(of_shot, np.minimum(relative, 0.0), margin)]
-    radii = likelihood.resolution.separation(likelihood.nuisance.is_coarse)
-    return order[separate(
-        modes.shots[order], modes.points[order], radii, modes.curvature[order])]
+    prior, resolution = likelihood.nuisance, likelihood.resolution
+    points, radii = modes.points[order], resolution.separation(prior.is_coarse)
+    if n_moving := prior.velocity.shape[1]:
+        velocities = modes.values[order, :n_moving] @ prior.velocity.T
+        rates = np.matmul(polar_derivative(points), velocities[..., None])[..., 0]
+        points, radii = np.hstack([points, rates]), np.append(radii, resolution.rate_steps)
+    return order[separate(modes.shots[order], points, radii, modes.curvature[order])]

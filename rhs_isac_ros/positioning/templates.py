@@ -14,7 +14,7 @@ import numpy as np
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import adjoint, read_only
 from rhs_isac_ros.model.gaussian import quadratic_form
-from rhs_isac_ros.model.geometry import to_positions
+from rhs_isac_ros.model.geometry import to_positions, velocity_std_mps
 from rhs_isac_ros.positioning.lattice import (
     PHASE_ERROR,
     Expansion,
@@ -79,7 +79,11 @@ def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None =
         'curvature': np.empty((n_cells, 3, 3)),
         'normal': standard_normal(N_NORMAL),
     }
-    table['spread'], table['limiter'] = _moments(model, _positions_in(model.scenario, part))
+    positions, std = _positions_in(model.scenario, part), velocity_std_mps(model.scenario)
+    if std.any():
+        rng = np.random.default_rng(0)
+        positions = np.hstack([positions, std * rng.standard_normal(positions.shape)])
+    table['spread'], table['limiter'] = _moments(model, positions)
     table['whitener'] = np.matmul(table['limiter'], model.whitener)
     by_node = np.argsort(grid.node, kind='stable')
     of_node = Segments.of_counts(np.bincount(grid.node, minlength=len(grid.nodes)))

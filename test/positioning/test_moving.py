@@ -1,0 +1,137 @@
+"""Positions and velocities of users who move during a cycle."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.special import chdtri
+
+from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.geometry import to_polar, to_positions
+from rhs_isac_ros.positioning import BayesEstimator, MlEstimator
+from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.system import System
+
+# A cycle of 0.36 s, in which a user walks several wavelengths.
+WALKING = Scenario(
+    center_frequencies_hz=(5.25e9, 5.75e9), n_subbands=2, n_frames=12, frame_duration_s=0.015,
+    elements_per_side=10, element_interval_wavelengths=0.35, n_feeds=1,
+    feed_positions_m=((0.3, 0.0, 0.0),), refractive_index=1.0, max_user_speed_mps=1.5,
+    multipath_to_los_db=-6, band_phase_std_rad=6.2832, roi_center_m=(2.5, 0, 0),
+    roi_size_m=(2, 2, 0), user_speed_std_mps=1.0, outside_probability=0.0)
+
+
+def system_of(**changes) -> System:
+    scenario = dataclasses.replace(WALKING, **changes)
+    return System(scenario, random_codebook(scenario, np.random.default_rng(3)))
+
+
+def users_of(scenario, n, speed, rng):
+    """States in random directions in the plane of the region."""
+    way = rng.standard_normal((n, 3)) * (np.array(scenario.roi_size_m) > 0)
+    return np.hstack([scenario.sample_positions(n, rng),
+                      speed * way / np.linalg.norm(way, axis=1, keepdims=True)])
+
+
+def inside(errors, covariances, n):
+    covariances = covariances + 1e-8 * np.eye(covariances.shape[-1])
+    squares = np.einsum('ni,nij,nj->n', errors, np.linalg.inv(covariances), errors)
+    return np.mean(squares <= chdtri(n, 0.05))
+
+
+@pytest.fixture(scope='module')
+def walking():
+    system = system_of()
+    return system, BayesEstimator(system)
+
+
+@pytest.mark.parametrize('declared', [{}, dict(
+    timing_std_s=1e-7, user_gain_std_db=2.0, carrier_offset_std_hz=3.0, element_error_rms=0.05)],
+    ids=['plain', 'impaired'])
+@pytest.mark.parametrize('moves', [False, True])
+def test_gradient_and_information_are_those_of_the_likelihood(declared, moves):
+    """The observed information differs from the expected one only by noise."""
+    from rhs_isac_ros.positioning.search import OneState
+
+    system, rng = system_of(**declared), np.random.default_rng(1)
+    likelihood = Likelihood(system)
+    conditional = OneState(likelihood)._conditional
+    state, n = users_of(system.scenario, 1, 1.0, rng), len(likelihood.nuisance)
+    signals = likelihood.signals(system.sample(state, rng))
+    point, values = to_polar(state[:, :3]), 0.1 * rng.standard_normal((1, n))
+    values[:, :2] = state[:, 3:5]
+    local = conditional.at(point, values, moves=moves).local(values, signals)
+    unknowns = np.hstack([point, values])[0]
+    first = 0 if moves else 3
+    assert local.gradient.shape == (1, 3 + n - first)
+    for row in range(first, 3 + n):
+        step = np.zeros(3 + n)
+        step[row] = 1e-6
+        ahead, behind = (conditional.at(one[None, :3], one[None, 3:]).local(
+            one[None, 3:], signals) for one in (unknowns + step, unknowns - step))
+        slope = (ahead.value - behind.value)[0] / 2e-6
+        if row < 5 or not declared:
+            assert local.gradient[0, row - first] == pytest.approx(
+                slope, rel=1e-3, abs=0.5 if row < 3 else 1e-2)
+
+
+def test_positions_and_velocities_are_in_their_regions(walking):
+    system, estimator = walking
+    rng = np.random.default_rng(2)
+    states = np.vstack([users_of(system.scenario, 16, speed, rng) for speed in (0, 0.3, 1, 2)])
+    estimate = estimator.estimate(system.sample(states, rng))
+    assert estimate.fix.all()
+    errors = np.hstack([estimate.mean, estimate.velocity]) - states
+    # Nobody moves up or down.
+    np.testing.assert_array_equal(estimate.velocity[:, 2], 0)
+    errors, joint = np.delete(errors, [2, 5], 1), estimate.joint_covariance
+    joint = np.delete(np.delete(joint, [2, 5], 1), [2, 5], 2)
+    assert inside(errors[:, :2], joint[:, :2, :2], 2) >= 0.85
+    assert inside(errors, joint, 4) >= 0.85
+    assert np.sqrt(np.mean(errors[:, 2:]**2)) < 0.3
+
+
+def test_without_the_phases_of_bands_range_and_radial_speed_are_ambiguous():
+    """A range step that the phases of the bands explain leaves the signals as they are."""
+    system, rng = system_of(multipath_to_los_db=-40.0), np.random.default_rng(4)
+    likelihood = Likelihood(system)
+    state = users_of(system.scenario, 1, 1.0, rng)
+    signals = likelihood.signals(system.sample(state, rng))
+    point, values = to_polar(state[:, :3]), np.zeros((1, len(likelihood.nuisance)))
+    values[:, :2] = state[:, 3:5]
+
+    def log_likelihood(longer_m=0.0, faster_mps=0.0, settled=True):
+        moved = point + [longer_m, 0, 0]
+        sight = to_positions(moved) / moved[0, 0]
+        changed = likelihood.nuisance.carried(values, point, moved)
+        changed[:, :2] += faster_mps * sight[:, :2]
+        located = likelihood.at(moved, changed)
+        if settled:
+            changed = located.settled(changed, signals)
+        return located.local(changed, signals).value[0]
+
+    values = likelihood.at(point, values).settled(values, signals)
+    best = log_likelihood()
+    assert log_likelihood(0.005) > best - 20
+    assert log_likelihood(0.005, settled=False) < best - 1000
+    assert log_likelihood(0.0, 0.05) < best - 1000
+
+
+def test_a_faster_user_than_declared_is_not_at_a_wrong_place(walking):
+    system, estimator = walking
+    rng = np.random.default_rng(5)
+    states = users_of(system.scenario, 16, 3, rng)
+    estimate = estimator.estimate(system.sample(states, rng))
+    errors = (estimate.mean - states[:, :3])[estimate.fix]
+    assert not len(errors) or inside(
+        errors[:, :2], estimate.covariance[estimate.fix, :2, :2], 2) >= 0.7
+
+
+def test_ml_has_the_most_likely_velocity(walking):
+    system, _ = walking
+    rng = np.random.default_rng(6)
+    states = users_of(system.scenario, 3, 1.0, rng)
+    estimate = MlEstimator(system).estimate(system.sample(states, rng))
+    assert np.abs(estimate.velocity - states[:, 3:]).max() < 1
+    assert np.linalg.eigvalsh(estimate.joint_covariance).min() > -1e-12
