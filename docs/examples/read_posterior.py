@@ -20,10 +20,12 @@ def estimate(posterior):
 
     Those of a prior, which a track takes from earlier signals, are not in the posterior.
     """
-    weights, means = np.exp(array(posterior.log_weights)), array(posterior.means)
+    # Where users move, columns for the velocity follow those for the position.
+    weights, means = np.exp(array(posterior.log_weights)), array(posterior.means)[:, :3]
     mean = weights @ means
     offsets = means - mean
-    covariance = np.tensordot(weights, array(posterior.covariances_m2), axes=1)
+    covariances = array(posterior.covariances_m2)[:, :3, :3]
+    covariance = np.tensordot(weights, covariances, axes=1)
     covariance += offsets.T @ (weights[:, None] * offsets)
     # The pose of the surface has errors: a shift, and a rotation about the surface.
     surface = posterior.surface_position_m
@@ -38,7 +40,7 @@ def show(posterior):
     likely = np.argmax(array(posterior.log_weights))
     print(f'cycle {posterior.cycle_id}, user {posterior.user}: {mean.round(3)} m, standard '
           f'deviations {np.sqrt(np.diag(covariance)).round(3)} m, most likely near '
-          f'{array(posterior.means)[likely].round(3)} m', flush=True)
+          f'{array(posterior.means)[likely, :3].round(3)} m', flush=True)
 
 
 if __name__ == '__main__':

@@ -185,7 +185,8 @@ def mode_bars(message: m.Posterior, origin: np.ndarray, surface: np.ndarray) -> 
 
     Ranges are distances from the centre of the surface, float64 [3] [m].
     """
-    errors = np.linalg.norm(message.means - surface, axis=1) - np.linalg.norm(origin - surface)
+    ranges = np.linalg.norm(message.means[:, :3] - surface, axis=1)
+    errors = ranges - np.linalg.norm(origin - surface)
     probabilities, _ = mixture_weights(message.log_weights)
     return Lines(tuple(_line(error, HEIGHT_M * probability) for error, probability in zip(
         errors.tolist(), probabilities.tolist(), strict=True)),
@@ -303,7 +304,7 @@ class NetworkView:
                 yield path, points
                 yield f'{path}/ellipsoids', ellipsoids
                 yield f'{MODES}/found', mode_bars(
-                    message, self._origins.get(message.cycle_id, message.means[0]),
+                    message, self._origins.get(message.cycle_id, message.means[0, :3]),
                     self._scenario.pose.origin)
             case m.NoFix():
                 path = _path(message.user)

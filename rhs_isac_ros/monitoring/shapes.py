@@ -243,10 +243,10 @@ def modes(message: m.Posterior) -> tuple[Points, Ellipsoids]:
     """
     probabilities, _ = mixture_weights(message.log_weights)
     chosen = probabilities >= _MIN_PROBABILITY
-    strength, means = np.cbrt(probabilities[chosen])[:, None], message.means[chosen]
+    strength, means = np.cbrt(probabilities[chosen])[:, None], message.means[chosen, :3]
     colours = strength * user_colour(message.user) + (1 - strength) * np.array(_GREY)
     return (Points(means, colours, _MODE_RADIUS_M * strength[:, 0]),
-            _ellipsoids(means, message.covariances_m2[chosen], colours))
+            _ellipsoids(means, message.covariances_m2[chosen, :3, :3], colours))
 
 
 def path(user: int, positions: Iterable[np.ndarray]) -> Lines:

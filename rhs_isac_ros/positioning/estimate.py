@@ -10,7 +10,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.arrays import numbers, position_problem
 from rhs_isac_ros.model.gaussian import symmetric
-from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.mixture import Mixture, with_velocities
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.support.fields import finite
 
@@ -38,8 +38,8 @@ class Sighting:
 
     pose: Pose
     #: Likelihood as a density with moments in the frame of the site, D = 3, as if the pose were
-    #: exact. With `sheets`, the moments are those in the region. Without, its Gaussians touch the
-    #: sheets at their maxima.
+    #: exact; D = 6, with the declared density of velocities, if users move. With `sheets`, the
+    #: moments are those in the region. Without, its Gaussians touch the sheets at their maxima.
     mixture: Mixture
     #: Probability that the mixture does not contain the position of the user.
     missing: float = MISS_PROBABILITY
@@ -59,7 +59,7 @@ class Sighting:
     @property
     def likelihood(self) -> Sheets:
         """The sheets; raises ValueError if those of the mixture are behind the surface."""
-        return self.sheets or Sheets.tangent(self.mixture, self.pose)
+        return self.sheets or Sheets.tangent(self.mixture.position(), self.pose)
 
     @classmethod
     def of(cls, estimate: 'Estimate', pose: Pose | None = None) -> 'Sighting | None':
@@ -185,6 +185,20 @@ class Estimate:
     def fix(self) -> np.ndarray:
         """Whether there is a position, bool [] or [N]."""
         return np.isfinite(self.mean).all(axis=-1)
+
+    def with_velocities(self, others: Sequence[Mixture], variance: np.ndarray) -> 'Estimate':
+        """Add those of the mixtures that have velocities; see the function `with_velocities`."""
+        moving = [one for one in others if one.means.shape[1] > 3]
+        if not moving or self.mixture is None:
+            return self
+        return self.moving(with_velocities(self.mixture, moving, variance))
+
+    def moving(self, mixture: Mixture) -> 'Estimate':
+        """Return the estimate with the moments of a mixture with velocities."""
+        mean, covariance = mixture.moments()
+        return dataclasses.replace(
+            self, mean=mean[:3], covariance=covariance[:3, :3], velocity=mean[3:],
+            velocity_covariance=covariance[3:, 3:], density=mixture)
 
     def to_site(self, pose: Pose) -> 'Estimate':
         """Convert from the frame of a surface to that of the site, with the errors of its pose.

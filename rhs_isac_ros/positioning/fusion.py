@@ -33,7 +33,7 @@ from rhs_isac_ros.model.geometry import jacobian, polar_derivative, to_polar, to
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.alternatives import Outside, log_odds_of, rejection
 from rhs_isac_ros.positioning.estimate import SITE, Estimate, Sighting, regular
-from rhs_isac_ros.positioning.mixture import Mixture, log_volume
+from rhs_isac_ros.positioning.mixture import Mixture, log_volume, velocity_variance
 from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.positioning.sheets import Inside, log_values, move_inside
 from rhs_isac_ros.positioning.templates import standard_normal
@@ -91,16 +91,16 @@ class _Limits(NamedTuple):
 _LIMITS = _Limits()
 
 
-def fuse(sightings: Sequence[Sighting], bounds_m: np.ndarray, outside_probability: float = 0.0
-         ) -> Estimate:
+def fuse(sightings: Sequence[Sighting], bounds_m: np.ndarray, outside_probability: float = 0.0,
+         user_speed_std_mps: float = 0.0) -> Estimate:
     """Multiply the likelihoods of the surfaces, for a user between the bounds of the region.
 
     The bounds, float64 [2, 3] [m], and the result are in the frame of the site. The prior
     probability of a user outside of the region is from 0 to less than 1. If that of all sightings
-    exceeds `alternatives.LIMIT`, the result is a reason; with 0, users are inside. Raises
-    ValueError without sightings, or if one has no density in the region.
+    exceeds `alternatives.LIMIT`, the result is a reason; with 0, users are inside. Velocities have
+    the given prior. Raises ValueError without sightings, or if one has no density in the region.
     """
-    return Fuser(bounds_m, outside_probability).fuse(sightings)
+    return Fuser(bounds_m, outside_probability, user_speed_std_mps).fuse(sightings)
 
 
 class Fuser:
@@ -109,9 +109,11 @@ class Fuser:
     The products of sightings that begin in the same way share their first factors.
     """
 
-    def __init__(self, bounds_m: np.ndarray, outside_probability: float = 0.0) -> None:
-        """Take the bounds of the region and the prior probability; see the function `fuse`."""
+    def __init__(self, bounds_m: np.ndarray, outside_probability: float = 0.0,
+                 user_speed_std_mps: float = 0.0) -> None:
+        """Take the bounds of the region and what is known of users; see the function `fuse`."""
         self._bounds_m, self._outside_probability = bounds_m, outside_probability
+        self._velocity_variance = velocity_variance(user_speed_std_mps, bounds_m)
         self._factor = functools.cache(lambda one: _Factor.of(one, bounds_m))
         self._product = functools.cache(self._multiply)
         self._fused = functools.cache(self._locate)
@@ -148,13 +150,15 @@ class Fuser:
             common['outside_probability'] = probability
             if reason := rejection(Outside, probability, 1 - probability):
                 return Estimate.without_fix(reason, **common)
-        return Estimate(*products.moments.moments(), density=functools.cache(
-            functools.partial(products.mixture, factors)), **common)
+        return Estimate(*products.moments.moments(), density=functools.cache(functools.partial(
+            products.mixture, factors)), **common).with_velocities(
+                [one.mixture for one in sightings], self._velocity_variance)
 
 
 def _log_share_of(mixture: Mixture, bounds_m: np.ndarray) -> float:
     """Return the logarithm of the probability of a region, or minus infinity."""
     free = np.ptp(bounds_m, axis=0) > 0
+    mixture = mixture.position()
     positions = mixture.means[:, None] + np.matmul(
         standard_normal(_LIMITS.of_sheet),
         np.swapaxes(np.linalg.cholesky(mixture.covariances), 1, 2))

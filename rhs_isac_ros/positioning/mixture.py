@@ -4,6 +4,7 @@ A mixture represents the posterior of one cycle, from one or several surfaces. I
 Cartesian coordinates. Where a component is a curved sheet around a surface, `fusion` bends it.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -19,6 +20,10 @@ MAX_COMPONENTS = 48
 _MERGE_DISTANCE = 1.0
 # Components whose log-weight is below the heaviest by more than this are discarded.
 _WEIGHT_MARGIN = 18.0
+# Standard deviation of components of velocities that are 0, so that covariances have inverses.
+_FIXED_MPS = 1e-5
+# Largest share of the information of a component that a prior is taken to be.
+_MOST_OF_PRIOR = 0.999
 # Largest difference from a symmetric matrix, relative to the largest element.
 _ASYMMETRY = 1e-6
 _MixtureT = TypeVar('_MixtureT', bound='Mixture')
@@ -137,10 +142,47 @@ class Mixture(_Arrays):
                              covariances=factor * self.covariances)
 
     def moved(self, before: Pose, after: Pose) -> 'Mixture':
-        """Return the position as if a surface with one pose had another pose."""
+        """Return the mixture as if a surface with one pose had another pose."""
         turn = after.rotation @ before.rotation.T
-        return self._replace(means=after.to_site(before.to_surface(self.means)),
-                             covariances=turn @ self.covariances @ turn.T)
+        whole = np.kron(np.eye(self.means.shape[1] // 3), turn)
+        means = self.means @ whole.T
+        means[:, :3] = after.to_site(before.to_surface(self.means[:, :3]))
+        return self._replace(means=means, covariances=whole @ self.covariances @ whole.T)
+
+    def velocities(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return means [T, 3] and covariances [T, 3, 3] of the velocity at positions [T, 3].
+
+        The last result, [T, 3, 3] [1/s], is the derivative of the means of the components.
+        """
+        place, cross = self.covariances[:, :3, :3], self.covariances[:, 3:, :3]
+        slopes = cross @ np.linalg.inv(place)
+        offsets = positions[:, None] - self.means[:, :3]
+        log_density, _ = overlap(offsets, np.broadcast_to(place, (*offsets.shape, 3)))
+        shares, _ = mixture_weights(self.log_weights + log_density)
+        means = self.means[:, 3:] + np.matmul(slopes, offsets[..., None])[..., 0]
+        within = self.covariances[:, 3:, 3:] - slopes @ np.swapaxes(cross, 1, 2)
+        mean, between = moments(shares, means)
+        return (mean, symmetric(np.tensordot(shares, within, axes=1) + between),
+                np.tensordot(shares, slopes, axes=1))
+
+    def without_prior(self, variance: np.ndarray) -> 'Mixture':
+        """Divide by the density of velocities before the signals, D = 6.
+
+        That density is Gaussian around 0 with the covariance `variance`, [3, 3] [m^2/s^2]. The
+        product of the result with it has the weights of this mixture.
+        """
+        information = np.zeros((6, 6))
+        information[3:, 3:] = np.linalg.inv(variance)
+        roots = np.linalg.cholesky(self.covariances)
+        # Moments of samples may exceed those of the prior.
+        shares, axes = np.linalg.eigh(np.swapaxes(roots, 1, 2) @ information @ roots)
+        left = 1 / (1 - np.clip(shares, 0.0, _MOST_OF_PRIOR))
+        covariances = roots @ (axes * left[:, None]) @ np.swapaxes(roots @ axes, 1, 2)
+        means = np.matmul(covariances, np.linalg.solve(
+            self.covariances, self.means[..., None]))[..., 0]
+        log_density, _ = overlap(means[:, 3:], covariances[:, 3:, 3:] + variance)
+        return self._replace(log_weights=self.log_weights - log_density, means=means,
+                             covariances=symmetric(covariances))
 
     def or_within(self, centre_m: np.ndarray, covariance: np.ndarray, probability: float
                   ) -> 'Mixture':
@@ -259,6 +301,44 @@ class Mixture(_Arrays):
         size = means.shape[1]
         covariances = (shares @ spread.reshape(len(group), -1)).reshape(-1, size, size)
         return self._replace(log_weights=log_weights, means=means, covariances=covariances)
+
+
+def velocity_variance(std_mps: float, bounds_m: np.ndarray) -> np.ndarray:
+    """Return the covariance of the velocities of users before any signals, [3, 3] [m^2/s^2].
+
+    They have components only along the axes with an extent between the bounds, [2, 3] [m].
+    """
+    return np.diag(std_mps**2 * (np.ptp(bounds_m, axis=0) > 0) + _FIXED_MPS**2)
+
+
+def with_velocities(
+        places: Mixture, others: Sequence[Mixture], variance: np.ndarray) -> Mixture:
+    """Add the velocities of mixtures with D = 6 to a mixture of positions.
+
+    Each component has the product of their densities at its mean; the mass becomes 1. All of them
+    contain the same density before the signals, with a variance [3, 3] [m^2/s^2]; see
+    `Mixture.without_prior`.
+    """
+    first, *rest = others
+    mean, within, slope = first.velocities(places.means)
+    log_weights = places.log_weights
+    for one in rest:
+        other, spread, other_slope = one.without_prior(variance).velocities(places.means)
+        log_density, precision = overlap(other - mean, within + spread)
+        gain = np.matmul(within, precision)
+        log_weights = log_weights + log_density
+        mean = mean + np.matmul(gain, (other - mean)[..., None])[..., 0]
+        slope = slope + np.matmul(gain, other_slope - slope)
+        within = symmetric(within - np.matmul(gain, within))
+    cross = np.matmul(slope, places.covariances)
+    covariances = np.concatenate([
+        np.concatenate([places.covariances, np.swapaxes(cross, 1, 2)], axis=2),
+        np.concatenate([cross, within + np.matmul(cross, np.swapaxes(slope, 1, 2))], axis=2)],
+        axis=1)
+    found = Mixture._make((
+        log_weights, np.hstack([places.means, mean]), symmetric(covariances))).normalised()
+    found.constant_covariance = places.constant_covariance
+    return found
 
 
 def overlap(offsets: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -83,9 +83,14 @@ class Site:
                         for name, value in content['surfaces'].items()}, bounds_m)
 
     @property
-    def outside_probability(self) -> float:
-        """Prior probability of a user outside of the region, that of the leader."""
-        return self.surfaces[self.leader].scenario.outside_probability
+    def users(self) -> tuple[float, float]:
+        """What `fuse` assumes of users, by the leader's scenario.
+
+        The prior probability that a user is outside of the region, and the standard deviation of
+        each component of the velocity [m/s].
+        """
+        scenario = self.surfaces[self.leader].scenario
+        return scenario.outside_probability, scenario.user_speed_std_mps
 
     @property
     def leader(self) -> str:
@@ -143,7 +148,7 @@ class SiteEstimator:
         agreements, places = [], []
         for _, sightings in self._each(
                 self._site.sample(rng.uniform(low, high, size=(n, 3)), rng)):
-            fuser = Fuser(self._site.bounds_m, self._site.outside_probability)
+            fuser = Fuser(self._site.bounds_m, *self._site.users)
             # In the order of the pairs, so that products are reused.
             if sightings and (fused := fuser.fuse(
                     [one for _, one in sorted(sightings.items())])).fix:
@@ -166,8 +171,7 @@ class SiteEstimator:
     def _fused(self, posteriors: Mapping[str, Estimate], sightings: Mapping[str, Sighting]
                ) -> Estimate:
         if sightings:
-            return fuse(list(sightings.values()), self._site.bounds_m,
-                        self._site.outside_probability)
+            return fuse(list(sightings.values()), self._site.bounds_m, *self._site.users)
         return Estimate.without_fix('; '.join(
             f'{name}: {one.reason}' for name, one in posteriors.items()), frame=SITE)
 

@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.model.multipath import time_correlation
 from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT, LIMIT
 from rhs_isac_ros.positioning.estimate import SITE, Estimate, SignalError
 from rhs_isac_ros.positioning.estimators import SearchEstimator
-from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.mixture import Mixture, velocity_variance
 from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.support.fields import finite, to_number
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -79,8 +79,10 @@ class Motion:
         return self.speed_mps**2 / 3
 
     def start(self, mixture: Mixture) -> Mixture:
-        """Add velocities of the stationary process to a mixture of positions."""
-        n = len(mixture.means)
+        """Add velocities of the stationary process to a mixture without velocities."""
+        n, size = mixture.means.shape
+        if size > 3:
+            return mixture
         covariances = np.zeros((n, 6, 6))
         covariances[:, :3, :3] = mixture.covariances
         covariances[:, 3:, 3:] = self.velocity_variance * np.eye(3)
@@ -155,7 +157,7 @@ class MixtureTracker:
 
     def __init__(self, scenario: Scenario, bounds_m: np.ndarray, motion: Motion) -> None:
         self._scenario, self._motion = scenario, motion
-        self._centre_m, self._size_m = bounds_m.mean(axis=0), np.ptp(bounds_m, axis=0)
+        self._users = _Users.of(scenario, bounds_m, Pose())
         self._mixture: Mixture | None = None
         self._time_s, self._n_phases = -np.inf, 0
 
@@ -181,22 +183,47 @@ class MixtureTracker:
         share = independent_share(self._scenario, elapsed_s)
         if share < LIMITS.least_share:
             return self._described(predicted, constant)
-        predicted = predicted.or_within(
-            self._centre_m, np.diag(self._size_m**2), LIMITS.loss_rate_hz * elapsed_s)
-        seen = predicted.product(likelihood.fresh.powered(share)).weighted(np.log1p(-missing))
-        unseen = predicted.weighted(np.log(missing) - np.log(self._size_m).sum())
-        self._mixture = concatenate(seen, unseen).normalised().reduce(LIMITS.max_components)
+        self._mixture = self._users.updated(predicted, likelihood, missing, share, elapsed_s)
         self._time_s = time_s
         self._n_phases += 1
         return self._described(self._mixture, constant)
 
     def _described(self, mixture: Mixture, constant: np.ndarray) -> Estimate:
-        mixture = mixture.shared(constant)
-        mean, covariance = mixture.moments()
-        return Estimate(
-            mean[:3], covariance[:3, :3], velocity=mean[3:],
-            velocity_covariance=covariance[3:, 3:], n_phases=self._n_phases, density=mixture,
-            frame=SITE)
+        return Estimate.without_fix('', n_phases=self._n_phases, frame=SITE).moving(
+            mixture.shared(constant))
+
+
+class _Users(NamedTuple):
+    """What is known of users without signals, in the frame of the site."""
+
+    centre_m: np.ndarray  # Of the region, float64 [3].
+    squares_m2: np.ndarray  # Squared edges of the region as a covariance, float64 [3, 3].
+    log_volume: float
+    velocity: np.ndarray  # Covariance of velocities in a cycle, float64 [3, 3] [m^2/s^2].
+
+    @classmethod
+    def of(cls, scenario: Scenario, bounds_m: np.ndarray, pose: Pose) -> '_Users':
+        """Take the bounds of the region around a pose, float64 [2, 3] [m]."""
+        size_m = np.ptp(bounds_m, axis=0)
+        return cls(pose.to_site(bounds_m.mean(axis=0)),
+                   pose.covariances_to_site(np.diag(size_m**2)), float(np.log(size_m).sum()),
+                   pose.covariances_to_site(
+                       velocity_variance(scenario.user_speed_std_mps, bounds_m)))
+
+    def updated(self, predicted: Mixture, likelihood: Mixture, missing: float, share: float,
+                elapsed_s: float) -> Mixture:
+        """Multiply a prediction by a likelihood of positions, or also of velocities.
+
+        The arguments are those of `MixtureTracker.update`.
+        """
+        likelihood = likelihood.fresh
+        if likelihood.means.shape[1] > 3:
+            likelihood = likelihood.without_prior(self.velocity)
+        predicted = predicted.or_within(
+            self.centre_m, self.squares_m2, LIMITS.loss_rate_hz * elapsed_s)
+        seen = predicted.product(likelihood.powered(share)).weighted(np.log1p(-missing))
+        unseen = predicted.weighted(np.log(missing) - self.log_volume)
+        return concatenate(seen, unseen).normalised().reduce(LIMITS.max_components)
 
 
 class Tracker:
@@ -213,6 +240,8 @@ class Tracker:
 
     def __init__(self, estimator: SearchEstimator, motion: Motion | None = None) -> None:
         self.estimator, self._motion = estimator, motion or Motion()
+        scenario = estimator.scenario
+        self._users = _Users.of(scenario, scenario.roi_bounds_m, scenario.pose)
         #: Posterior after the latest phase; None before the first one. Its sighting is that of the
         #: signals of this phase alone.
         self.latest: Estimate | None = None
@@ -248,9 +277,8 @@ class Tracker:
         predicted = self._motion.predict(self._mixture._replace(
             log_weights=self._mixture.log_weights * (
                 1 - shared * min(n_before, 1.0) / (1 + n_before * shared))), elapsed_s)
-        found = self.latest = self.estimator.posterior(
-            received, predicted if is_new else None, share=share,
-            wrong=LIMITS.loss_rate_hz * elapsed_s, n_before=n_before)
+        found = self.latest = self._posterior(received, predicted, elapsed_s, n_before) if (
+            is_new) else self.estimator.posterior(received)
         if not found.fix:
             return self._predicted(time_s, found)
         self._latest_s = time_s
@@ -261,6 +289,23 @@ class Tracker:
         self._constant = found.unbounded.constant_covariance
         self._n_phases += 1
         return self._described(found, self._mixture)
+
+    def _posterior(self, received: np.ndarray, predicted: Mixture, elapsed_s: float,
+                   n_before: float) -> Estimate:
+        """Return the posterior for a prediction; see `SearchEstimator.posterior`."""
+        estimator, share = self.estimator, independent_share(self.estimator.scenario, elapsed_s)
+        if not estimator.scenario.user_speed_std_mps:
+            return estimator.posterior(
+                received, predicted, share=share, wrong=LIMITS.loss_rate_hz * elapsed_s,
+                n_before=n_before)
+        # The posterior of users who move has velocities, which the prediction has, too.
+        found = estimator.posterior(received)
+        if found.sighting is None or not found.fix:
+            return found
+        mixture = self._users.updated(predicted, found.sighting.mixture.normalised(),
+                                      found.sighting.missing, share, elapsed_s)
+        return estimator.restricted(
+            estimator.in_front(mixture, LIMITS.elsewhere), found, self._constant)
 
     def predict(self, time_s: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Predict the position at a time [s] after the latest phase, in the surface's frame.
@@ -285,6 +330,8 @@ class Tracker:
         if not found.fix:
             return self._predicted(time_s, found)
         begin = self.estimator.begin(found)
+        if self.estimator.scenario.user_speed_std_mps and found.mixture:
+            begin = found.mixture
         mixture = self._motion.start(begin.fresh)
         if time_s > self._latest_s:
             self._mixture, self._time_s, self._latest_s = mixture, time_s, time_s

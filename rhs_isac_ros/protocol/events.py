@@ -190,7 +190,7 @@ class RevertSettings:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PublishTrack:
-    """Publish the estimated position and velocity of a tracked user.
+    """Publish the estimated position and velocity of a user.
 
     `stamp_ns` is the time of the measurement, as in `Message`.
     """

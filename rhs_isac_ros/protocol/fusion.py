@@ -99,7 +99,7 @@ class Fusion(Role):
                  settings: FusionSettings | None = None) -> None:
         super().__init__()
         self._bounds_m, self._stopwatch = site.bounds_m, stopwatch
-        self._outside_probability = site.outside_probability
+        self._users = site.users
         self._surfaces, self._scenario = site.surfaces, site.surfaces[site.leader].scenario
         for one in site.surfaces.values():
             one.prepare()
@@ -208,7 +208,7 @@ class Fusion(Role):
         begin = self._stopwatch()
         sightings = {name: sighting_of(one) for name, one in fix.posteriors.items()}
         # Anything may be published on the topic, such as a mixture inside the surface.
-        fuser = Fuser(self._bounds_m, self._outside_probability)
+        fuser = Fuser(self._bounds_m, *self._users)
         try:
             fused = fuser.fuse([self._trusted(name, one) for name, one in sightings.items()])
             agreements = pair_agreements(sightings, fuser) if self._test else {}
@@ -224,7 +224,7 @@ class Fusion(Role):
         if self._test and all(
                 one.outside_probability <= LIMIT for one in fix.posteriors.values()):
             place = fused.mean if fused.fix else next(iter(
-                sightings.values())).mixture.moments()[0]
+                sightings.values())).mixture.position().moments()[0]
             self._test.add(agreements, place)
             self._examine(self._test.suspects())
 

@@ -362,9 +362,10 @@ class Posterior(Message):
     user_instance: int = 0
     codebook_id: str
     log_weights: np.ndarray = array('COMPONENTS')
-    means: np.ndarray = array('COMPONENTS 3', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M)
+    #: Positions, or positions and velocities, and their covariances.
+    means: np.ndarray = array('COMPONENTS D', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M)
     covariances_m2: np.ndarray = array(
-        'COMPONENTS 3 3', low=-MAX_COORDINATE_M**2, high=MAX_COORDINATE_M**2)
+        'COMPONENTS D D', low=-MAX_COORDINATE_M**2, high=MAX_COORDINATE_M**2)
     log_evidence: float
     missing_probability: float = number(1e-9, 1 - 1e-9)
     outside_probability: float = number(0, 1, default=0.0)
@@ -383,8 +384,9 @@ class Posterior(Message):
     misfit_log_ratio: float = optional_float(math.nan)
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return the numbers of Gaussians, COMPONENTS and SHEETS."""
-        return {'COMPONENTS': len(self.log_weights), 'SHEETS': len(self.sheet_log_weights)}
+        """Return the numbers of Gaussians, COMPONENTS and SHEETS, and their dimension D."""
+        return {'COMPONENTS': len(self.log_weights), 'SHEETS': len(self.sheet_log_weights),
+                'D': 6 if self.means.shape[1:] == (6,) else 3}
 
     def own_problem(self) -> str:
         """Describe a mixture without a density, a pose that is none, or means behind it."""
@@ -400,7 +402,7 @@ class Posterior(Message):
             pose = self.surface_pose
         except ValueError as error:
             return f'surface_{error}'
-        problem = position_problem(pose.to_surface(self.means))
+        problem = position_problem(pose.to_surface(self.means[:, :3]))
         return f'means: {problem}' if problem else ''
 
     @property

@@ -408,10 +408,9 @@ class Positioner(Role):
         return proposal(self._library, self._tracks.predict(user))
 
     def _publish_track(self, received: m.ReceivedSignals, estimate: Estimate) -> None:
-        user, loss = received.user, None
-        if estimate.n_phases:
+        user, loss = received.user, _Loss.BLOCKED if estimate.is_predicted else None
+        if np.isfinite(estimate.velocity).all():
             self.act(events.PublishTrack(user, estimate, received.stamp_ns))
-            loss = _Loss.BLOCKED if estimate.is_predicted else None
         self._log_change(received, loss, f'the track of user {user} predicts its position: '
                          f'{describe_doubts(estimate)}')
 

@@ -387,13 +387,14 @@ class Mismatches:
         return self._texts
 
     def _find(self, topic: str, before: Mapping[str, float]) -> Iterator[tuple[str, str]]:
-        own = self._node.get_fully_qualified_name()
-        for publisher, subscription in itertools.product(
-                self._node.get_publishers_info_by_topic(topic),
-                self._node.get_subscriptions_info_by_topic(topic)):
-            mine, other = ((publisher, subscription) if full_name(publisher) == own else
-                           (subscription, publisher))
-            if full_name(mine) != own:
+        own, endpoints = self._node.get_fully_qualified_name(), [
+            *self._node.get_publishers_info_by_topic(topic),
+            *self._node.get_subscriptions_info_by_topic(topic)]
+        for mine, other in itertools.product(
+                (one for one in endpoints if full_name(one) == own), endpoints):
+            # Two publishers of a type have nothing to exchange.
+            kind = 'qos' if other.topic_type == mine.topic_type else 'type'
+            if kind == 'qos' and other.endpoint_type == mine.endpoint_type:
                 continue
             name = full_name(other)
             if other.node_name in UNNAMED:
@@ -403,13 +404,14 @@ class Mismatches:
                     self._are_named = False
                     continue
                 name = f'DDS endpoint {gid}'
-            compatibility, reason = qos_check_compatible(
-                publisher.qos_profile, subscription.qos_profile)
-            kind = 'qos'
-            if other.topic_type != mine.topic_type:
-                kind, reason = 'type', f'type {other.topic_type}, expected {mine.topic_type}'
-            elif compatibility != QoSCompatibility.ERROR:
-                continue
+            reason = f'type {other.topic_type}, expected {mine.topic_type}'
+            if kind == 'qos':
+                publisher, subscription = sorted(
+                    (mine, other), key=lambda endpoint: endpoint.endpoint_type)
+                compatibility, reason = qos_check_compatible(
+                    publisher.qos_profile, subscription.qos_profile)
+                if compatibility != QoSCompatibility.ERROR:
+                    continue
             reason = reason.removeprefix('ERROR: ').rstrip(';. ')
             yield (f'conflict.{kind}.{topic.lstrip("/")}.{name.lstrip("/").replace(" ", "_")}',
                    f'{topic}: no messages between this node and {name}: {reason}')

@@ -421,7 +421,8 @@ class SiteRecording(Recording):
                 if posterior.fix:
                     again[name][key] = posterior.to_site(scenario.pose).mean
             if sightings and (fused := fuse(
-                    sightings, self._networks.bounds_m, leader.outside_probability)).fix:
+                    sightings, self._networks.bounds_m, leader.outside_probability,
+                    leader.user_speed_std_mps)).fix:
                 again[''][key] = fused.mean
         return again
 

@@ -47,6 +47,7 @@ def test_compressed_rows_match_the_vectors_to_a_multiple_of_the_tolerance(case, 
 SIZES = [(1, 3, 2, 2, 3), (2, 2, 3, 1, 3), (3, 1, 2, 3, 2), (2, 2, 1, 2, 4), (1, 1, 4, 3, 4)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
 @pytest.mark.parametrize('sizes', SIZES)
 def test_gradients_are_the_limit_of_differences_of_plain_bounds(

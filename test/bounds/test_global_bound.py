@@ -18,6 +18,7 @@ def bound_and_codebook(n_phases=1024, **fields):
     return scenario, codebook, bound
 
 
+@pytest.mark.slow
 def test_without_signal_the_bound_is_the_variance_of_the_region():
     scenario, _, bound = bound_and_codebook(256, max_power_w=1e-15, noise_psd_dbm_hz=0.0)
     assert bound.value == pytest.approx(

@@ -98,6 +98,7 @@ def test_the_cost_contains_the_error_probability_of_a_likelihood_decision(
     assert wrong == pytest.approx(expected, abs=4 * math.sqrt(expected / n_draws))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
 @pytest.mark.parametrize('seed', [0, 1, 2])
 def test_gradients_are_the_limit_of_differences_of_the_value(
@@ -166,6 +167,7 @@ def test_a_sample_of_all_pairs_has_the_cost_and_the_gradients_of_all_pairs(many,
     assert_near(sample(codebook), many(codebook), 1e-5)
 
 
+@pytest.mark.slow
 def test_the_mean_over_samples_is_the_cost_of_all_pairs(many, codebook, random_beams, scenario):
     """Also for another codebook than that of the samples, whose costs scatter more."""
     other = random_beams(scenario, np.random.default_rng(5))

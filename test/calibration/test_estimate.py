@@ -48,6 +48,7 @@ def test_a_surface_is_recovered(scenario, beams, damaged, send, changes):
     assert excess_energy(plain, beams, surface, None) > 10.0
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_the_errors(scenario, beams, damaged, send, truth):
     """Over several surfaces, the normalised errors of all numbers have unit variance."""
     normalised = []
@@ -133,6 +134,7 @@ def test_several_codebooks_reveal_more_of_the_elements(scenario, damaged, send, 
     assert together.std()[:25].mean() < 0.8 * alone.std()[:25].mean()
 
 
+@pytest.mark.slow
 def test_estimators_use_the_surface(scenario, beams, damaged, send):
     """With errors close to those of exact knowledge, and consistent covariances.
 

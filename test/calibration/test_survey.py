@@ -71,6 +71,7 @@ def test_fields_are_those_of_the_hall(estimate):
     assert estimate.about['prior_weight'] > 200
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_the_hall(estimate, beams):
     measured = MeasurementModel(dataclasses.replace(DECLARED, multipath=estimate), beams)
     true = MeasurementModel(HALL, beams)

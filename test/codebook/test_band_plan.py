@@ -51,6 +51,7 @@ def errors(plans):
     return range_confusion_error(plans, np.array([50.0, 200.0]), 12.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('n_bands', [2, 3, 4])
 @pytest.mark.parametrize('seed', range(2))
 def test_the_coordinate_search_finds_the_best_plan_of_a_small_raster(n_bands, seed):

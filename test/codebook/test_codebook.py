@@ -187,6 +187,7 @@ SHIPPED = {'codebook.yaml': 'ambiguity', 'codebook_ambiguity.yaml': 'ambiguity',
            'codebook_crlb.yaml': 'crlb'}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', SHIPPED)
 def test_shipped_codebooks_are_feasible_and_match_their_metadata(name):
     """On held-out positions; observing all elements would give about 0.018 m^2."""

@@ -51,6 +51,7 @@ def test_the_codebook_is_that_of_the_nearest_cell_with_the_next_wider_spread(bui
     assert built.codebook_at(place, 0.5) is None
 
 
+@pytest.mark.slow
 def test_a_codebook_has_a_lower_objective_in_its_cell(built, start):
     for number in (0, 6):
         cell = built.plan.cells(SCENARIO)[number]

@@ -56,6 +56,7 @@ CASES = {
 GRADIENT = pytest.mark.parametrize('case', CASES.values(), ids=CASES)
 
 
+@pytest.mark.slow
 @GRADIENT
 @pytest.mark.parametrize('seed', range(3))
 def test_finds_the_minimum_and_counts_every_evaluation(quadratic, search_of, case, seed):
@@ -85,6 +86,7 @@ def test_begins_at_the_start_and_stops_at_the_limit_of_steps(
         assert reason == case.at_limit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('unit', [2.0**-40, 2.0**10, 2.0**40])
 @pytest.mark.parametrize('minimize', [minimize_exactly, minimize_direct])
 def test_the_unit_of_the_objective_does_not_matter(quadratic, search_of, minimize, unit):
@@ -260,6 +262,7 @@ def search_from(problem, scenario):
     return make
 
 
+@pytest.mark.slow
 def test_samples_lead_to_the_value_that_all_pairs_lead_to(search_from):
     search, plain = search_from(120), search_from(60)
     methods.minimize_sampled(search, ROUNDS)
@@ -370,6 +373,7 @@ def test_optimised_levels_beat_rounding(continuous, levels):
     assert result.codebook.average_crlb_m2 == pytest.approx(found, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_the_penalty_moves_the_amplitudes_to_the_levels(monkeypatch):
     rounds = []
 

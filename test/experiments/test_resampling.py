@@ -44,6 +44,7 @@ def test_the_interval_of_many_cases_is_that_of_their_standard_error():
     assert (value, high - low) == pytest.approx((results.mean(), 2 * 1.96 / 4000**0.5), rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('members', [2, 5])
 def test_intervals_of_few_members_have_their_nominal_coverage(members):
     rng, inside, variances = np.random.default_rng(0), 0, []

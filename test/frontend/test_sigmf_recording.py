@@ -90,6 +90,7 @@ def cycles(n):
     return [(cycle, band) for cycle in range(1, n + 1) for band in (0, 1)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('radio', [WaveformRadio, Float32Radio])
 def test_playback_yields_the_same_signals_bit_for_bit(tmp_path, radio):
     _, feeds = record(tmp_path / 'samples', cycles(N_CYCLES), radio)

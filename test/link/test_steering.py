@@ -145,6 +145,7 @@ def test_choosing_from_no_band_is_an_error(table1):
         choose_beam(table1.scenario, POSITION, np.eye(3), [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('band', [0, 1])
 def test_capacities_of_the_outcome_match_the_reference(table1, reference_link, band):
     scenario, link = table1.scenario, reference_link(table1, band)

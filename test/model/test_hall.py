@@ -452,6 +452,7 @@ def test_many_elements_have_the_same_spatial_covariance(measured, request):
             found.scatter(rows), product, atol=1e-12 * np.abs(product).max())
 
 
+@pytest.mark.slow
 def test_both_simulations_have_the_measured_covariance(measured, beams, target):
     positions = np.tile(measured.roi_center_m, (N, 1))
     model = MeasurementModel(measured, beams)

@@ -39,6 +39,7 @@ def test_mean_los_power_is_the_adaptive_integral(other, band):
     assert mp.mean_los_power(other, band) == pytest.approx(expected, rel=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('band', 'm', 'n'), [(0, 0, 8), (1, 0, 1), (1, 7, 3), (1, 2, 6)])
 @pytest.mark.parametrize('direction', [(0.0, 0.0), (40.0, 0.0), (0.0, -25.0), (-60.0, 80.0)])
 def test_covariance_is_the_adaptive_integral(other, plain, direction, band, m, n):

@@ -170,6 +170,7 @@ def test_residuals_of_the_model_cause_no_warning():
     assert test.ratio == pytest.approx(1, abs=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('scale', [0.93, 1.07])
 def test_slightly_wrong_residuals_cause_a_warning_after_some_fixes(scale):
     values = energies(4 * WINDOW, scale)
@@ -191,6 +192,7 @@ def test_residuals_that_vary_too_much_cause_a_warning():
     assert not filled(mean + values - EXPECTED).drifts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('shape', [1.0, 10.0, 62.5])
 def test_the_variance_of_the_model_causes_no_warning(shape):
     """Energies of few measurements have a skewed distribution."""
@@ -294,6 +296,7 @@ def located(world, codebook, estimator):
     return estimator.estimate(simulate_received(world, codebook, positions, rng))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('change', 'cause'), [
     ({'multipath_to_los_db': Scenario().multipath_to_los_db + 6}, LEVEL),
     ({'delay_spread_s': 2 * Scenario().delay_spread_s}, SPREAD),

@@ -102,6 +102,7 @@ def test_narrow_peaks_leave_too_few_effective_draws(codebook):
     assert drawn.fit(query, 0) is None
 
 
+@pytest.mark.slow
 def test_estimates_from_draws_agree_with_those_from_modes(codebook):
     """Laplace's method is rough below the noise, but the modes are at the right places."""
     estimator, rng = make_estimator('bayes', WEAK, codebook), np.random.default_rng(2)

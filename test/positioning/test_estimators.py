@@ -33,6 +33,7 @@ def squared_normalised(errors, covariances):
     return np.einsum('nu,nu->n', errors, np.linalg.solve(covariances, errors[..., None])[..., 0])
 
 
+@pytest.mark.slow
 def test_the_covariance_describes_the_errors_on_table_1(table1_estimates):
     """The squared normalised error of three coordinates is 3 on average."""
     positions, _, estimate = table1_estimates

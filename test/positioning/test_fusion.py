@@ -64,6 +64,38 @@ def integrated(sightings, bounds=BOUNDS, n=400_000, std=STD):
     return mean, (positions - mean).T @ ((positions - mean) * weights[:, None])
 
 
+def with_velocity(sighting, velocity, std_mps=1.0, radial_mps=0.02):
+    """Add a velocity that is known along the line of sight, and otherwise has the prior."""
+    mean, covariance = sighting.mixture.moments()
+    sight = mean - sighting.pose.origin
+    sight /= np.linalg.norm(sight)
+    information = np.eye(3) / std_mps**2 + np.outer(sight, sight) / radial_mps**2
+    joint = np.zeros((1, 6, 6))
+    joint[0, :3, :3], joint[0, 3:, 3:] = covariance, np.linalg.inv(information)
+    along = joint[0, 3:, 3:] @ sight * (sight @ velocity) / radial_mps**2
+    return dataclasses.replace(sighting, mixture=Mixture(
+        np.zeros(1), np.concatenate([mean, along])[None], joint))
+
+
+def test_two_surfaces_see_the_velocity_along_two_lines_of_sight():
+    velocity = np.array([0.7, -0.4, 0.0])
+    seen = [sheets(FRONT, PLACE), sheets(SIDE, PLACE)]
+    plain = fuse(seen, BOUNDS)
+    assert np.isnan(plain.velocity).all()
+    both = fuse([with_velocity(one, velocity) for one in seen], BOUNDS, 0.0, 1.0)
+    np.testing.assert_allclose(both.mean, plain.mean, atol=1e-6)
+    np.testing.assert_allclose(both.covariance, plain.covariance, atol=1e-6)
+    np.testing.assert_allclose(both.velocity, velocity, atol=0.03)
+    std = np.sqrt(np.diag(both.velocity_covariance))
+    assert (std[:2] < 0.05).all() and std[2] == pytest.approx(1, abs=0.02)
+    assert both.mixture.means.shape[1] == 6
+    # A surface whose scenario declares no velocity only locates the user.
+    one = fuse([with_velocity(seen[0], velocity), seen[1]], BOUNDS, 0.0, 1.0)
+    np.testing.assert_allclose(one.covariance, plain.covariance, atol=1e-6)
+    assert np.sqrt(np.linalg.eigvalsh(one.velocity_covariance)) == pytest.approx(
+        [0.02, 1, 1], rel=0.02)
+
+
 def assert_moments(fused, mean, covariance, tolerance=0.05):
     assert fused.mixture.log_mass == pytest.approx(0, abs=1e-12)
     found, spread = fused.mixture.moments()
@@ -73,6 +105,7 @@ def assert_moments(fused, mean, covariance, tolerance=0.05):
                                atol=2 * tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('others', [[], [SIDE], [OPPOSITE], [SIDE, OPPOSITE]],
                          ids=['alone', 'side', 'opposite', 'three'])
 def test_the_posterior_is_the_integral_of_the_product(others):

@@ -92,6 +92,7 @@ def test_the_gradient_is_that_of_the_log_likelihood(codebook, changes):
         assert difference == pytest.approx(gradient[0, index], rel=1e-3, abs=1e-3 / scale[index])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('changes', [{}, ALL, NOISY], ids=['position', 'all parameters', 'noise'])
 def test_the_information_is_the_covariance_of_the_gradient(codebook, changes):
     """Averaged over signals at the true parameters, without the prior.

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.model import Pose
+from rhs_isac_ros.positioning.mixture import Mixture, with_velocities
 from rhs_isac_ros.positioning.segments import select
 
 
@@ -51,6 +52,69 @@ def test_a_product_is_the_product_of_the_densities(size):
     points = np.random.default_rng(8).normal(size=(20, size))
     np.testing.assert_allclose(first.product(second).log_density(points),
                                first.log_density(points) + second.log_density(points[:, :3]))
+
+
+VARIANCE = np.diag([30.0, 40.0, 50.0])
+
+
+def moving(seed, n=3):
+    """Components whose velocities are known better than a prior with `VARIANCE`."""
+    return mixture(seed, n=n, size=6, spread=0.4)
+
+
+def test_without_the_prior_a_mixture_is_a_likelihood():
+    both, points = moving(9), np.random.default_rng(10).normal(size=(20, 6))
+    prior = multivariate_normal(np.zeros(3), VARIANCE).logpdf(points[:, 3:])
+    np.testing.assert_allclose(both.without_prior(VARIANCE).log_density(points) + prior,
+                               both.log_density(points))
+
+
+def test_velocities_that_exceed_the_prior_are_no_information():
+    wide = one(np.zeros(6), np.diag([1.0, 1, 1, 90, 90, 90])).without_prior(VARIANCE)
+    assert np.linalg.eigvalsh(wide.covariances[0])[3:].min() > 1e4
+
+
+def test_velocities_at_a_position_are_conditional():
+    both, place = moving(11), np.array([[0.3, -0.2, 0.5]])
+    mean, covariance, _ = both.velocities(place)
+    grid = np.stack(np.meshgrid(*[np.linspace(-8, 8, 41)] * 3), axis=-1).reshape(-1, 3)
+    weights = np.exp(both.log_density(np.hstack([np.broadcast_to(place, grid.shape), grid])))
+    np.testing.assert_allclose(mean[0], weights @ grid / weights.sum(), atol=1e-3)
+    np.testing.assert_allclose(covariance[0], np.cov(
+        grid.T, ddof=0, aweights=weights), atol=1e-3)
+
+
+def test_velocities_of_several_surfaces_are_multiplied_with_one_prior():
+    first, second = moving(13, n=1), moving(14, n=1)
+    exact = first.product(second.without_prior(VARIANCE))
+    places = first.position().product(second.position())
+    found = with_velocities(places, [first, second], VARIANCE)
+    for one_of, other in zip(found.velocities(places.means), exact.velocities(places.means),
+                             strict=True):
+        np.testing.assert_allclose(one_of, other, rtol=1e-9)
+    np.testing.assert_allclose(found.means[:, :3], places.means)
+    np.testing.assert_allclose(found.covariances[:, :3, :3], places.covariances)
+
+
+def test_a_surface_that_disagrees_about_the_velocity_weakens_a_place():
+    """Of two places, the first surface sees a velocity of the other direction at one."""
+    first = Mixture(np.zeros(2), np.array([[0.0, 0, 0, 2, 0, 0], [9.0, 0, 0, -2, 0, 0]]),
+                    np.array([np.eye(6) / 4] * 2))
+    second = first._replace(means=np.abs(first.means))
+    found = with_velocities(first.position(), [first, second], VARIANCE)
+    assert found.log_weights[0] > found.log_weights[1] + 10
+    np.testing.assert_allclose(found.means[0, 3:], [2, 0, 0], atol=0.02)
+
+
+def test_a_moved_mixture_turns_velocities():
+    pose, both = Pose((1.0, 2.0, 3.0), (0.0, 0.0, 0.6, 0.8)), moving(15)
+    moved = both.moved(Pose(), pose)
+    np.testing.assert_allclose(moved.means[:, :3], pose.to_site(both.means[:, :3]))
+    np.testing.assert_allclose(moved.means[:, 3:], pose.vectors_to_site(both.means[:, 3:]))
+    np.testing.assert_allclose(
+        moved.covariances[:, 3:, :3], pose.covariances_to_site(both.covariances[:, 3:, :3]))
+    for old, new in zip(both.position().moved(Pose(), pose), moved.position(), strict=True):
+        np.testing.assert_allclose(old, new)
 
 
 def test_the_position_is_a_marginal():

@@ -51,6 +51,7 @@ def mse(network, scenario, codebook, first, n):
     return np.mean(np.sum((estimate.mean - positions)[estimate.fix]**2, axis=1))
 
 
+@pytest.mark.slow
 def test_training_reduces_the_error(scenario, codebook, training):
     network, epochs = training
     spread = np.sum(np.array(scenario.roi_size_m)**2) / 12

@@ -233,6 +233,7 @@ def test_shares_are_those_of_steps_with_drawn_surfaces(codebook):
     np.testing.assert_allclose(constant_shares(model), shares.mean(axis=0), rtol=0.15)
 
 
+@pytest.mark.slow
 def test_a_track_is_no_better_than_the_errors_that_all_phases_share(codebook):
     estimator = BayesEstimator(System(ERRONEOUS, codebook))
     rng, place = np.random.default_rng(2), np.array([8.0, 0.5, 0.2])

@@ -134,6 +134,7 @@ def test_steps_continue_until_they_gain_nothing(codebook):
     assert np.abs(modes.points - points[modes.shots]).max() < 5e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('changes', [{'user_gain_std_db': 1.0}, {'phase_std_rad': 0.5}], ids=str)
 def test_the_likelihood_of_a_mode_is_the_average_over_the_parameter(codebook, changes):
     """The reference integrates numerically at the position of the mode."""

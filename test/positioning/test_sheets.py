@@ -49,6 +49,7 @@ def restricted(centre, bounds):
     return gaussian
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('extents', EXTENTS, ids=str)
 @pytest.mark.parametrize('shift', [
     (0.0, 0.0, 0.0), (0.01, 0.05, -0.03), (-0.02, -0.1, 0.12)], ids=str)
@@ -69,6 +70,7 @@ def test_samples_have_the_moments_and_the_mass_of_the_gaussian_in_the_region(ext
             np.average(positions[0], axis=0, weights=weights), mean, atol=0.15 * std.max() + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('extents', EXTENTS, ids=str)
 def test_steps_inside_the_region_reach_the_most_likely_position(extents):
     bounds = bounds_of(extents)

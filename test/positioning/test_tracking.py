@@ -273,6 +273,7 @@ def test_a_track_finds_a_user_that_is_suddenly_elsewhere(tracker, sample):
     assert error(estimate, elsewhere) < 0.7
 
 
+@pytest.mark.slow
 def test_estimates_are_inside_the_region(tracker, sample):
     scenario = Scenario()
     low, high = scenario.roi_bounds_m
@@ -313,6 +314,7 @@ def test_a_track_makes_a_user_outside_less_probable(random_beams):
     assert (track[1:] < single[1:] / 10).all()
 
 
+@pytest.mark.slow
 def test_an_estimator_of_another_codebook_continues_the_track(table1, tracker, follow):
     assert follow(np.arange(10) * PERIOD_S).n_phases == 10
     tracker.estimator = make_estimator('bayes', table1.scenario, table1.codebook)
@@ -359,6 +361,7 @@ def test_correlated_multipath_does_not_narrow_the_covariance(table1_estimator, s
     assert again.n_phases == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('bad_s', [np.nan, np.inf, -np.inf, 1j, None])
 def test_a_time_that_is_not_finite_is_an_error_and_does_not_change_the_track(
         table1, table1_estimator, bad_s):
@@ -403,6 +406,7 @@ def test_the_movement_decides_between_the_modes_of_mixtures(mixture_tracker):
     assert np.trace(estimate.covariance) < 0.03
 
 
+@pytest.mark.slow
 def test_the_covariances_of_tracks_of_mixtures_match_their_errors():
     """Of users who move as assumed."""
     rng, motion, squares = np.random.default_rng(5), Motion(turn_s=1e6), []
@@ -437,6 +441,38 @@ def test_an_error_that_all_phases_share_is_counted_once():
     np.testing.assert_allclose(found.mean, expected[0], atol=0.003)
     np.testing.assert_allclose(found.covariance, joint[0, 0] * np.eye(3), atol=0.001)
     np.testing.assert_allclose(found.velocity_covariance, joint[1, 1] * np.eye(3), atol=0.001)
+
+
+def test_velocities_that_are_measured_are_those_of_the_track():
+    """The result is that of conditioning on all phases together, for a user without turns.
+
+    A phase contains the velocity, for users whose velocities have a standard deviation of 2 m/s.
+    """
+    motion, std = Motion(1.0, 1e9, 1e9), np.array([0.1, 0.3])
+    scenario = Scenario(user_speed_std_mps=2.0)
+    tracker = MixtureTracker(scenario, scenario.roi_bounds_m, motion)
+    rng, times_s = np.random.default_rng(8), np.arange(6) / 4
+    seen = [np.concatenate([START, VELOCITY]) + np.repeat(std, 3) * rng.standard_normal(6)
+            for _ in times_s]
+    own = std[1]**2 * 4 / (4 + std[1]**2)
+    for time_s, state in zip(times_s, seen, strict=True):
+        state[:3] += time_s * VELOCITY
+        mean, covariance = state.copy(), np.diag(np.repeat([std[0]**2, own], 3))
+        # The posterior of the velocity, for the likelihood around the value that was measured.
+        mean[3:] *= own / std[1]**2
+        found = tracker.update(time_s, Mixture(np.zeros(1), mean[None], covariance[None]), 1e-9)
+    # Along one axis: the position at the end, which may be anywhere, and the velocity.
+    n = len(times_s)
+    slopes = np.column_stack([np.ones(2 * n), np.concatenate([times_s - times_s[-1], np.ones(n)])])
+    slopes[n:, 0] = 0
+    weights = np.repeat(1 / std**2, n)
+    # The first phase has the density of velocities of its scenario.
+    joint = np.linalg.inv(slopes.T @ (weights[:, None] * slopes) + np.diag([0, 1 / 4]))
+    values = np.concatenate([[one[:3] for one in seen], [one[3:] for one in seen]])
+    expected = joint @ slopes.T @ (weights[:, None] * values)
+    np.testing.assert_allclose(found.mean, expected[0], atol=1e-3)
+    np.testing.assert_allclose(found.velocity, expected[1], atol=1e-3)
+    np.testing.assert_allclose(found.velocity_covariance, joint[1, 1] * np.eye(3), atol=1e-3)
 
 
 def test_late_phases_do_not_change_a_track_of_mixtures(mixture_tracker):

@@ -137,6 +137,7 @@ SYMBOLS = {size: np.array([1, size * 1j]) for size in (0.0, 0.98, 0.99, 1.0, 1.0
 VALID = [(m.Pilot, {'symbols': SYMBOLS[size]}) for size in (0.99, 1.0, 1.01)]
 VALID += [(kind, {'position': np.array([1e6, -1e6, 0])})
           for kind in (m.PositionEstimate, m.GroundTruth)]
+VALID += [(m.Posterior, {'means': np.ones((2, 6)), 'covariances_m2': np.stack([np.eye(6)] * 2)})]
 VALID += [(kind, {'analog': sets(1.0, 0.0)}) for kind in (m.RhsConfiguration, m.Beam)]
 MALFORMED = [
     (m.FeedSignals, {'signals': np.zeros((3, 3, 2))},
@@ -157,7 +158,9 @@ MALFORMED = [
     (m.Posterior, {'covariances_m2': np.stack([np.eye(3), np.diag([1.0, 1.0, 0.0])])},
      'eigenvalue 0, expected positive eigenvalues'),
     (m.Posterior, {'means': -np.ones((2, 3))}, 'means: x = -1 m, expected x > 0'),
-    (m.Posterior, {'means': np.zeros((3, 3))}, 'expected [COMPONENTS = 2, 3]'),
+    (m.Posterior, {'means': np.zeros((3, 3))}, 'expected [COMPONENTS = 2, D = 3]'),
+    (m.Posterior, {'covariances_m2': np.stack([np.eye(6)] * 2)},
+     'expected [COMPONENTS = 2, D = 3, D = 3]'),
     (m.Posterior, {'surface_quaternion': np.zeros(4)}, 'a length other than 0'),
     (m.Posterior, {'surface_uncertainty': -np.eye(6)}, 'without negative eigenvalues'),
     (m.Posterior, {'log_weights': np.zeros(257), 'means': np.zeros((257, 3)),

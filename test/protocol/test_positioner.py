@@ -18,6 +18,7 @@ from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     EstimatorBuilt,
     LogMessage,
+    PublishTrack,
 )
 from rhs_isac_ros.protocol.fusion import sighting_of
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
@@ -64,6 +65,19 @@ def requested(positioner, *events):
     """Return the ids of the codebooks for which estimators are requested."""
     return [action.codebook.id for event in events for action in positioner.handle(event, 0.0)
             if isinstance(action, BuildEstimator)]
+
+
+@pytest.mark.parametrize('velocity', [[0.5, -1.0, 0.0], [np.nan] * 3])
+def test_a_velocity_is_published_with_the_position_at_the_reference_time(
+        positioner, codebooks, example, velocity):
+    estimate = Estimate(PLACE, np.eye(3), velocity=np.array(velocity),
+                        velocity_covariance=np.eye(3))
+    requested(positioner, CodebookOffered(codebooks[0]))
+    positioner.handle(ready(codebooks[0], lambda received: estimate), 0.0)
+    signals = example(m.ReceivedSignals, codebook_id=codebooks[0].id, user=2, stamp_ns=7)
+    found = [(action.user, action.stamp_ns, action.estimate.velocity.tolist())
+             for action in positioner.handle(signals, 0.0) if isinstance(action, PublishTrack)]
+    assert found == ([] if np.isnan(velocity).any() else [(2, 7, velocity)])
 
 
 def test_the_codebook_of_the_signals_selects_the_estimator(

@@ -11,6 +11,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import serialize_message
+from rclpy.topic_endpoint_info import TopicEndpointTypeEnum
 from ros_messages import position_estimate
 
 from rhs_isac_ros.codebook import Codebook
@@ -245,10 +246,11 @@ def test_closing_waits_for_the_running_job_and_discards_the_others(each_bench, b
     assert not results
 
 
-def endpoint(name, gid=1, topic_type='rhs_isac_msgs/msg/Ack', profile=endpoints.EXCHANGE):
+def endpoint(name, gid=1, topic_type='rhs_isac_msgs/msg/Ack', profile=endpoints.EXCHANGE,
+             endpoint_type=TopicEndpointTypeEnum.PUBLISHER):
     return types.SimpleNamespace(
         node_name=name, node_namespace='/', topic_type=topic_type, qos_profile=profile,
-        endpoint_gid=[gid] * 16)
+        endpoint_gid=[gid] * 16, endpoint_type=endpoint_type)
 
 
 @pytest.fixture
@@ -258,15 +260,20 @@ def graph(monkeypatch):
     node.get_fully_qualified_name.return_value = '/bs'
     node.publishers, node.subscriptions = [], [types.SimpleNamespace(topic_name='/ack')]
     node.count_publishers.return_value = node.count_subscribers.return_value = 1
-    node.get_subscriptions_info_by_topic.return_value = [endpoint('bs'), endpoint('recorder', 2)]
+    node.get_subscriptions_info_by_topic.return_value = [
+        endpoint(name, endpoint_type=TopicEndpointTypeEnum.SUBSCRIPTION)
+        for name in ('bs', 'recorder')]
     monkeypatch.setattr(endpoints.time, 'monotonic', clock)
     return node, clock
 
 
-def test_an_endpoint_of_another_type_is_named(graph):
+@pytest.mark.parametrize('receives', [True, False])
+def test_an_endpoint_of_another_type_is_named(graph, receives):
+    """Whether it publishes or subscribes: this node does not know for whom a topic is."""
     node, _ = graph
-    node.get_publishers_info_by_topic.return_value = [
-        endpoint('user_1'), endpoint('chatter', topic_type='std_msgs/msg/String')]
+    chatter = endpoint('chatter', topic_type='std_msgs/msg/String',
+                       endpoint_type=TopicEndpointTypeEnum(1 + receives))
+    node.get_publishers_info_by_topic.return_value = [endpoint('user_1'), chatter]
     assert endpoints.Mismatches(node).update() == {
         'conflict.type.ack.chatter': '/ack: no messages between this node and /chatter: type '
                                      'std_msgs/msg/String, expected rhs_isac_msgs/msg/Ack'}

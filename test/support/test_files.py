@@ -102,6 +102,7 @@ def test_the_error_of_a_missing_file_names_it_once(tmp_path, read):
         read(path)
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_is_an_error_or_changes_no_content(file):
     content = file.read_bytes()
     n_errors = 0
