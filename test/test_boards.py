@@ -24,6 +24,7 @@ GRID = Scenario(n_subbands=2, n_frames=3, elements_per_side=4, n_feeds=2,
 BOARDS = {
     'lossy': {'kind': 'paper', 'loss_db_per_m': 9.0, 'masked': [0]}, 'phase': 'phase',
     'resonant': 'resonant', 'states': {'kind': 'states', 'states': [[0.5, 0.5], [-1, 0]]},
+    'three states': {'kind': 'states', 'states': [[0.5, 0.5], [-1, 0], [0.3, -0.7]]},
     'network': {'kind': 'network'}}
 USER = np.array([[4.1, 0.2, 0.1]])
 
@@ -41,7 +42,8 @@ def system(request, network_file):
     if request.param == 'network':
         board = board | {'file': network_file}
     scenario = dataclasses.replace(
-        GRID, board=board, amplitude_levels=2 * (request.param == 'states'))
+        GRID, board=board, amplitude_levels=len(board.get('states', ()))
+        if isinstance(board, dict) else 0)
     return System(scenario, random_codebook(scenario, np.random.default_rng(0)))
 
 
@@ -75,7 +77,8 @@ def steered(system, surface=None):
     assert choice.expected_bps > 0
     report = capacity_report(scenario, choice.beam, USER[0], surface=surface)
     assert report.actual_bps > 0
-    step = 1.0 if scenario.amplitude_levels or scenario.board.is_amplitude else 0.02
+    step = (1 / (scenario.amplitude_levels - 1) if scenario.amplitude_levels else
+            1.0 if scenario.board.is_affine else 0.02)
     for change in step * np.concatenate([np.eye(16), -np.eye(16)]):
         analog = np.clip(choice.beam.analog + change, 0, 1)
         other = applied_beam(dataclasses.replace(choice.beam, analog=analog), surface)

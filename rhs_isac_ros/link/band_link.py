@@ -8,13 +8,12 @@ import numpy as np
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import checked_position, read_only
-from rhs_isac_ros.model.board import Factor
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.geometry import element_positions, feed_positions
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
-from rhs_isac_ros.model.surface import NOMINAL, onboard_matrix
+from rhs_isac_ros.model.surface import NOMINAL, onboard_matrix, ports_of
 
 # Gains above this limit have finite reciprocals.
 _MIN_GAIN = 1e-300
@@ -58,9 +57,8 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
 class BandLink:
     """The link between the surface and a user in one band, or the links in several bands.
 
-    For several bands, all arrays except `slope` and `offset` have a leading axis for the band, and
-    methods take configurations, float64 [N_B, n, N_E]. For one band, methods take float64
-    [..., N_E].
+    For several bands, all arrays have a leading axis for the band, and methods take
+    configurations, float64 [N_B, n, N_E]. For one band, methods take float64 [..., N_E].
     """
 
     onboard: np.ndarray  #: B_j with the gain of the band, complex128 [N_SB, K, N_E].
@@ -68,8 +66,8 @@ class BandLink:
     spatial: SpatialCovariance  #: V_i.
     noise_power_w: float  #: Noise power of a sub-band [W].
     power_w: float  #: Power of the digital part, summed over sub-bands [W].
-    slope: Factor  #: Slope of the coefficients in the configuration, [N_E] or a number.
-    offset: Factor  #: Coefficients for the configuration 0, [N_E] or a number.
+    slope: np.ndarray  #: Slopes of the coefficients in the configuration, [N_E].
+    offset: np.ndarray  #: Coefficients for the configuration 0, [N_E].
 
     @classmethod
     def to(cls, scenario: Scenario, position: np.ndarray, bands: int | Sequence[int],
@@ -85,7 +83,7 @@ class BandLink:
             los = los[0]
         index = band_index(bands)
         return cls(onboard[index], los, spatial_covariance(scenario)[index],
-                   scenario.noise_power_w, scenario.max_power_w, slope, offset)
+                   scenario.noise_power_w, scenario.max_power_w, slope[index], offset[index])
 
     def at_subbands(self, subbands: np.ndarray) -> 'BandLink':
         """Return the links in a subset of the sub-bands, with their share of the power."""
@@ -117,10 +115,11 @@ class BandLink:
         Returns B_j times the coefficients, complex128 [..., N_SB, K, N_E], its product with V_i,
         and its product with the line-of-sight gains, complex128 [..., N_SB, K, 1].
         """
-        onboard, los = self.onboard, self.los[..., None]
+        onboard, los, slope, offset = self.onboard, self.los[..., None], self.slope, self.offset
         if onboard.ndim == 4:
-            onboard, los = onboard[:, None], los[:, None]
-        configured = onboard * (self.slope * analog + self.offset)[..., None, None, :]
+            onboard, los, slope, offset = (
+                array[:, None] for array in (onboard, los, slope, offset))
+        configured = onboard * (slope * analog + offset)[..., None, None, :]
         return configured, self.spatial.scatter(configured), np.matmul(configured, los)
 
     @staticmethod
@@ -141,10 +140,15 @@ def band_index(bands: int | Sequence[int]) -> int | slice | list[int]:
 
 @functools.lru_cache(maxsize=16)
 def arrays(scenario: Scenario, surface: SurfaceEstimate | None
-           ) -> tuple[np.ndarray, Factor, Factor]:
-    """Return `BandLink.onboard` of all bands, read-only, and slope and offset of the elements."""
+           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return `onboard`, `slope` and `offset` of the links in all bands, read-only."""
     slope, offset, gains = surface.response if surface else NOMINAL
-    return read_only(np.reshape(gains, (-1, 1, 1, 1)) * onboard_matrix(scenario)), slope, offset
+    ends = np.zeros((scenario.n_bands, 2, scenario.n_elements))
+    ends[:, 1] = 1.0
+    low, high = np.moveaxis(scenario.board.coefficients(ports_of(scenario), ends)[:, 0], 1, 0)
+    off = slope * low + offset + np.zeros_like(high)
+    return (read_only(np.reshape(gains, (-1, 1, 1, 1)) * onboard_matrix(scenario)),
+            read_only(slope * (high - low)), read_only(off))
 
 
 @functools.lru_cache(maxsize=16)

@@ -108,7 +108,8 @@ def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
     onboard, slope, offset = band_link.arrays(scenario, surface)
     subbands = band_link.representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS)
     on_board, resting = (
-        np.moveaxis(factor * onboard[:, subbands], -1, 1) for factor in (slope, offset))
+        np.moveaxis(factor[:, None, None] * onboard[:, subbands], -1, 1)
+        for factor in (slope, offset))
     resting = resting[:, :resting.shape[1] * bool(np.any(offset))]
     modes = _modes(scenario)[:, :, None, None]
     gains = _with_rest(*(one[..., None] * modes[:, :one.shape[1]] for one in (on_board, resting)))

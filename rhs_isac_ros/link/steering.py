@@ -83,7 +83,8 @@ class _Point(NamedTuple):
         snr = gain * power
         amplitude = np.sqrt(power / link.noise_power_w)
         digital = (np.conj(directions[..., -1]) * amplitude[..., None])[..., None, :]
-        weights = link.slope * np.matmul(digital, link.onboard[:, None])[..., 0, :]
+        weights = np.matmul(digital, link.onboard[:, None])[..., 0, :]
+        weights *= link.slope[:, None, None]
         received = np.conj(np.matmul(digital, direct)[..., 0])
         towards = received * link.los[:, None]
         towards += np.conj(np.matmul(digital, scattered)[..., 0, :])
@@ -154,8 +155,8 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
     """Find a beam that nearly maximises Eq. (10) for a user at a position, float64 [3] [m].
 
     A search from many starts, including the matched filter, proposes configurations. The best few
-    are improved together with the digital part. Amplitudes are 0 or 1, which are valid for any
-    number of amplitude levels. On a board whose coefficients are not amplitudes, the search is
+    are improved together with the digital part. Tunings are 0 or 1, which are valid for any
+    number of levels. On a board whose coefficients are not affine in the tunings, the search is
     that of `tuned_beam`. The power over all sub-bands is P_max. The beam is deterministic.
     Bands are counted from 0. A calibrated surface applies its coefficients to the configuration.
     Raises ValueError if the position is not a finite [3] array, or the band is out of range.
@@ -178,7 +179,7 @@ def steer_bands(
     for band in bands:
         if not 0 <= band < scenario.n_bands:
             raise ValueError(f'band: {band}, expected 0 to {scenario.n_bands - 1}')
-    if not scenario.board.is_amplitude:
+    if not scenario.board.is_affine:
         return [tuned_beam(scenario, position, band, surface) for band in bands]
     link = BandLink.to(scenario, position, bands, surface)
     starts = candidate_configurations(

@@ -1,10 +1,10 @@
 """Search for a beam on any board, also with coupling, by the gradient of the capacity.
 
-The searches of `steering` change single elements, whose coefficients are amplitudes. On other
-boards, L-BFGS-B climbs in the tunings of all elements, from a focused beam if elements have
-coefficients of their own. The steps are few, because the data of a cycle wait for the beam;
-three more starts and 60 steps would gain 1 % with resonances and 3 % with coupling. If tunings are
-discrete, single tunings are then exchanged as long as this increases the capacity.
+The searches of `steering` require coefficients that are affine in the tunings, such as amplitudes
+or two states. On other boards, L-BFGS-B climbs in the tunings of all elements, from a focused beam
+if elements have coefficients of their own. The steps are few, because the data of a cycle wait for
+the beam; three more starts and 60 steps would gain 1 % with resonances and 3 % with coupling. If
+tunings are discrete, they are then exchanged as long as this increases the capacity.
 """
 
 import dataclasses
@@ -109,18 +109,25 @@ class TunedLink:
         return float(np.log1p(snr).sum()), gradient[0, 0]
 
     def exchanged(self, tunings: np.ndarray, n_levels: int) -> np.ndarray:
-        """Return tunings after the best exchanges of single ones for other levels, if any."""
+        """Return tunings after exchanges for other levels, until no single one is better.
+
+        Each round makes the exchanges of highest gain together: one, two, four, or more.
+        """
         if not n_levels:
             return tunings
-        rate, rows = self.rates(tunings[None])[0], np.arange(len(tunings))
+        rate, n = self.rates(tunings[None])[0], len(tunings)
+        levels, counts = np.linspace(0, 1, n_levels), 2**np.arange(n.bit_length())
         for _ in range(_N_EXCHANGES):
-            others = np.repeat(tunings[None], len(tunings) * n_levels, axis=0)
-            others[np.arange(len(others)), np.repeat(rows, n_levels)] = np.tile(
-                np.linspace(0, 1, n_levels), len(tunings))
-            rates = self.rates(others)
+            others = np.repeat(tunings[None], n * n_levels, axis=0)
+            others[np.arange(len(others)), np.repeat(np.arange(n), n_levels)] = np.tile(levels, n)
+            rates = self.rates(others).reshape(n, n_levels)
+            order = np.argsort(-rates.max(axis=1))
+            is_exchanged = np.argsort(order) < counts[:, None]
+            together = np.where(is_exchanged, levels[rates.argmax(axis=1)], tunings)
+            rates = self.rates(together)
             if rates.max() <= rate * (1 + _MIN_GAIN):
                 break
-            rate, tunings = rates.max(), others[rates.argmax()]
+            rate, tunings = rates.max(), together[rates.argmax()]
         return tunings
 
     def _channels(self, tunings: np.ndarray) -> np.ndarray:

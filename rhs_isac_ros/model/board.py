@@ -75,6 +75,11 @@ class Board(abc.ABC):
     #: Whether the coefficient of an element is its tuning, apart from a constant factor.
     is_amplitude: ClassVar[bool] = False
 
+    @property
+    def is_affine(self) -> bool:
+        """Whether coefficients are affine in the tunings, and the same in all of a band."""
+        return self.is_amplitude
+
     @abc.abstractmethod
     def transfer(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
         """Return the transfer, complex128 [B, J, Q, N_E, K], for tunings [B, Q, N_E]."""

@@ -252,6 +252,11 @@ class States(Elementwise):
                     f'{scenario.n_bands} and {scenario.n_elements}')
         return super().misfit(scenario)
 
+    @property
+    def is_affine(self) -> bool:
+        """Whether there are only two states, with which the coefficients are affine."""
+        return len(self._table) == 2
+
     def coefficients(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
         """Return the interpolated states, complex128 [B, 1, Q, N_E]."""
         position = tunings[:, None] * (len(self._table) - 1)

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from rhs_isac_ros.calibration import known_states
 from rhs_isac_ros.link import (
     Beamformer,
     CapacityReport,
@@ -193,6 +194,16 @@ def test_a_beam_for_a_calibrated_surface_has_the_capacity_of_the_search(table1, 
         change = capacity(scenario, other, POSITION[None])[0] - best
         # A failed element does not follow.
         assert change == 0 if damaged.failed[element] else change < 0
+
+
+@pytest.mark.parametrize('states', [(1, -1), (0.9, 1), (0.2, 0.9j)])
+def test_two_states_of_a_board_have_the_beams_of_the_same_states_of_a_calibration(table1, states):
+    board = {'kind': 'states', 'states': [[complex(s).real, complex(s).imag] for s in states]}
+    same = dataclasses.replace(table1.scenario, board=board, amplitude_levels=2)
+    expected = steer(table1.scenario, POSITION, 1, known_states(table1.scenario, *states).surface)
+    found = steer(same, POSITION, 1)
+    np.testing.assert_array_equal(found.analog, expected.analog)
+    np.testing.assert_allclose(found.digital, expected.digital, rtol=1e-9)
 
 
 def test_a_report_is_about_the_calibrated_surface(table1, damaged):

@@ -9,7 +9,8 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
 
 POSITION = np.array([8.0, 1.0, 0.2])
-BOARDS = [('phase', 0), ('resonant', 0), ({'kind': 'states', 'states': [[1, 0], [-1, 0]]}, 2)]
+BOARDS = [('phase', 0), ('resonant', 0), ({'kind': 'states', 'states': [[1, 0], [-1, 0]]}, 2),
+          ({'kind': 'states', 'states': [[1, 0], [0, 1], [-0.5, -0.5]]}, 3)]
 
 
 @pytest.mark.parametrize(('board', 'levels'), BOARDS)
@@ -22,7 +23,7 @@ def test_no_single_tuning_increases_the_capacity_by_more_than_a_ten_thousandth(b
     best = link.rates(beam.analog[None])[0]
     bits = best / np.log(2) * scenario.subband_width_hz
     assert capacity(scenario, beam, POSITION[None])[0] == pytest.approx(bits)
-    steps = [0.0, 1.0] if levels else [0.02, -0.02]
+    steps = np.linspace(0, 1, levels) if levels else [0.02, -0.02]
     for element in range(25):
         for step in steps:
             changed = beam.analog.copy()
