@@ -38,17 +38,18 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def multiply_rows(matrices: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Multiply rows [..., B, n] by B matrices [B, m, n]; return complex128 [..., B, m].
+    """Multiply rows [..., *B, n] by B matrices [*B, m, n]; return [..., *B, m].
 
     A row is rounded in the same way among any number of other rows.
     """
     # BLAS rounds by the sizes of a product, so all products have the same size.
-    flat = rows.reshape(-1, *rows.shape[-2:])
-    padded = np.zeros((-(-len(flat) // _ROWS), _ROWS, *flat.shape[1:]), complex)
-    padded.reshape(-1, *flat.shape[1:])[:len(flat)] = flat
-    products = np.matmul(np.swapaxes(padded, 1, 2), np.swapaxes(matrices, 1, 2))
-    found = np.swapaxes(products, 1, 2).reshape(-1, *products.shape[1::2])[:len(flat)]
-    return found.reshape(*rows.shape[:-1], matrices.shape[-2])
+    shape = rows.shape[rows.ndim - matrices.ndim + 1:]
+    flat = rows.reshape(-1, *shape)
+    padded = np.zeros((-(-len(flat) // _ROWS), _ROWS, *shape), rows.dtype)
+    padded.reshape(-1, *shape)[:len(flat)] = flat
+    products = np.matmul(np.moveaxis(padded, 1, -2), np.swapaxes(matrices, -2, -1))
+    found = np.moveaxis(products, -2, 1).reshape(-1, *shape[:-1], matrices.shape[-2])
+    return found[:len(flat)].reshape(*rows.shape[:-1], matrices.shape[-2])
 
 
 def mixture_weights(log_weights: np.ndarray, axis: int | tuple[int, ...] = -1

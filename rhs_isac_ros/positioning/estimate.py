@@ -248,8 +248,7 @@ class Estimator(Protocol):
 
         The signals are complex128 [N_B, N_SB F], or [N, N_B, N_SB F] for N positions,
         sub-band-major; the estimate has a leading dimension N if the signals have one. An
-        estimate in a batch may differ from the estimate of the same shot alone, but rarely by
-        more than a few hundredths of a standard deviation.
+        estimate in a batch is that of the same shot alone, apart from rounding.
         """
         ...
 

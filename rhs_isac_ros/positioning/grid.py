@@ -341,7 +341,9 @@ def separate(shots: np.ndarray, points: np.ndarray, radii: np.ndarray,
         return chosen
     if curvature is not None:
         variance = np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2) / radii[:3]**2
-        reach = float(np.clip(np.sqrt(_LIMITS.same_mode * variance.max()), 1.0, _LIMITS.reach))
+        # No other pair is close, so that the result for a shot does not depend on the others.
+        furthest = np.sqrt(_LIMITS.same_mode * variance.sum(axis=1).max())
+        reach = float(np.clip(furthest, 1.0, _LIMITS.reach))
     # Move points of different shots far away from each other.
     scaled[:, 0] += shots * (2 * reach + np.ptp(scaled[:, 0]))
     # The first index of each pair is the smaller one.

@@ -28,6 +28,10 @@ from rhs_isac_ros.positioning.segments import Segments
 PHASE_ERROR = 0.2
 
 
+# Number of positions that represent the region.
+_N_POINTS = 1024
+
+
 class _Limits(NamedTuple):
     """Limits of the lengths of a grid."""
 
@@ -132,6 +136,14 @@ def carrier_wavenumbers(scenario: Scenario) -> np.ndarray:
 def subband_wavenumbers(scenario: Scenario) -> np.ndarray:
     """Return the wavenumbers k_n of the sub-bands, float64 [N_B, N_SB] [1/m]."""
     return 2 * np.pi * subband_frequencies_hz(scenario) / SPEED_OF_LIGHT_MPS
+
+
+@functools.cache
+def unit_points() -> np.ndarray:
+    """Return quasi-random points in the unit cube, float64 [1024, 3], read-only."""
+    from scipy.stats import qmc
+
+    return read_only(qmc.Sobol(3, seed=0).random(_N_POINTS))
 
 
 class Shell(NamedTuple):
@@ -300,4 +312,4 @@ def whiten(whitener: np.ndarray, mean: np.ndarray, slopes: np.ndarray | None = N
     n_columns, n_bands, n_rows = columns.shape[1:]
     columns = np.moveaxis(columns, 2, 0).reshape(n_bands, -1, n_rows)
     white = np.matmul(columns, np.swapaxes(whitener, 1, 2))
-    return np.moveaxis(white.reshape(n_bands, len(mean), n_columns, n_rows), 0, 2)
+    return np.moveaxis(white.reshape(n_bands, len(mean), n_columns, -1), 0, 2)

@@ -167,13 +167,17 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     modes, gain = step(starts)
     # Points that the latest steps started from, and the known log-likelihoods there.
     origins, known = starts, modes.log_likelihood - gain
+    # Shots whose modes have changed. The modes of the others stay, whatever happens to shots that
+    # are located together with them.
+    changed = starts.shots
     for number in range(n_steps):
-        chosen = _prune(likelihood, modes, gain, margin)
+        chosen = _prune(likelihood, modes, gain, margin, changed)
         modes, origins, gain, known = (
             select(modes, chosen), select(origins, chosen), gain[chosen], known[chosen])
         (moving,) = np.nonzero(np.abs(gain) > _ASCENT.gain)
         if not len(moving) or number == n_steps - 1:
             break
+        changed = modes.shots[moving]
         moved, new_gain = step(select(modes, moving).starts())
         reached = moved.log_likelihood - new_gain
         too_long = reached < known[moving] - _ASCENT.gain
@@ -191,7 +195,7 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
         if len(worse):
             modes.replace(worse, step(select(origins, worse), moves=False)[0])
         gain[moving] = 0.0
-        modes = select(modes, _prune(likelihood, modes, gain, margin))
+        modes = select(modes, _prune(likelihood, modes, gain, margin, modes.shots[moving]))
     return modes
 
 
@@ -297,12 +301,18 @@ def _rise(local: Local, whole: np.ndarray) -> np.ndarray:
     return rise - likelihood_loss(whole, local.information)
 
 
-def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float) -> np.ndarray:
-    """Return indices of the probable, separate modes of each shot, the most likely first."""
+def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float,
+           changed: np.ndarray) -> np.ndarray:
+    """Return indices of the probable, separate modes of each shot, the most likely first.
+
+    All modes of shots that are not in `changed` are kept, in their order.
+    """
     # The likelihood of a mode is a prediction, and may be arbitrarily wrong before convergence.
     # The likelihood before the last step is known, and its maximum limits the best prediction.
     value = modes.log_likelihood + np.maximum(gain, 0)
-    order = modes.order
+    has_changed = np.isin(modes.shots, changed)
+    rest, order = np.flatnonzero(~has_changed), modes.order
+    order = order[has_changed[order]]
     of_shot = Segments.of_keys(modes.shots[order])
     known = (modes.log_likelihood - gain)[order]
     best = np.minimum(of_shot.first(modes.log_likelihood[order]), of_shot.max(known))
@@ -314,4 +324,6 @@ def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float
         velocities = modes.values[order, :n_moving] @ prior.velocity.T
         rates = np.matmul(polar_derivative(points), velocities[..., None])[..., 0]
         points, radii = np.hstack([points, rates]), np.append(radii, resolution.rate_steps)
-    return order[separate(modes.shots[order], points, radii, modes.curvature[order])]
+    order = order[separate(modes.shots[order], points, radii, modes.curvature[order])]
+    kept = np.concatenate([rest, order])
+    return kept[np.argsort(modes.shots[kept], kind='stable')] if len(rest) else order

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import adjoint, read_only
+from rhs_isac_ros.model.arrays import adjoint, multiply_rows, read_only
 from rhs_isac_ros.model.gaussian import quadratic_form
 from rhs_isac_ros.model.geometry import to_positions, velocity_std_mps
 from rhs_isac_ros.positioning.lattice import (
@@ -21,6 +21,7 @@ from rhs_isac_ros.positioning.lattice import (
     Grid,
     Resolution,
     lay_grid,
+    unit_points,
     whiten,
 )
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
@@ -36,8 +37,7 @@ class _Limits(NamedTuple):
 
     # Number of templates computed at a time.
     block: int = 128
-    # Number of positions in the second moments of the means, in the region and in a part of it.
-    moments: int = 1024
+    # Number of positions in the second moments of the means in a part of the region.
     part_moments: int = 32
     # Largest mean energy of a component of the whitened signals. The error of a template is about
     # `PHASE_ERROR` times its amplitude. With this limit, it does not exceed the noise.
@@ -126,18 +126,10 @@ def _positions_in(scenario: Scenario, part: Grid | None) -> np.ndarray:
     """Return evenly spread positions in the region, or in the box of a part of its grid."""
     low, high = scenario.roi_bounds_m
     if part is None:
-        return low + (high - low) * _unit_points()
+        return low + (high - low) * unit_points()
     centres = to_positions(part.points)
     low, high = (np.clip(edge, low, high) for edge in (centres.min(axis=0), centres.max(axis=0)))
-    return low + (high - low) * _unit_points()[:_LIMITS.part_moments]
-
-
-@functools.cache
-def _unit_points() -> np.ndarray:
-    """Return quasi-random points in the unit cube, read-only."""
-    from scipy.stats import qmc
-
-    return read_only(qmc.Sobol(3, seed=0).random(_LIMITS.moments))
+    return low + (high - low) * unit_points()[:_LIMITS.part_moments]
 
 
 def _moments(model: MeasurementModel, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -198,13 +190,12 @@ class Filters(NamedTuple):
         Returns signals weighted with the inverse covariance, complex64 [N, N_B, N_SB, F]; filter
         outputs, complex64 [N, N_B, N_SB, G]; and energies of limited signals, float64 [N].
         """
-        limited = np.matmul(np.swapaxes(whitened, 0, 1), np.swapaxes(self.limiter, 1, 2))
-        weighted = np.swapaxes(np.matmul(limited, self.whitener.conj()), 0, 1)
+        limited = multiply_rows(self.limiter, whitened)
+        weighted = multiply_rows(adjoint(self.whitener), limited)
         n, n_bands = weighted.shape[:2]
         signals = weighted.reshape(n, n_bands, -1, self.templates.shape[3]).astype(np.complex64)
-        outputs = np.matmul(self.templates, np.moveaxis(signals, 0, 3))
-        return (signals, np.ascontiguousarray(np.moveaxis(outputs, 3, 0)),
-                np.sum(np.abs(limited)**2, axis=(0, 2)))
+        outputs = multiply_rows(self.templates, signals)
+        return signals, outputs, np.sum(np.abs(limited)**2, axis=(1, 2))
 
 
 class Cells(NamedTuple):

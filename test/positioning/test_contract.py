@@ -70,11 +70,8 @@ def test_a_shot_has_the_same_estimate_alone_as_in_a_batch(estimator, received):
         assert single.mean.shape == (3,)
         assert single.covariance.shape == (3, 3)
         assert (single.reason, single.fix) == ('', True)
-        # Rounding to single precision on the grid decides about modes at the margin.
-        scale = np.sqrt(np.trace(single.covariance))
-        np.testing.assert_allclose(single.mean, batch.mean[n], atol=0.01 * scale)
-        np.testing.assert_allclose(
-            single.covariance, batch.covariance[n], atol=0.02 * scale**2)
+        np.testing.assert_allclose(single.mean, batch.mean[n], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(single.covariance, batch.covariance[n], rtol=0, atol=1e-9)
 
 
 def test_an_empty_batch_gives_empty_estimates(estimator, received):

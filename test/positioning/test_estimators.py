@@ -286,13 +286,11 @@ def test_posteriors_of_several_shots_are_those_of_each(table1_estimator, phases)
     assert found.fix.tolist() == [True, True, True, False]
     for n, one in enumerate(received):
         alone = table1_estimator.posterior(one)
-        # The search of a batch may take one step more, as `Estimator.estimate` states.
         assert found[n].fix == alone.fix
         if alone.fix:
-            std = np.sqrt(np.diagonal(alone.covariance))
-            np.testing.assert_allclose(found[n].mean / std, alone.mean / std, rtol=0, atol=0.03)
-            np.testing.assert_allclose(found[n].mixture.moments()[1] / np.outer(std, std),
-                                       alone.covariance / np.outer(std, std), atol=0.06)
+            np.testing.assert_allclose(found[n].mean, alone.mean, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(
+                found[n].mixture.moments()[1], alone.covariance, rtol=0, atol=1e-9)
     assert found[3].mixture is None
 
 
