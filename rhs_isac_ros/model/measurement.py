@@ -14,11 +14,20 @@ import functools
 import numpy as np
 
 from rhs_isac_ros.model.arrays import (
+    adjoint,
     blocks,
     checked_positions,
     checked_states,
     multiply_rows,
     read_only,
+)
+from rhs_isac_ros.model.compression import (
+    combine_subbands,
+    combined_covariance,
+    draw_scattered,
+    expand_functions,
+    is_slow,
+    subband_functions,
 )
 from rhs_isac_ros.model.elements import (
     DeclaredElements,
@@ -126,13 +135,21 @@ def simulate_received(
     radiation = radiation_matrix(scenario, codebook, surface.response if surface else NOMINAL)
     n_bands, n_measurements, _ = radiation.shape
     received = np.empty((len(states), n_bands, n_measurements), complex)
-    for block in blocks(len(states), _BLOCK):
+    # Gains of all elements in many sub-bands take too much memory.
+    is_large = subband_functions(scenario) is not None
+    for block in blocks(len(states), _MIN_BLOCK if is_large else _BLOCK):
         for band in range(n_bands):
             direct = _direct(scenario, states[block], band, blocked[block], radiation[band])
-            gains = 0.0 if scenario.channel else draw_multipath(scenario, band, len(direct), rng)
+            gains: np.ndarray | float = 0.0
+            scattered: np.ndarray | float = 0.0
+            if not scenario.channel and is_large:
+                scattered = draw_scattered(scenario, band, radiation[band], len(direct), rng)
+            elif not scenario.channel:
+                gains = draw_multipath(scenario, band, len(direct), rng)
             noise = _thermal_noise(scenario, direct.shape, rng)
             symbol = 1.0 if factors is None else factors[block, band]
-            received[block, band] = received_signal(direct, gains, radiation[band], noise, symbol)
+            received[block, band] = received_signal(
+                direct, gains, radiation[band], noise + scattered * symbol, symbol)
     return received
 
 
@@ -248,29 +265,63 @@ class MeasurementModel:
         return covariance + scattered, direct
 
     @functools.cached_property
+    def _functions(self) -> np.ndarray | None:
+        """Functions of the sub-bands, or None if there are not many; see `compression`."""
+        functions = subband_functions(self.scenario) if self.elements.is_exact else None
+        if functions is None or not is_slow(functions, self.radiation):
+            return None
+        return functions
+
+    @functools.cached_property
+    def combined_root(self) -> np.ndarray:
+        """The same factor of the covariance of `combine`d signals, [N_B, n, n], read-only."""
+        covariance = self.covariance() if self._functions is None else combined_covariance(
+            self.scenario, self.radiation, self._functions)
+        return read_only(covariance_root(
+            self.scenario, covariance, orthogonal=nuisance_of(self.scenario).has_gain))
+
+    @functools.cached_property
+    def combined_whitener(self) -> np.ndarray:
+        """Inverse of `combined_root`, complex128 [N_B, n, n], read-only."""
+        return read_only(np.linalg.inv(self.combined_root))
+
+    @functools.cached_property
     def root(self) -> np.ndarray:
-        """Factor L_i with L_i L_i^H = Lambda_i, complex128 [N_B, N_SB F, N_SB F], read-only.
+        """Factor L_i with L_i L_i^H = Lambda_i, complex128 [N_B, N_SB F, n].
 
         It is the Cholesky factor. With an unknown gain, which does not act on the noise, its
-        columns are orthogonal instead.
+        columns are orthogonal instead. The number n is N_SB F, or less for many sub-bands, whose
+        signals are combined first; L_i L_i^H is then the covariance of the combined signals.
         """
-        return read_only(covariance_root(
-            self.scenario, self.covariance(), orthogonal=nuisance_of(self.scenario).has_gain))
+        return read_only(self.expand(self.combined_root))
 
     @functools.cached_property
     def whitener(self) -> np.ndarray:
-        """Inverse of `root`, complex128 [N_B, N_SB F, N_SB F], read-only."""
-        return read_only(np.linalg.inv(self.root))
+        """Inverse of `root`, complex128 [N_B, n, N_SB F]."""
+        return read_only(adjoint(self.expand(adjoint(self.combined_whitener))))
+
+    @property
+    def n_whitened(self) -> int:
+        """Number of whitened signals of all bands."""
+        return int(np.prod(self.combined_root.shape[:2]))
 
     @one_blas_thread
     def prepare(self) -> 'MeasurementModel':
         """Compute what later calls need, and return the model."""
-        _ = self.whitener, self._weights
+        _ = self.combined_whitener, self._weights
         return self
 
+    def expand(self, matrices: np.ndarray) -> np.ndarray:
+        """Apply the adjoint of `combine` to matrices [N_B, n, m]; return [N_B, N_SB F, m]."""
+        return expand_functions(self._functions, matrices)
+
+    def combine(self, signals: np.ndarray) -> np.ndarray:
+        """Combine many sub-bands of signals [..., N_B, N_SB F] to [..., N_B, n]."""
+        return combine_subbands(self._functions, signals)
+
     def whiten(self, signals: np.ndarray) -> np.ndarray:
-        """Transform signals [..., N_B, N_SB F] to unit covariance; the shape stays the same."""
-        return multiply_rows(self.whitener, signals)
+        """Transform signals [..., N_B, N_SB F] to unit covariance, [..., N_B, n]."""
+        return multiply_rows(self.combined_whitener, self.combine(signals))
 
     def mean(self, positions: np.ndarray) -> np.ndarray:
         """Compute the mean signals, complex128 [N, N_B, N_SB F]: Eq. (8) for the direct path."""
@@ -292,6 +343,7 @@ class MeasurementModel:
         if by_coordinate is None:
             by_coordinate = np.broadcast_to(np.eye(states.shape[1]), (n, *states.shape[1:] * 2))
         n_slopes = by_coordinate.shape[2]
+        n_rows = self.combined_whitener.shape[1] if whitened else n_rows
         mean = np.empty((n, n_bands, n_rows), complex)
         jacobian = np.empty((n, n_slopes, n_bands, n_rows), complex)
         by_term = np.zeros((n, 0, 0)) if moving else np.matmul(
@@ -301,9 +353,7 @@ class MeasurementModel:
             terms = (weights.moving(states[block], by_coordinate[block]) if moving
                      else weights.terms(states[block], n_slopes > 0))
             if whitened:
-                shape = terms.shape
-                terms = np.matmul(terms.reshape(n_bands, -1, n_rows),
-                                  np.swapaxes(self.whitener, 1, 2)).reshape(shape)
+                terms = self._whitened_terms(terms)
             mean[block] = np.swapaxes(terms[:, :, 0], 0, 1)
             if not n_slopes:
                 return
@@ -340,9 +390,15 @@ class MeasurementModel:
         else:
             signals = model.mean(states)
             signals[blocked] = 0
+            if subband_functions(scenario) is not None:
+                for band, radiation in enumerate(model.radiation):
+                    signals[:, band] += draw_scattered(
+                        scenario, band, radiation, len(states), rng)
+                return signals * (1.0 if factors is None else factors) + _thermal_noise(
+                    scenario, signals.shape, rng)
             white = complex_normal(signals.shape, rng)
             # Factors act on the multipath, but not on the noise.
-            roots = model.root if factors is None else map(
+            roots = model.combined_root if factors is None else map(
                 square_root, scattered_covariance(scenario, model.radiation))
             for band, root in enumerate(roots):
                 signals[:, band] += white[:, band, :root.shape[1]] @ root.T
@@ -350,6 +406,12 @@ class MeasurementModel:
                 return signals
         noise = _thermal_noise(scenario, signals.shape, rng)
         return signals * (1.0 if factors is None else factors) + noise
+
+    def _whitened_terms(self, terms: np.ndarray) -> np.ndarray:
+        """Whiten the result of `ElementSums.terms`."""
+        flat = combine_subbands(self._functions, terms.reshape(len(terms), -1, terms.shape[-1]))
+        white = np.matmul(flat, np.swapaxes(self.combined_whitener, 1, 2))
+        return white.reshape(*terms.shape[:-1], -1)
 
     @functools.cached_property
     def _weights(self) -> 'ElementSums':

@@ -192,7 +192,7 @@ def test_prepare_leaves_nothing_to_compute(case):
     before = dict(vars(model))
     model.sample(case.vectors['positions'], np.random.default_rng(7))
     assert vars(model) == before
-    assert {'root', 'whitener', '_weights'} <= before.keys()
+    assert {'combined_root', 'combined_whitener', '_weights'} <= before.keys()
 
 
 @pytest.mark.parametrize('pattern', [
