@@ -21,6 +21,7 @@ from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
 from rhs_isac_ros.model.geometry import element_positions, to_positions
 from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers, whiten
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
+from rhs_isac_ros.positioning.projection import ProjectedModel, project, reaching, white_means
 from rhs_isac_ros.positioning.segments import Segments
 from rhs_isac_ros.support.threads import map_blocks
 
@@ -86,7 +87,8 @@ class Blocked:
 
     name, reason, limit = 'blocked', 'blocked', BLOCKED_LIMIT
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, n_measurements: int) -> None:
+        self._n = n_measurements
         self.log_odds = log_odds_of(scenario.blocked_probability)
         self._median_db, self._std_db = scenario.multipath_level_db
 
@@ -98,12 +100,17 @@ class Blocked:
         gain_db = min(prior.gain_std / NEPERS_PER_DB, _UNKNOWN_GAIN_DB)
         std_db = math.hypot(BLOCKED_STD_DB, self._std_db, gain_db)
         in_sight, blocked = (
-            float(log_evidence_of_level(energy[[index]], whitened.size, std, self._median_db)[0])
+            float(log_evidence_of_level(energy[[index]], self._n, std, self._median_db)[0])
             for index, std in enumerate((self._std_db, std_db)))
         if prior.gain_std:
             # Relative to the density of an unknown gain that positions assume.
             blocked += math.log(gain_db * NEPERS_PER_DB / prior.gain_unit)
         return blocked - (in_sight + residual) + prior.log_evidence_of_aligned(aligned)
+
+    def seen(self, model: MeasurementModel, received: np.ndarray, whitened: np.ndarray
+             ) -> np.ndarray:
+        """Return the whitened signals, of which only the energy matters."""
+        return whitened
 
     def given(self, wrong: float) -> 'Blocked':
         """Return the alternative; whether a user is in sight does not depend on a prior."""
@@ -122,8 +129,9 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
     A template is a whitened mean times the range, without the carrier's phase. It depends on the
     direction and, through the curvature of the wavefront and the delays of the sub-bands, slowly
     on the range. For T template ranges, R ranges and V directions, the arrays are
-    ``outer_filters``, the conjugate templates, complex64 [N_B, T V, N_SB F]; ``outer_energy``,
-    their energy [m^2], float32 [T, V]; ``outer_index``, the index of the template range for each
+    ``outer_filters``, the conjugate templates, complex64 [N_B, T V, N_SB F]; ``outer_basis``, that
+    of a `ProjectedModel`, empty if all signals are compared; ``outer_energy``, the energy of the
+    templates [m^2], float32 [T, V]; ``outer_index``, the index of the template range for each
     range, int64 [R]; and ``outer_weights``, the prior probability of ranges and directions, 0
     inside the region, float64 [R, V].
     """
@@ -132,15 +140,21 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
     nodes, index = _template_ranges(scenario, ranges)
     weights = _prior(scenario, ranges, directions)
     points = _points(nodes, directions).reshape(-1, 3)
-    n_bands, n_rows = model.shape
-    filters = np.empty((n_bands, len(points), n_rows), np.complex64)
+    model = reaching(model, points)
     whitener = model.whitener.astype(np.complex64)
+    n_bands, n_columns, _ = whitener.shape
+    filters = np.empty((n_bands, len(points), n_columns), np.complex64)
     energy = np.empty(len(points), np.float32)
 
     def fill(block: slice) -> None:
         part = points[block]
         carrier = np.exp(1j * carrier_wavenumbers(scenario) * part[:, :1]) * part[:, :1]
-        templates = whiten(whitener, model.mean(to_positions(part)).astype(np.complex64))[:, 0]
+        if isinstance(model, ProjectedModel):
+            # Sums over interpolated sub-bands cancel.
+            templates = np.swapaxes(white_means(model, to_positions(part)), 0, 1)
+        else:
+            means = model.mean(to_positions(part)).astype(np.complex64)
+            templates = whiten(whitener, means)[:, 0]
         templates *= carrier[..., None]
         filters[:, block] = np.swapaxes(templates, 0, 1).conj()
         energy[block] = np.sum(np.abs(templates)**2, axis=(1, 2))
@@ -148,6 +162,7 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
     map_blocks(fill, blocks(len(points), GRID.block), progress)
     return {
         'outer_filters': filters,
+        'outer_basis': getattr(model, 'basis', np.zeros((n_bands, 0))),
         'outer_energy': energy.reshape(len(nodes), -1),
         'outer_index': index,
         'outer_weights': weights,
@@ -174,6 +189,7 @@ class Outside:
         self._probability = scenario.outside_probability
         self.log_odds = log_odds_of(self._probability)
         self._filters, self._index = arrays['outer_filters'], arrays['outer_index']
+        self._basis = arrays['outer_basis']
         ranges = _ranges(scenario)[:, None]
         self._scale = (2 / ranges).astype(np.float32)
         self._node_energy = np.maximum(arrays['outer_energy'], np.finfo(np.float32).tiny)
@@ -181,6 +197,13 @@ class Outside:
         with np.errstate(divide='ignore'):
             log_prior = np.log(arrays['outer_weights'])
         self._offset = (log_prior - self._energy).astype(np.float32)
+
+    def seen(self, model: MeasurementModel, received: np.ndarray, whitened: np.ndarray
+             ) -> np.ndarray:
+        """Return the whitened signals of N shots in the dimensions of the templates."""
+        if not isinstance(model, ProjectedModel):
+            return whitened
+        return project(self._basis, model.full.whiten(received))
 
     def given(self, wrong: float) -> 'Outside':
         """Return the alternative for a prior of the position that is wrong with a probability."""

@@ -80,9 +80,10 @@ class _Rays(NamedTuple):
 class DrawnPosterior:
     """The posterior of positions without nuisance parameters, computed from the table alone."""
 
-    def __init__(self, scenario: Scenario, table: TemplateTable,
+    def __init__(self, scenario: Scenario, table: TemplateTable, n_measurements: int,
                  sampling: Sampling = SAMPLING) -> None:
         self._table, self._sampling, resolution = table, sampling, Resolution.of(scenario)
+        self._n_measurements = n_measurements
         self._wavelength_m = resolution.wavelength_m
         # Rays have a length only in a region with a volume.
         low, high = resolution.bounds_m
@@ -147,7 +148,7 @@ class DrawnPosterior:
         return Fit(
             mean, regular(covariance * (1 + variance)),
             float(log_total) - np.log(total_share) - energy - self._log_region,
-            energy - best, query.signals[0].size + float(weights @ rays.average) - best, 0.0,
+            energy - best, self._n_measurements + float(weights @ rays.average) - best, 0.0,
             functools.partial(_described, rays, weights, 1 + variance, self._bounds))
 
     def _probabilities(self, query: Query, shot: int) -> np.ndarray:

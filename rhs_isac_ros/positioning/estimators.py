@@ -95,7 +95,8 @@ class SearchScope(NamedTuple):
         scenario = likelihood.scenario
         kind = MovingTable if scenario.user_speed_std_mps else TemplateTable
         table = kind(scenario, arrays, grid=grid)
-        alternatives = [Blocked(scenario)] if scenario.blocked_probability else []
+        alternatives = ([Blocked(scenario, likelihood.model.n_whitened)]
+                        if scenario.blocked_probability else [])
         return cls(table, Alignment(likelihood, table.spread), alternatives, np.zeros(1, bool))
 
 
@@ -131,8 +132,9 @@ class SearchEstimator(abc.ABC):
         scenario = system.scenario
         self._likelihood = likelihood = Likelihood(system)
         self._rejects_outside = reject_outside and bool(scenario.outside_probability)
-        self._load = functools.partial(load_table, system, table_folder, progress)
-        prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
+        self._load = functools.partial(
+            load_table, system, table_folder, progress, model=likelihood.model)
+        prior, n_measurements = likelihood.nuisance, likelihood.model.n_whitened
         median_db, std_db = scenario.multipath_level_db
         # Median multipath level of users in sight, and the share of a residual's deviation that
         # is due to the level.
@@ -160,13 +162,14 @@ class SearchEstimator(abc.ABC):
     @functools.cached_property
     def _region(self) -> SearchScope:
         """The whole region."""
-        scenario = self.scenario
+        scenario = self._likelihood.scenario
         scope = SearchScope.of(self._likelihood, self._load(), lay_grid(scenario))
         if self._rejects_outside:
             outside = Outside(scenario, self._load(outside=True))
             scope = scope._replace(alternatives=[outside, *scope.alternatives])
         if self.averages and self._exact_likelihood:
-            scope = scope._replace(drawn=DrawnPosterior(scenario, scope.table))
+            scope = scope._replace(drawn=DrawnPosterior(
+                scenario, scope.table, self._n_measurements))
         return scope
 
     def prepare(self) -> None:
@@ -179,7 +182,7 @@ class SearchEstimator(abc.ABC):
         A user is outside only if the prior is wrong. The part is left out if the table of the
         region exists.
         """
-        likelihood, grid = self._likelihood, lay_grid(self.scenario)
+        likelihood, grid = self._likelihood, lay_grid(self._likelihood.scenario)
         chosen = cells_of(bent, grid, likelihood.resolution)
         # A cached property is in vars() once it is computed.
         if '_region' not in vars(self) and chosen.any():
@@ -319,7 +322,8 @@ class SearchEstimator(abc.ABC):
 
         With `draws`, positions are drawn if the search for modes would be too long.
         """
-        energies = np.sum(np.abs(signals.received)**2, axis=(1, 2)) / self.scenario.noise_power_w
+        energies = np.sum(np.abs(self._likelihood.model.combine(
+            signals.received))**2, axis=(1, 2)) / self.scenario.noise_power_w
         reasons = list(map(self._test.min_energy_test, energies.tolist()))
         found = [_Found(self, Estimate.without_fix(reason)) for reason in reasons]
         usable = [row for row, reason in enumerate(reasons) if not reason]
@@ -328,8 +332,11 @@ class SearchEstimator(abc.ABC):
             aligned = scope.alignment.values_of_each(signals.received)
             whitened = self._likelihood.whitened(aligned, signals)
             fits = self._fits(scope, signals, aligned, whitened, draws)
+            seen = whitened
+            for alternative in scope.alternatives:
+                seen = alternative.seen(self._likelihood.model, signals.received, seen)
             for row, (fit, modes), one, values in zip(
-                    usable, fits, whitened, aligned, strict=True):
+                    usable, fits, seen, aligned, strict=True):
                 estimate, log_ratios = self._judge(scope.alternatives, fit, one, values)
                 found[row] = _Found(self, estimate, fit, modes, log_ratios)
         return found

@@ -25,6 +25,7 @@ from rhs_isac_ros.model.gaussian import (
 )
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.nuisance import UNIFORM_EQUIVALENT, NuisancePrior
+from rhs_isac_ros.positioning.projection import projected
 from rhs_isac_ros.system import System
 
 
@@ -144,13 +145,13 @@ class Likelihood(Conditional):
     """The likelihood with one covariance, in which element errors are averaged over the region."""
 
     def __init__(self, system: System) -> None:
-        self.scenario, self.codebook, self.surface = (
-            system.scenario, system.codebook, system.surface)
+        self.codebook, self.surface = system.codebook, system.surface
         # Estimators are built between cycles; the first estimate should be as fast as later ones.
-        self.model = system.prepare()
+        self.model = projected(system.prepare()).prepare()
+        self.scenario = self.model.scenario
         self.nuisance = NuisancePrior(self.model)
         self.resolution = Resolution.of(self.scenario)
-        self.factors = Factors.of_roots(self.nuisance, self.model.root)
+        self.factors = Factors.of_roots(self.nuisance, self.model.combined_root)
         self.log_det = float(self.factors.log_det)
 
     def signals(self, received: np.ndarray) -> Signals:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rhs_isac_ros import __version__
+from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.positioning import alternatives, templates
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.system import System
@@ -19,7 +20,7 @@ from rhs_isac_ros.system import System
 _MAX_FILES = 32
 _PREFIX = 'table-'
 # Version of the contents; tables of other versions are ignored.
-_FORMAT = 7
+_FORMAT = 8
 
 
 def default_folder() -> Path | None:
@@ -37,24 +38,25 @@ def default_folder() -> Path | None:
 
 
 def load_table(system: System, folder: Path | None = None,
-               progress: Callable[[float], None] | None = None, *, outside: bool = False
-               ) -> Mapping[str, np.ndarray]:
+               progress: Callable[[float], None] | None = None, *, outside: bool = False,
+               model: MeasurementModel | None = None) -> Mapping[str, np.ndarray]:
     """Load the table of a system from a folder, or compute it and store it there.
 
-    The result contains the arrays of `tabulate` or, if `outside`, those of `tabulate_outside`. If
-    they come from a folder, they are read-only and mapped into memory. Without a folder, or with a
-    `RuntimeWarning` if the folder cannot be written, the table is kept only in memory. During the
-    computation, `progress` is called with the completed share.
+    The result contains the arrays of `tabulate` or, if `outside`, those of `tabulate_outside`, for
+    `model`, the projected model of the system, if it is given. If they come from a folder, they
+    are read-only and mapped into memory. Without a folder, or with a `RuntimeWarning` if the
+    folder cannot be written, the table is kept only in memory. During the computation, `progress`
+    is called with the completed share.
     """
     tabulate = alternatives.tabulate_outside if outside else templates.tabulate
     if folder is None:
-        return tabulate(system, progress)
+        return tabulate(model or system, progress)
     key = table_key(system)
     path = folder / f'{_PREFIX}{key}{"-outside" if outside else ""}.npy'
     table = _read(path, key)
     if table is not None:
         return table
-    table = tabulate(system, progress)
+    table = tabulate(model or system, progress)
     try:
         _write(path, key, table)
     except OSError as error:

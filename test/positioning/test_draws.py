@@ -30,7 +30,8 @@ def found_and_exact(scenario, codebook, n=N, sampling=SAMPLING):
     """Draws for n shots, and mean, covariance and log evidence from 2^15 points."""
     likelihood = Likelihood(System(scenario, codebook))
     table = TemplateTable(scenario, tabulate(likelihood.model))
-    drawn, rng = DrawnPosterior(scenario, table, sampling), np.random.default_rng(1)
+    drawn = DrawnPosterior(scenario, table, likelihood.model.n_whitened, sampling)
+    rng = np.random.default_rng(1)
     received = simulate_received(scenario, codebook, scenario.sample_positions(n, rng), rng)
     whitened = likelihood.signals(received).whitened
     query = table.query(whitened, likelihood.nuisance, 8.0)
@@ -83,7 +84,8 @@ def table_and_query(codebook, sampling=SAMPLING, **changes):
     scenario = dataclasses.replace(WEAK, **changes)
     likelihood = Likelihood(System(scenario, codebook))
     table = TemplateTable(scenario, tabulate(likelihood.model))
-    return DrawnPosterior(scenario, table, sampling), table, table.query(
+    drawn = DrawnPosterior(scenario, table, likelihood.model.n_whitened, sampling)
+    return drawn, table, table.query(
         likelihood.model.whiten(likelihood.model.mean(np.array([[6.0, 1.0, 0.2]]))),
         likelihood.nuisance, 8.0)
 
