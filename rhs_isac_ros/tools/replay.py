@@ -346,9 +346,11 @@ class Recording:
                     [*SignalLog.RECEIVES, Codebook]):
                 log.add(*found)
         self.scenarios, leader = scenarios, next(iter(self.logs.values()))
-        self.truths: _Positions = {
+        # In the order of the cycles: the clock of a recording may have gone back.
+        self.truths: _Positions = dict(sorted({
             key: truth.position for log in self.logs.values()
-            for key, signals in log.signals.items() if (truth := leader.truths.of(signals))}
+            for key, signals in log.signals.items()
+            if (truth := leader.truths.of(signals))}.items()))
         if self.truths and (last := max(self.truths)) not in self.logs[''].ended:
             del self.truths[last]
         if not self.truths:

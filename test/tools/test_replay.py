@@ -53,10 +53,10 @@ def test_the_recording_contains_the_cycles_observed_live(run):
     assert list(codebooks) == [shipped.id] == [codebook.id for codebook in codebooks.values()]
 
 
-def filtered(path, keep, namespaces=('',)):
+def filtered(path, keep, namespaces=('',), time_of=lambda time_ns: time_ns):
     """Copy the messages of a recording that a function of topic and content selects.
 
-    The copy contains them once for each namespace, one after the other.
+    The copy contains them once for each namespace, one after the other, at other times.
     """
     from mcap.reader import make_reader
     from mcap.writer import Writer
@@ -71,7 +71,8 @@ def filtered(path, keep, namespaces=('',)):
                 if topic not in channels:
                     channels[topic] = writer.register_channel(
                         topic, 'cdr', writer.register_schema(about.name, '', b''))
-                writer.add_message(channels[topic], message.log_time, message.data, 0)
+                writer.add_message(
+                    channels[topic], time_of(message.log_time), message.data, 0)
         writer.finish()
     return copy
 
@@ -94,6 +95,20 @@ def test_a_copy_by_another_program_has_the_same_table(run, capsys, tmp_path, cop
             assert main([*map(str, arguments)]) == 0
             tables.append(capsys.readouterr().out)
     assert len({*tables}) == 1
+
+
+@pytest.mark.parametrize('time_of', [
+    lambda time_ns, middle_ns: time_ns - 10**12 * (time_ns > middle_ns), min],
+    ids=['goes back', 'stands still'])
+def test_the_clock_of_a_recording_does_not_matter(run, capsys, time_of):
+    times_ns = [int(1e9 * time_s) for *_, time_s in read(run.path, ['/received_signals'])]
+    path = filtered(run.path, lambda *_: True, time_of=lambda time_ns: time_of(
+        time_ns, times_ns[len(times_ns) // 2]))
+    tables = []
+    for file in (run.path, path):
+        assert main([str(file), '--config', str(CONFIG / 'quick.yaml'), '--track']) == 0
+        tables.append(capsys.readouterr().out)
+    assert tables[0] == tables[1]
 
 
 def test_cycles_that_had_no_fix_live_count_for_every_estimator(run, capsys):
