@@ -1,4 +1,7 @@
-"""A robot as a user, in the frame of the robot and in the time of its simulation."""
+"""A robot as a user, in the frame of the robot and in the time of its simulation.
+
+All nodes of the network are in one process, and the elements of the surface resonate.
+"""
 
 import math
 import time
@@ -23,7 +26,7 @@ from rhs_isac_ros.ros.endpoints import EXCHANGE
 
 # The surface is turned by 90 degrees about z, and moved.
 TURNED = Pose((1.0, 2.0, 3.0), (0.0, 0.0, 1.0, 1.0))
-SCENARIO = 'pose: {position_m: [1, 2, 3], quaternion: [0, 0, 1, 1]}'
+SCENARIO = 'pose: {position_m: [1, 2, 3], quaternion: [0, 0, 1, 1]}\nboard: resonant'
 # Begin of the simulation, far from the time of the computer [s], and its pace, which is slow, so
 # that a busy machine delays the robot little.
 BEGIN_S, PACE = 1000.0, 0.2

@@ -15,7 +15,6 @@ from policy_rules import permissions, rules, used
 from scipy.stats import chi2
 
 import rhs_isac_msgs.msg as ros
-from rhs_isac_ros.codebook import default_codebook_file
 from rhs_isac_ros.positioning import Site, fuse
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.fusion import sighting_of
@@ -35,20 +34,21 @@ STEPS = {'step_timeout_s': 10.0}
 # Roles without which a surface carries no data, and those without which it has no posterior.
 OF_DATA = {'rhs_controller', 'transmission', 'channel', 'receiver'}
 OF_POSTERIOR = {'rhs_controller', 'positioner', 'channel', 'receiver'}
+FILES = {'front': {'scenario': 'table1.yaml', 'codebook': 'codebook.yaml'},
+         'side': {'scenario': 'resonant.yaml', 'codebook': 'codebook_resonant.yaml'}}
 POSES = {'front': ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]),
          'side': ([10.0, -10.0, 0.0], [0.0, 0.0, 1.0, 1.0])}
 
 
 @pytest.fixture(scope='module')
 def make_site_file(tmp_path_factory):
-    """Function that writes a site file with the given surfaces, all of Table I."""
+    """Function that writes a site file: the paper's surface in front, a resonant one beside."""
     def make(*names):
         file = tmp_path_factory.mktemp('site') / 'site.yaml'
         file.write_text(yaml.safe_dump({
             'roi_center_m': [10.0, 0.0, 0.0], 'roi_size_m': [10.0, 10.0, 2.0],
             'surfaces': {name: {
-                'scenario': str(ROOT / 'config' / 'table1.yaml'),
-                'codebook': str(default_codebook_file()),
+                **{kind: str(ROOT / 'config' / file) for kind, file in FILES[name].items()},
                 'pose': {'position_m': POSES[name][0], 'quaternion': POSES[name][1],
                          'uncertainty': [0.02, 0.2]}} for name in names}},
             sort_keys=False), encoding='utf-8')
