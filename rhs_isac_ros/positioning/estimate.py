@@ -198,7 +198,8 @@ class Estimate:
         mean, covariance = mixture.moments()
         return dataclasses.replace(
             self, mean=mean[:3], covariance=covariance[:3, :3], velocity=mean[3:],
-            velocity_covariance=covariance[3:, 3:], density=mixture)
+            velocity_covariance=covariance[3:, 3:], cross_covariance=covariance[:3, 3:],
+            density=mixture)
 
     def to_site(self, pose: Pose) -> 'Estimate':
         """Convert from the frame of a surface to that of the site, with the errors of its pose.
