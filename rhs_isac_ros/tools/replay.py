@@ -28,6 +28,7 @@ from rhs_isac_ros.nodes.optimizer import OptimizerNode, ros_parameters
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
     BayesEstimator,
+    Estimate,
     Estimator,
     EstimatorKind,
     Motion,
@@ -61,7 +62,7 @@ from rhs_isac_ros.system import System
 from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.command import ToolError
 
-# Positions, float64 [3] [m], by cycle and user.
+# Positions, float64 [3] [m], some with velocities, [6] [m, m/s], by cycle and user.
 _Positions: TypeAlias = dict[Key, np.ndarray]
 _SIGNALS = topics.NAMES[m.ReceivedSignals]
 _ESTIMATES = topics.NAMES[m.PositionEstimate]
@@ -347,10 +348,11 @@ class Recording:
                 log.add(*found)
         self.scenarios, leader = scenarios, next(iter(self.logs.values()))
         # In the order of the cycles: the clock of a recording may have gone back.
-        self.truths: _Positions = dict(sorted({
-            key: truth.position for log in self.logs.values()
-            for key, signals in log.signals.items()
+        found_in = dict(sorted({
+            key: truth for log in self.logs.values() for key, signals in log.signals.items()
             if (truth := leader.truths.of(signals))}.items()))
+        self.truths: _Positions = {key: truth.position for key, truth in found_in.items()}
+        self._velocities = {key: truth.velocity for key, truth in found_in.items()}
         if self.truths and (last := max(self.truths)) not in self.logs[''].ended:
             del self.truths[last]
         if not self.truths:
@@ -363,8 +365,13 @@ class Recording:
 
     def errors_m(self, positions: _Positions) -> np.ndarray:
         """Return the errors of positions, float64 [N] [m]; NaN without a position."""
-        return np.array([np.linalg.norm(positions.get(key, np.full(3, np.nan)) - truth)
+        return np.array([np.linalg.norm(positions.get(key, np.full(3, np.nan))[:3] - truth)
                          for key, truth in self.truths.items()])
+
+    def velocity_errors_mps(self, positions: _Positions) -> np.ndarray:
+        """Return the errors of the velocities, float64 [n] [m/s], where there are any."""
+        return np.array([np.linalg.norm(found[3:] - self._velocities[key])
+                         for key, found in positions.items() if found[3:].size])
 
 
 def load(path: Path, namespace: str = '/', config: Path | None = None,
@@ -375,6 +382,11 @@ def load(path: Path, namespace: str = '/', config: Path | None = None,
     """
     return Recording(path, namespace, {
         '': command.choose_scenario(config, path, namespace, site)})
+
+
+def _state(estimate: Estimate) -> np.ndarray:
+    state = np.append(estimate.mean, estimate.velocity)
+    return state[np.isfinite(state)]
 
 
 def locate(
@@ -393,7 +405,7 @@ def locate(
             tracks.locate(signals, estimator, track_speed_mps,
                           signals.time_s(log.arrived_s[key])))
         if estimate.fix:
-            found[key] = estimate.to_site(recording.scenarios[''].pose).mean
+            found[key] = _state(estimate.to_site(recording.scenarios[''].pose))
     return found
 
 
@@ -421,11 +433,11 @@ class SiteRecording(Recording):
                 if sighting := Sighting.of(posterior):
                     sightings.append(sighting)
                 if posterior.fix:
-                    again[name][key] = posterior.to_site(scenario.pose).mean
+                    again[name][key] = _state(posterior.to_site(scenario.pose))
             if sightings and (fused := fuse(
                     sightings, self._networks.bounds_m, leader.outside_probability,
                     leader.user_speed_std_mps)).fix:
-                again[''][key] = fused.mean
+                again[''][key] = _state(fused)
         return again
 
     def _estimator(self, folder: Path | None, name: str, codebook_id: str) -> BayesEstimator:
@@ -452,7 +464,7 @@ def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
     recording = SiteRecording(options.file, options.namespace, networks)
     command.print_now(f'{len(recording.truths)} cycles')
     again = recording.located(default_folder())
-    rows = [_row(f'{label}{name or "fusion"}', recording.errors_m(positions))
+    rows = [_row(f'{label}{name or "fusion"}', recording, positions)
             for name, found in again.items()
             for label, positions in (('live ', recording.live(name)), ('', found))]
     _print_table(rows)
@@ -501,30 +513,34 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     codebooks = _codebooks(recording, options.codebook)
     names = sorted({estimate.estimator for estimate in log.estimates.values()})
     command.print_now(f'{len(recording.truths)} cycles')
-    rows = [_row(f'live {", ".join(names)}', recording.errors_m(recording.live()))]
+    rows = [_row(f'live {", ".join(names)}', recording, recording.live())]
     surface = load_surface(str(options.calibration or ''), scenario)
     for kind in _kinds(options):
         accepted = kind.accepted(table_folder=default_folder(), model_file=options.model or '',
                                  reject_outside=True)
         estimators = {codebook_id: kind.create(System(scenario, codebook, surface), **accepted)
                       for codebook_id, codebook in codebooks.items()}
-        rows.append(_row(kind.name, recording.errors_m(locate(recording, estimators))))
+        rows.append(_row(kind.name, recording, locate(recording, estimators)))
         if options.track and kind.uses_tracks:
-            rows.append(_row('track', recording.errors_m(locate(
-                recording, estimators, options.track_speed or Motion.speed_mps))))
+            rows.append(_row('track', recording, locate(
+                recording, estimators, options.track_speed or Motion.speed_mps)))
     _print_table(rows)
     return 0
 
 
-def _print_table(rows: Iterable[Sequence[str]]) -> None:
-    print(command.text_table(['', 'median error', 'root mean square', 'no fix'], rows, '<>>>'))
+def _print_table(rows: Sequence[Sequence[str]]) -> None:
+    heads = ['', 'median error', 'root mean square', 'no fix', 'velocity, rms']
+    n = 5 if any(row[-1] for row in rows) else 4
+    print(command.text_table(heads[:n], [row[:n] for row in rows], '<>>>>'[:n]))
 
 
-def _row(name: str, errors: np.ndarray) -> list[str]:
+def _row(name: str, recording: Recording, positions: _Positions) -> list[str]:
+    errors, speeds = recording.errors_m(positions), recording.velocity_errors_mps(positions)
     fixes = errors[~np.isnan(errors)]
     median, rms = ((np.median(fixes), np.sqrt(np.mean(fixes**2))) if len(fixes)
                    else (np.nan, np.nan))
-    return [name, f'{median:.6f} m', f'{rms:.6f} m', str(len(errors) - len(fixes))]
+    return [name, f'{median:.6f} m', f'{rms:.6f} m', str(len(errors) - len(fixes)),
+            f'{np.sqrt(np.mean(speeds**2)):.6f} m/s' if len(speeds) else '']
 
 
 def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:

@@ -172,7 +172,11 @@ def test_users_are_tracked_beside_single_cycles(run, replayed):
     estimators = {key: make_estimator('bayes', recording.scenarios[''], codebook)
                   for key, codebook in recording.logs[''].codebooks.items()}
     alone = recording.errors_m(locate(recording, estimators))
-    tracked = recording.errors_m(locate(recording, estimators, 1.0))
+    states = locate(recording, estimators, 1.0)
+    tracked, velocities = recording.errors_m(states), recording.velocity_errors_mps(states)
+    # Single cycles have no velocity.
+    assert len(velocities) == np.isfinite(tracked).sum()
+    assert not recording.velocity_errors_mps(locate(recording, estimators)).size
     users = [user for _, user in recording.truths]
     first = [users.index(user) for user in set(users)]
     assert len(first) < len(users)
@@ -180,7 +184,8 @@ def test_users_are_tracked_beside_single_cycles(run, replayed):
     np.testing.assert_array_equal(tracked[first], alone[first])
     found, _ = replayed('--track')
     assert found['track'] == [
-        f'{np.median(tracked):.6f}', 'm', f'{np.sqrt(np.mean(tracked**2)):.6f}', 'm', '0']
+        f'{np.median(tracked):.6f}', 'm', f'{np.sqrt(np.mean(tracked**2)):.6f}', 'm', '0',
+        f'{np.sqrt(np.mean(velocities**2)):.6f}', 'm/s']
 
 
 def test_an_estimator_of_a_plugin_is_available(replayed, install):
