@@ -95,20 +95,25 @@ def frame_times_s(scenario: Scenario) -> np.ndarray:
     return read_only(times - times.mean())
 
 
-def undeclared_movement(scenario: Scenario) -> str:
-    """Return a warning if users may move too far in a cycle to be taken for users at rest, or ''.
+def stands_still(scenario: Scenario, speed_mps: float) -> bool:
+    """Return whether a user with this speed may be taken for one at rest.
 
-    There is none if a velocity is declared, or if the phase of the direct path changes by less
-    than `_AT_REST_RAD` from the first frame to the last one.
+    The phase of the direct path then changes by less than `_AT_REST_RAD` from the first frame of a
+    cycle to the last one.
     """
-    speed_mps, duration_s = scenario.max_user_speed_mps, float(np.ptp(frame_times_s(scenario)))
     turn = 2 * np.pi * max(scenario.center_frequencies_hz) / SPEED_OF_LIGHT_MPS
-    phase = turn * speed_mps * duration_s
-    if scenario.user_speed_std_mps or phase < _AT_REST_RAD:
+    return bool(turn * speed_mps * np.ptp(frame_times_s(scenario)) < _AT_REST_RAD)
+
+
+def undeclared_movement(scenario: Scenario) -> str:
+    """Return a warning if users may move in a cycle, and no velocity is declared; otherwise ''."""
+    speed_mps, duration_s = scenario.max_user_speed_mps, np.ptp(frame_times_s(scenario))
+    if scenario.user_speed_std_mps or stands_still(scenario, speed_mps):
         return ''
     return (f'user_speed_std_mps: 0, but users of max_user_speed_mps = {speed_mps:g} m/s move by '
-            f'{phase:.1f} rad in a cycle of {duration_s:.2g} s, and positions assume that they '
-            f'stand still; declare about {speed_mps / 3**0.5:.2g} m/s for each component')
+            f'{speed_mps * duration_s:.2g} m in a cycle of {duration_s:.2g} s, and positions '
+            f'assume that they stand still; declare about {speed_mps / 3**0.5:.2g} m/s for each '
+            'component')
 
 
 def measurement_times_s(scenario: Scenario) -> np.ndarray:

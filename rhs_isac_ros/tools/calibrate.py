@@ -8,6 +8,7 @@ positions.
 import argparse
 import dataclasses
 import functools
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -35,6 +36,7 @@ from rhs_isac_ros.calibration.survey import PLACE_WAVELENGTHS
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import MultipathEstimate, Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
+from rhs_isac_ros.model.geometry import stands_still
 from rhs_isac_ros.monitoring.cycle_log import SignalLog
 from rhs_isac_ros.positioning import Sighting, Site, make_estimator
 from rhs_isac_ros.positioning.alignment import PoseError, estimate_pose
@@ -67,11 +69,14 @@ Assumption: TypeAlias = Callable[[list[Pilots]], tuple[Scenario, SurfaceEstimate
 
 
 class PilotLog(SignalLog):
-    """Collects pilots, also of cycles without a fix, which may require the calibration."""
+    """Collects pilots, also of cycles without a fix, which may require the calibration.
+
+    Users have to stand still: the pilots of a cycle have one position.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__()
-        self._pose = scenario.pose
+        self._scenario = scenario
 
     @property
     def n_pilots(self) -> int:
@@ -89,13 +94,23 @@ class PilotLog(SignalLog):
         groups: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
         for signals, truth in self._known():
             groups.setdefault(signals.codebook_id, []).append(
-                (self._pose.to_surface(truth.position), signals.stacked))
+                (self._scenario.pose.to_surface(truth.position), signals.stacked))
         return [Pilots(self.codebooks[codebook_id], *map(np.array, zip(*group, strict=True)))
                 for codebook_id, group in groups.items()]
 
+    @property
+    def n_moving(self) -> int:
+        """Number of cycles that are left out because their users moved too far."""
+        return sum(not self._is_at_rest(truth) for signals in self.signals.values()
+                   if (truth := self.truths.of(signals)))
+
+    def _is_at_rest(self, truth: m.GroundTruth) -> bool:
+        return stands_still(self._scenario, float(np.linalg.norm(truth.velocity)))
+
     def _known(self) -> list[tuple[m.ReceivedSignals, m.GroundTruth]]:
         return [(signals, truth) for signals in self.signals.values()
-                if (truth := self.truths.of(signals)) and signals.codebook_id in self.codebooks]
+                if (truth := self.truths.of(signals)) and signals.codebook_id in self.codebooks
+                and self._is_at_rest(truth)]
 
 
 class CalibratorNode(Node):
@@ -240,6 +255,9 @@ def _collected(
     if log.missing_codebooks:
         raise RecordingError(f'{source}: codebook {log.missing_codebooks[0]}: not in the '
                              'recording; give its file with --codebook FILE')
+    if log.n_moving:
+        print(f'calibrate: {source}: {log.n_moving} cycles of users who moved are left out',
+              file=sys.stderr)
     if not (pilots := log.pilots()):
         raise RecordingError(
             f'{source}: no received signals with a true position, expected at least one in the '

@@ -68,6 +68,8 @@ from rhs_isac_ros.tools.pictures import compose_cycles, prepare_drawing
 
 # Maximum time between two complete cycles [s].
 _CYCLE_TIMEOUT_S = 60.0
+# Time to wait for a step of a cycle if estimators find velocities, which takes most of a second.
+_MOVING_TIMEOUT_S = 4.0
 # Speed of users whom codebooks follow; faster ones move too far between two cycles.
 _WALKING_MPS = 1.0
 # Period of checks [s].
@@ -365,6 +367,7 @@ class _Demonstration:
             # Other radios have noise of their own.
             radio=options.radio, radio_options=options.radio_options,
             samples_folder=options.samples, receiver_noise=options.radio == 'emulated',
+            step_timeout_s=_MOVING_TIMEOUT_S if self.scenario.user_speed_std_mps else None,
             speed_mps=_WALKING_MPS if options.follow else None,
             # The parameter does not admit 0.
             track_speed_mps=None if options.prior == REGION else _WALKING_MPS if options.follow

@@ -38,7 +38,10 @@ class EmulatedLink:
 
     def received(self, codebook: Codebook, cycle_id: int, user: int, position: np.ndarray
                  ) -> np.ndarray:
-        """Return the signals of a cycle, complex128 [N_B, N_SB F]; `position` is of the site."""
+        """Return the signals of a cycle, complex128 [N_B, N_SB F].
+
+        `position` is that in the site, [3] [m], or position and velocity, [6] [m, m/s].
+        """
         # Start and carrier of the radio are drawn again.
         self._radio.close()
         feeds = np.stack([self._feeds(codebook, cycle_id, user, position, band)
@@ -53,8 +56,8 @@ class EmulatedLink:
         """Return the signals at the feeds for the pilots of a band, complex128 [F, N_SB, K]."""
         analog = codebook.analog[band]
         for event in (
-                m.GroundTruth(
-                    cycle_id=cycle_id, user=user, position=position, velocity=np.zeros(3)),
+                m.GroundTruth(cycle_id=cycle_id, user=user, position=position[:3],
+                              velocity=np.append(position[3:], np.zeros(3))[:3]),
                 m.RhsConfiguration(cycle_id=cycle_id, mode=m.Mode.POSITIONING, band=band,
                                    codebook_id=codebook.id, analog=analog),
                 m.Pilot(cycle_id=cycle_id, user=user, band=band,

@@ -1,5 +1,7 @@
 """Pilots at known positions, assembled from messages."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -57,6 +59,17 @@ def test_positions_of_others_do_not_count(log, codebook, message):
     log.add(message)
     log.add(signals(3, codebook.id))
     assert (log.n_pilots, log.pilots()) == (0, [])
+
+
+@pytest.mark.parametrize(('speed_mps', 'n_pilots'), [(0.01, 1), (0.1, 0)])
+def test_users_who_move_during_long_frames_are_left_out(codebook, speed_mps, n_pilots):
+    """In three frames of 0.1 s, the phase at 3 GHz changes by a radian at 0.05 m/s."""
+    log = PilotLog(Scenario(n_frames=2, frame_duration_s=0.1))
+    velocity = np.array([0.0, speed_mps, 0.0])
+    for message in (codebook, dataclasses.replace(truth(1), velocity=velocity),
+                    signals(1, codebook.id)):
+        log.add(message)
+    assert (log.n_pilots, log.n_moving) == (n_pilots, 1 - n_pilots)
 
 
 def test_repeated_signals_count_once(log, codebook):
