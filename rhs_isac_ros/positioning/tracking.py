@@ -18,6 +18,7 @@ from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT, LIMIT
 from rhs_isac_ros.positioning.estimate import SITE, Estimate, SignalError
 from rhs_isac_ros.positioning.estimators import SearchEstimator
 from rhs_isac_ros.positioning.mixture import Mixture, velocity_variance
+from rhs_isac_ros.positioning.prior import MIN_EXTENT_M
 from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.support.fields import finite, to_number
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -205,6 +206,7 @@ class _Users(NamedTuple):
     def of(cls, scenario: Scenario, bounds_m: np.ndarray, pose: Pose) -> '_Users':
         """Take the bounds of the region around a pose, float64 [2, 3] [m]."""
         size_m = np.ptp(bounds_m, axis=0)
+        size_m = np.where(size_m > 0, size_m, MIN_EXTENT_M)
         return cls(pose.to_site(bounds_m.mean(axis=0)),
                    pose.covariances_to_site(np.diag(size_m**2)), float(np.log(size_m).sum()),
                    pose.covariances_to_site(

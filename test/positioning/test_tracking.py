@@ -7,9 +7,15 @@ import numpy as np
 import pytest
 from scipy.special import chdtri
 
-from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.codebook import Codebook, random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.positioning import Mixture, SignalError, Tracker, make_estimator
+from rhs_isac_ros.positioning import (
+    BayesEstimator,
+    Mixture,
+    SignalError,
+    Tracker,
+    make_estimator,
+)
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.tracking import (
     MAX_GAP_S,
@@ -17,6 +23,7 @@ from rhs_isac_ros.positioning.tracking import (
     Motion,
     independent_share,
 )
+from rhs_isac_ros.system import System
 
 PLACE = np.array([[9.0, -2.0, 0.5], [6.0, 3.0, -0.5]])
 
@@ -473,6 +480,36 @@ def test_velocities_that_are_measured_are_those_of_the_track():
     np.testing.assert_allclose(found.mean, expected[0], atol=1e-3)
     np.testing.assert_allclose(found.velocity, expected[1], atol=1e-3)
     np.testing.assert_allclose(found.velocity_covariance, joint[1, 1] * np.eye(3), atol=1e-3)
+
+
+@pytest.mark.parametrize('height_m', [0.0, 1.0], ids=['plane', 'room'])
+def test_users_who_move_during_a_cycle_are_tracked(height_m):
+    """Positions are better than those of single cycles, and covariances match the errors."""
+    scenario = Scenario(
+        center_frequencies_hz=(5.25e9, 5.75e9), n_subbands=2, n_frames=12, frame_duration_s=0.015,
+        elements_per_side=8, element_interval_wavelengths=0.4, n_feeds=1, refractive_index=1.0,
+        feed_positions_m=((0.3, 0.0, 0.0),), max_user_speed_mps=1.5, multipath_to_los_db=-6,
+        band_phase_std_rad=6.2832, roi_center_m=(3.5, 0, 0), roi_size_m=(3, 3, height_m),
+        user_speed_std_mps=0.8, outside_probability=0.0)
+    rng, velocity = np.random.default_rng(3), np.array([0.3, -0.6, 0.0])
+    system = System(scenario, random_codebook(scenario, rng))
+    tracker, errors, squares = Tracker(BayesEstimator(system), Motion(1.0)), [], []
+    for time_s in np.add.outer(100 * np.arange(4), 0.5 * np.arange(5)).ravel():
+        place = np.array([3.0, 0.7, 0.0]) + time_s % 100 * velocity
+        found = tracker.update(time_s, system.sample(np.append(place, velocity)[None], rng)[0])
+        alone, _ = tracker.latest.sighting.mixture.moments()
+        errors.append([error(found, place), np.linalg.norm(alone[:3] - place),
+                       np.linalg.norm(found.velocity - velocity)])
+        deviation = (found.mean - place)[:2]
+        squares.append(deviation @ np.linalg.solve(found.covariance[:2, :2], deviation))
+    # The first two cycles of a walk are left out.
+    tracked_m, alone_m, velocity_mps = np.sqrt(np.mean(
+        np.square(np.reshape(errors, (4, 5, 3))[:, 2:]), axis=(0, 1)))
+    assert tracked_m < 0.8 * alone_m
+    assert velocity_mps < 0.5
+    assert 1 < np.mean(squares) < 4
+    predicted, _ = tracker.predict(time_s + 0.5)
+    np.testing.assert_allclose(predicted, found.mean + 0.5 * found.velocity, atol=0.1)
 
 
 def test_late_phases_do_not_change_a_track_of_mixtures(mixture_tracker):
