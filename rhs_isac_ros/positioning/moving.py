@@ -132,12 +132,13 @@ class MovingTable(TemplateTable):
             means = np.moveaxis(templates * turn[..., None], 2, 0)
             weights = (adjoint(whitener) @ whitener).reshape(
                 n_subbands, n_frames, n_subbands, n_frames).transpose(1, 3, 2, 0)
-            products = np.empty((n_frames, n_frames, n_nodes), complex)
+            # Products of two frames count twice.
             for frame, weight in enumerate(weights):
-                columns = np.matmul(np.swapaxes(means, 1, 2), weight)
-                products[frame] = np.einsum('sg,pgs->pg', means[frame].conj(), columns)
-            between = ramps[:, None] * ramps.conj()
-            total += np.einsum('qpg,qpv->gv', products, between, optimize=True).real
+                columns = np.matmul(np.swapaxes(means[frame:], 1, 2), weight[frame:])
+                products = np.einsum('sg,pgs->gp', means[frame].conj(), columns)
+                products[:, 1:] *= 2
+                total += (products.astype(np.complex64) @ (
+                    ramps[frame] * ramps[frame:].conj())).real
         return total
 
     def search(self, whitened: np.ndarray, prior: NuisancePrior, margin: float | np.ndarray,
