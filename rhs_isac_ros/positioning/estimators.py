@@ -12,10 +12,11 @@ import numpy as np
 
 from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
+from rhs_isac_ros.model.constants import POWER_NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import share_of_level
-from rhs_isac_ros.model.geometry import jacobian
+from rhs_isac_ros.model.geometry import jacobian, velocity_std_mps
 from rhs_isac_ros.positioning.alternatives import Alternative, Blocked, Outside, rejection
-from rhs_isac_ros.positioning.diagnosis import FitTest, misfit_log_ratio
+from rhs_isac_ros.positioning.diagnosis import FitTest, misfit_log_ratio, speed_test
 from rhs_isac_ros.positioning.draws import DrawnPosterior
 from rhs_isac_ros.positioning.estimate import (
     MISS_PROBABILITY,
@@ -397,7 +398,7 @@ class SearchEstimator(abc.ABC):
             one.log_odds + log_ratios[one.name] for one in alternatives)]))
         weights = self._likelihood.weights_at(np.array([fit.gain]))[0]
         reason = self._reason(alternatives, whitened * np.exp(-fit.gain) * weights,
-                              fit.residual, probabilities)
+                              fit.residual, probabilities) or self._too_fast(fit)
         # Without a fix, only a residual that nothing explains is evidence against the scenario.
         # The residual is the reason if the texts are equal.
         is_evidence = (reason == self._test.residual_test(fit.residual) if reason
@@ -413,6 +414,17 @@ class SearchEstimator(abc.ABC):
             statistics.update(velocity=fit.mean[3:], velocity_covariance=covariance[3:, 3:],
                               cross_covariance=covariance[:3, 3:])
         return Estimate(fit.mean[:3], covariance[:3, :3], reason, **statistics), log_ratios
+
+    def _too_fast(self, fit: Fit) -> str:
+        """Return the reason if the user may be faster than declared, or ''."""
+        moving = np.flatnonzero(velocity_std_mps(self.scenario))
+        if not len(moving):
+            return ''
+        _, std_db = self.scenario.multipath_level_db
+        return speed_test(
+            fit.residual / (self._level * max(fit.expected, 0.5)),
+            float(np.hypot(self._n_measurements**-0.5, POWER_NEPERS_PER_DB * std_db)),
+            fit.mean[3 + moving] / self.scenario.user_speed_std_mps)
 
     def _scale(self, fit: Fit) -> float:
         """Return the factor of the covariance for the multipath level that the residual shows."""
