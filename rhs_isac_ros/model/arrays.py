@@ -38,7 +38,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def multiply_rows(matrices: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Multiply rows [..., *B, n] by B matrices [*B, m, n]; return [..., *B, m].
+    """Multiply rows ``[..., *B, n]`` by matrices ``[*B, m, n]``; return ``[..., *B, m]``.
 
     A row is rounded in the same way among any number of other rows.
     """

@@ -274,7 +274,7 @@ class MeasurementModel:
 
     @functools.cached_property
     def combined_root(self) -> np.ndarray:
-        """The same factor of the covariance of `combine`d signals, [N_B, n, n], read-only."""
+        """The same factor of the covariance of signals after `combine`, [N_B, n, n], read-only."""
         covariance = self.covariance() if self._functions is None else combined_covariance(
             self.scenario, self.radiation, self._functions)
         return read_only(covariance_root(

@@ -131,7 +131,8 @@ class _Posterior:
         conditional: Conditional = self._dispersed or likelihood
         prior, value = likelihood.nuisance, np.empty(len(points))
         values = np.repeat(self._aligned[shot][None], len(points), axis=0)
-        outputs = likelihood.at(points, moves=False).outputs(values, select(self._signals, [shot]))
+        outputs = likelihood.at(points, values, moves=False).outputs(
+            values, select(self._signals, [shot]))
         if len(prior):
             # The steps of `marginal_at` begin near the most likely gain.
             whitened = self._whitened[shot]
@@ -140,7 +141,7 @@ class _Posterior:
             values += prior.start(outputs.T, np.broadcast_to(gain, len(points)))
         for start in range(0, len(points), _BLOCK):
             block = slice(start, start + _BLOCK)
-            value[block], values[block] = marginal_at(
+            value[block], values[block], _ = marginal_at(
                 conditional, likelihood, points[block], values[block],
                 select(self._signals, [shot]))
         if not len(prior):
@@ -149,7 +150,7 @@ class _Posterior:
         value[near] = self._integrated(conditional, points[near], values[near], shot)
         if self._phases.is_informative:
             signals = select(self._signals, [shot])
-            outputs = likelihood.at(points, moves=False).outputs(values, signals)
+            outputs = likelihood.at(points, values, moves=False).outputs(values, signals)
             turned = outputs * np.exp(1j * values @ prior.phases.T)
             value += self._phases.factors(turned.T)[0]
         return value
@@ -163,7 +164,7 @@ class _Posterior:
         n_values = values.shape[1]
         normal = ndtri(qmc.Sobol(n_values, seed=0).random(_N_VALUES))
         signals = select(self._signals, [shot])
-        located = conditional.at(points, moves=False)
+        located = conditional.at(points, values, moves=False)
         among = located.local(values, signals).information
         roots = np.linalg.cholesky(among)
         value = np.empty((len(points), _N_VALUES))
