@@ -33,7 +33,7 @@ from rhs_isac_ros.system import System
 SPEEDS_MPS = 0.0, 0.1, 0.3, 1.0, 2.0
 # Users that are located at a time; samples of a mode of the exact posterior, and the factor of
 # their covariances.
-BLOCK, SAMPLES, WIDENING = 25, 1024, 1.3**2
+BLOCK, SAMPLES, WIDENING = 50, 1024, 1.3**2
 
 
 def main() -> None:
