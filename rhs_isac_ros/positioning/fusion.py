@@ -51,7 +51,7 @@ class _Limits(NamedTuple):
     # Numbers of samples of a sheet, of a part of a product, and of all parts together that are
     # computed at a time. Factor by which samples are wider than a Gaussian.
     of_sheet: int = 64
-    of_product: int = 128
+    of_product: int = 256
     samples: int = 1 << 13
     spread: float = 1.2
     # Information of a uniform prior in the region that narrows Gaussians, as a share of it, and
@@ -71,7 +71,7 @@ class _Limits(NamedTuple):
     within: float = 0.75
     # Share of the samples that have to be effective in parts whose weight is within a margin of
     # the best. Others are halved, this many at a time and so often.
-    effective: float = 0.25
+    effective: float = 0.35
     margin: float = 5.0
     parts: int = 32
     halvings: int = 8

@@ -105,7 +105,6 @@ def assert_moments(fused, mean, covariance, tolerance=0.05):
                                atol=2 * tolerance)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('others', [[], [SIDE], [OPPOSITE], [SIDE, OPPOSITE]],
                          ids=['alone', 'side', 'opposite', 'three'])
 def test_the_posterior_is_the_integral_of_the_product(others):
