@@ -7,7 +7,7 @@ as long as the weights of the codebook are slow. Chebyshev polynomials of a freq
 stretched at the edges represent them; the error decreases exponentially with their number.
 
 The combinations E^H y have the mean E^H mu and the covariance E^H Lambda E. Their likelihood is
-exact; compared with that of all signals, it lacks less than 1e-6 nats. The covariance needs no
+exact; compared with that of all signals, it lacks about 1e-5 nats or less. The covariance needs no
 array of all measurements: T_i is a sum of few products of functions of the sub-band with matrices,
 and K_f of Eq. (3) is a Toeplitz matrix.
 """
@@ -30,7 +30,8 @@ from rhs_isac_ros.model.multipath import (
 from rhs_isac_ros.model.scenario import Scenario
 
 # Number of functions of the sub-bands, and further ones per turn of the phase over the band that
-# the range of the region causes. With them, less than 1e-6 nats are lost.
+# the range of the region causes. With them, less than 1e-6 nats are lost of 256 sub-bands in
+# 100 MHz; a third more functions add less than 1e-5 nats to 3276 sub-bands.
 _FUNCTIONS, _PER_TURN = 64, 8
 # Share of the largest singular value below which terms of T_i are rounding errors, and share of
 # T_i that the functions may lack if it changes slowly.
@@ -116,15 +117,21 @@ def combined_covariance(scenario: Scenario, radiation: np.ndarray, functions: np
     return np.array(covariance) + noise
 
 
-def draw_scattered(scenario: Scenario, band: int, radiation: np.ndarray, n: int,
-                   rng: np.random.Generator) -> np.ndarray:
-    """Draw the signals of declared multipath for T_i, [N_SB F, N_E]; complex128 [n, N_SB F]."""
-    over, frames = _terms(scenario, radiation)
-    root = square_root(_correlated(scenario, band, frames))
-    power = np.sum(np.abs(root)**2, axis=0)
-    root = root[:, power > _DRAWN * power.max()]
-    # Parts of the signals that are independent of each other, [N_SB, F, r].
-    parts = np.tensordot(over, root.reshape(*frames.shape[:2], -1), axes=1)
+def scattered_parts(scenario: Scenario, radiation: np.ndarray) -> list[np.ndarray]:
+    """Return independent parts of the declared multipath for each T_i, complex128 [N_SB, F, R]."""
+    parts = []
+    for band, one in enumerate(radiation):
+        over, frames = _terms(scenario, one)
+        root = square_root(_correlated(scenario, band, frames))
+        power = np.sum(np.abs(root)**2, axis=0)
+        root = root[:, power > _DRAWN * power.max()]
+        parts.append(np.tensordot(over, root.reshape(*frames.shape[:2], -1), axes=1))
+    return parts
+
+
+def draw_scattered(scenario: Scenario, parts: np.ndarray, n: int, rng: np.random.Generator
+                   ) -> np.ndarray:
+    """Draw n signals of multipath from its `scattered_parts`, complex128 [n, N_SB F]."""
     factor = _delay_factor(scenario)
     drawn = np.empty((n, *parts.shape[:2]), complex)
     for block in blocks(n, max(_BLOCK_NUMBERS // (factor.shape[1] * parts.shape[2]), 1)):

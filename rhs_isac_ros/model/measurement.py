@@ -27,6 +27,7 @@ from rhs_isac_ros.model.compression import (
     draw_scattered,
     expand_functions,
     is_slow,
+    scattered_parts,
     subband_functions,
 )
 from rhs_isac_ros.model.elements import (
@@ -137,13 +138,14 @@ def simulate_received(
     received = np.empty((len(states), n_bands, n_measurements), complex)
     # Gains of all elements in many sub-bands take too much memory.
     is_large = subband_functions(scenario) is not None
+    parts = scattered_parts(scenario, radiation) if is_large and not scenario.channel else []
     for block in blocks(len(states), _MIN_BLOCK if is_large else _BLOCK):
         for band in range(n_bands):
             direct = _direct(scenario, states[block], band, blocked[block], radiation[band])
             gains: np.ndarray | float = 0.0
             scattered: np.ndarray | float = 0.0
-            if not scenario.channel and is_large:
-                scattered = draw_scattered(scenario, band, radiation[band], len(direct), rng)
+            if parts:
+                scattered = draw_scattered(scenario, parts[band], len(direct), rng)
             elif not scenario.channel:
                 gains = draw_multipath(scenario, band, len(direct), rng)
             noise = _thermal_noise(scenario, direct.shape, rng)
@@ -391,19 +393,17 @@ class MeasurementModel:
             signals = model.mean(states)
             signals[blocked] = 0
             if subband_functions(scenario) is not None:
-                for band, radiation in enumerate(model.radiation):
-                    signals[:, band] += draw_scattered(
-                        scenario, band, radiation, len(states), rng)
-                return signals * (1.0 if factors is None else factors) + _thermal_noise(
-                    scenario, signals.shape, rng)
-            white = complex_normal(signals.shape, rng)
-            # Factors act on the multipath, but not on the noise.
-            roots = model.combined_root if factors is None else map(
-                square_root, scattered_covariance(scenario, model.radiation))
-            for band, root in enumerate(roots):
-                signals[:, band] += white[:, band, :root.shape[1]] @ root.T
-            if factors is None:
-                return signals
+                for band, parts in enumerate(model._parts):
+                    signals[:, band] += draw_scattered(scenario, parts, len(states), rng)
+            else:
+                white = complex_normal(signals.shape, rng)
+                # Factors act on the multipath, but not on the noise.
+                roots = model.combined_root if factors is None else map(
+                    square_root, scattered_covariance(scenario, model.radiation))
+                for band, root in enumerate(roots):
+                    signals[:, band] += white[:, band, :root.shape[1]] @ root.T
+                if factors is None:
+                    return signals
         noise = _thermal_noise(scenario, signals.shape, rng)
         return signals * (1.0 if factors is None else factors) + noise
 
@@ -412,6 +412,10 @@ class MeasurementModel:
         flat = combine_subbands(self._functions, terms.reshape(len(terms), -1, terms.shape[-1]))
         white = np.matmul(flat, np.swapaxes(self.combined_whitener, 1, 2))
         return white.reshape(*terms.shape[:-1], -1)
+
+    @functools.cached_property
+    def _parts(self) -> list[np.ndarray]:
+        return scattered_parts(self.scenario, self.radiation)
 
     @functools.cached_property
     def _weights(self) -> 'ElementSums':
