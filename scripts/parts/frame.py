@@ -1,6 +1,7 @@
 """The frame of benchmarks and experiments: options, errors of estimates, intervals and results."""
 
 import argparse
+import importlib
 import json
 import multiprocessing
 import re
@@ -70,11 +71,27 @@ def measured(options: argparse.Namespace, name: str, function: Callable[..., Map
 
     Results of an unfinished run are kept in results/benchmarks/NAME.jobs.
     """
+    work = _imported(function)
+
     def strand(case: str) -> Strand[dict[str, Any]]:
-        return (yield function, [Job.of(re.sub(r'\W+', '-', case), cases[case])])[0]
+        return (yield work, [Job.of(re.sub(r'\W+', '-', case), cases[case])])[0]
 
     with unfinished(Path('results/benchmarks') / name, options) as workers:
         return dict(zip(cases, workers.run([strand(case) for case in cases]), strict=True))
+
+
+def _imported(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of the main program as one of a module, which other processes import.
+
+    They would receive it by value, and what it uses of the main program by name: caches, and
+    functions of SciPy, are then missing in these processes.
+    """
+    if function.__module__ != '__main__':
+        return function
+    program = Path(str(sys.modules['__main__'].__file__))
+    module = importlib.import_module(f'{program.parent.name}.{program.stem}')
+    found: Callable[..., Any] = getattr(module, function.__name__)
+    return found
 
 
 def experiment_options(

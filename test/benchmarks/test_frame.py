@@ -1,10 +1,38 @@
 """The frame of the benchmarks: errors of estimates, intervals and tables."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from parts import frame
 
 from rhs_isac_ros.positioning import Estimate
+
+PROGRAM = '''
+import functools
+import multiprocessing
+
+from parts import frame
+from scipy.special import chdtri
+
+
+@functools.cache
+def level():
+    """Return a value that each process computes once."""
+    return 0.05
+
+
+def radius(size):
+    """Return a quantile."""
+    return {'squared': float(chdtri(size, level()))}
+
+
+if __name__ == '__main__':
+    options = frame.benchmark_parser('program', '', has_jobs=True).parse_args()
+    print(frame.measured(options, 'program', radius, {'one': {'size': 1}, 'three': {'size': 3}}))
+'''
 
 
 def test_errors_are_those_of_the_fixes():
@@ -76,3 +104,17 @@ def test_single_estimates_are_stacked():
 def test_a_function_runs_in_a_new_process():
     assert frame.in_new_process(pow, 2, 5) == 32
     assert frame.peak_mib() > 1
+
+
+def test_jobs_of_a_program_use_its_caches_and_ufuncs_in_other_processes(tmp_path):
+    program = tmp_path / 'programs' / 'program.py'
+    program.parent.mkdir()
+    program.write_text(PROGRAM)
+    path = os.pathsep.join([str(tmp_path), str(frame.CONFIG.parent / 'scripts'), *sys.path])
+    outputs = [subprocess.run(
+        [sys.executable, str(program), '--jobs', jobs], cwd=tmp_path, capture_output=True,
+        text=True, timeout=60, check=False, env={**os.environ, 'PYTHONPATH': path})
+        for jobs in '12']
+    assert [one.returncode for one in outputs] == [0, 0], outputs[1].stderr
+    assert "'three': {'squared': 7.8147" in outputs[0].stdout
+    assert outputs[0].stdout == outputs[1].stdout
