@@ -4,7 +4,7 @@
 functions except `los_waves` raise ValueError unless `checked_positions` accepts the positions.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -19,7 +19,7 @@ from rhs_isac_ros.model.scenario import Scenario
 # in which the angle grows is undefined.
 _MIN_BORESIGHT_OFFSET_M = 1e-9
 # Gain, radial factor [1/m^2], and boresight term [1/m] or None, all times the frequency [Hz],
-# complex128 [N_SB, N, N_E].
+# complex128 [B, N_SB, N, N_E] for B bands.
 Waves: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 # Number of unit phasors in the table of `_phasors`.
 _N_PHASORS = 512
@@ -28,8 +28,8 @@ _TABLE = np.exp(2j * np.pi * np.arange(_N_PHASORS) / _N_PHASORS)
 
 def los_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
     """Compute the line-of-sight gains h^LoS, complex128 [N, N_SB, N_E], defined below Eq. (1)."""
-    ((gain, _, _),) = los_waves(scenario, checked_positions(positions), [band], slopes=False)
-    return _positions_first(scenario, band, gain)
+    gain, _, _ = los_waves(scenario, checked_positions(positions), [band], slopes=False)
+    return _positions_first(scenario, band, gain[0])
 
 
 def draw_blocked(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -72,10 +72,9 @@ def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
 def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
              weights: np.ndarray) -> np.ndarray:
     """Sum `los_gain` of n bands over elements, weighted [n, N_SB, N_E]; return [n, N, N_SB]."""
-    waves = los_waves(scenario, checked_positions(positions), bands, slopes=False)
+    gain, _, _ = los_waves(scenario, checked_positions(positions), bands, slopes=False)
     scaled = weights / subband_frequencies_hz(scenario)[list(bands), :, None]
-    return np.stack([(gain @ row[..., None])[..., 0].T
-                     for (gain, _, _), row in zip(waves, scaled, strict=True)])
+    return np.swapaxes((gain @ scaled[..., None])[..., 0], 1, 2)
 
 
 def los_and_derivative(
@@ -86,17 +85,17 @@ def los_and_derivative(
     A gain pattern adds a term for the change of the gain with the angle from the boresight.
     """
     positions = checked_positions(positions)
-    ((*parts, boresight_term),) = los_waves(scenario, positions, [band])
-    gain, radial = (_positions_first(scenario, band, part) for part in parts)
+    *parts, boresight_term = los_waves(scenario, positions, [band])
+    gain, radial = (_positions_first(scenario, band, part[0]) for part in parts)
     derivative = radial[:, None] * np.moveaxis(_offsets(scenario, positions), 2, 1)[:, :, None]
     if boresight_term is not None:
-        derivative[:, 0] += _positions_first(scenario, band, boresight_term)
+        derivative[:, 0] += _positions_first(scenario, band, boresight_term[0])
     return gain, derivative
 
 
 def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *,
-              slopes: bool = True) -> Iterator[Waves]:
-    """Yield h^LoS times the frequency, and factors of its derivative, for one band at a time.
+              slopes: bool = True) -> Waves:
+    """Compute h^LoS times the frequency, and factors of its derivative.
 
     The derivative with respect to the user's position p is dh/dp = a (p - p_m) + b e_x. The
     boresight term b exists only with a gain pattern, which adds (dh/dtheta) (dtheta/dp) for the
@@ -107,40 +106,36 @@ def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *
     distances = np.sqrt(sum(
         (positions[:, axis, None] - elements[:, axis])**2 for axis in range(3)))
     inverse, turn = 1 / distances, -2 * np.pi / SPEED_OF_LIGHT_MPS * distances
-    minus_square = -inverse**2
     # Sub-bands are equally spaced: two phasors and a running product replace N_SB phasors.
-    step = _phasors(turn * scenario.spacing_hz)
+    step = _phasors(turn * scenario.spacing_hz) if scenario.n_subbands > 1 else turn
     offsets = _offsets(scenario, positions) if has_pattern(scenario) else np.zeros(0)
     amplitude = inverse * _amplitude(scenario, offsets)
 
     def over_subbands(first: np.ndarray) -> np.ndarray:
-        waves = np.empty((scenario.n_subbands, *first.shape), complex)
-        waves[0] = first
-        for subband in range(1, len(waves)):
-            np.multiply(waves[subband - 1], step, out=waves[subband])
+        waves = np.empty((len(first), scenario.n_subbands, *first.shape[1:]), complex)
+        waves[:, 0] = first
+        for subband in range(1, scenario.n_subbands):
+            np.multiply(waves[:, subband - 1], step, out=waves[:, subband])
         return waves
 
-    for band in bands:
-        frequencies = subband_frequencies_hz(scenario)[band]
-        phasors = _phasors(turn * frequencies[0])
-        gain = over_subbands(phasors * amplitude)
-        if not slopes:
-            yield gain, gain, None
-            continue
-        radial = np.empty(gain.shape, complex)
-        radial.real = minus_square
-        wavenumbers = 2 * np.pi / SPEED_OF_LIGHT_MPS * frequencies
-        np.multiply(-wavenumbers[:, None, None], inverse, out=radial.imag)
-        radial *= gain
-        if not has_pattern(scenario):
-            yield gain, radial, None
-            continue
-        # On boresight, where dtheta/dp has no direction, a smooth pattern has zero slope.
-        across = np.maximum(np.hypot(offsets[..., 1], offsets[..., 2]), _MIN_BORESIGHT_OFFSET_M)
-        by_angle = _amplitude(scenario, offsets, slope=True)
-        boresight_term = over_subbands(phasors * (-by_angle * inverse / across))
-        radial += boresight_term * (minus_square * offsets[..., 0])
-        yield gain, radial, boresight_term
+    frequencies = subband_frequencies_hz(scenario)[list(bands)]
+    phasors = _phasors(turn * frequencies[:, :1, None])
+    gain = over_subbands(phasors * amplitude)
+    if not slopes:
+        return gain, gain, None
+    radial = np.empty(gain.shape, complex)
+    radial.real = -inverse**2
+    wavenumbers = 2 * np.pi / SPEED_OF_LIGHT_MPS * frequencies
+    np.multiply(-wavenumbers[:, :, None, None], inverse, out=radial.imag)
+    radial *= gain
+    if not has_pattern(scenario):
+        return gain, radial, None
+    # On boresight, where dtheta/dp has no direction, a smooth pattern has zero slope.
+    across = np.maximum(np.hypot(offsets[..., 1], offsets[..., 2]), _MIN_BORESIGHT_OFFSET_M)
+    by_angle = _amplitude(scenario, offsets, slope=True)
+    boresight_term = over_subbands(phasors * (-by_angle * inverse / across))
+    radial -= boresight_term * (inverse**2 * offsets[..., 0])
+    return gain, radial, boresight_term
 
 
 def has_pattern(scenario: Scenario) -> bool:

@@ -456,8 +456,7 @@ class ElementSums:
         n_terms = 2 + len(self._axes) + self._has_pattern if slopes else 1
         terms = np.empty((n_bands, n, n_terms, n_subbands, n_frames), complex)
         waves = los_waves(self._scenario, positions, range(n_bands), slopes=slopes)
-        for band, of_band in enumerate(waves):
-            self._add_up(of_band, self._frames[band], self._moments[band], terms[band])
+        self._add_up(waves, self._frames, self._moments, terms)
         return terms.reshape(n_bands, n, n_terms, -1)
 
     def moving(self, states: np.ndarray, by_coordinate: np.ndarray) -> np.ndarray:
@@ -473,10 +472,10 @@ class ElementSums:
         moments = self._moments.reshape(n_bands, n_subbands, n_elements, -1, n_frames)
         for (band, frame), time_s in np.ndenumerate(frame_times_s(self._scenario)):
             places = states[:, :3] + time_s * states[:, 3:]
-            (waves,) = los_waves(self._scenario, places, [band], slopes=n_slopes > 0)
+            waves = los_waves(self._scenario, places, [band], slopes=n_slopes > 0)
             self._add_up(
-                waves, self._frames[band, :, :, [frame]].transpose(1, 2, 0),
-                moments[band, ..., frame], terms)
+                waves, self._frames[[band], ..., frame, None], moments[[band], ..., frame],
+                terms[None])
             rows[band, :, 0, :, frame] = terms[:, 0, :, 0]
             if n_slopes:
                 by_place = by_coordinate[:, :3] + time_s * by_coordinate[:, 3:]
@@ -486,16 +485,17 @@ class ElementSums:
 
     def _add_up(self, waves: Waves, frames: np.ndarray, moments: np.ndarray, terms: np.ndarray
                 ) -> None:
-        """Write the sums for some frames of one band to `terms`, [N, 1 + G, N_SB, F]."""
-        (gain, radial, boresight_term), rows = waves, np.moveaxis(terms, 2, 0)
-        rows[:, :, 0] = np.matmul(gain, frames)
-        if rows.shape[2] == 1:
+        """Write the sums for some frames of B bands to `terms`, [B, N, 1 + G, N_SB, F]."""
+        gain, radial, boresight_term = waves
+        rows = terms.transpose(0, 3, 1, 2, 4)
+        rows[..., 0, :] = np.matmul(gain, frames)
+        if terms.shape[2] == 1:
             return
         sums = np.matmul(radial, moments)
-        rows[:, :, 1:2 + len(self._axes)] = sums.reshape(
-            *gain.shape[:2], -1, frames.shape[2])
+        rows[..., 1:2 + len(self._axes), :] = sums.reshape(
+            *gain.shape[:-1], -1, frames.shape[-1])
         if boresight_term is not None:
-            rows[:, :, -1] = np.matmul(boresight_term, frames)
+            rows[..., -1, :] = np.matmul(boresight_term, frames)
 
     def weights(self, positions: np.ndarray) -> np.ndarray:
         """Compute the weights of the terms for each coordinate's derivative, float64 [N, 3, G]."""

@@ -8,6 +8,7 @@ alternative, compared with such a user alone, is within the limit of the alterna
 """
 
 import copy
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, TypeAlias
@@ -19,9 +20,14 @@ from rhs_isac_ros.model.arrays import blocks, log_sum
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
 from rhs_isac_ros.model.geometry import element_positions, to_positions
-from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers, whiten
+from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
-from rhs_isac_ros.positioning.projection import ProjectedModel, project, reaching, white_means
+from rhs_isac_ros.positioning.projection import (
+    ProjectedModel,
+    at_ranges,
+    project,
+    white_means,
+)
 from rhs_isac_ros.positioning.segments import Segments
 from rhs_isac_ros.support.threads import map_blocks
 
@@ -61,8 +67,10 @@ class OutsideGrid(NamedTuple):
     phase_error: float = 0.5
     # Largest sine of the angle from boresight.
     sine: float = 0.998
-    # Error of a residual due to the grid, as a share of the template's energy.
+    # Error of a residual due to the grid, as a share of the template's energy, and error of the
+    # gains of elements, as a share of a gain.
     error: float = 0.25
+    gain_error: float = 0.01
     # Directions with a log-likelihood below the best by more than this at all ranges are ignored.
     margin: float = 30.0
     # Quadrature over the gain: spacing [nepers], and reach in standard deviations.
@@ -129,8 +137,8 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
     A template is a whitened mean times the range, without the carrier's phase. It depends on the
     direction and, through the curvature of the wavefront and the delays of the sub-bands, slowly
     on the range. For T template ranges, R ranges and V directions, the arrays are
-    ``outer_filters``, the conjugate templates, complex64 [N_B, T V, N_SB F]; ``outer_basis``, that
-    of a `ProjectedModel`, empty if all signals are compared; ``outer_energy``, the energy of the
+    ``outer_filters``, the conjugate templates, complex64 [N_B, T V, D]; ``outer_basis``, that of
+    `at_ranges` with D dimensions, complex128 [N_B, n, D]; ``outer_energy``, the energy of the
     templates [m^2], float32 [T, V]; ``outer_index``, the index of the template range for each
     range, int64 [R]; and ``outer_weights``, the prior probability of ranges and directions, 0
     inside the region, float64 [R, V].
@@ -139,31 +147,26 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
     ranges, directions = _ranges(scenario), _directions(scenario)
     nodes, index = _template_ranges(scenario, ranges)
     weights = _prior(scenario, ranges, directions)
-    points = _points(nodes, directions).reshape(-1, 3)
-    model = reaching(model, points)
-    whitener = model.whitener.astype(np.complex64)
-    n_bands, n_columns, _ = whitener.shape
-    filters = np.empty((n_bands, len(points), n_columns), np.complex64)
-    energy = np.empty(len(points), np.float32)
+    points = _points(nodes, directions)
+    models = at_ranges(model, nodes, points.reshape(-1, 3), GRID.gain_error)
+    basis, shape = models[0].basis, (model.shape[0], *points.shape[:2])
+    filters = np.empty((*shape, basis.shape[2]), np.complex64)
+    energy = np.empty(shape[1:], np.float32)
 
-    def fill(block: slice) -> None:
-        part = points[block]
-        carrier = np.exp(1j * carrier_wavenumbers(scenario) * part[:, :1]) * part[:, :1]
-        if isinstance(model, ProjectedModel):
-            # Sums over interpolated sub-bands cancel.
-            templates = np.swapaxes(white_means(model, to_positions(part)), 0, 1)
-        else:
-            means = model.mean(to_positions(part)).astype(np.complex64)
-            templates = whiten(whitener, means)[:, 0]
-        templates *= carrier[..., None]
-        filters[:, block] = np.swapaxes(templates, 0, 1).conj()
-        energy[block] = np.sum(np.abs(templates)**2, axis=(1, 2))
+    def fill(part: tuple[int, slice]) -> None:
+        range_m = nodes[part[0]]
+        carrier = range_m * np.exp(1j * carrier_wavenumbers(scenario) * range_m)
+        templates = carrier[:, None, None] * white_means(
+            models[part[0]], to_positions(points[part]))[..., :-1]
+        filters[:, part[0], part[1]] = templates.conj()
+        energy[part] = np.sum(np.abs(templates)**2, axis=(0, 2))
 
-    map_blocks(fill, blocks(len(points), GRID.block), progress)
+    map_blocks(fill, list(itertools.product(
+        range(len(nodes)), blocks(len(directions), GRID.block))), progress)
     return {
-        'outer_filters': filters,
-        'outer_basis': getattr(model, 'basis', np.zeros((n_bands, 0))),
-        'outer_energy': energy.reshape(len(nodes), -1),
+        'outer_filters': filters.reshape(shape[0], -1, basis.shape[2]),
+        'outer_basis': basis,
+        'outer_energy': energy,
         'outer_index': index,
         'outer_weights': weights,
     }
@@ -253,18 +256,27 @@ class Outside:
         bound = (np.sum(filtered, axis=0)**2 / self._node_energy).max(axis=0)
         constants = log_weights - scales**2 * energy
         least = float((scales**2 * bound.max() + constants).max()) - GRID.margin
-        # Small scales make directions more alike. Those for any scale begin with the best ones.
-        counts = np.count_nonzero(
-            np.multiply.outer(scales**2, bound) >= (least - constants)[:, None], axis=1)
-        order = np.argsort(-bound)[:counts.max()]
+        likely = np.multiply.outer(scales**2, bound) >= (least - constants)[:, None]
+        directions = np.flatnonzero(likely.any(axis=0))
         arguments, offset = (
-            filtered[:, :, order][:, self._index] * self._scale, self._offset[:, order])
-        values = np.full(len(scales), -np.inf)
-        for row in np.flatnonzero(counts):
-            chosen = slice(counts[row])
-            logs = _log_bessel(arguments[..., chosen] * np.float32(scales[row]))
-            values[row] = log_sum(logs.sum(axis=0) + offset[:, chosen]) + constants[row]
-        return values
+            filtered[:, :, directions][:, self._index] * self._scale, self._offset[:, directions])
+        row, column = np.nonzero(likely[:, directions])
+        factors = scales.astype(np.float32)
+        # A Bessel function I_0(x) is at most exp(x), so few places need its value.
+        highest = arguments.sum(axis=0).T[column] * factors[row, None]
+        highest += offset.T[column]
+        highest += constants[row, None].astype(np.float32)
+        best, at = np.unravel_index(np.argmax(highest), highest.shape)
+        amplitudes = factors[row[best]] * arguments[:, at, column[best]]
+        least = float(highest[best, at] - np.sum(amplitudes - _log_bessel(amplitudes)))
+        pair, place = np.nonzero(highest >= least - GRID.margin)
+        row, column = row[pair], column[pair]
+        logs = _log_bessel(factors[row] * arguments[:, place, column]).sum(axis=0)
+        logs = logs + offset[place, column] + constants[row]
+        largest = logs.max(initial=np.finfo(float).min)
+        with np.errstate(divide='ignore'):
+            return largest + np.log(
+                np.bincount(row, np.exp(logs - largest), minlength=len(scales)))
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some position explains the signals up to this residual energy."""
@@ -275,7 +287,8 @@ class Outside:
 
     def _filter(self, whitened: np.ndarray) -> np.ndarray:
         """Return filter output magnitudes by template and direction, [N_B, T, V] [m]."""
-        signals = whitened.astype(np.complex64)[..., None]
+        # The energy outside of a basis is not part of a template.
+        signals = whitened[:, :self._filters.shape[2], None].astype(np.complex64)
         filtered = np.abs(np.matmul(self._filters, signals)[..., 0])
         return filtered.reshape(len(filtered), -1, self._energy.shape[1])
 

@@ -8,12 +8,14 @@ which resolve the carriers; see `peaks`.
 All lengths of the grid follow from the scenario; see `lattice`.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.gaussian import likelihood_loss
 from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.lattice import (
@@ -57,6 +59,8 @@ class _Limits(NamedTuple):
     # at which they are compared, in radii of an ellipsoid that contains no other mode.
     same_mode: float = 2.0
     reach: float = 3.0
+    # Number of points up to which comparing all pairs is faster than a search tree.
+    few_points: int = 48
 
 
 _LIMITS = _Limits()
@@ -325,6 +329,29 @@ def heaviest(of_shot: Segments, value: np.ndarray, margin: float | np.ndarray) -
     return relative + np.log(n_left) > of_shot.repeat(np.log(total)) - margin
 
 
+def _near(shots: np.ndarray, scaled: np.ndarray, reach: float
+          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return pairs of points of a shot within `reach`, the first one first, and their squares."""
+    if len(scaled) <= _LIMITS.few_points:
+        first, last = _all_pairs(len(scaled))
+    else:
+        from scipy.spatial import cKDTree
+
+        # Move points of different shots far away from each other.
+        moved = scaled.copy()
+        moved[:, 0] += shots * (2 * reach + np.ptp(scaled[:, 0]))
+        first, last = cKDTree(moved).query_pairs(reach, output_type='ndarray').T
+    squares = np.sum((scaled[last] - scaled[first])**2, axis=1)
+    near = np.flatnonzero((squares <= reach**2) & (shots[first] == shots[last]))
+    return first[near], last[near], squares[near]
+
+
+@functools.cache
+def _all_pairs(n: int) -> tuple[np.ndarray, np.ndarray]:
+    first, last = np.triu_indices(n, 1)
+    return read_only(first), read_only(last)
+
+
 def separate(shots: np.ndarray, points: np.ndarray, radii: np.ndarray,
              curvature: np.ndarray | None = None) -> np.ndarray:
     """Mark the points that do not belong to the mode of a better point, bool [M].
@@ -334,24 +361,13 @@ def separate(shots: np.ndarray, points: np.ndarray, radii: np.ndarray,
     [3] around a mode contains no other mode. Given the curvature [M, 3, 3] of the log-likelihood,
     broad modes extend further.
     """
-    from scipy.spatial import cKDTree
-
-    scaled, chosen, reach = points / radii, np.ones(len(points), bool), 1.0
-    if not len(points):
+    chosen = np.ones(len(points), bool)
+    if len(points) < 2:
         return chosen
+    better, worse, squares = _near(
+        shots, points / radii, 1.0 if curvature is None else _LIMITS.reach)
     if curvature is not None:
-        variance = np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2) / radii[:3]**2
-        # No other pair is close, so that the result for a shot does not depend on the others.
-        furthest = np.sqrt(_LIMITS.same_mode * variance.sum(axis=1).max())
-        reach = float(np.clip(furthest, 1.0, _LIMITS.reach))
-    # Move points of different shots far away from each other.
-    scaled[:, 0] += shots * (2 * reach + np.ptp(scaled[:, 0]))
-    # The first index of each pair is the smaller one.
-    better, worse = cKDTree(scaled).query_pairs(reach, output_type='ndarray').T
-    if curvature is not None:
-        offset = points[worse] - points[better]
-        close = np.sum((offset / radii)**2, axis=1) < 1
-        offset = offset[:, :3]
+        offset, close = (points[worse] - points[better])[:, :3], squares < 1
         close |= np.einsum('kp,kpq,kq->k', offset, curvature[worse], offset) < _LIMITS.same_mode
         worse, better = worse[close], better[close]
     previous = ~chosen

@@ -200,7 +200,9 @@ class WhiteMeans(NamedTuple):
         slopes = self.slopes.reshape(*self.slopes.shape[:2], self.mean[0].size)
         n_moving = prior.velocity.shape[1]
         by_point, by_velocity = np.split(slopes, [slopes.shape[1] - n_moving], axis=1)
-        by_values, observed = prior.slopes(whitened, self.mean)
+        by_values = observed = slopes[:, :0]
+        if len(prior):
+            by_values, observed = prior.slopes(whitened, self.mean)
         if n_moving:
             by_values[:, :n_moving] = observed[:, :n_moving] = by_velocity
         columns = Columns((whitened - self.mean).reshape(len(self.mean), -1), by_point,
@@ -236,7 +238,9 @@ def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
     first, n_linear = columns.by_point.shape[1], columns.linear.shape[1]
     n = first + len(prior)
     # The residual energy, and gradient and information of its negative.
-    expected = np.concatenate([columns.by_point, columns.by_values, columns.linear], axis=1)
+    expected = columns.by_point
+    if n + n_linear > first:
+        expected = np.concatenate([expected, columns.by_values, columns.linear], axis=1)
     slopes = expected if columns.observed is columns.by_values else np.concatenate(
         [columns.by_point, columns.observed, columns.linear], axis=1)
     information = quadratic_form(expected)

@@ -32,7 +32,7 @@ from rhs_isac_ros.positioning.lattice import unit_points
 _FEW = 128
 #: Mean energy of whitened means outside of the basis: a loss of log-likelihood [nats].
 MAX_LOSS = 1e-8
-# Largest error of interpolated gains, relative to the gain; share of the largest singular value
+# Usual error of interpolated gains; share of the largest singular value
 # that is zero up to rounding; and number of delays at which the error is minimised, with further
 # ones for each turn of the phase over the band.
 _MAX_ERROR, _SINGULAR, _DELAYS, _DELAYS_PER_TURN = 1e-9, 1e-13, 40, 6
@@ -47,16 +47,18 @@ class ProjectedModel(MeasurementModel):
         Orthonormal basis of whitened means, complex128 [N_B, n, d].
     ends_m
         Smallest and largest distance of a user; by default, those of the region of interest.
+    max_error
+        Largest error of interpolated gains, relative to the gain.
     """
 
     def __init__(self, full: MeasurementModel, basis: np.ndarray,
-                 ends_m: np.ndarray | None = None) -> None:
+                 ends_m: np.ndarray | None = None, max_error: float = _MAX_ERROR) -> None:
         self.full, self.basis = full, basis
         self.beams, self.surface, self.elements = full.beams, full.surface, full.elements
         n_bands, _, n_dimensions = basis.shape
         # One more dimension is for the energy outside of the basis.
         n_columns = n_dimensions + 1
-        weights = interpolation(full.scenario, ends_m)
+        weights = interpolation(full.scenario, ends_m, max_error)
         n_nodes = weights.shape[1]
         self.scenario = dataclasses.replace(
             full.scenario, n_subbands=n_nodes, n_frames=n_columns,
@@ -118,14 +120,20 @@ def projected(model: MeasurementModel) -> MeasurementModel:
     return ProjectedModel(model, basis_of([means]))
 
 
-def reaching(model: MeasurementModel, points: np.ndarray) -> MeasurementModel:
-    """Return a model, projected or not, that holds for users at points (r [m], u, v), [M, 3]."""
-    if not isinstance(model, ProjectedModel):
-        return model
-    few = points[::-(-len(points) // len(unit_points()))]
-    ranges_m = points[:, 0]
-    return ProjectedModel(model.full, basis_of([white_means(model.full, to_positions(few))]),
-                          np.array([ranges_m.min(), ranges_m.max()])).prepare()
+def at_ranges(model: MeasurementModel, ranges_m: np.ndarray, points: np.ndarray, max_error: float
+              ) -> list[ProjectedModel]:
+    """Return a model for each range [m], whose gains have errors up to `max_error`.
+
+    The basis is that of a model that is projected, for users at points (r [m], u, v), [M, 3], or
+    contains all whitened signals.
+    """
+    full, basis = model, np.tile(np.eye(model.combined_root.shape[1]), (model.shape[0], 1, 1))
+    if isinstance(model, ProjectedModel):
+        few = points[::-(-len(points) // len(unit_points()))]
+        full = model.full
+        basis = basis_of([white_means(full, to_positions(few))])
+    return [ProjectedModel(full, basis, np.full(2, range_m), max_error)
+            for range_m in ranges_m.tolist()]
 
 
 def white_means(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
@@ -148,7 +156,8 @@ def basis_of(samples: Sequence[np.ndarray]) -> np.ndarray:
     return vectors[:, :, -n_dimensions:]
 
 
-def interpolation(scenario: Scenario, ends_m: np.ndarray | None = None) -> np.ndarray:
+def interpolation(scenario: Scenario, ends_m: np.ndarray | None = None,
+                  max_error: float = _MAX_ERROR) -> np.ndarray:
     """Return weights [N_SB, Q] that interpolate gains from Q equally spaced frequencies.
 
     They hold for users at distances between `ends_m`, by default in the region of interest.
@@ -163,13 +172,13 @@ def interpolation(scenario: Scenario, ends_m: np.ndarray | None = None) -> np.nd
     # The error is largest at the ends of the interval.
     nodes_s = np.cos(np.pi * (np.arange(n_delays) + 0.5) / n_delays) * np.ptp(delays) / 2
     gains = np.exp(-2j * np.pi * np.multiply.outer(nodes_s, offsets_hz))
-    for n_nodes in range(2 + int(turns), scenario.n_subbands + 1):
+    for n_nodes in range(1 + int(turns), scenario.n_subbands + 1):
         # As sub-bands of a scenario, the nodes have the bandwidth of the sub-bands, and therefore
         # the same grids.
         nodes_hz = ((np.arange(n_nodes) + 0.5) / n_nodes - 0.5) * scenario.bandwidth_hz
         at_nodes = np.exp(-2j * np.pi * np.multiply.outer(nodes_s, nodes_hz))
         weights = np.linalg.lstsq(at_nodes, gains, rcond=_SINGULAR)[0]
-        if np.abs(at_nodes @ weights - gains).max() <= _MAX_ERROR:
+        if np.abs(at_nodes @ weights - gains).max() <= max_error:
             break
     # The mean delay turns the gains from a node to a sub-band.
     turned: np.ndarray = weights.T * np.exp(

@@ -310,9 +310,10 @@ def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float
     # The likelihood of a mode is a prediction, and may be arbitrarily wrong before convergence.
     # The likelihood before the last step is known, and its maximum limits the best prediction.
     value = modes.log_likelihood + np.maximum(gain, 0)
-    has_changed = np.isin(modes.shots, changed)
-    rest, order = np.flatnonzero(~has_changed), modes.order
-    order = order[has_changed[order]]
+    has_changed = np.zeros(modes.shots[-1] + 1, bool)
+    has_changed[changed] = True
+    order, chosen = modes.order, has_changed[modes.shots]
+    rest, order = order[~chosen[order]], order[chosen[order]]
     of_shot = Segments.of_keys(modes.shots[order])
     known = (modes.log_likelihood - gain)[order]
     best = np.minimum(of_shot.first(modes.log_likelihood[order]), of_shot.max(known))
