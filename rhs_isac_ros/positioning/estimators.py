@@ -52,7 +52,7 @@ from rhs_isac_ros.positioning.prior import (
     uniform,
 )
 from rhs_isac_ros.positioning.search import GRID_MARGIN, Modes, modes_from
-from rhs_isac_ros.positioning.segments import concatenate, select
+from rhs_isac_ros.positioning.segments import Segments, concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.positioning.templates import N_NORMAL, standard_normal, tabulate
@@ -74,6 +74,8 @@ class _Limits(NamedTuple):
     # Total probability of the alternatives above which residuals are not compared with the
     # scenario.
     doubt: float = 0.05
+    # Growth of errors on the grid, see `NuisancePrior.growth`, above which it is searched again.
+    noisier: float = 8.0
 
 
 _LIMITS = _Limits()
@@ -353,10 +355,30 @@ class SearchEstimator(abc.ABC):
         fits: dict[int, tuple[Fit, Modes | None]] = {
             shot: (fit, None) for shot, fit in drawn.items()}
         if len(starts.shots):
-            modes = modes_from(
-                starts, self._likelihood, signals, aligned, float(margin.max()))
+            modes = self._in_noise(scope, modes_from(
+                starts, self._likelihood, signals, aligned, float(margin.max())),
+                signals, aligned, whitened, margin)
             fits.update(self._fits_of(scope, modes, signals))
         return [fits[shot] for shot in range(len(aligned))]
+
+    def _in_noise(self, scope: SearchScope, modes: Modes, signals: Signals, aligned: np.ndarray,
+                  whitened: np.ndarray, margin: np.ndarray) -> Modes:
+        """Search again, with a wider margin, for the modes of shots with a low gain."""
+        prior, best = self._likelihood.nuisance, Segments.of_keys(modes.shots)
+        growth = prior.growth(best.first(modes.values) @ prior.gain)
+        parts = [modes]
+        # The margin of users who move does not depend on the scope.
+        for place in np.flatnonzero((growth > _LIMITS.noisier) & (not prior.velocity.size)):
+            shot = int(modes.shots[best.starts[place]])
+            starts = scope.table.starts(
+                whitened[[shot]], prior,
+                growth[place] * GRID_MARGIN + scope.alignment.margin + margin)
+            parts[0] = select(parts[0], parts[0].shots != shot)
+            parts.append(modes_from(
+                starts._replace(shots=starts.shots + shot), self._likelihood, signals, aligned,
+                float(margin.max())))
+        modes = concatenate(*parts)
+        return select(modes, np.argsort(modes.shots, kind='stable'))
 
     def _fits_of(self, scope: SearchScope, modes: Modes, signals: Signals
                  ) -> Iterator[tuple[int, tuple[Fit, Modes]]]:

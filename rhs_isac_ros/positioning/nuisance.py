@@ -56,6 +56,7 @@ class NuisancePrior(Exponents):
     #: Half of the change of a parameter that does not change the signals, float64 [Q].
     half_period: np.ndarray
     information: np.ndarray  #: Contribution of the model's covariance, float64 [Q, Q].
+    noise_share: float  #: Largest share of thermal noise in a whitened measurement.
 
     def __init__(self, model: MeasurementModel) -> None:
         self.scenario, declared = model.scenario, nuisance_of(model.scenario)
@@ -92,6 +93,8 @@ class NuisancePrior(Exponents):
         self.gains, self.has_gain = self.scaled_patterns.real.mean(axis=2).T, declared.has_gain
         self._operators = self._multiplying(model.root, model.whitener)
         self.information = self.information_of(model.root, model.whitener)
+        self.noise_share = self.scenario.noise_power_w * float(
+            np.sum(np.abs(model.whitener)**2, axis=2).max())
 
     @functools.cached_property
     def gain(self) -> np.ndarray:
@@ -266,6 +269,15 @@ class NuisancePrior(Exponents):
         if self.gain_std:
             values += np.outer(gain, self._gain_variance / self.gain_std**2)
         return values
+
+    def growth(self, gain: np.ndarray) -> np.ndarray:
+        """Return factors of at least 1 for differences of log-likelihoods at gains [nepers].
+
+        On the grid, the noise is that of a gain of 0. Divided by a lower gain, it is stronger, and
+        the log-likelihoods of two positions are in error by up to such a factor each.
+        """
+        power = np.exp(np.clip(-2 * gain, 0.0, _MAX_EXPONENT))
+        return 1 + 2 * self.noise_share * self.has_gain * (power - 1)
 
     def noise_weights(self, gains: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return factors of whitened measurements, and the shares of noise in them, [M, n] each.

@@ -181,6 +181,18 @@ def test_an_unknown_gain_needs_no_prior(codebook):
         assert np.nanmax(estimate.blocked_probability) < 0.05
 
 
+def test_a_weak_user_keeps_all_modes(shipped):
+    """Divided by the low gain, the noise exceeds that for which the grid is computed."""
+    declared = Scenario(multipath_to_los_db=-20.0, user_gain_std_db=6.0)
+    sent = dataclasses.replace(
+        declared, user_gain_std_db=0.0, user_gain=declared.user_gain * 10**-0.85)
+    positions = sent.sample_positions(40, np.random.default_rng(1))
+    received = MeasurementModel(sent, shipped).sample(positions, np.random.default_rng(2))
+    estimate = make_estimator('bayes', declared, shipped).estimate(received)
+    squares = squared_normalised(estimate.mean - positions, estimate.covariance)
+    assert squares.max() < 30 and squares.mean() < 5
+
+
 def test_an_unknown_timing_requires_an_unknown_phase(codebook):
     with pytest.raises(ScenarioError, match='^timing_std_s: unknown, expected an unknown phase'):
         make_estimator(
