@@ -30,7 +30,7 @@ from rhs_isac_ros.positioning.estimate import (
 from rhs_isac_ros.positioning.failures import refinement_of
 from rhs_isac_ros.positioning.grid import TemplateTable
 from rhs_isac_ros.positioning.lattice import Grid, lay_grid
-from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
+from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
 from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.positioning.moving import MovingTable
 from rhs_isac_ros.positioning.offsets import Alignment
@@ -152,9 +152,8 @@ class SearchEstimator(abc.ABC):
         # each fitted coordinate or parameter.
         n_fitted = 3 + len(prior)
         self._mean_residual = max(n_measurements - n_fitted / 2, 0.5)
-        # The likelihood of positions; None if it also depends on other unknowns.
-        self._exact_likelihood = (
-            likelihood if self._refinement.is_exact and not len(prior) else None)
+        # Whether the likelihood depends on nothing but the position.
+        self._is_plain = self._refinement.is_exact and not len(prior)
         # Points that represent a standard Gaussian, float64 [128, 3].
         self.normal = standard_normal(N_NORMAL) if lazy else self._region.table.normal
         self._mode_normal = (
@@ -170,7 +169,7 @@ class SearchEstimator(abc.ABC):
         if self._rejects_outside:
             outside = Outside(scenario, self._load(outside=True))
             scope = scope._replace(alternatives=[outside, *scope.alternatives])
-        if self.averages and self._exact_likelihood:
+        if self.averages and self._is_plain:
             scope = scope._replace(drawn=DrawnPosterior(
                 scenario, scope.table, self._n_measurements))
         return scope
@@ -254,8 +253,8 @@ class SearchEstimator(abc.ABC):
             if found.modes is None or found.estimate.reason:
                 continue
             products = multiply(
-                before, found.modes, share, self._exact_likelihood, signals, self._bounds,
-                constant, n_before)
+                before, found.modes, share, found.conditionals, self._likelihood, signals,
+                self._bounds, constant, n_before)
             if not is_doubtful(products.energy / self._level, self._n_measurements):
                 break
         if found.modes is None or found.estimate.reason:
@@ -338,22 +337,21 @@ class SearchEstimator(abc.ABC):
             seen = whitened
             for alternative in scope.alternatives:
                 seen = alternative.seen(self._likelihood.model, signals.received, seen)
-            for row, (fit, modes), one, values in zip(
-                    usable, fits, seen, aligned, strict=True):
-                estimate, log_ratios = self._judge(scope.alternatives, fit, one, values)
-                found[row] = _Found(self, estimate, fit, modes, log_ratios)
+            for row, searched, one, values in zip(usable, fits, seen, aligned, strict=True):
+                estimate, log_ratios = self._judge(
+                    scope.alternatives, searched.fit, one, values)
+                found[row] = _Found(self, estimate, log_ratios, *searched)
         return found
 
     def _fits(self, scope: SearchScope, signals: Signals, aligned: np.ndarray,
-              whitened: np.ndarray, draws: bool) -> list[tuple[Fit, Modes | None]]:
-        """Find the posterior and the modes of each shot; the modes are None after draws."""
+              whitened: np.ndarray, draws: bool) -> list['_Searched']:
+        """Find the posterior of each shot."""
         # Margin of modes in each cell, beyond the usual one.
         margin = self._refinement.margin + PRIOR_MARGIN * scope.favoured
         starts, drawn = scope.table.search(
             whitened, self._likelihood.nuisance, GRID_MARGIN + scope.alignment.margin + margin,
             scope.drawn.fit if scope.drawn and draws else None)
-        fits: dict[int, tuple[Fit, Modes | None]] = {
-            shot: (fit, None) for shot, fit in drawn.items()}
+        fits = {shot: _Searched(fit) for shot, fit in drawn.items()}
         if len(starts.shots):
             modes = self._in_noise(scope, modes_from(
                 starts, self._likelihood, signals, aligned, float(margin.max())),
@@ -381,8 +379,8 @@ class SearchEstimator(abc.ABC):
         return select(modes, np.argsort(modes.shots, kind='stable'))
 
     def _fits_of(self, scope: SearchScope, modes: Modes, signals: Signals
-                 ) -> Iterator[tuple[int, tuple[Fit, Modes]]]:
-        """Yield each shot that has modes, with its posterior and its refined modes."""
+                 ) -> Iterator[tuple[int, '_Searched']]:
+        """Yield each shot that has modes, with its posterior."""
         likelihood = self._likelihood
         modes, conditionals = self._refinement.refine(modes, signals, scope.table)
         if likelihood.nuisance.is_coarse:
@@ -408,7 +406,7 @@ class SearchEstimator(abc.ABC):
             describe = functools.partial(
                 samples.described, n, None if likelihood.nuisance.is_coarse else of_shot,
                 self._bounds)
-            yield shot, (Fit._make((*fit, describe)), of_shot)
+            yield shot, _Searched(Fit._make((*fit, describe)), of_shot, conditionals[shot])
 
     def _judge(self, alternatives: Sequence[Alternative], fit: Fit, whitened: np.ndarray,
                aligned: np.ndarray) -> tuple[Estimate, dict[str, float]]:
@@ -495,15 +493,25 @@ class MlEstimator(SearchEstimator):
         return best, regular(covariance + offsets[:, :, None] * offsets[:, None])
 
 
+class _Searched(NamedTuple):
+    """The posterior of one shot, and the refined modes unless positions were drawn."""
+
+    fit: Fit
+    modes: Modes | None = None
+    conditionals: Sequence[Conditional] = ()  # The likelihood for each state of the surface.
+
+
 class _Found(NamedTuple):
     """The estimate of one shot, and how it was found if the signals are stronger than noise."""
 
     estimator: SearchEstimator
     estimate: Estimate
-    fit: Fit | None = None
-    modes: Modes | None = None  # None after draws.
     #: Logarithms of the likelihoods of alternatives, by name, relative to a user in sight.
     log_ratios: Mapping[str, float] = {}
+    fit: Fit | None = None
+    # Those of `_Searched`.
+    modes: Modes | None = None
+    conditionals: Sequence[Conditional] = ()
 
     def posterior(self) -> Estimate:
         """Return the estimate with its mixture and its sighting."""

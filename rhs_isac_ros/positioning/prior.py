@@ -16,6 +16,7 @@ their covariance is added to its result. Between modes, the evidence of phases w
 grows more slowly than their number. `fusion` treats errors of poses in the same way.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,9 +29,9 @@ from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.estimate import regular
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Grid, Resolution
-from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
+from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
 from rhs_isac_ros.positioning.mixture import Mixture, overlap
-from rhs_isac_ros.positioning.search import EXACT_MARGIN, Modes
+from rhs_isac_ros.positioning.search import EXACT_MARGIN, Modes, expanded_at
 from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets, move_inside
 
@@ -100,29 +101,28 @@ class Products(NamedTuple):
     best: Sheets  #: The mode of the heaviest product, with all errors.
 
 
-def multiply(bent: Sheets, modes: Modes, share: float, likelihood: Likelihood | None,
-             signals: Signals, bounds_m: np.ndarray, constant: np.ndarray,
-             n_before: float = 0.0) -> Products:
+def multiply(bent: Sheets, modes: Modes, share: float, conditionals: Sequence[Conditional],
+             likelihood: Likelihood, signals: Signals, bounds_m: np.ndarray,
+             constant: np.ndarray, n_before: float = 0.0) -> Products:
     """Multiply a prior by the likelihood of the signals of one phase, N = 1.
 
-    `likelihood`, if given, is evaluated at the heaviest products. Each component is also kept
-    without an update, for an unlikely mode that the search may have missed; it is assumed to be as
-    wide as the best mode. `share`, from 0 to 1, is an exponent of the likelihood: below 1 if
-    successive multipath is similar. `constant` and `n_before` are those of `Sheets.narrowed`.
+    The likelihoods for the states of the surface, `conditionals`, are evaluated at the heaviest
+    products. Each component is also kept without an update, for an unlikely mode that the search
+    may have missed; it is assumed to be as wide as the best mode. `share`, from 0 to 1, is an
+    exponent of the likelihood: below 1 if successive multipath is similar. `constant` and
+    `n_before` are those of `Sheets.narrowed`.
     """
     whole = modes.sheets(share)
     sheets = whole.narrowed(constant, n_before)
     component, mode = bent.heaviest_pairs(sheets, _LIMITS.products)
     chosen = select(bent, component)
     found = chosen.updated(select(sheets, mode))
-    if likelihood is not None:
-        # The heaviest products come first.
-        n = _LIMITS.exact
-        before = select(chosen, slice(n))
-        exact = before.updated(
-            _expanded(found.means[:n, :3], share, likelihood, signals).narrowed(
-                constant, n_before))
-        found = concatenate(exact, select(found, slice(n, None)))
+    # The heaviest products come first.
+    n = _LIMITS.exact
+    exact = select(chosen, slice(n)).updated(
+        _expanded(found.means[:n, :3], select(modes, mode[:n]), share, conditionals, likelihood,
+                  signals).narrowed(constant, n_before))
+    found = concatenate(exact, select(found, slice(n, None)))
     # The best mode comes first.
     missed, _ = overlap(np.zeros(3), bent.covariances[:, :3, :3] + sheets.covariances[0])
     missed += sheets.log_weights[0] + share * _FLOOR
@@ -143,11 +143,16 @@ def _energy(point: np.ndarray, component: Sheets, mode: Modes, bounds_m: np.ndar
     return float(losses[0])
 
 
-def _expanded(points: np.ndarray, share: float, likelihood: Likelihood, signals: Signals
-              ) -> Sheets:
-    """Expand the likelihood at points (r, u, v), [C, 3]; each has one sheet."""
-    value, gradient, curvature, _ = likelihood.local(
-        points, np.zeros((len(points), 0)), select(signals, np.zeros(len(points), int)))
+def _expanded(points: np.ndarray, modes: Modes, share: float, conditionals: Sequence[Conditional],
+              likelihood: Likelihood, signals: Signals) -> Sheets:
+    """Expand the likelihood at points (r, u, v) in C modes, [C, 3]; each has one sheet."""
+    values = likelihood.nuisance.carried(modes.values, modes.points, points)
+    value, gradient, curvature = (np.empty((len(points), *shape)) for shape in ((), (3,), (3, 3)))
+    for state in np.unique(modes.state):
+        (rows,) = np.nonzero(modes.state == state)
+        value[rows], gradient[rows], curvature[rows] = expanded_at(
+            conditionals[state], likelihood, points[rows], values[rows],
+            select(signals, np.zeros(len(rows), int)))
     return Sheets.expanded(points, gradient, curvature, value, share)
 
 

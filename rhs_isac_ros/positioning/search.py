@@ -228,6 +228,19 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
     return local.value + rise + marginal.log_volume, values, local.information
 
 
+def expanded_at(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
+                values: np.ndarray, signals: Signals
+                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the marginal log-likelihood at M points, [M], its gradient, and its curvature.
+
+    The arguments are those of `marginal_at`.
+    """
+    value, values, _ = marginal_at(conditional, likelihood, points, values, signals)
+    local = conditional.local(points, values, signals)
+    marginal = marginalise(local.information, local.gradient)
+    return value, marginal.gradient, marginal.information
+
+
 def _settled(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
              values: np.ndarray, signals: Signals, moves: bool = True
              ) -> tuple[Located, np.ndarray]:

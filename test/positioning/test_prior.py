@@ -1,6 +1,7 @@
 """Posteriors with a mixture as prior."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
 from rhs_isac_ros.model.elements import draw_surface
 from rhs_isac_ros.model.gaussian import quadratic_form
 from rhs_isac_ros.model.geometry import jacobian, region_information, to_polar
-from rhs_isac_ros.positioning import BayesEstimator, Mixture, Motion, Tracker
+from rhs_isac_ros.positioning import BayesEstimator, Mixture, Motion, Tracker, prior
 from rhs_isac_ros.positioning.lattice import Resolution, lay_grid
+from rhs_isac_ros.positioning.likelihood import Signals
 from rhs_isac_ros.positioning.prior import cells_of, constant_shares, multiply
 from rhs_isac_ros.positioning.search import Modes
 from rhs_isac_ros.positioning.segments import concatenate
@@ -106,12 +108,21 @@ def test_the_search_covers_four_standard_deviations():
 
 
 @pytest.mark.parametrize('share', [0.25, 1.0])
-def test_a_share_is_an_exponent_of_the_likelihood(share):
+def test_a_share_is_an_exponent_of_the_likelihood(monkeypatch, share):
     point, before = to_polar(PLACE), Sheets.from_mixture(around(PLACE + [0.1, -0.2, 0.05]), Pose())
     curvature = np.diag(1 / np.array([0.1, 0.02, 0.03])**2)
     modes = Modes(np.zeros(1, int), point[None], np.zeros((1, 3)), curvature[None], np.zeros(1),
                   np.zeros((1, 0)), np.zeros(1), np.zeros(1, int))
-    found = multiply(before, modes, share, None, None, Scenario().roi_bounds_m, np.zeros(3)).bent
+
+    def quadratic(conditional, likelihood, points, values, signals):
+        offsets = points - point
+        slopes = -offsets @ curvature
+        return np.sum(offsets * slopes, axis=1) / 2, slopes, curvature[None]
+
+    monkeypatch.setattr(prior, 'expanded_at', quadratic)
+    likelihood = SimpleNamespace(nuisance=SimpleNamespace(carried=lambda values, *points: values))
+    found = multiply(before, modes, share, [None], likelihood, Signals(*np.zeros((2, 1))),
+                     Scenario().roi_bounds_m, np.zeros(3)).bent
     precision = np.linalg.inv(before.covariances[0])
     covariance = np.linalg.inv(precision + share * curvature)
     np.testing.assert_allclose(found.covariances[0], covariance, atol=1e-12)
