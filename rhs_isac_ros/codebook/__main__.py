@@ -5,7 +5,6 @@ import dataclasses
 import importlib.util
 import math
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -50,7 +49,7 @@ from rhs_isac_ros.support.arguments import (
     seed,
 )
 from rhs_isac_ros.support.exits import exit_code_of, print_error
-from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.files import save_or_rescue, write_whole
 from rhs_isac_ros.support.jobs import JobError, Workers, add_run_options, unfinished
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.pictures import write_picture
@@ -61,14 +60,15 @@ HELD_OUT_POSITIONS = 2000
 # With more positions, the samples would fill the memory.
 _MAX_POSITIONS = 10**5
 # Errors that the user can correct; the command prints their messages.
-ERRORS = (JobError, MissingLibraryError, ValueError, OSError, MemoryError)
+ERRORS = (JobError, MissingLibraryError, ValueError, ConnectionError, MemoryError)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, even if Ctrl-C ends the search, or 2 after one of `ERRORS`.
 
     The exit code is 130 if Ctrl-C ends jobs, which writes no codebook. If the first argument is
-    ``library``, the others are those of `library_command`.
+    ``library``, the others are those of `library_command`. Raises OSError if a file cannot be
+    written.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ['library']:
@@ -166,8 +166,8 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     If Ctrl-C ends a search in this process, the best codebook so far is written. With jobs, Ctrl-C
     raises KeyboardInterrupt; the same call then continues with the unfinished jobs. Returns the
     codebook in the file and the reason why the search stopped. Raises one of `ERRORS` if an option
-    or a file is invalid, or a library is missing; an existing output file is then kept, unless
-    only the plot fails.
+    or a file is invalid, or a library is missing, and OSError if a file cannot be written; an
+    existing output file is then kept, unless only the plot fails.
     """
     output, partial = options.output, _partial(options.output)
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
@@ -204,7 +204,7 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
         scenario, result.codebook, calibration.surface if calibration else None), held_out)
     average, error = float(bounds.mean()), float(bounds.std() / HELD_OUT_POSITIONS**0.5)
     codebook = dataclasses.replace(result.codebook, average_crlb_m2=average)
-    _save(codebook, output)
+    save_or_rescue(codebook.save, output)
     partial.unlink(missing_ok=True)
     print(f'{output}: average CRLB {average:.5f} m^2 (standard error {error:.5f}) over '
           f'{HELD_OUT_POSITIONS} held-out positions; {result.reason}')
@@ -268,16 +268,6 @@ def _save_partial(result: OptimizeResult, partial: Path) -> None:
         result.codebook.save(partial)
     except OSError as error:
         print(f'warning: {partial}: {error}', file=sys.stderr)
-
-
-def _save(codebook: Codebook, output: Path) -> None:
-    """Save the result; if that fails, save it in a temporary directory and raise OSError."""
-    try:
-        codebook.save(output)
-    except OSError as error:
-        rescue = Path(tempfile.mkdtemp(prefix='rhs_isac_ros.')) / output.name
-        codebook.save(rescue)
-        raise OSError(f'{output}: {error}; the codebook is in {rescue}') from error
 
 
 def _value(progress: Progress) -> str:

@@ -20,18 +20,22 @@ from rhs_isac_ros.support.arguments import (
     positive_float,
 )
 from rhs_isac_ros.support.exits import print_error
+from rhs_isac_ros.support.files import save_or_rescue
 from rhs_isac_ros.support.jobs import JobError, add_run_options, unfinished
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, 2 after an error, or 130 after Ctrl-C."""
+    """Run the command; return 0, 2 after an error, or 130 after Ctrl-C.
+
+    Raises OSError if the file cannot be written.
+    """
     parser = _parser()
     options = parser.parse_args(arguments)
     try:
         _run(options)
     except KeyboardInterrupt:
         return 130
-    except (JobError, ValueError, OSError, MemoryError) as error:
+    except (JobError, ValueError, ConnectionError, MemoryError) as error:
         print_error(error, parser.prog)
         return 2
     return 0
@@ -69,7 +73,7 @@ def _run(options: argparse.Namespace) -> None:
         made = library.make_library(
             scenario, start, options.objective, sorted(options.spreads), options.loss,
             None if options.quiet else _print_loss, workers)
-        made.save(options.output)
+        save_or_rescue(made.save, options.output)
     numbers = ', '.join(f'{np.sum(made.spreads_m == spread_m)} for {spread_m:g} m'
                         for spread_m in made.plan.spreads_m)
     print(f'{options.output}: {made.id}, {len(made.codebooks)} codebooks: {numbers}')

@@ -23,12 +23,16 @@ from rhs_isac_ros.support.arguments import (
     seed,
 )
 from rhs_isac_ros.support.exits import exit_code_of, print_error
+from rhs_isac_ros.support.files import save_or_rescue
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.progress import progress_bar
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit code: 0, 2 after an error, or 130 after Ctrl-C."""
+    """Run the command; return its exit code: 0, 2 after an error, or 130 after Ctrl-C.
+
+    Raises OSError if the file cannot be written.
+    """
     parser = ArgumentParser(
         prog='python3 -m rhs_isac_ros.positioning', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
@@ -56,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     # Errors of scenario and codebook are ValueErrors.
-    except (ValueError, OSError, MemoryError, MissingLibraryError) as error:
+    except (ValueError, MemoryError, MissingLibraryError) as error:
         print_error(error, parser.prog)
         return 2
     return 0
@@ -71,7 +75,7 @@ def _run(options: argparse.Namespace) -> None:
             scenario, codebook, options.pairs, options.seed, options.hidden, options.epochs,
             show and (lambda epoch, mse_m2: show(epoch, f'{mse_m2:.3f} m^2')),
             options.inputs)
-    network.save(output)
+    save_or_rescue(network.save, output)
     about = network.about
     print(f'{output}: codebook {codebook.id}, {about["epochs"]} epochs; mean squared error '
           f'{about["validation_mse_m2"]:.3f} m^2 in validation, {about["test_mse_m2"]:.3f} m^2 '

@@ -97,17 +97,35 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
     path = Path(path)
     # Files of `tempfile` would have narrower permissions than other new files.
     temporary = path.with_name(f'.{path.name}.{secrets.token_hex(4)}')
-    stream = open(temporary, 'xb')
+    with writing(path):
+        stream = open(temporary, 'xb')
+        try:
+            with stream:
+                if callable(content):
+                    content(stream)
+                else:
+                    stream.write(content.encode() if isinstance(content, str) else content)
+            os.replace(temporary, path)
+        except BaseException:
+            os.unlink(temporary)
+            raise
+
+
+def save_or_rescue(save: Callable[[Path], None], path: Path) -> None:
+    """Save the result of long work; if that fails, save it in a temporary directory, too.
+
+    Raises OSError, which names the copy, if `path` cannot be written.
+    """
     try:
-        with writing(path), stream:
-            if callable(content):
-                content(stream)
-            else:
-                stream.write(content.encode() if isinstance(content, str) else content)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+        save(path)
+    except OSError as error:
+        rescue = Path(tempfile.mkdtemp(prefix='rhs_isac_ros.')) / path.name
+        try:
+            save(rescue)
+        except OSError:
+            rescue.parent.rmdir()
+            raise error from None
+        raise OSError(f'{error}; the result is in {rescue}') from None
 
 
 @contextlib.contextmanager
@@ -116,8 +134,10 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno and error.filename is None:
+        if error.errno:
+            # Not the name of a temporary file.
             error.filename = str(path)
+            del error.filename2
         raise
 
 

@@ -53,7 +53,12 @@ from rhs_isac_ros.support.arguments import (
     positive_float,
     positive_int,
 )
-from rhs_isac_ros.support.files import ArchiveError, read_arrays, write_whole
+from rhs_isac_ros.support.files import (
+    ArchiveError,
+    read_arrays,
+    save_or_rescue,
+    write_whole,
+)
 from rhs_isac_ros.tools import command
 
 # The messages that pilots consist of.
@@ -188,7 +193,9 @@ def _align(options: argparse.Namespace, arguments: list[str]) -> int:
               f'{np.degrees(change[3:]).round(2)} deg; standard deviations {std[:3].round(3)} m, '
               f'{np.degrees(std[3:]).round(2)} deg', flush=True)
         poses[name] = pose
-    write_whole(options.output, site_text(options.site, poses, options.output.parent))
+    save_or_rescue(
+        lambda path: write_whole(path, site_text(options.site, poses, path.parent)),
+        options.output)
     print(options.output)
     return 0
 
@@ -223,7 +230,7 @@ def _calibrate(options: argparse.Namespace, arguments: list[str]) -> int:
 
 
 def _save(calibration: Calibration, output: Path) -> int:
-    calibration.save(output)
+    save_or_rescue(calibration.save, output)
     print(f'{output}: calibration {calibration.id}')
     return 0
 
@@ -281,7 +288,7 @@ def _survey(scenario: Scenario, pilots: Sequence[Pilots], options: argparse.Name
     print(survey_report(estimate), flush=True)
     _print_errors(scenario, [group], lambda _: (scenario, surface), lambda some: (
         dataclasses.replace(scenario, multipath=surveyed(*some)), surface))
-    estimate.save(options.output)
+    save_or_rescue(estimate.save, options.output)
     print(f'{options.output}: multipath {estimate.digest}; use it with the line '
           f'"multipath: {options.output.name}" in a scenario file beside it')
 

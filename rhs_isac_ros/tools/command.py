@@ -47,7 +47,7 @@ _POLL_PERIOD_S = 0.02
 _SETTLE_S = 1.0 if is_secure() else 0.4
 # Errors in arguments and files.
 INVALID = (StartError, RecordingError, ScenarioError, SiteError, SystemFileError, CodebookError,
-           CalibrationError, ModelError, plugins.PluginError, OSError)
+           CalibrationError, ModelError, plugins.PluginError)
 # Advice after an error about messages that do not match the scenario.
 OTHER_SCENARIO = '; if the network uses another scenario, pass it with --config FILE'
 _NodeT = TypeVar('_NodeT', bound=Node)
@@ -70,8 +70,8 @@ def entry(
     """Return the main function of a command whose command line may contain ROS arguments.
 
     The function takes arguments, by default from the command line. It returns the exit code of
-    `work`; 0 after a signal or if the reader closes the output; 1 after a `ToolError` or if a
-    library is missing; 2 if an argument or a file is invalid.
+    `work`; 0 after a signal or if the reader closes the output; 1 after a `ToolError`, if a
+    library is missing or a file cannot be written; 2 if an argument or a file is invalid.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def entry(
         except BrokenPipeError:
             discard_stdout()
             return 0
-        except (ToolError, MissingLibraryError) as error:
+        except (ToolError, MissingLibraryError, OSError) as error:
             print_error(error, parser.prog)
             return 1
         except INVALID as error:

@@ -58,6 +58,7 @@ from rhs_isac_ros.ros.recording import (
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
 from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.system import System
 from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.command import ToolError
@@ -320,7 +321,7 @@ def _first_codebook(options: argparse.Namespace) -> Codebook:
 def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
         file = Path(folder) / 'scenario.yaml'
-        file.write_text(yaml.safe_dump(scenario.changes(folder)), encoding='utf-8')
+        write_whole(file, yaml.safe_dump(scenario.changes(folder)))
         return OptimizerNode(parameter_overrides=ros_parameters(
             {'scenario_file': str(file), **codebook.to_parameters()}))
 

@@ -75,11 +75,14 @@ class RerunStream:
         self._server: subprocess.Popen[bytes] | None = None
 
     def save(self, path: Path) -> None:
-        """Write to ``<name>.part``, which `close` renames; raise OSError if it is unwritable."""
+        """Write to ``<name>.part``, which `close` renames.
+
+        Raises OSError if this file exists, because another view writes it, or is unwritable.
+        """
         partial = path.with_name(f'{path.name}.part')
-        self._files = partial, path
         # Rerun reports an unwritable file without its reason.
-        partial.open('wb').close()
+        partial.open('xb').close()
+        self._files = partial, path
         self._rerun.save(partial, default_blueprint=blueprint(), recording=self._stream)
         self._begin()
 

@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from nav_msgs.msg import Odometry
@@ -126,7 +127,8 @@ def entries(path: Path, namespace: str, scenario: Scenario, max_cycles: int = 0
     """
     view = NetworkView(scenario)
     yield from view.begin()
-    for found, time_s in command.recorded(path, namespace, scenario, [*RECEIVES, Report]):
+    for found, time_s in _by_cycle(
+            command.recorded(path, namespace, scenario, [*RECEIVES, Report])):
         if isinstance(found, tuple):
             yield from view.add_report(*found)
             continue
@@ -138,6 +140,15 @@ def entries(path: Path, namespace: str, scenario: Scenario, max_cycles: int = 0
             break
     if not view.n_cycles:
         raise RecordingError(f'{path}: no cycle in the namespace {namespace}')
+
+
+def _by_cycle(found: Iterable[tuple[Any, float]]) -> list[tuple[Any, float]]:
+    """Sort messages by cycle, from its beacons on: the clock of a recording may have gone back."""
+    keyed, latest = [], 0
+    for message, time_s in found:
+        latest = getattr(message, 'cycle_id', 0) or latest
+        keyed.append(((latest, not isinstance(message, m.Beacon)), (message, time_s)))
+    return [pair for _, pair in sorted(keyed, key=lambda one: one[0])]
 
 
 def _conflict(options: argparse.Namespace) -> str:

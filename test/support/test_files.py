@@ -3,7 +3,6 @@
 import io
 import json
 import os
-import resource
 import zipfile
 
 import numpy as np
@@ -16,6 +15,7 @@ from rhs_isac_ros.support.files import (
     read_archive,
     read_arrays,
     read_yaml,
+    save_or_rescue,
     write_archive,
     write_whole,
 )
@@ -49,16 +49,31 @@ def test_a_failing_write_leaves_only_the_old_file(tmp_path, monkeypatch, failing
     assert os.listdir(tmp_path) == ['file']
 
 
-def test_a_full_disk_is_an_error_that_names_the_file(tmp_path):
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path, full_disk):
     path = tmp_path / 'file'
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, limits[1]))
-    try:
-        with pytest.raises(OSError, match=f"too large: '{path}'"):
-            write_whole(path, bytes(2048))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with full_disk(1024), pytest.raises(OSError, match=f"too large: '{path}'$"):
+        write_whole(path, bytes(2048))
     assert not list(tmp_path.iterdir())
+    # Neither is the temporary file named if it cannot even be created.
+    with pytest.raises(OSError, match=f"No such file or directory: '{path}/none'$"):
+        write_whole(path / 'none', b'')
+
+
+@pytest.mark.parametrize('is_rescued', [True, False])
+def test_the_result_of_long_work_is_rescued(tmp_path, monkeypatch, is_rescued):
+    rescue, path = tmp_path / 'rescue', tmp_path / 'none' / 'file'
+    rescue.mkdir()
+    monkeypatch.setattr('tempfile.tempdir', str(rescue))
+
+    def save(target):
+        write_whole(target if is_rescued or target == path else path, 'result')
+    with pytest.raises(OSError, match=f"'{path}'") as error:
+        save_or_rescue(save, path)
+    saved = list(rescue.iterdir())
+    assert len(saved) == is_rescued
+    for folder in saved:
+        assert str(error.value).endswith(f'; the result is in {folder / "file"}')
+        assert (folder / 'file').read_text(encoding='utf-8') == 'result'
 
 
 def test_a_file_in_a_missing_folder_is_not_writable(tmp_path):

@@ -196,6 +196,17 @@ def test_known_states_need_no_pilots(tmp_path):
         0.5 + 0.5j, *[-1] * 35]
 
 
+def test_a_full_disk_keeps_an_existing_file(tmp_path, monkeypatch, capsys, full_disk):
+    file = tmp_path / 'states.npz'
+    file.write_text('old', encoding='utf-8')
+    monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
+    with full_disk(10):
+        assert calibrate.main(['--states=1,-1', '--output', str(file)]) == 1
+    assert capsys.readouterr() == ('', f"calibrate: error: [Errno 27] File too large: '{file}'\n")
+    assert [(path, path.read_text(encoding='utf-8')) for path in tmp_path.iterdir()] == [
+        (file, 'old')]
+
+
 @pytest.mark.parametrize('states', ['1', '1,2,3', '1,x', 'nan,1', ''])
 def test_states_are_two_numbers(states, capsys):
     with pytest.raises(SystemExit):

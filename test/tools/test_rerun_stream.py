@@ -1,6 +1,5 @@
 """The entries of a view in a file of Rerun, read back with its own reader."""
 
-import resource
 
 import numpy as np
 import pytest
@@ -132,20 +131,25 @@ def test_a_file_that_cannot_be_written_is_an_error(tmp_path):
         RerunStream().save(tmp_path / 'missing' / 'view.rrd')
 
 
-def test_a_full_disk_is_an_error_that_names_the_file(tmp_path):
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path, full_disk):
     stream, place = RerunStream(), np.zeros((100, 3))
     stream.save(tmp_path / 'view.rrd')
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, limits[1]))
-    try:
-        with pytest.raises(OSError, match='too large.*view.rrd.part'):
-            stream.write(Entry(cycle, 'a', Points(place, place, place[:, 0]))
-                         for cycle in range(1, 100))
-            stream.close()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with full_disk(8192), pytest.raises(OSError, match='too large.*view.rrd.part'):
+        stream.write(Entry(cycle, 'a', Points(place, place, place[:, 0]))
+                     for cycle in range(1, 100))
+        stream.close()
     stream.discard()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_second_view_leaves_the_file_of_the_first_alone(tmp_path):
+    first, second = RerunStream(), RerunStream()
+    first.save(tmp_path / 'view.rrd')
+    with pytest.raises(FileExistsError, match='view.rrd.part'):
+        second.save(tmp_path / 'view.rrd')
+    second.discard()
+    first.close()
+    assert [file.name for file in tmp_path.iterdir()] == ['view.rrd']
 
 
 def test_a_discarded_file_leaves_nothing(tmp_path):

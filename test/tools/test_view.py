@@ -13,7 +13,10 @@ import pytest
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring import network_view
+from rhs_isac_ros.monitoring.network_view import RECEIVES
+from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.recording import RecordingError, read
+from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.view import ViewNode, entries, main
 
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -105,6 +108,21 @@ def test_a_recording_is_shown_with_modes(recording, run, paths, tmp_path, capsys
     n_posteriors = sum(1 for _ in read(recording, ['/posterior']))
     assert shown[f'{network_view.MODES}/found'] == n_posteriors
     assert len(run.cycles) <= shown['error/crlb'] <= n_posteriors
+
+
+def test_all_cycles_are_shown_in_their_order_if_the_clock_of_a_recording_went_back(
+        run, monkeypatch):
+    found = list(command.recorded(run.path, '/', SCENARIO, RECEIVES))
+
+    def logged(messages):
+        monkeypatch.setattr(command, 'recorded', lambda *_: iter(messages))
+        return [entry.entity.text for entry in entries(run.path, '/', SCENARIO)
+                if entry.path == network_view.LOG]
+    # Readers sort by time. Within a cycle, too, some messages then come before its beacon.
+    middle = [index for index, (message, _) in enumerate(found)
+              if isinstance(message, m.PositionEstimate)][1]
+    assert len(expected := logged(found)) >= 2
+    assert logged([*found[middle:], *found[:middle]]) == expected
 
 
 def test_a_recording_without_the_namespace_is_an_error(recording, tmp_path, capsys):
