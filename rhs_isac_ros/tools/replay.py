@@ -320,10 +320,9 @@ def _first_codebook(options: argparse.Namespace) -> Codebook:
 
 def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
-        file = Path(folder) / 'scenario.yaml'
-        write_whole(file, yaml.safe_dump(scenario.changes(folder)))
+        write_whole(file := f'{folder}/scenario.yaml', yaml.safe_dump(scenario.changes(folder)))
         return OptimizerNode(parameter_overrides=ros_parameters(
-            {'scenario_file': str(file), **codebook.to_parameters()}))
+            {'scenario_file': file, **codebook.to_parameters()}))
 
 
 def _optimizer_present(node: Node) -> bool:
