@@ -9,8 +9,10 @@ import argparse
 import contextlib
 import ctypes
 import dataclasses
+import functools
 import hashlib
 import importlib.util
+import inspect
 import json
 import os
 import queue
@@ -41,7 +43,10 @@ from rhs_isac_ros.support.threads import one_blas_thread
 
 
 class JobError(Exception):
-    """A job failed, its process died, or its worker has another version of this package."""
+    """A job failed, its process died, or its worker has other sources of this package."""
+
+
+Function: TypeAlias = Callable[..., Mapping[str, Any]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,16 +69,49 @@ class Job:
 
 
 class JobResult(NamedTuple):
-    """The result of a job as JSON in `text`, or its error, with the package version used."""
+    """The result of a job as JSON in `text`, or its error, with the sources of this package."""
 
     job: Job
     text: str = ''
     error: str = ''
-    version: str = __version__
+    sources: str = ''
+
+
+def sources_of(function: Function | None = None) -> str:
+    """Return the version of this package with a digest of the sources of a function's results.
+
+    They are the modules of this package, that of the function, and those that it imports from. A
+    function without a module in a file, as in a notebook, is itself such a source. Sources in an
+    archive have no digest.
+    """
+    while isinstance(function, functools.partial):
+        function = function.func
+    module = sys.modules[function.__module__] if function else None
+    named = vars(module).values() if module else ()
+    modules = [module, *(
+        value if inspect.ismodule(value) else
+        sys.modules.get(str(getattr(value, '__module__', ''))) for value in named)]
+    files, text = {str(getattr(one, '__file__', '')) for one in modules if one}, ''
+    if inspect.isfunction(function) and not hasattr(module, '__file__'):
+        with contextlib.suppress(OSError):  # There is no text of a command line.
+            text = inspect.getsource(function)
+    return f'{__version__} {_digest(*sorted(files), text=text)}'
+
+
+@functools.cache
+def _digest(*files: str, text: str) -> str:
+    """Return a digest of this package, further modules and a text, 16 hexadecimal digits."""
+    package = Path(__file__).parents[1]
+    others = [path for file in files if package not in (path := Path(file)).parents]
+    whole = hashlib.sha256(text.encode())
+    for path in (*sorted(package.rglob('*.py')), *others):
+        if path.suffix == '.py' and path.is_file():
+            whole.update(hashlib.sha256(path.read_bytes()).digest())
+    return whole.hexdigest()[:16]
 
 
 @one_blas_thread
-def attempt(function: Callable[..., Mapping[str, Any]], job: Job,
+def attempt(function: Function, job: Job,
             given: Mapping[str, Any] = MappingProxyType({})) -> JobResult:
     """Run a job in this process; return errors as text, because some errors cannot be pickled.
 
@@ -81,32 +119,28 @@ def attempt(function: Callable[..., Mapping[str, Any]], job: Job,
     """
     plugins.GIVEN.update(given)
     try:
-        return JobResult(job, text=json.dumps(as_json(function(**job.arguments))))
+        return JobResult(
+            job, json.dumps(as_json(function(**job.arguments))), sources=sources_of())
     except MissingLibraryError as error:
         return JobResult(job, error=str(error))
     except Exception:
         return JobResult(job, error=traceback.format_exc())
 
 
-def _stored(folder: Path, job: Job) -> dict[str, Any] | None:
-    """Return the stored result of a job; None if it is missing, damaged or out of date."""
+def _stored(file: Path, record: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the stored result of a job; None if it is missing, damaged or of another record."""
     try:
-        record = json.loads(_file(folder, job).read_bytes())
+        found = json.loads(file.read_bytes())
     except (FileNotFoundError, ValueError):
         return None
-    if not isinstance(record, dict) or not isinstance(record.get('result'), dict):
+    if not isinstance(found, dict) or not isinstance(result := found.pop('result', None), dict):
         return None
-    return (record['result'] if _as_text(record | {'result': {}}) == _as_text(_record(job, {}))
-            else None)
+    return result if _as_text(found) == _as_text(record) else None
 
 
 def _as_text(value: Mapping[str, Any]) -> str:
     """Return JSON, in which 1, 1.0 and True differ, but lists and tuples do not."""
     return json.dumps(json.loads(json.dumps(value)), sort_keys=True)
-
-
-def _record(job: Job, result: Mapping[str, Any]) -> dict[str, Any]:
-    return {'version': __version__, 'arguments': dict(job.arguments), 'result': result}
 
 
 def as_json(value: Any) -> Any:
@@ -142,7 +176,6 @@ _WATCH_S = 1.0
 _ONE_THREAD = {f'{library}_NUM_THREADS': '1'
                for library in ('OMP', 'OPENBLAS', 'MKL', 'BLIS', 'VECLIB', 'NUMBA', 'NUMEXPR')}
 
-Function: TypeAlias = Callable[..., Mapping[str, Any]]
 _End = TypeVar('_End')
 #: Yields a function with jobs, receives their results in the same order, and returns its own.
 Strand: TypeAlias = Generator[tuple[Function, Sequence[Job]], list[dict[str, Any]], _End]
@@ -179,8 +212,13 @@ class Workers:
                     executor, slots = stack.enter_context(self._executor())
                 while state.ready and len(running) < slots:
                     function, job = state.ready.popleft()
-                    with _interrupts_ignored() if slots > 1 else contextlib.nullcontext():
-                        future = executor.submit(*self._call(function, job))
+                    try:
+                        # The first call starts the processes. Later ones must not lose Ctrl-C.
+                        with (_interrupts_ignored() if slots > 1 and not running
+                              else contextlib.nullcontext()):
+                            future = executor.submit(*self._call(function, job))
+                    except Exception as error:
+                        raise _failure(job, error) from error
                     running[future] = job
                     future.add_done_callback(done.put)
                 future = done.get()
@@ -219,17 +257,24 @@ class Workers:
             executor.shutdown(kill_workers=True)
 
     def _result(self, job: Job, future: 'Future[JobResult]') -> dict[str, Any]:
-        """Return the result of a job; raise JobError if it failed or ran with another version."""
+        """Return the result of a job; raise JobError if it failed or ran with other sources."""
         try:
             return _decoded(future.result())
-        except BrokenExecutor as error:
-            raise JobError(f'a process died, possibly out of memory: {error}') from error
         except CancelledError:
             raise ConnectionError(f'Dask cluster {self.dask}: connection lost') from None
         except JobError:
             raise
         except Exception as error:  # The job killed its worker or could not be sent to one.
-            raise JobError(f'job {job.name} failed: {type(error).__name__}: {error}') from error
+            raise _failure(job, error) from error
+
+
+def _failure(job: Job, error: Exception) -> JobError:
+    """Return the error of a job that a process could not receive, or did not return."""
+    if isinstance(error, BrokenExecutor) and not error.__cause__:
+        return JobError(f'a process died, possibly out of memory: {error}')
+    # Only the last line of a traceback from another process names what cannot be pickled.
+    cause = str(error.__cause__ or '').strip('\n "').rpartition('\n')[2]
+    return JobError(f'job {job.name} failed: {type(error).__name__}: {error} {cause}')
 
 
 #: Runs jobs in this process, and keeps no results.
@@ -243,7 +288,8 @@ class _State:
         self.ready: deque[tuple[Function, Job]] = deque()
         self.ends: dict[int, Any] = {}
         self._strands, self._folder = strands, folder
-        self._jobs: dict[str, Job] = {}
+        # What a job depends on, by its name.
+        self._records: dict[str, dict[str, Any]] = {}
         self._known: dict[str, dict[str, Any]] = {}
         # Jobs that each strand has asked for, names of those without a result, and strands that
         # wait for a job.
@@ -256,7 +302,7 @@ class _State:
     @property
     def n_jobs(self) -> int:
         """The number of jobs so far."""
-        return len(self._jobs)
+        return len(self._records)
 
     @property
     def n_done(self) -> int:
@@ -266,8 +312,8 @@ class _State:
     def take(self, job: Job, result: dict[str, Any]) -> None:
         """Keep the result of a job, and advance each strand that has waited only for this one."""
         if self._folder:
-            write_whole(_file(self._folder, job),
-                        json.dumps(_record(job, result), indent=1) + '\n')
+            record = self._records[job.name] | {'result': result}
+            write_whole(_file(self._folder, job), json.dumps(record, indent=1) + '\n')
         self._known[job.name] = result
         for number in self._waiting.pop(job.name):
             self._missing[number].remove(job.name)
@@ -285,7 +331,9 @@ class _State:
             except StopIteration as end:
                 self.ends[number] = end.value
                 return
-            self._asked[number] = [self._admitted(function, _checked(job)) for job in jobs]
+            sources = sources_of(function)
+            self._asked[number] = [
+                self._admitted(function, _checked(job), sources) for job in jobs]
             self._missing[number] = {job.name for job in self._asked[number]} - {*self._known}
             for name in self._missing[number]:
                 self._waiting[name].append(number)
@@ -293,17 +341,18 @@ class _State:
                 return
             results = self._results(number)
 
-    def _admitted(self, function: Function, job: Job) -> Job:
+    def _admitted(self, function: Function, job: Job, sources: str) -> Job:
         """Return a job, which is ready to run if it is new and has no stored result."""
-        known = self._jobs.setdefault(job.name, job)
-        if known is job:
-            stored = _stored(self._folder, job) if self._folder else None
+        record = {'sources': sources, 'arguments': dict(job.arguments)}
+        known = self._records.setdefault(job.name, record)
+        if known is record:
+            stored = _stored(_file(self._folder, job), record) if self._folder else None
             if stored is None:
                 self.ready.append((function, job))
                 self._waiting[job.name] = []
             else:
                 self._known[job.name] = stored
-        elif _as_text(known.arguments) != _as_text(job.arguments):
+        elif _as_text(known) != _as_text(record):
             raise ValueError(f'jobs: two have the name {job.name}, expected unique names')
         return job
 
@@ -411,7 +460,7 @@ def run_jobs(
     use instead, whose first worker may take `worker_timeout_s` to appear. Progress, with the
     label, appears on stderr.
 
-    Raises JobError if a job fails, its process dies or its worker has another version of this
+    Raises JobError if a job fails, its process dies or its worker has other sources of this
     package, ConnectionError if the cluster does not respond, OSError if a result cannot be read or
     stored, MissingLibraryError if a library is not installed, and ValueError if two jobs have the
     same name, or JSON cannot represent an argument.
@@ -428,13 +477,13 @@ def run_jobs(
 
 
 def _decoded(job_result: JobResult) -> dict[str, Any]:
-    """Return the result of a job; raise JobError if it failed or ran with another version."""
+    """Return the result of a job; raise JobError if it failed or ran with other sources."""
     name = job_result.job.name
     if job_result.error:
         raise JobError(f'job {name} failed: {job_result.error.strip()}')
-    if job_result.version != __version__:
-        raise JobError(f'job {name}: the worker has rhs_isac_ros {job_result.version}, expected '
-                       f'{__version__}, the version of this machine')
+    if job_result.sources != sources_of():
+        raise JobError(f'job {name}: the worker has rhs_isac_ros {job_result.sources}, expected '
+                       f'{sources_of()}, that of this machine')
     return json.loads(job_result.text)
 
 

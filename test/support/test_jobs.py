@@ -1,11 +1,16 @@
 """Running jobs: stored results, repeated jobs, and runs that end early."""
 
+import functools
+import importlib
 import io
 import json
+import linecache
 import os
 import subprocess
 import sys
+import threading
 import time
+import types
 
 import numpy as np
 import pytest
@@ -114,7 +119,7 @@ def test_an_interrupted_run_keeps_its_finished_jobs(tmp_path):
 
 
 @pytest.mark.parametrize('content', [
-    b'', b'{"version": ', b'\xff\xfe', b'[]', b'{}', b'{"result": 1}', {'version': '0.0.0'},
+    b'', b'{"sources": ', b'\xff\xfe', b'[]', b'{}', b'{"result": 1}', {'sources': '0.0.0'},
     {'arguments': {'number': 1, 'of': [1, 3]}}])
 def test_a_job_whose_result_is_damaged_or_of_another_call_is_repeated(tmp_path, content):
     run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
@@ -125,10 +130,68 @@ def test_a_job_whose_result_is_damaged_or_of_another_call_is_repeated(tmp_path, 
     assert numbers_run_again(tmp_path) == []
 
 
-def test_a_worker_of_another_version_is_an_error(tmp_path, monkeypatch):
-    monkeypatch.setattr(jobs_module, '__version__', '9.9.9')
-    with pytest.raises(JobError, match=r'square-0: the worker has .*, expected 9\.9\.9'):
-        run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
+def test_a_worker_with_other_sources_is_an_error(tmp_path, monkeypatch):
+    answers = iter(['ours', 'theirs', 'ours', 'ours'])
+    monkeypatch.setattr(jobs_module, 'sources_of', lambda *_: next(answers))
+    with pytest.raises(JobError, match='square-0: the worker has .* theirs, expected ours'):
+        run_jobs(Worker(), JOBS, n_jobs=1)
+
+
+@pytest.mark.parametrize('wrap', [lambda work: work, functools.partial])
+def test_results_of_other_sources_are_not_reused(tmp_path, monkeypatch, wrap):
+    """Sources are those of the package, of the function, and of what its module imports."""
+    monkeypatch.setattr(sys, 'dont_write_bytecode', True)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / 'study.py').write_text(
+        'from helper import found\n'
+        'calls = []\n'
+        'def work(number, of):\n'
+        '    calls.append(number)\n'
+        '    return {"found": found()}\n')
+    found = []
+    for text in ('1', '1', '2'):
+        (tmp_path / 'helper.py').write_text(f'def found():\n    return {text}\n')
+        for name in ('helper', 'study'):
+            monkeypatch.delitem(sys.modules, name, raising=False)
+        importlib.invalidate_caches()
+        jobs_module._digest.cache_clear()
+        study = importlib.import_module('study')
+        found += run_jobs(wrap(study.work), JOBS[:1], tmp_path / 'kept', n_jobs=1)
+        found += study.calls
+    assert found == [{'found': 1}, 0, {'found': 1}, {'found': 2}, 0]
+
+
+def test_a_function_without_a_module_in_a_file_is_a_source():
+    module = types.ModuleType('__main__')
+    texts = [f'def work():\n    return {number}\n' for number in (1, 2, 1)]
+    digests = []
+    for number, text in enumerate(texts):
+        linecache.cache[f'<cell {number}>'] = len(text), None, text.splitlines(True), ''
+        exec(compile(text, f'<cell {number}>', 'exec'), vars(module))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setitem(sys.modules, '__main__', module)
+            digests.append(jobs_module.sources_of(module.work))
+    assert digests[0] == digests[2] != digests[1]
+
+
+def test_what_cannot_be_sent_to_a_cluster_is_named(cluster):
+    lock = threading.Lock()
+
+    def work(number, of):
+        return {'lock': str(lock)}
+
+    with pytest.raises(JobError, match="(?s)^job square-0 failed: .* pickle '_thread.lock'"):
+        run_jobs(work, JOBS[:2], dask=cluster.scheduler_address)
+
+
+def test_what_a_process_cannot_read_is_named():
+    class Unreadable:
+        def __reduce__(self):
+            return int, ('nothing',)
+
+    unreadable = Unreadable()
+    with pytest.raises(JobError, match="^job square-. failed: .* literal .*'nothing'$"):
+        run_jobs(lambda number, of: {'it': str(unreadable)}, JOBS[:2], n_jobs=2)
 
 
 def test_a_result_may_be_infinite_or_missing(tmp_path):
