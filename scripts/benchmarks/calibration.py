@@ -12,9 +12,9 @@ over surfaces and positions together; for shares, Wilson's. The calibration assu
 distribution of surfaces, or with --silent the default distribution.
 """
 
-import argparse
 import dataclasses
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -38,61 +38,63 @@ PILOTS = 200
 
 def main() -> None:
     """Run the benchmark."""
-    parser = frame.benchmark_parser('calibration', __doc__, 600)
+    parser = frame.benchmark_parser('calibration', __doc__, 600, has_jobs=True)
     parser.add_argument('--surfaces', type=positive_int, default=6, help='number of surfaces')
     parser.add_argument('--silent', action='store_true', help='calibrate with the default prior')
     options = parser.parse_args()
-    scenario, codebook = Scenario(), Codebook.default()
+    found = frame.measured(options, 'calibration', measure, {
+        f'{name}, {index}': {
+            'changes': changes, 'index': index, 'n': options.positions, 'seed': options.seed,
+            'silent': options.silent}
+        for name, changes in DEVIATIONS.items() for index in range(options.surfaces)})
     print(f'{options.surfaces} surfaces, {PILOTS} pilots each, {options.positions} fresh '
           f'positions, seed {options.seed}\n')
     table = frame.Table(['surface', 'knowledge'], {
         'no fix [%]': ('no_fix_share', 1), 'MSE [m²]': ('mse_m2', 3), 'to exact': ('to_exact', 3),
         'to undamaged': ('to_undamaged', 3), 'in the 95 % region [%]': ('covered_share', 1)})
     rows = []
-    for name, changes in DEVIATIONS.items():
-        declared = dataclasses.replace(scenario, **changes)
-        results, took_s, found = measure(declared, scenario, codebook, options)
+    for name in DEVIATIONS:
+        surfaces = [found[f'{name}, {index}'] for index in range(options.surfaces)]
+        results = {knowledge: [frame.Fixes(*map(np.array, one['fixes'][knowledge]))
+                               for one in surfaces] for knowledge in surfaces[0]['fixes']}
         references = {f'to_{kind}': squares_of(results[kind]) for kind in ('exact', 'undamaged')}
         for knowledge, fixes in results.items():
             rows.append({'surface': name, 'knowledge': knowledge,
                          **table.row(name, knowledge, **figures(fixes, references))})
-        print(f'{name}: {found}; a calibration takes {took_s:.1f} s', flush=True)
+        n_found, n_failed, n_false = np.sum([one['failures'] for one in surfaces], axis=0)
+        took_s = np.mean([one['took_s'] for one in surfaces])
+        print(f'{name}: {n_found} of {n_failed} failed elements found, {n_false} false; '
+              f'a calibration takes {took_s:.1f} s', flush=True)
     frame.write_results(options.json, rows)
 
 
-def measure(declared: Scenario, silent: Scenario, codebook: Codebook,
-            options: argparse.Namespace) -> tuple[dict[str, list[frame.Fixes]], float, str]:
-    """Measure all surfaces with each kind of knowledge.
+def measure(changes: Mapping[str, float], index: int, n: int, seed: int, silent: bool
+            ) -> Mapping[str, Any]:
+    """Measure a surface with each kind of knowledge.
 
-    Returns the fixes of each surface by knowledge; the duration of a calibration [s]; and how many
-    failed elements were found.
+    Returns the fixes by knowledge, the counts of failed elements, and the duration of the
+    calibration [s].
     """
-    positions = silent.sample_positions(
-        options.positions, streams.generator(options.seed, streams.HELD_OUT))
-    found: dict[str, list[frame.Fixes]] = {}
-    counts, elapsed_s = np.zeros(3, int), 0.0
-    for index in range(options.surfaces):
-        rng = streams.generator(options.seed, streams.SURFACE, index)
-        surface = draw_surface(declared, rng)
-        model = MeasurementModel(silent, codebook, surface)
-        places = silent.sample_positions(PILOTS, rng)
-        pilots = Pilots(codebook, places, model.sample(places, rng))
-        begin_s = time.perf_counter()
-        calibration = calibrate(silent if options.silent else declared, [pilots])
-        elapsed_s += time.perf_counter() - begin_s
-        counts += failures(surface, calibration)
-        received = model.sample(positions, rng)
-        undamaged = MeasurementModel(silent, codebook).sample(positions, rng)
-        cases: dict[str, tuple[Scenario, Any, np.ndarray]] = {
-            'silent': (silent, None, received),
-            'after': (silent, calibration.surface, received),
-            'exact': (silent, surface, received), 'undamaged': (silent, None, undamaged)}
-        for name, (scenario, known, signals) in cases.items():
-            estimator = make_estimator('bayes', scenario, codebook, surface=known)
-            fixes = frame.Fixes.of(estimator.estimate(signals), positions)
-            found.setdefault(name, []).append(fixes)
-    return found, elapsed_s / options.surfaces, (
-        f'{counts[0]} of {counts[1]} failed elements found, {counts[2]} false')
+    scenario, codebook = Scenario(), Codebook.default()
+    declared = dataclasses.replace(scenario, **changes)
+    positions = scenario.sample_positions(n, streams.generator(seed, streams.HELD_OUT))
+    rng = streams.generator(seed, streams.SURFACE, index)
+    surface = draw_surface(declared, rng)
+    model = MeasurementModel(scenario, codebook, surface)
+    places = scenario.sample_positions(PILOTS, rng)
+    pilots = Pilots(codebook, places, model.sample(places, rng))
+    begin_s = time.perf_counter()
+    calibration = calibrate(scenario if silent else declared, [pilots])
+    took_s = time.perf_counter() - begin_s
+    received = model.sample(positions, rng)
+    undamaged = MeasurementModel(scenario, codebook).sample(positions, rng)
+    cases: dict[str, tuple[Any, np.ndarray]] = {
+        'silent': (None, received), 'after': (calibration.surface, received),
+        'exact': (surface, received), 'undamaged': (None, undamaged)}
+    return {'took_s': took_s, 'failures': failures(surface, calibration), 'fixes': {
+        name: list(frame.Fixes.of(make_estimator(
+            'bayes', scenario, codebook, surface=known).estimate(signals), positions))
+        for name, (known, signals) in cases.items()}}
 
 
 def failures(surface: ElementErrors, calibration: Calibration) -> np.ndarray:

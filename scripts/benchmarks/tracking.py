@@ -12,7 +12,9 @@ ellipsoid of its covariance that contains 95 % of a Gaussian.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from parts import frame
@@ -29,38 +31,40 @@ N_CYCLES, PERIOD_S, SPEED_MPS = 60, 0.1, 1.0
 # Time after which the cycles of a walk count [s].
 WARM_UP_S = 2.0
 TIMES_S = PERIOD_S * np.arange(N_CYCLES)
+COUNTED = TIMES_S >= WARM_UP_S
+# Number of walks of a job.
+BLOCK = 25
 # Locates one user, by the time and the signals of each cycle.
 Method = Callable[[float, np.ndarray], Estimate]
 
 
 def main() -> None:
     """Run the benchmark."""
-    parser = frame.benchmark_parser('tracking', __doc__)
+    parser = frame.benchmark_parser('tracking', __doc__, has_jobs=True)
     add = parser.add_argument
     add('--config', type=input_file, help='YAML file of the scenario (default: Table I)')
     add('--codebook', type=input_file, default=default_codebook_file(), help='codebook file')
     add('--walks', type=positive_int, default=200, help='number of walks')
     options = parser.parse_args()
-    scenario, codebook = frame.scenario_of(options.config), Codebook.load(options.codebook)
-    codebook.check(scenario)
-    positions, signals = simulate_walks(scenario, codebook, options.walks, TIMES_S, options.seed)
-    estimator = BayesEstimator(System(scenario, codebook))
-    estimates, times_s = measure({
-        'single cycles': lambda: lambda _, received: estimator.estimate(received),
-        'track': lambda: Tracker(estimator).update}, signals)
+    codebook = Codebook.load(options.codebook, frame.scenario_of(options.config))
+    found = frame.measured(options, 'tracking', measure, {
+        f'walks from {first}': {
+            'config': options.config and str(options.config), 'codebook': str(options.codebook),
+            'n_walks': options.walks, 'first': first, 'seed': options.seed}
+        for first in range(0, options.walks, BLOCK)})
     print(f'{options.walks} walks, codebook {codebook.id}, seed {options.seed}\n')
     table = frame.Table(['method'], {
         'rms error [m]': ('rms_m', 3), 'median [m]': ('median_m', 3),
         'in the 95 % region [%]': ('covered', 1), 'normalised error': ('nees', 2),
         'CPU time of a cycle [ms]': ('time_ms', 1)})
-    counted = np.nonzero(TIMES_S >= WARM_UP_S)[0]
-    places = positions[:, counted].reshape(-1, 3)
     # The intervals resample the walks.
-    walks = np.repeat(np.arange(options.walks), len(counted))
-    figures = {}
-    for name, rows in estimates.items():
-        estimate = Estimate.of_each([row[cycle] for row in rows for cycle in counted])
-        fixes = frame.Fixes.of(estimate, places)
+    walks = np.repeat(np.arange(options.walks), np.count_nonzero(COUNTED))
+    figures, times_s = {}, {}
+    for name in next(iter(found.values())):
+        *errors, times_s[name] = (
+            np.concatenate(parts) for parts in zip(*(one[name] for one in found.values()),
+                                                   strict=True))
+        fixes = frame.Fixes(*errors)
         walk = walks[fixes.fix]
         figures[name] = table.row(name, **fixes.figures(walk) | {
             'covered': frame.mean_interval(100.0 * fixes.inside, walk),
@@ -98,23 +102,35 @@ def simulate_walks(scenario: Scenario, codebook: Codebook, n_walks: int, times_s
     return positions, signals
 
 
-def measure(methods: dict[str, Callable[[], Method]], signals: np.ndarray
-            ) -> tuple[dict[str, list[list[Estimate]]], dict[str, np.ndarray]]:
-    """Run every method over all walks, one after the other on each, so that times compare.
+def measure(config: str | None, codebook: str, n_walks: int, first: int, seed: int
+            ) -> Mapping[str, Any]:
+    """Run every method over a block of walks, one after the other, so that times compare.
 
-    Returns the estimates of each walk and cycle, and the CPU times, float64 [W, C] [s].
+    Returns the fixes of the cycles that count by method, and the CPU times [s] of all cycles.
     """
-    estimates: dict[str, list[list[Estimate]]] = {name: [] for name in methods}
-    times_s = {name: np.empty(signals.shape[:2]) for name in methods}
-    for walk, of_walk in enumerate(signals):
+    scenario = frame.scenario_of(config and Path(config))
+    book = Codebook.load(codebook, scenario)
+    # The random numbers are those of all walks.
+    positions, signals = (one[first:first + BLOCK] for one in simulate_walks(
+        scenario, book, n_walks, TIMES_S, seed))
+    estimator = BayesEstimator(System(scenario, book))
+    methods: dict[str, Callable[[], Method]] = {
+        'single cycles': lambda: lambda _, received: estimator.estimate(received),
+        'track': lambda: Tracker(estimator).update}
+    estimates: dict[str, list[Estimate]] = {name: [] for name in methods}
+    times_s: dict[str, list[float]] = {name: [] for name in methods}
+    for of_walk in signals:
         for name, make in methods.items():
-            update, row = make(), []
-            for cycle, received in enumerate(of_walk):
+            update = make()
+            for time_s, received in zip(TIMES_S, of_walk, strict=True):
                 begin = time.process_time()
-                row.append(update(TIMES_S[cycle], received))
-                times_s[name][walk, cycle] = time.process_time() - begin
-            estimates[name].append(row)
-    return estimates, times_s
+                estimates[name].append(update(time_s, received))
+                times_s[name].append(time.process_time() - begin)
+    counted = np.tile(COUNTED, len(signals))
+    places = positions[:, COUNTED].reshape(-1, 3)
+    return {name: [*frame.Fixes.of(Estimate.of_each(
+        [one for one, counts in zip(found, counted, strict=True) if counts]), places),
+        times_s[name]] for name, found in estimates.items()}
 
 
 if __name__ == '__main__':

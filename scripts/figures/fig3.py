@@ -188,7 +188,8 @@ def picture(summary: Summary) -> Any:
 def reproduce(options: argparse.Namespace) -> None:
     """Run the jobs that have no results yet, print the report and write the files."""
     trials, jobs = options.trials, make_jobs(options.trials)
-    results = run_jobs(trial, jobs, options.output / 'jobs', options.jobs, options.dask)
+    results = run_jobs(frame.imported(trial), jobs, options.output / 'jobs', options.jobs,
+                       options.dask)
     entries = [{**job.arguments, **result} for job, result in zip(jobs, results, strict=True)]
     summary = Summary(entries)
     report = '\n\n'.join([

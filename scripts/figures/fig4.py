@@ -138,7 +138,7 @@ class Experiment:
     def _run(self, function: Any, jobs: Sequence[Job]) -> dict[str, dict]:
         options = self._options
         results = run_jobs(
-            function, jobs, options.output / 'jobs', options.jobs, options.dask)
+            frame.imported(function), jobs, options.output / 'jobs', options.jobs, options.dask)
         return dict(zip([job.name for job in jobs], results, strict=True))
 
     def codebooks(self, levels: Sequence[float]) -> dict[tuple[str, float, int], dict]:

@@ -71,7 +71,7 @@ def measured(options: argparse.Namespace, name: str, function: Callable[..., Map
 
     Results of an unfinished run are kept in results/benchmarks/NAME.jobs.
     """
-    work = _imported(function)
+    work = imported(function)
 
     def strand(case: str) -> Strand[dict[str, Any]]:
         return (yield work, [Job.of(re.sub(r'\W+', '-', case), cases[case])])[0]
@@ -80,7 +80,7 @@ def measured(options: argparse.Namespace, name: str, function: Callable[..., Map
         return dict(zip(cases, workers.run([strand(case) for case in cases]), strict=True))
 
 
-def _imported(function: Callable[..., Any]) -> Callable[..., Any]:
+def imported(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function of the main program as one of a module, which other processes import.
 
     They would receive it by value, and what it uses of the main program by name: caches, and
