@@ -5,6 +5,9 @@ scratch folder. Both process the same signals in turn, with one thread each. Tim
 single estimates, of estimates in batches of 50, and of building an estimator without stored
 tables; only the ratios can be compared between machines. The first cycle of a track, which has no
 prior, counts too.
+
+With `--growth`, how do times and memory grow with the numbers of sub-bands, frames, elements and
+feeds, and with the region? A signal of New Radio with 3276 sub-carriers comes last.
 """
 
 import argparse
@@ -23,6 +26,20 @@ from parts import frame, speed_worker
 ROOT = Path(__file__).parents[2]
 CASES = (*speed_worker.FIXES, speed_worker.LAB, speed_worker.FUSION, speed_worker.TRACK)
 BUILD = 'build'
+# Sizes that grow by factors of two, as fields in which scenarios differ from Table I. The region
+# grows along x. Sub-bands are those of New Radio with a spacing of 30 kHz, and the last scenario
+# has those of a carrier of 100 MHz.
+GRID = {'center_frequencies_hz': [2.75e9], 'subband_width_hz': 30e3,
+        'frame_duration_s': 1e-3 / 28}
+GROWTH = {
+    'sub-bands': [GRID | {'n_subbands': 8 * n} for n in (16, 32, 64, 128)],
+    'frames': [{'n_frames': 4 * n} for n in (1, 2, 4, 8)],
+    'elements': [{'elements_per_side': [10 * n, 10]} for n in (1, 2, 4, 8)],
+    'feeds': [{'n_feeds': 3 * n} for n in (1, 2, 4)],
+    'volume of the region': [
+        {'roi_center_m': [5 + 5 * n, 0.0, 0.0], 'roi_size_m': [10.0 * n, 10.0, 2.0]}
+        for n in (1, 2, 4)],
+    '3276 sub-bands': [GRID | {'n_subbands': 3276}]}
 # Estimates of one revision before the other takes its turn, and how often estimators are built.
 TURN, BUILDS = 20, 3
 
@@ -101,6 +118,32 @@ def measure(options: argparse.Namespace, roots: list[Path], folder: Path) -> dic
     return dict(results)
 
 
+def growth(n: int) -> dict[str, object]:
+    """Measure each size in a process of its own, and print a row for each."""
+    table = frame.Table(['size', 'factor'], {
+        'simulate [s]': ('simulate_s', 2), 'bounds [s]': ('crlb_s', 2),
+        'build [s]': ('build_s', 2), 'fix [s]': ('fix_s', 4), 'total [s]': ('total_s', 1),
+        'memory [GiB]': ('memory_gib', 2)})
+    rows: dict[str, list[dict[str, object]]] = {}
+    for size, sizes in GROWTH.items():
+        for number, fields in enumerate(sizes):
+            found = subprocess.run(
+                [sys.executable, speed_worker.__file__, 'stages', json.dumps(fields), str(n)],
+                env=os.environ | {'PYTHONPATH': str(ROOT), 'OPENBLAS_NUM_THREADS': '1'},
+                stdout=subprocess.PIPE, check=True)
+            rows.setdefault(size, []).append(
+                table.row(size, str(2**number), **json.loads(found.stdout)))
+    print()
+    exponents = frame.Table(['size'], {'build': ('build', 2), 'fix': ('fix', 2)})
+    found_of = {}
+    for size, times in rows.items():
+        if len(times) > 1:
+            found_of[size] = exponents.row(size, **{
+                kind: float(np.polyfit(np.arange(len(times)), np.log2(
+                    [one[f'{kind}_s'] for one in times]), 1)[0]) for kind in ('build', 'fix')})
+    return {'sizes': rows, 'exponents': found_of}
+
+
 def main() -> None:
     """Run the benchmark."""
     parser = frame.benchmark_parser('speed', __doc__, positions=200)
@@ -108,7 +151,12 @@ def main() -> None:
                         help='revision to compare with (default: %(default)s)')
     parser.add_argument('--only', action='append', choices=[*CASES, *speed_worker.BUILDS],
                         help='measure only this case; repeatable')
+    parser.add_argument('--growth', action='store_true',
+                        help='measure the growth with the sizes of a scenario instead')
     options = parser.parse_args()
+    if options.growth:
+        frame.write_results(options.json, growth(options.positions))
+        return
     with tempfile.TemporaryDirectory() as scratch:
         other, folder = Path(scratch, 'other'), Path(scratch, 'signals')
         other.mkdir()

@@ -3,13 +3,15 @@
 Usage: speed_worker.py CONFIG SIGNALS. CONFIG is the folder ``config`` of the revision, and SIGNALS
 a folder with the signals of each case. Each line on the standard input is a case, ``single``,
 ``batch`` or ``build``, and the first and last index of its signals; each line on the standard
-output is a list of times [s].
+output is a list of times [s]. With ``stages`` in place of the folders, the arguments are fields in
+which a scenario differs from Table I, and a number of fixes; see `stages`.
 """
 
 import dataclasses
 import functools
 import json
 import math
+import resource
 import sys
 import time
 from collections.abc import Callable
@@ -19,10 +21,11 @@ from typing import Any
 import numpy as np
 import scipy.stats.qmc  # noqa: F401 - estimators import it when they first need it
 
+from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.codebook.unoptimised import random_codebook
-from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
 from rhs_isac_ros.positioning import Site, SiteEstimator, Tracker, fuse, make_estimator
 
 # Fields in which each case differs from Table I.
@@ -101,8 +104,34 @@ def build(parts: tuple[Scenario, Codebook, dict[str, Any]], _: int = 0) -> Any:
     return make_estimator('bayes', scenario, codebook, reject_outside=True, **known)
 
 
+def stages(fields: dict[str, Any], n: int) -> dict[str, float]:
+    """Return CPU times [s] of all that leads to n fixes, of a fix, and the peak memory [GiB]."""
+    begin, found = time.process_time(), {}
+    scenario = dataclasses.replace(Scenario(), **fields)
+    codebook = random_codebook(scenario, np.random.default_rng(1))
+    rng = np.random.default_rng(2)
+    positions = scenario.sample_positions(n, rng)
+    received = simulate_received(scenario, codebook, positions, rng)
+    found['simulate_s'] = time.process_time() - begin
+    crlb(scenario, codebook, positions)
+    found['crlb_s'] = time.process_time() - begin - found['simulate_s']
+    before = time.process_time()
+    locate = build((scenario, codebook, {}))
+    found['build_s'] = time.process_time() - before
+    locate.estimate(received[0])
+    before = time.process_time()
+    for one in received:
+        locate.estimate(one)
+    found['fix_s'] = (time.process_time() - before) / n
+    found['total_s'] = time.process_time() - begin
+    return found | {'memory_gib': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20}
+
+
 def main() -> None:
     """Measure what the standard input names."""
+    if sys.argv[1] == 'stages':
+        print(json.dumps(stages(json.loads(sys.argv[2]), int(sys.argv[3]))))
+        return
     config, folder = map(Path, sys.argv[1:])
     known: dict[str, Callable[[Any], Any]] = {}
     for line in sys.stdin:
