@@ -46,8 +46,8 @@ from rhs_isac_ros.positioning.segments import concatenate, select
 
 # Largest expected number of failures for which sets are searched.
 _MAX_EXPECTED = 2.0
-# Number of sets whose covariance is kept.
-_MAX_SURFACES = 256
+# Number of sets whose covariance is kept, and memory of their extensions [bytes].
+_MAX_SURFACES, _EXTENSION_BYTES = 256, 1 << 26
 # Number of places at which all elements are compared at a time.
 _PLACES = 8
 
@@ -288,9 +288,12 @@ class FailedSurfaces:
             covariance = surface.covariance + self.effects.growth(surface)
             covariance += remainder * self._error
             found = Whitening.of(covariance, self.likelihood.nuisance, self.whitening(failed))
-            # Only extensions of the intact surface serve all shots; each takes a few megabytes.
-            self._extensions = {(failed, remainder): found} | {
-                key: kept for key, kept in known.items() if not key[0]}
+            # Extensions of the intact surface serve all shots. Others often serve successive ones.
+            n_kept = _EXTENSION_BYTES // found.factors.whitener.nbytes
+            others = [key for key in known if key[0]]
+            left_out = others[:max(len(others) + 1 - n_kept, 0)]
+            self._extensions = {key: known[key] for key in known if key not in left_out} | {
+                (failed, remainder): found}
         return found
 
     @property
