@@ -128,11 +128,33 @@ def check_power(scenario: Scenario, signals: np.ndarray, kind: str) -> None:
 
 def residuals_of(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
     """Remove the likeliest impairments and the mean from the pilots; return [N, N_B, R]."""
+    _, aligned, mean = _aligned(model, pilots)
+    return aligned - mean
+
+
+def log_evidence(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
+    """Return the logarithm of the density of each pilot, without a constant, float64 [N].
+
+    Impairments are integrated out by the method of Laplace.
+    """
+    nuisance, (values, aligned, mean) = nuisance_of(model.scenario), _aligned(model, pilots)
+    energy = np.sum(np.abs(model.whiten(aligned - mean))**2, axis=(1, 2))
+    log_root = np.sum(np.linalg.slogdet(model.combined_root)[1])
+    log_gain = np.sum(np.log(np.abs(nuisance.divide(np.ones_like(mean), values))), axis=(1, 2))
+    curvature = _curvature(nuisance, model.whiten(nuisance.derivatives(aligned, mean)))
+    evidence: np.ndarray = 2 * (log_gain - log_root) - energy - (
+        values**2 @ nuisance.precision + np.linalg.slogdet(curvature)[1]) / 2
+    return evidence
+
+
+def _aligned(model: MeasurementModel, pilots: Pilots
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the likeliest impairments [N, Q], the pilots without them, and the mean."""
     nuisance, mean = nuisance_of(model.scenario), model.mean(pilots.positions)
     values = initial_values(nuisance, model.whiten(pilots.received), model.whiten(mean))
     for _ in range(_ALIGNMENT_STEPS if len(nuisance) else 0):
         values = refined_values(nuisance, values, pilots.received, mean, model.whiten)
-    return nuisance.divide(pilots.received, values) - mean
+    return values, nuisance.divide(pilots.received, values), mean
 
 
 @one_blas_thread
@@ -188,7 +210,8 @@ def refined_values(nuisance: Nuisance, values: np.ndarray, signals: np.ndarray, 
 
 def _curvature(nuisance: Nuisance, slopes: np.ndarray) -> np.ndarray:
     """Return the curvature [N, Q, Q] that results from whitened slopes and the prior."""
-    curvature = quadratic_form(slopes.reshape(*slopes.shape[:2], -1))
+    size = slopes.shape[2] * slopes.shape[3]
+    curvature = quadratic_form(slopes.reshape(*slopes.shape[:2], size))
     return curvature + np.diag(nuisance.precision)
 
 

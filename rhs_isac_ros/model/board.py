@@ -109,6 +109,11 @@ class Board(abc.ABC):
             if getattr(self, field.name) != field.default}
         return {'kind': self.kind, **changed} if changed else self.kind
 
+    @property
+    def declared(self) -> str:
+        """The kind of the board, or '' for the default."""
+        return '' if self.plain == 'paper' else self.kind
+
     @functools.cached_property
     def id(self) -> str:
         """Hash of the board, 16 hexadecimal digits, the same in all processes."""

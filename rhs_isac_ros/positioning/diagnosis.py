@@ -75,10 +75,11 @@ _MAX_DISPERSION = 1.2
 class FitTest:
     """Tests of the energies of N_B N_SB F signals; each returns a reason to reject, or ''.
 
-    `level` is the median power of the multipath of users in sight, relative to the model.
+    `level` is the median power of the multipath of users in sight, relative to the model. `board`
+    names the declared board, which residuals that are too large may contradict.
     """
 
-    def __init__(self, n_measurements: int, level: float = 1.0) -> None:
+    def __init__(self, n_measurements: int, level: float = 1.0, board: str = '') -> None:
         from scipy.special import gammaincinv
 
         self.min_energy = float(gammaincinv(n_measurements, FALSE_ALARM))
@@ -87,6 +88,7 @@ class FitTest:
         # direct path is (energy / residual)**n.
         self._weak_share = FALSE_ALARM**(1 / n_measurements)
         self.max_residual = energy_limit(n_measurements)
+        self._hint = f'; the surface may have another board than {board!r}' if board else ''
 
     def min_energy_test(self, energy: float) -> str:
         """Reject signals weaker than noise; `energy` is relative to the noise."""
@@ -111,7 +113,8 @@ class FitTest:
 
     def residual_test(self, residual: float) -> str:
         """Reject signals whose residual at the best position exceeds the limit for noise."""
-        return _excess(_RESIDUAL, residual, self.max_residual)
+        excess = _excess(_RESIDUAL, residual, self.max_residual)
+        return excess and excess + self._hint
 
 
 def speed_test(residual: float, std: float, speeds: np.ndarray) -> str:

@@ -143,7 +143,8 @@ class SearchEstimator(abc.ABC):
         # is due to the level.
         self._level, self._n_measurements = 10**(median_db / 10), n_measurements
         self._level_share = share_of_level(n_measurements, std_db)
-        self._test = FitTest(n_measurements, self._level)
+        self._test = FitTest(
+            n_measurements, self._level, likelihood.scenario.board.declared)
         self._bounds = likelihood.resolution.bounds_m
         self._prior_m2 = float(np.sum((self._bounds[1] - self._bounds[0])**2)) / 12
         self._phases = BandPhases(likelihood)

@@ -156,7 +156,8 @@ class NeuralEstimator:
             model_file if isinstance(model_file, Network) else read_model(model_file))
         source = 'model' if isinstance(model_file, Network) else str(model_file)
         _check_purpose(self._network, system, source)
-        self._test = FitTest(int(np.prod(system.shape)))
+        self._test = FitTest(
+            int(np.prod(system.shape)), board=system.scenario.board.declared)
 
     @one_blas_thread
     def estimate(self, received: np.ndarray) -> Estimate:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
+import yaml
 from rclpy.node import Node
 
 from rhs_isac_ros.calibration import (
@@ -31,10 +32,13 @@ from rhs_isac_ros.calibration import (
     survey,
     survey_report,
 )
+from rhs_isac_ros.calibration.boards import board_evidence, fit_board
 from rhs_isac_ros.calibration.estimate import places_of
 from rhs_isac_ros.calibration.survey import PLACE_WAVELENGTHS
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import MultipathEstimate, Scenario
+from rhs_isac_ros.model.board import Board
+from rhs_isac_ros.model.boards import board_of
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.geometry import stands_still
 from rhs_isac_ros.monitoring.cycle_log import SignalLog
@@ -53,8 +57,10 @@ from rhs_isac_ros.support.arguments import (
     positive_float,
     positive_int,
 )
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import (
     ArchiveError,
+    parse_yaml,
     read_arrays,
     save_or_rescue,
     write_whole,
@@ -217,6 +223,9 @@ def _calibrate(options: argparse.Namespace, arguments: list[str]) -> int:
             # The reports contain these warnings.
             warnings.simplefilter('ignore', CalibrationWarning)
             warnings.simplefilter('ignore', SurveyWarning)
+            if options.board is not None:
+                _compare(scenario, pilots, options)
+                return 0
             if options.multipath:
                 _survey(scenario, pilots, options)
                 return 0
@@ -227,6 +236,29 @@ def _calibrate(options: argparse.Namespace, arguments: list[str]) -> int:
         return _save(calibration, options.output)
     except ValueError as error:
         raise CalibrationError(str(error)) from None
+
+
+def _compare(scenario: Scenario, pilots: Sequence[Pilots], options: argparse.Namespace) -> None:
+    """Print the evidence of boards, and fit parameters of the best one."""
+    found = {board: board_evidence(scenario, pilots, board)
+             for board in dict.fromkeys([scenario.board, *options.board])}
+    best = max(found, key=lambda board: found[board])
+    for board, value in sorted(found.items(), key=lambda item: -item[1]):
+        print(f'{_board_text(board)}: log evidence {value - found[best]:.1f}', flush=True)
+    if options.fit:
+        fit = fit_board(dataclasses.replace(scenario, board=best), pilots, options.fit)
+        std = np.sqrt(np.diagonal(fit.covariance))
+        for name, value, deviation, row in zip(
+                fit.names, fit.values, std, fit.covariance, strict=True):
+            print(f'{name}: {value:.8g} +- {deviation:.3g}; row of the covariance: '
+                  f'{", ".join(f"{entry:.3g}" for entry in row)}')
+        gain = board_evidence(scenario, pilots, fit.board) - found[best]
+        print(f'log evidence {gain:.1f} with the line "board: {_board_text(fit.board)}" in the '
+              'scenario file')
+
+
+def _board_text(board: Board) -> str:
+    return yaml.safe_dump(board.plain, default_flow_style=True, width=10**6).split('\n')[0]
 
 
 def _save(calibration: Calibration, output: Path) -> int:
@@ -335,6 +367,11 @@ def _folds(scenario: Scenario, pilots: Sequence[Pilots]
             yield others, left_out
 
 
+def _board(text: str) -> Board:
+    with translated(ValueError, argparse.ArgumentTypeError):
+        return board_of(parse_yaml(text))
+
+
 def _states(text: str) -> tuple[complex, ...]:
     try:
         states = tuple(complex(word) for word in text.split(','))
@@ -348,13 +385,15 @@ def _states(text: str) -> tuple[complex, ...]:
 def _conflict(options: argparse.Namespace) -> str:
     options.output = options.output or (_SITE_OUTPUT if options.site else _OUTPUT)
     others = [name for name in (
-        'file', 'multipath', 'states', 'system', 'config', 'codebook', 'calibration',
+        'file', 'multipath', 'states', 'board', 'system', 'config', 'codebook', 'calibration',
         'namespace')
         if getattr(options, name) not in (None, False, '/')]
     if options.site and others:
         return f'argument --site: not allowed with {", ".join(others)}'
     if options.calibration and not options.multipath:
         return 'argument --calibration: expected together with --multipath'
+    if options.fit and options.board is None:
+        return 'argument --fit: expected together with --board'
     if options.states and options.codebook:
         return 'argument --codebook: not allowed with --states'
     if options.namespace != '/' and not options.file:
@@ -382,6 +421,11 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument('--states', type=_states, metavar='OFF,ON',
         help='write a surface whose elements have these coefficients for 0 and 1, such as 1,-1 or '
         '0.5+0.1j,-0.6, without an estimation')
+    what.add_argument('--board', type=_board, nargs='*', metavar='BOARD',
+        help='compare the board of the scenario with others by their evidence, such as paper or '
+        '"{kind: resonant, quality_factor: 30}", instead of calibrating its elements')
+    add('--fit', nargs='+', metavar='FIELD',
+        help='fields of the most probable board to estimate, such as quality_factor')
     add('--site', type=input_file, metavar='FILE',
         help='estimate the poses of the surfaces of a running site, except for the first one, '
         'from users that two surfaces locate; write a site file')

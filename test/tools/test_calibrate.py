@@ -174,6 +174,36 @@ def test_arrays_are_a_survey_of_the_multipath(two_folds, tmp_path):
     assert 'received: missing' in done.err
 
 
+def test_boards_are_compared_and_the_best_one_is_fitted(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    lossy = dataclasses.replace(SCENARIO, board={'kind': 'paper', 'loss_db_per_m': 20.0})
+    positions = SCENARIO.sample_positions(40, rng)
+    np.savez(tmp_path / 'arrays.npz', positions=positions,
+             received=simulate_received(lossy, CODEBOOK, positions, rng))
+    options = (tmp_path / 'arrays.npz', '--config', CONFIG / 'quick.yaml', '--codebook',
+               CONFIG / 'codebook_quick.yaml', '--board')
+    done = call(*options, 'resonant', '{kind: paper, loss_db_per_m: 9}', '--fit', 'loss_db_per_m')
+    assert (done.code, done.err) == (0, '')
+    lines = done.out.splitlines()
+    assert lines[0] == '{kind: paper, loss_db_per_m: 9.0}: log evidence 0.0'
+    assert lines[1].startswith('paper: log evidence -')
+    assert lines[2].startswith('resonant: log evidence -')
+    value, std = map(float, re.match(
+        r'loss_db_per_m: ([\d.]+) \+- ([\d.]+); row of the covariance: ', lines[3]).groups())
+    assert abs(value - 20) < 3 * std < 15
+    board = re.fullmatch(r'log evidence [\d.]+ with the line "board: (.*)" in the scenario file',
+                         lines[4])[1]
+    assert float(re.search('loss_db_per_m: ([^}]+)}', board)[1]) == pytest.approx(value)
+    done = call(*options, '--fit', 'masked')
+    assert (done.code, done.out) == (2, 'paper: log evidence 0.0\n')
+    assert "masked: expected a field of the board 'paper'" in done.err
+    for wrong, error in (((*options, 'none'), "argument --board: 'none', expected a plug-in"),
+                         ((*options[:-1], '--fit', 'masked'), 'together with --board')):
+        with pytest.raises(SystemExit):
+            calibrate.main([*map(str, wrong)])
+        assert error in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(('arguments', 'error'), [
     (['--namespace', '/lab'], 'no received signals with a true position'),
     (['--namespace', NAMESPACE, '--config', CONFIG / 'table1.yaml'], ': shape '),
