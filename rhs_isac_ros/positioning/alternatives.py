@@ -72,7 +72,7 @@ class OutsideGrid(NamedTuple):
     error: float = 0.25
     gain_error: float = 0.01
     # Directions with a log-likelihood below the best by more than this at all ranges are ignored.
-    margin: float = 30.0
+    margin: float = 20.0
     # Quadrature over the gain: spacing [nepers], and reach in standard deviations.
     gain_step: float = 0.04
     gain_reach: float = 4.0
