@@ -145,6 +145,7 @@ def test_the_pitch_is_the_largest_with_a_small_loss(start, monkeypatch):
     assert [loss for *_, loss in reports] == pytest.approx([0.3, 0.1, 0.04])
 
 
+@pytest.mark.slow
 def test_the_command_continues_after_an_interruption_and_on_other_workers(
         start, tmp_path, capsys, monkeypatch):
     pytest.importorskip('joblib')

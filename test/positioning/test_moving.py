@@ -76,6 +76,7 @@ def test_gradient_and_information_are_those_of_the_likelihood(declared, moves):
                 slope, rel=1e-3, abs=0.5 if row < 3 else 1e-2)
 
 
+@pytest.mark.slow
 def test_positions_and_velocities_are_in_their_regions(walking):
     system, estimator = walking
     rng = np.random.default_rng(2)
@@ -118,6 +119,7 @@ def test_without_the_phases_of_bands_range_and_radial_speed_are_ambiguous():
     assert log_likelihood(0.0, 0.05) < best - 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('speed_mps', [5, 10])
 def test_a_faster_user_than_declared_is_hardly_ever_at_a_wrong_place(walking, speed_mps):
     system, estimator = walking

@@ -91,6 +91,7 @@ def test_the_mean_is_that_of_the_posterior_with_the_prior_of_the_phases(codebook
 # The average over a wavelength nearly removes a phase that all bands share, unless the carriers
 # are far apart. Unlikely phases then have a noticeable part in it, and the wrapped normal
 # distribution is only close to their density.
+@pytest.mark.slow
 @pytest.mark.parametrize(('frequencies_hz', 'tolerance'), [
     ((2.5e9, 2.54e9, 2.6e9), 0.02), ((2.4e9, 3.5e9, 5.8e9), 0.4)])
 @pytest.mark.parametrize('phase_std_rad', [0.0, 0.5, UNIFORM_RAD])

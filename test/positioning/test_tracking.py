@@ -482,6 +482,7 @@ def test_velocities_that_are_measured_are_those_of_the_track():
     np.testing.assert_allclose(found.velocity_covariance, joint[1, 1] * np.eye(3), atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('height_m', [0.0, 1.0], ids=['plane', 'room'])
 def test_users_who_move_during_a_cycle_are_tracked(height_m):
     """Positions are better than those of single cycles, and covariances match the errors."""
