@@ -22,7 +22,8 @@ The modules, in reading order:
 * `templates`, `peaks`, `grid`: starts of the search; `search`: ascent from the starts to the
   modes; `failures`: modes if elements have failed
 * `posterior`: from modes to samples; `draws`: samples without modes; `alternatives`: users outside
-  or blocked; `diagnosis`: tests of the fit between signals and model
+  or blocked; `diagnosis`: tests of the fit between signals and model;
+  `movement`: tests of how users move in a cycle
 * `prior`: the update of a mixture with signals, and errors that all phases share; `fusion`:
   several surfaces; `agreement`: surfaces whose pose is wrong; `alignment`: the pose of a surface
   from common users; `site`: the surfaces of a site in a file

@@ -37,9 +37,6 @@ from rhs_isac_ros.positioning.estimate import Estimate
 WINDOW = 400
 MIN_RETURN = 100
 MIN_RESIDUALS = 10
-# Probability of a residual and a velocity below which the user may be faster than declared. Wrong
-# positions of such users may be as probable as this.
-TOO_FAST = 2e-3
 
 
 class _Limits(NamedTuple):
@@ -115,23 +112,6 @@ class FitTest:
         """Reject signals whose residual at the best position exceeds the limit for noise."""
         excess = _excess(_RESIDUAL, residual, self.max_residual)
         return excess and excess + self._hint
-
-
-def speed_test(residual: float, std: float, speeds: np.ndarray) -> str:
-    """Reject a residual and a velocity that are improbable together, as of too fast a user.
-
-    Takes the residual relative to its expectation, the standard deviation of its logarithm, and
-    the components of the velocity relative to their standard deviations. Fisher's method combines
-    the probabilities.
-    """
-    from scipy.special import chdtrc, ndtr
-
-    product = float(ndtr(-np.log(residual) / std) * chdtrc(len(speeds), np.sum(speeds**2)))
-    probability = product * (1 - np.log(max(product, np.finfo(float).tiny)))
-    return '' if probability >= TOO_FAST else (
-        f'velocity: {np.linalg.norm(speeds):.2g} standard deviations, with {residual:.3g} times '
-        f'the expected {_RESIDUAL}: probability {probability:.1g}, expected at least '
-        f'{TOO_FAST:g}; the user may be faster than user_speed_std_mps')
 
 
 def _excess(subject: str, value: float, limit: float) -> str:

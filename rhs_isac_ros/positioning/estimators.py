@@ -12,11 +12,10 @@ import numpy as np
 
 from rhs_isac_ros.model import Pose
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
-from rhs_isac_ros.model.constants import POWER_NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import share_of_level
-from rhs_isac_ros.model.geometry import jacobian, velocity_std_mps
+from rhs_isac_ros.model.geometry import jacobian
 from rhs_isac_ros.positioning.alternatives import Alternative, Blocked, Outside, rejection
-from rhs_isac_ros.positioning.diagnosis import FitTest, misfit_log_ratio, speed_test
+from rhs_isac_ros.positioning.diagnosis import FitTest, misfit_log_ratio
 from rhs_isac_ros.positioning.draws import DrawnPosterior
 from rhs_isac_ros.positioning.estimate import (
     MISS_PROBABILITY,
@@ -32,6 +31,7 @@ from rhs_isac_ros.positioning.grid import TemplateTable
 from rhs_isac_ros.positioning.lattice import Grid, lay_grid
 from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
 from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.movement import MovementTest
 from rhs_isac_ros.positioning.moving import MovingTable
 from rhs_isac_ros.positioning.offsets import Alignment
 from rhs_isac_ros.positioning.posterior import (
@@ -145,6 +145,7 @@ class SearchEstimator(abc.ABC):
         self._level_share = share_of_level(n_measurements, std_db)
         self._test = FitTest(
             n_measurements, self._level, likelihood.scenario.board.declared)
+        self._movement = MovementTest.of(system, likelihood)
         self._bounds = likelihood.resolution.bounds_m
         self._prior_m2 = float(np.sum((self._bounds[1] - self._bounds[0])**2)) / 12
         self._phases = BandPhases(likelihood)
@@ -338,9 +339,10 @@ class SearchEstimator(abc.ABC):
             seen = whitened
             for alternative in scope.alternatives:
                 seen = alternative.seen(self._likelihood.model, signals.received, seen)
-            for row, searched, one, values in zip(usable, fits, seen, aligned, strict=True):
+            for n, (row, searched, one, values) in enumerate(zip(
+                    usable, fits, seen, aligned, strict=True)):
                 estimate, log_ratios = self._judge(
-                    scope.alternatives, searched.fit, one, values)
+                    scope.alternatives, searched, select(signals, [n]), one, values)
                 found[row] = _Found(self, estimate, log_ratios, *searched)
         return found
 
@@ -409,9 +411,11 @@ class SearchEstimator(abc.ABC):
                 self._bounds)
             yield shot, _Searched(Fit._make((*fit, describe)), of_shot, conditionals[shot])
 
-    def _judge(self, alternatives: Sequence[Alternative], fit: Fit, whitened: np.ndarray,
-               aligned: np.ndarray) -> tuple[Estimate, dict[str, float]]:
+    def _judge(self, alternatives: Sequence[Alternative], searched: '_Searched',
+               signals: Signals, whitened: np.ndarray, aligned: np.ndarray
+               ) -> tuple[Estimate, dict[str, float]]:
         """Return the position of one shot, or the reason why there is none; and `log_ratios`."""
+        fit = searched.fit
         log_ratios = {one.name: one.log_evidence_of(
             whitened, aligned, fit.residual, self._likelihood.nuisance) - fit.log_evidence
             for one in alternatives}
@@ -419,7 +423,10 @@ class SearchEstimator(abc.ABC):
             one.log_odds + log_ratios[one.name] for one in alternatives)]))
         weights = self._likelihood.weights_at(np.array([fit.gain]))[0]
         reason = self._reason(alternatives, whitened * np.exp(-fit.gain) * weights,
-                              fit.residual, probabilities) or self._too_fast(fit)
+                              fit.residual, probabilities)
+        if self._movement and not reason:
+            reason = self._movement.reason(
+                fit, searched.modes, signals, aligned, self._scale(fit))
         # Without a fix, only a residual that nothing explains is evidence against the scenario.
         # The residual is the reason if the texts are equal.
         is_evidence = (reason == self._test.residual_test(fit.residual) if reason
@@ -435,17 +442,6 @@ class SearchEstimator(abc.ABC):
             statistics.update(velocity=fit.mean[3:], velocity_covariance=covariance[3:, 3:],
                               cross_covariance=covariance[:3, 3:])
         return Estimate(fit.mean[:3], covariance[:3, :3], reason, **statistics), log_ratios
-
-    def _too_fast(self, fit: Fit) -> str:
-        """Return the reason if the user may be faster than declared, or ''."""
-        moving = np.flatnonzero(velocity_std_mps(self.scenario))
-        if not len(moving):
-            return ''
-        _, std_db = self.scenario.multipath_level_db
-        return speed_test(
-            fit.residual / (self._level * max(fit.expected, 0.5)),
-            float(np.hypot(self._n_measurements**-0.5, POWER_NEPERS_PER_DB * std_db)),
-            fit.mean[3 + moving] / self.scenario.user_speed_std_mps)
 
     def _scale(self, fit: Fit) -> float:
         """Return the factor of the covariance for the multipath level that the residual shows."""

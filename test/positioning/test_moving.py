@@ -1,43 +1,12 @@
 """Positions and velocities of users who move during a cycle."""
 
-import dataclasses
-
 import numpy as np
 import pytest
-from scipy.special import chdtri
+from walking_users import inside, system_of, users_of
 
-from rhs_isac_ros.codebook import random_codebook
-from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.positioning import BayesEstimator, MlEstimator
 from rhs_isac_ros.positioning.likelihood import Likelihood
-from rhs_isac_ros.system import System
-
-# A cycle of 0.36 s, in which a user walks several wavelengths.
-WALKING = Scenario(
-    center_frequencies_hz=(5.25e9, 5.75e9), n_subbands=2, n_frames=12, frame_duration_s=0.015,
-    elements_per_side=10, element_interval_wavelengths=0.35, n_feeds=1,
-    feed_positions_m=((0.3, 0.0, 0.0),), refractive_index=1.0, max_user_speed_mps=1.5,
-    multipath_to_los_db=-6, band_phase_std_rad=6.2832, roi_center_m=(2.5, 0, 0),
-    roi_size_m=(2, 2, 0), user_speed_std_mps=1.0, outside_probability=0.0)
-
-
-def system_of(**changes) -> System:
-    scenario = dataclasses.replace(WALKING, **changes)
-    return System(scenario, random_codebook(scenario, np.random.default_rng(3)))
-
-
-def users_of(scenario, n, speed, rng):
-    """States in random directions in the plane of the region."""
-    way = rng.standard_normal((n, 3)) * (np.array(scenario.roi_size_m) > 0)
-    return np.hstack([scenario.sample_positions(n, rng),
-                      speed * way / np.linalg.norm(way, axis=1, keepdims=True)])
-
-
-def inside(errors, covariances, n):
-    covariances = covariances + 1e-8 * np.eye(covariances.shape[-1])
-    squares = np.einsum('ni,nij,nj->n', errors, np.linalg.inv(covariances), errors)
-    return np.mean(squares <= chdtri(n, 0.05))
 
 
 @pytest.fixture(scope='module')
@@ -117,18 +86,6 @@ def test_without_the_phases_of_bands_range_and_radial_speed_are_ambiguous():
     assert log_likelihood(0.005) > best - 20
     assert log_likelihood(0.005, settled=False) < best - 1000
     assert log_likelihood(0.0, 0.05) < best - 1000
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('speed_mps', [5, 10])
-def test_a_faster_user_than_declared_is_hardly_ever_at_a_wrong_place(walking, speed_mps):
-    system, estimator = walking
-    rng = np.random.default_rng(5)
-    states = users_of(system.scenario, 16, speed_mps, rng)
-    estimate = estimator.estimate(system.sample(states, rng))
-    errors = np.linalg.norm((estimate.mean - states[:, :3])[estimate.fix], axis=1)
-    assert np.count_nonzero(errors > 1) <= 2
-    assert any('faster than user_speed_std_mps' in reason for reason in estimate.reason)
 
 
 def test_ml_has_the_most_likely_velocity(walking):

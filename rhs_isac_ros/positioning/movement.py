@@ -1,0 +1,166 @@
+"""Tests of whether a user moves as the scenario declares while the surface steps its patterns.
+
+Signals of a user who moves otherwise often fit a wrong position. Two alternatives to a user as
+declared therefore have an evidence, the likelihood averaged over their unknowns:
+
+* Amplitude and phase of the direct path are Gaussian and independent from frame to frame, as those
+  of a user who crosses several beams of the surface in a cycle. Only the delay is common.
+* If users are declared to be slower, the user walks. One Gauss-Newton step from each mode, with
+  the velocity of someone who walks, finds those who move little, and are near a mode.
+
+If the scenario declares a velocity, a residual and a velocity that are improbable together also
+show that the user is too fast. With short frames, the phase of the direct path hardly changes
+during a cycle, whatever the user does, and no test is needed.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS
+from rhs_isac_ros.model.arrays import log_sum
+from rhs_isac_ros.model.constants import POWER_NEPERS_PER_DB
+from rhs_isac_ros.model.geometry import stands_still, velocity_std_mps
+from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
+from rhs_isac_ros.positioning.estimate import Fit
+from rhs_isac_ros.positioning.grid import Starts
+from rhs_isac_ros.positioning.lattice import Resolution, subband_wavenumbers, unit_points
+from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
+from rhs_isac_ros.positioning.search import Modes, ascend
+from rhs_isac_ros.system import System
+
+# Speeds of users whose scenario declares none [m/s]: one at which frames are long, and the
+# standard deviation of each component.
+_WALKING_MPS, _WALKING_STD_MPS = 1.5, 1.0
+# Prior probability that a user moves otherwise, and largest probability with a fix: above it, a
+# 95 % region cannot attain its coverage.
+_PRIOR, _LIMIT = 0.05, 0.05
+# Probability of a residual and a velocity below which the user may be faster than declared.
+_TOO_FAST = 2e-3
+# Numbers of powers of the direct path, and of positions from whose means these follow; largest
+# offset of the timing in standard deviations; and largest number of delays for each sub-band.
+_POWERS, _POSITIONS, _OFFSET, _DELAYS = 9, 64, 1.5, 2
+
+
+class MovementTest:
+    """Tests of the movement in one cycle, for a system with long frames."""
+
+    def __init__(self, system: System, likelihood: Likelihood) -> None:
+        self._system, self._likelihood, scenario = system, likelihood, system.scenario
+        self._bases, self._shares, self._energies = _frames(system)
+        self._walking: Likelihood | None = None
+        if scenario.user_speed_std_mps < _WALKING_STD_MPS:
+            self._walking = Likelihood(System(
+                dataclasses.replace(scenario, user_speed_std_mps=_WALKING_STD_MPS),
+                system.codebook, system.surface))
+            self._conditional = DispersedLikelihood.of(self._walking) or self._walking
+
+    @classmethod
+    def of(cls, system: System, likelihood: Likelihood) -> 'MovementTest | None':
+        """Return the tests, or None if frames are so short that movement does not matter."""
+        is_short = stands_still(system.scenario, _WALKING_MPS)
+        return None if is_short else cls(system, likelihood)
+
+    def reason(self, fit: Fit, modes: Modes | None, signals: Signals, aligned: np.ndarray,
+               level: float) -> str:
+        """Return why there is no fix, or ''.
+
+        Takes one shot, the parameters `aligned` that follow from the signals alone, float64 [Q],
+        and the level of the multipath that the residual shows, relative to the model.
+        """
+        log_ratio = self._unsteady(fit, signals, aligned, level)
+        if self._walking and modes is not None:
+            log_ratio = max(log_ratio, self._walks(self._walking, modes, signals))
+        odds = _PRIOR / (1 - _PRIOR) * np.exp(min(log_ratio, 100.0))
+        if odds > _LIMIT / (1 - _LIMIT):
+            return (f'velocity: probability {odds / (1 + odds):.3g} that the user moves otherwise '
+                    f'than with user_speed_std_mps = {self._system.scenario.user_speed_std_mps:g},'
+                    f' expected at most {_LIMIT:g}')
+        return self._too_fast(fit)
+
+    def _unsteady(self, fit: Fit, signals: Signals, aligned: np.ndarray, level: float) -> float:
+        """Return the log evidence of independent frames, relative to that of the fit."""
+        likelihood, prior = self._likelihood, self._likelihood.nuisance
+        if likelihood.model is self._system:
+            weights = likelihood.weights_at(np.array([fit.gain]))[0]
+            whitened = likelihood.whitened(aligned[None], signals)[0] * np.exp(-fit.gain) * weights
+            constant = 2 * float(np.log(weights).sum())
+        else:
+            whitened, constant = self._system.whiten(signals.received[0]), 0.0
+        powers = np.abs(np.einsum('tbnf,bn->tbf', self._bases.conj(), whitened))**2 / level
+        excess = np.multiply.outer(self._energies, self._shares)
+        values = np.sum(powers * excess / (1 + excess) - np.log1p(excess), axis=(2, 3))
+        if prior.gain_std:
+            # Laplace's integral over the gain, as in the evidence of the fit.
+            n = signals.received.size
+            constant -= (fit.gain / prior.gain_std)**2 / 2 + 2 * n * fit.gain + float(
+                np.log(4 * n) / 2 + np.log(prior.gain_unit))
+        rest = (fit.residual - np.sum(np.abs(whitened)**2)) / level - fit.residual
+        return (log_sum(values) - np.log(values.size) + constant + float(rest)
+                + prior.log_evidence_of_aligned(aligned) - fit.log_evidence)
+
+    def _walks(self, walking: Likelihood, modes: Modes, signals: Signals) -> float:
+        """Return the log evidence of a user who walks, relative to that of the modes."""
+        prior, wide = self._likelihood.nuisance, walking.nuisance
+        n_moving, n_wide = prior.velocity.shape[1], wide.velocity.shape[1]
+        others = modes.values[:, n_moving:][:, ~prior.phases[:, n_moving:].any(axis=0)]
+        values = np.zeros((len(others), len(wide)))
+        values[:, :n_moving] = modes.values[:, :n_moving] * (
+            self._system.scenario.user_speed_std_mps / _WALKING_STD_MPS)
+        values[:, n_wide:n_wide + others.shape[1]] = others
+        starts = Starts(np.zeros(len(others), int), modes.points, values)
+        found = ascend(self._conditional, walking, starts, walking.signals(signals.received), 1)
+        return _log_mass(found) - _log_mass(modes)
+
+    def _too_fast(self, fit: Fit) -> str:
+        """Return the reason if residual and velocity are improbable together, or ''."""
+        from scipy.special import chdtrc, ndtr
+
+        scenario = self._system.scenario
+        (moving,) = np.nonzero(velocity_std_mps(scenario))
+        if not len(moving):
+            return ''
+        median_db, std_db = scenario.multipath_level_db
+        residual = fit.residual / (10**(median_db / 10) * max(fit.expected, 0.5))
+        std = np.hypot(self._system.n_whitened**-0.5, POWER_NEPERS_PER_DB * std_db)
+        speeds = fit.mean[3 + moving] / scenario.user_speed_std_mps
+        # Fisher's method combines the probabilities.
+        product = float(ndtr(-np.log(residual) / std) * chdtrc(len(speeds), np.sum(speeds**2)))
+        probability = product * (1 - np.log(max(product, np.finfo(float).tiny)))
+        return '' if probability >= _TOO_FAST else (
+            f'velocity: {np.linalg.norm(speeds):.2g} standard deviations, with {residual:.3g} '
+            f'times the expected residual energy: probability {probability:.1g}, expected at '
+            f'least {_TOO_FAST:g}; the user may be faster than user_speed_std_mps')
+
+
+def _frames(system: System) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return bases of direct paths with independent frames, and energies of those in the region.
+
+    For T delays and n whitened measurements of a band, the bases are complex128 [T, N_B, n, F].
+    The second array contains the share of each direction in the energy, float64 [T, N_B, F], and
+    the third one energies from the smallest to the largest, float64 [P].
+    """
+    scenario, resolution = system.scenario, Resolution.of(system.scenario)
+    low, high = scenario.roi_bounds_m
+    whitened, _ = system.mean_and_jacobian(
+        low + (high - low) * unit_points()[:_POSITIONS], np.zeros((_POSITIONS, 3, 0)),
+        whitened=True)
+    energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
+    offset_m = _OFFSET * SPEED_OF_LIGHT_MPS * min(
+        scenario.timing_std_s, 1 / (2 * scenario.spacing_hz))
+    ends_m = resolution.nearest_m - offset_m, resolution.farthest_m + offset_m
+    n_delays = min(1 + int(np.ceil(2 * np.ptp(ends_m) / resolution.delay_m)),
+                   _DELAYS * scenario.n_subbands)
+    wavenumbers = subband_wavenumbers(scenario)
+    wavenumbers = wavenumbers - wavenumbers.mean(axis=1, keepdims=True)
+    turns = np.exp(-1j * wavenumbers * np.linspace(*ends_m, n_delays)[:, None, None])
+    frames = turns[..., None] * np.eye(scenario.n_frames)[:, None, None, None]
+    columns = system.whiten(frames.reshape(*frames.shape[:3], -1))
+    bases, values, _ = np.linalg.svd(np.moveaxis(columns, 0, -1), full_matrices=False)
+    shares = values**2 / np.sum(values**2, axis=(1, 2), keepdims=True)
+    return bases, shares, np.geomspace(energies.min(), energies.max(), _POWERS)
+
+
+def _log_mass(modes: Modes) -> float:
+    """Return the logarithm of the integral of the likelihood over the modes."""
+    return log_sum(modes.log_likelihood - np.linalg.slogdet(modes.curvature)[1] / 2)

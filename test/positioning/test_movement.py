@@ -1,0 +1,49 @@
+"""Users who move otherwise than their scenario declares."""
+
+import numpy as np
+import pytest
+from walking_users import inside, system_of, users_of
+
+from rhs_isac_ros.positioning import BayesEstimator
+from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.positioning.movement import MovementTest
+
+DECLARED = {'walking': {}, 'slow': dict(user_speed_std_mps=0.1), 'at rest': dict(
+    user_speed_std_mps=0.0), 'at rest among still scatterers': dict(
+    user_speed_std_mps=0.0, max_user_speed_mps=0.01), 'at rest, impaired': dict(
+    user_speed_std_mps=0.0, timing_std_s=1e-7, user_gain_std_db=2.0, element_error_rms=0.05)}
+
+
+@pytest.fixture(scope='module', params=DECLARED.values(), ids=list(DECLARED))
+def declared(request):
+    system = system_of(**request.param)
+    return system, BayesEstimator(system)
+
+
+def located(system, estimator, speed_mps, n=16):
+    """Whether users with a speed have fixes, errors and covariances of these, and reasons."""
+    states = users_of(system.scenario, n, speed_mps, np.random.default_rng([5, int(speed_mps)]))
+    estimate = estimator.estimate(system.sample(states, np.random.default_rng(6)))
+    errors = (estimate.mean - states[:, :3])[estimate.fix, :2]
+    return estimate.fix, errors, estimate.covariance[estimate.fix, :2, :2], estimate.reason
+
+
+def test_users_as_declared_have_a_fix(declared):
+    fix, errors, covariances, _ = located(*declared, declared[0].scenario.user_speed_std_mps)
+    assert fix.mean() >= 0.9
+    assert inside(errors, covariances, 2) >= 0.85
+
+
+@pytest.mark.parametrize('times', [5, 30])
+def test_faster_users_have_no_fix_at_a_wrong_place(declared, times):
+    system, estimator = declared
+    speed_mps = times * max(system.scenario.user_speed_std_mps, 0.03)
+    fix, errors, covariances, reasons = located(system, estimator, speed_mps)
+    wrong = np.count_nonzero(fix) * (1 - inside(errors, covariances, 2)) if fix.any() else 0
+    assert wrong < 2.5
+    assert all('user_speed_std_mps' in one or one.startswith('residual') for one in reasons if one)
+
+
+def test_short_frames_need_no_test():
+    short = system_of(frame_duration_s=4e-6, user_speed_std_mps=0.0)
+    assert MovementTest.of(short, Likelihood(short)) is None
