@@ -187,7 +187,7 @@ class SignalLog:
         self.arrived_s: dict[Key, float] = {}  # Arrival of the signals.
         self.estimates: dict[Key, m.PositionEstimate] = {}
         self.codebooks: dict[str, Codebook] = {}
-        #: Cycles that were answered, or that ended.
+        #: Cycles that were answered, or that ended without being served.
         self.ended: set[Key] = set()
         self.truths = TruePositions()
 
@@ -204,5 +204,6 @@ class SignalLog:
                 self.signals[key], self.arrived_s[key] = found, arrived_s
             case m.PositionEstimate():
                 self.estimates[key] = found
-        if isinstance(found, ANSWERS) or isinstance(found, m.ProtocolState) and found.outcome:
+        if isinstance(found, ANSWERS) or isinstance(
+                found, m.ProtocolState) and found.outcome not in ('', 'served'):
             self.ended.add(key)

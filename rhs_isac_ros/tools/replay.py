@@ -216,14 +216,15 @@ class RepublisherNode(Node):
             self.unanswered += 1
             self._answer_timeout_s = _SHORT_S
 
-    def check(self) -> None:
-        """Raise ToolError if a topic has another publisher, or lacks subscribers for too long."""
+    def is_done(self) -> bool:
+        """Return `finished`; raise ToolError for another publisher or missing subscribers."""
         self._begin_s = min(self._begin_s, time.monotonic())
         for name, publisher in self._message_publishers.items():
             if self.count_publishers(publisher.topic_name) > 1:
                 raise ToolError(f'{name}: already published by another node')
         if self.waits_for and time.monotonic() > self._begin_s + self._timeout_s:
             raise ToolError(f'{self.waits_for}: no subscriber within {self._timeout_s:g} s')
+        return self.finished
 
 
 def _without_gaps(
@@ -271,10 +272,7 @@ def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         node.optimizer = _optimizer(scenario, first_codebook)
         return [node, node.optimizer]
 
-    def done() -> bool:
-        nodes[0].check()
-        return nodes[0].finished
-    code = run(create, arguments, done)
+    code = run(create, arguments, lambda: nodes[0].is_done())
     if nodes:
         print(f'{nodes[0].count} messages published')
         if nodes[0].unanswered:
@@ -335,8 +333,8 @@ class Recording:
 
     `logs` contains those of each surface by name, and '' for what answers the base station: the
     network itself or, in a site, the fusion. `truths` contains the positions of all cycles with
-    signals and a true position, also of those without a fix, but without a last one that has not
-    ended. Raises RecordingError if there are none.
+    signals and a true position, also of those without a fix, but without those of which the
+    recorder, at its start or end, has missed the answer. Raises RecordingError if there are none.
     """
 
     def __init__(self, path: Path, namespace: str, scenarios: Mapping[str, Scenario]) -> None:
@@ -351,10 +349,11 @@ class Recording:
         found_in = dict(sorted({
             key: truth for log in self.logs.values() for key, signals in log.signals.items()
             if (truth := leader.truths.of(signals))}.items()))
-        self.truths: _Positions = {key: truth.position for key, truth in found_in.items()}
+        ended = self.logs[''].ended & found_in.keys()
+        keys = [key for key in found_in if key >= min(ended, default=key)]
+        self.truths: _Positions = {
+            key: found_in[key].position for key in keys if key in ended or key != keys[-1]}
         self._velocities = {key: truth.velocity for key, truth in found_in.items()}
-        if self.truths and (last := max(self.truths)) not in self.logs[''].ended:
-            del self.truths[last]
         if not self.truths:
             raise RecordingError(f'{path}: no received signals with a true position in the '
                                  f'namespace {namespace}; see --namespace and --site')
