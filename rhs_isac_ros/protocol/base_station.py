@@ -63,6 +63,11 @@ class Cycle(Reception):
         default_factory=lambda: np.full(len(m.Phase), math.nan))
 
 
+# Number of beacons after which a base station that knows no user sends fewer, because each of them
+# wakes several threads of the middleware; and their period from then on [s].
+_N_FAST, _ALONE_S = 50, 1.0
+
+
 def _admission(settings: BaseStationSettings) -> Admission:
     return Admission(settings.allowed_users, settings.max_users, settings.ack_rate_hz)
 
@@ -156,7 +161,8 @@ class BaseStation(SignalCollector):
         """Return the timeout of a state [s], or None; attempts at a step have equal parts."""
         settings = self._settings.in_use
         if state is BsState.BEACONING:
-            return settings.ack_timeout_s
+            is_alone = not self._users and self._cycle.attempt >= _N_FAST
+            return max(settings.ack_timeout_s, _ALONE_S * is_alone)
         if state is BsState.RESTING:
             return 0.0 if self._pause_requested else settings.rest_s
         return settings.step_timeout_s / (settings.retries + 1) if state in STEPS else None

@@ -285,3 +285,14 @@ def test_a_codebook_offered_while_nobody_answers_costs_no_cycle(network, codeboo
     assert attempts == [*range(net['bs'].counters['unanswered'] + 1)]
     assert [beacon.attempt for beacon in net.sent(m.Beacon, cycle_id=2)] == [0]
     net.verify()
+
+
+def test_a_base_station_without_users_sends_fewer_beacons(network, places):
+    net = network(0)
+    net.run(limit_s=4.95)
+    assert len(net.sent(m.Beacon)) == 50
+    net.run(limit_s=10.0)
+    assert len(net.sent(m.Beacon)) == 60
+    net.add_user(1, places[0])
+    net.run_cycles(2)
+    assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'served')]
