@@ -375,8 +375,11 @@ class Mismatches:
         may receive a name.
         """
         node = self._node
-        ours = {*(one.topic_name for one in node.publishers),
-                *(one.topic_name for one in node.subscriptions)} - {*_FOREIGN}
+        # The lists of the node lack the topics of its actions.
+        own = node.get_name(), node.get_namespace()
+        ours = {topic for topic, _ in [
+            *node.get_publisher_names_and_types_by_node(*own),
+            *node.get_subscriber_names_and_types_by_node(*own)]} - {*_FOREIGN}
         counts = [(topic, node.count_publishers(topic), node.count_subscribers(topic))
                   for topic in sorted(ours)]
         if counts != self._counts or not self._are_named:

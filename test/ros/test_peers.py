@@ -1,17 +1,20 @@
 """Other nodes that are present, and endpoints that do not fit."""
 
+import contextlib
 import threading
 import time
 from unittest import mock
 
 import numpy as np
 import pytest
+from node_bench import Bench
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from ros_messages import parameters, to_ros
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
@@ -210,6 +213,18 @@ def test_endpoints_with_incompatible_qos_are_named_once(bench, capfd):
         assert log.count(text) == log.count(reason) == 1
     bench.remove(observer)
     bench.until(lambda: not keys & node.report().details.keys(), 'its end')
+
+
+def test_endpoints_of_another_type_on_the_hidden_topics_of_an_action_are_named(bench):
+    node, hidden = bench.add_role('bs'), [f'locate/_action/{name}' for name in (
+        'feedback', 'status')]
+    # One participant would refuse two types for a topic.
+    with contextlib.closing(Bench(EventsExecutor)) as other:
+        observer = other.add(Node, 'observer')
+        for name in hidden:
+            observer.create_publisher(String, name, 1)
+        keys = {f'conflict.type.{name}.observer' for name in hidden}
+        bench.until(lambda: keys <= node.report().details.keys(), 'the report')
 
 
 def test_compatible_observers_are_no_conflict(bench):
