@@ -61,3 +61,16 @@ def test_a_second_surface_reduces_the_error_and_its_pose_is_found(printed):
     before = numbers(r'entered: off by (\S+) m and (\S+)°; error of the users (\S+) m', text)
     after = numbers(r'estimated: off by (\S+) m and (\S+)°; error of the users (\S+) m', text)
     assert all(2 * better < worse for better, worse in zip(after, before, strict=True))
+
+
+def test_the_codebook_of_a_board_is_the_better_one_and_pilots_name_the_board(printed):
+    text = printed('boards')
+    bounds = {name: float(bound) for name, bound in re.findall(
+        r"^(\w+ +(?:own|paper's) codebook) +average CRLB (\S+) m²", text, re.MULTILINE)}
+    assert len(bounds) == 5
+    for board in ('resonant', 'coupled '):
+        assert bounds[f"{board}  own codebook"] < 0.9 * bounds[f"{board}  paper's codebook"]
+    assert numbers(r'of 50 users with a fix, mean squared error (\S+) m²', text)[0] > 10
+    evidence = dict(re.findall(r'^(\w+) +log evidence (\S+)$', text, re.MULTILINE))
+    assert evidence.pop('coupled') == '0'
+    assert max(map(float, evidence.values())) < -1000
