@@ -21,7 +21,7 @@ point. Failed elements permit no such sum.
 import argparse
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -73,76 +73,90 @@ DECLARATIONS: dict[str, dict[str, Any]] = {
 TRIPLES = (('gain', 'timing', 'failed'), ('phase', 'carrier', 'elements'),
            ('band phase', 'elements', 'failed'))
 FOUR_BANDS = 'four unequally spaced bands, random phase per band'
-OUTSIDE = {'x = 18 m': (18.0, 0.0, 0.0), 'x = 30 m': (30.0, 0.0, 0.0),
-           'y = 6 m': (10.0, 6.0, 0.0), 'z = 3 m': (10.0, 0.0, 3.0)}
+OUTSIDE = {f'a user at {name}': place for name, place in {
+    'x = 18 m': (18.0, 0.0, 0.0), 'x = 30 m': (30.0, 0.0, 0.0), 'y = 6 m': (10.0, 6.0, 0.0),
+    'z = 3 m': (10.0, 0.0, 3.0)}.items()}
+SHELL = f'a shell {SHELL_M[0]:g} m to {SHELL_M[1]:g} m outside'
 
 
 def main() -> None:
     """Run the benchmark."""
     options = parse_options()
-    base, codebook = frame.scenario_of(options.config), Codebook.load(options.codebook)
     print(f'{options.positions} positions, seed {options.seed}\n')
+    # Arguments of a job are plain.
+    settings = {name: str(value) if isinstance(value, Path) else value
+                for name, value in vars(options).items()
+                if name not in ('dask', 'jobs', 'json', 'only')}
+    found = frame.measured(options, 'robustness', rows_of, {
+        name: {'name': name, 'settings': settings} for name in situations(options)
+        if not options.only or any(text in name for text in options.only)})
     table = frame.Table(['signals from', 'scenario'], {
         'no fix [%]': ('without_fix', 1), 'MSE [m²]': ('mse_m2', 2),
         'predicted': ('predicted_mse_m2', 2), 'in the 95 % region [%]': ('covered', 1),
         'possibly outside [%]': ('possibly_outside', 1), 'median residual': ('residual', 0),
         'shots until a warning': ('warns_after', 0), 'warned [%]': ('warned', 0),
         'time [ms]': ('time_ms', 1), 'MSE to posterior': ('mse_to_posterior', 3)})
-    rows = []
-    for name, kind, scenario, book, positions, received in cases(options, base, codebook):
-        estimate, row = measure(scenario, book, positions, received, options)
+    frame.write_results(options.json, [
+        {'signals': name, 'scenario': kind, **table.row(name, kind, **row)}
+        for name, rows in found.items() for kind, row in rows.items()])
+
+
+def rows_of(name: str, settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the figures of a situation, by the kind of the scenario of the estimator."""
+    options, rows = argparse.Namespace(**settings), {}
+    for kind, scenario, book, positions, received in cases(name, options):
+        estimate, rows[kind] = measure(scenario, book, positions, received, options)
         if options.reference and kind == 'declared' and not can_enumerate(scenario):
             n = options.reference
-            row['mse_to_posterior'] = ratio_to_posterior(
+            rows[kind]['mse_to_posterior'] = ratio_to_posterior(
                 scenario, book, positions[:n], received[:n], estimate)
-        rows.append({'signals': name, 'scenario': kind, **table.row(name, kind, **row)})
-        # All rows take long.
-        frame.write_results(options.json, rows)
+    return rows
 
 
-# Name, kind, scenario and codebook of the estimator, positions, and received signals.
-Case = tuple[str, str, Scenario, Codebook, np.ndarray, np.ndarray]
+def situations(options: argparse.Namespace
+               ) -> dict[str, tuple[Scenario, Codebook, dict[str, Any] | None]]:
+    """Return scenarios and codebooks by name, with the declaration of users in the region."""
+    base, codebook = frame.scenario_of(options.config), Codebook.load(options.codebook)
+    if options.pairs:
+        combined = ((names, {key: value for name in names
+                             for key, value in DECLARATIONS[name].items()})
+                    for names in (*itertools.combinations(DECLARATIONS, 2), *TRIPLES))
+        return {' + '.join(names): (base, codebook, changes) for names, changes in combined
+                if len(changes) == len(names)}
+    four = Scenario(center_frequencies_hz=FOUR_BANDS_HZ)
+    random = random_codebook(four, streams.generator(options.seed, streams.START))
+    return {**{name: (base, codebook, changes) for name, changes in DEVIATIONS.items()},
+            FOUR_BANDS: (four, random, DEVIATIONS[RANDOM_PHASE]),
+            **{name: (base, codebook, None) for name in (*OUTSIDE, SHELL)}}
 
 
-def cases(options: argparse.Namespace, base: Scenario, codebook: Codebook) -> Iterator[Case]:
-    """Yield the requested rows: signals with the scenario of the estimator.
+# Kind, scenario and codebook of the estimator, positions, and received signals.
+Case = tuple[str, Scenario, Codebook, np.ndarray, np.ndarray]
+
+
+def cases(name: str, options: argparse.Namespace) -> Iterator[Case]:
+    """Yield the signals of a situation with each scenario of the estimator.
 
     Users inside the region are located with a silent and a declaring scenario.
     """
-    def wanted(name: str) -> bool:
-        return not options.only or any(text in name for text in options.only)
-
-    inside = [(name, base, codebook, changes) for name, changes in DEVIATIONS.items()]
-    four = Scenario(center_frequencies_hz=FOUR_BANDS_HZ)
-    inside.append((FOUR_BANDS, four, random_codebook(
-        four, streams.generator(options.seed, streams.START)), DEVIATIONS[RANDOM_PHASE]))
-    if options.pairs:
-        combined = [(names, {key: value for name in names
-                             for key, value in DECLARATIONS[name].items()})
-                    for names in (*itertools.combinations(DECLARATIONS, 2), *TRIPLES)]
-        inside = [(' + '.join(names), base, codebook, changes) for names, changes in combined
-                  if len(changes) == len(names)]
-    for name, silent, book, changes in inside:
-        if wanted(name):
-            declared = dataclasses.replace(silent, **changes)
-            positions, received = draw(declared, book, options)
-            if changes and not options.pairs:
-                yield name, 'silent', silent, book, positions, received
-            yield name, 'declared', declared, book, positions, received
-    if options.pairs:
+    silent, book, changes = situations(options)[name]
+    if changes is None:
+        rng, n = streams.generator(options.seed, streams.HELD_OUT), options.positions
+        around = shell(silent, n, rng)
+        positions = np.tile(OUTSIDE[name], (n, 1)) if name in OUTSIDE else around
+        received = MeasurementModel(silent, book).sample(positions, rng)
+        yield 'silent', silent, book, positions, received
         return
-    rng, n = streams.generator(options.seed, streams.HELD_OUT), options.positions
-    model = MeasurementModel(base, codebook)
-    places = {f'a user at {name}': np.tile(place, (n, 1)) for name, place in OUTSIDE.items()}
-    places[f'a shell {SHELL_M[0]:g} m to {SHELL_M[1]:g} m outside'] = shell(base, n, rng)
-    for name, positions in places.items():
-        if wanted(name):
-            yield name, 'silent', base, codebook, positions, model.sample(positions, rng)
+    declared = dataclasses.replace(silent, **changes)
+    positions, received = draw(declared, book, options)
+    if changes and not options.pairs:
+        yield 'silent', silent, book, positions, received
+    yield 'declared', declared, book, positions, received
 
 
 def parse_options() -> argparse.Namespace:
     """Parse the command line."""
-    parser = frame.benchmark_parser('robustness', __doc__, 600)
+    parser = frame.benchmark_parser('robustness', __doc__, 600, has_jobs=True)
     add = parser.add_argument
     add('--inside', action='store_true',
         help='estimate without reject_outside, as if no user were outside of the region')

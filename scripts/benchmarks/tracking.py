@@ -13,7 +13,6 @@ ellipsoid of its covariance that contains 95 % of a Gaussian.
 
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -108,7 +107,7 @@ def measure(config: str | None, codebook: str, n_walks: int, first: int, seed: i
 
     Returns the fixes of the cycles that count by method, and the CPU times [s] of all cycles.
     """
-    scenario = frame.scenario_of(config and Path(config))
+    scenario = frame.scenario_of(config)
     book = Codebook.load(codebook, scenario)
     # The random numbers are those of all walks.
     positions, signals = (one[first:first + BLOCK] for one in simulate_walks(

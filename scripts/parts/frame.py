@@ -151,7 +151,7 @@ def system(name: str) -> tuple[Scenario, Codebook]:
     return Scenario.from_yaml(CONFIG / scenario), Codebook.load(CONFIG / codebook)
 
 
-def scenario_of(file: Path | None) -> Scenario:
+def scenario_of(file: Path | str | None) -> Scenario:
     """Load a scenario; Table I without a file."""
     return Scenario.from_yaml(file) if file else Scenario()
 
