@@ -9,6 +9,7 @@ from scipy.special import chdtri
 
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
+from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.elements import draw_surface
 from rhs_isac_ros.model.gaussian import quadratic_form
 from rhs_isac_ros.model.geometry import jacobian, region_information, to_polar
@@ -16,8 +17,8 @@ from rhs_isac_ros.positioning import BayesEstimator, Mixture, Motion, Tracker, p
 from rhs_isac_ros.positioning.lattice import Resolution, lay_grid
 from rhs_isac_ros.positioning.likelihood import Signals
 from rhs_isac_ros.positioning.prior import cells_of, constant_shares, multiply
-from rhs_isac_ros.positioning.search import Modes
-from rhs_isac_ros.positioning.segments import concatenate
+from rhs_isac_ros.positioning.search import Modes, marginal_at
+from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.system import System
 
@@ -155,6 +156,30 @@ def test_the_posterior_is_the_prior_times_the_likelihood(table1_estimator, model
         np.testing.assert_allclose(mean_of_mixture, found.mean, atol=1e-9)
     # The reference has an effective number of about fifty points.
     assert np.mean(errors) < 0.1
+
+
+def test_modes_with_unknown_phases_are_as_broad_as_the_likelihood_near_the_prior():
+    """The reference weighs points drawn from the prior with the likelihood at each of them."""
+    scenario = Scenario(elements_per_side=6, n_frames=4, band_phase_std_rad='unknown')
+    beams, rng = random_codebook(scenario, np.random.default_rng(0)), np.random.default_rng(1)
+    estimator, errors, sizes = BayesEstimator(System(scenario, beams)), [], []
+    likelihood, bounds = estimator._likelihood, scenario.roi_bounds_m
+    for place in scenario.sample_positions(10, rng):
+        density = around(place + STD_M * rng.standard_normal(3))
+        signals = estimator.system.sample(place[None], rng)
+        found = estimator.posterior(signals[0], density, wrong=1e-9)
+        points = density.sample(4000, rng)
+        points = points[((points >= bounds[0]) & (points <= bounds[1])).all(axis=1)]
+        logs, _, _ = marginal_at(
+            likelihood, likelihood, to_polar(points),
+            np.zeros((len(points), len(likelihood.nuisance))),
+            select(likelihood.signals(signals), np.zeros(len(points), int)))
+        weights, _ = mixture_weights(logs)
+        error, spread = found.mean - weights @ points, np.cov(points.T, aweights=weights, ddof=0)
+        errors.append(error @ np.linalg.solve(spread, error))
+        sizes.append(np.linalg.slogdet(found.covariance)[1] - np.linalg.slogdet(spread)[1])
+    assert np.mean(errors) < 0.1
+    np.testing.assert_allclose(sizes, 0, atol=0.5)
 
 
 def test_a_codebook_that_has_not_been_seen_gives_the_same_posterior(
