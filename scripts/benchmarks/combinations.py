@@ -103,8 +103,8 @@ INGREDIENTS: dict[str, Ingredient] = {
     'outside': declare(change(outside=0.25), outside_probability=0.25),
     'blocked': declare(blocked_probability=0.2),
     'thin': change(size_m=(10.0, 10.0, 0.0)),
-    # What pilots as samples require of a scenario.
-    'waveform': declare(change(radio=WaveformRadio), timing_std_s=1e-7, frame_duration_s=1e-4,
+    # What pilots as samples require of a scenario. The timing contains the delay of the multipath.
+    'waveform': declare(change(radio=WaveformRadio), timing_std_s=5e-7, frame_duration_s=1e-4,
                         band_phase_std_rad=6.2832),
 }
 

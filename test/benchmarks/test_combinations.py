@@ -25,7 +25,7 @@ def test_each_ingredient_meets_each_other_one_and_stands_alone():
 def test_declarations_of_two_ingredients_add_up():
     setting = INGREDIENTS['gain'](INGREDIENTS['waveform'](Setting()))
     assert setting.declared['user_gain_std_db'] == 3
-    assert setting.declared['timing_std_s'] == 1e-7
+    assert setting.declared['timing_std_s'] == 5e-7
 
 
 @pytest.mark.parametrize(('pair', 'reason'), [
