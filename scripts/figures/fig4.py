@@ -82,7 +82,7 @@ def optimise(scenario: Mapping[str, Any], samples: int, seed: int) -> dict:
                       n_positions=samples, seed=seed)
     if result.reason == INTERRUPTED:
         raise KeyboardInterrupt
-    return as_json(result.codebook)
+    return result.codebook.to_parameters()
 
 
 def locate(estimator: str, inputs: str, scenario: Mapping[str, Any], codebook: Mapping[str, Any],
@@ -122,11 +122,6 @@ def capacity_losses(scenario: Mapping[str, Any], first: int,
             for name, means in estimates.items()}
 
 
-def as_json(codebook: Codebook) -> dict[str, Any]:
-    """Return the parameters of a codebook with plain lists."""
-    return {name: np.asarray(value).tolist() for name, value in codebook.to_parameters().items()}
-
-
 class Experiment:
     """The jobs of all conditions; those that have results are not repeated."""
 
@@ -151,7 +146,7 @@ class Experiment:
                 for key in keys if key[0] == 'algorithm-1'}
         optimised = self._run(optimise, list(jobs.values()))
         return {key: optimised[jobs[key].name] if key in jobs else
-                as_json(codebook_of(key[0], worlds[key[1]], key[2])) for key in keys}
+                codebook_of(key[0], worlds[key[1]], key[2]).to_parameters() for key in keys}
 
     def results(self, conditions: Sequence[Condition]) -> Results:
         """Return the estimates in all conditions."""

@@ -162,7 +162,7 @@ def test_the_command_writes_all_files_and_repeats_no_job(tmp_path, monkeypatch, 
 
 def test_trials_of_bayes_locate_their_share_of_the_positions():
     world = Scenario(multipath_to_los_db=-30.0)
-    book = fig4.as_json(fig4.directional_codebook(world))
+    book = fig4.directional_codebook(world).to_parameters()
     located = fig4.locate('bayes', '', world.changes(), book, 0, 0, 6, 1, 2)
     truth, _ = fig4.System(world, fig4.directional_codebook(world)).pairs(6, fig4.TEST_SEED)
     assert located['without_fix'] == 0
