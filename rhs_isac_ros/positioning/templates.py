@@ -190,7 +190,7 @@ class Filters(NamedTuple):
         Returns signals weighted with the inverse covariance, complex64 [N, N_B, N_SB, F]; filter
         outputs, complex64 [N, N_B, N_SB, G]; and energies of limited signals, float64 [N].
         """
-        limited = multiply_rows(self.limiter, whitened)
+        limited = whitened if self.is_exact else multiply_rows(self.limiter, whitened)
         weighted = multiply_rows(adjoint(self.whitener), limited)
         n, n_bands = weighted.shape[:2]
         signals = weighted.reshape(n, n_bands, -1, self.templates.shape[3]).astype(np.complex64)
