@@ -16,13 +16,16 @@ from rhs_isac_ros.support.arguments import (
     positive_float,
     positive_int,
 )
-from rhs_isac_ros.support.exits import print_error
+from rhs_isac_ros.support.exits import exit_code_of, print_error
 from rhs_isac_ros.support.files import read_yaml, write_archive
 from rhs_isac_ros.support.optional import MissingLibraryError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, or 2 after an error that the user can correct."""
+    """Run the command; return 0, or 2 after an error in the arguments or a file.
+
+    Raises OSError if the file cannot be written.
+    """
     parser = ArgumentParser(prog='python3 -m rhs_isac_ros.model', description=__doc__)
     kinds = parser.add_subparsers(dest='kind', required=True)
     style = argparse.ArgumentDefaultsHelpFormatter
@@ -57,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                       'load_susceptance_slope_s': np.array(options.slope)}
         network = Admittances.of(arrays)
         write_archive(options.output, arrays, {})
-    except (MissingLibraryError, ValueError, TypeError, OSError) as error:
+    except (MissingLibraryError, ValueError, TypeError) as error:
         print_error(error, parser.prog)
         return 2
     n_elements, n_feeds = network.between.shape[1:]
@@ -67,4 +70,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

@@ -86,14 +86,11 @@ def _snapshot(options: argparse.Namespace, arguments: list[str]) -> int:
 
 
 def draw(scene: SceneState, scenario: Scenario, path: Path) -> None:
-    """Draw a scene, and print the missing parts; raise ToolError if the file is not writable."""
+    """Draw a scene, and print the missing parts; raise OSError if the file cannot be written."""
     missing = _missing(scene)
     if missing:
         print(f'{_PROGRAM}: not in the picture: {"; ".join(missing)}', file=sys.stderr)
-    try:
-        write_picture(path, compose_scene(scene, scenario))
-    except OSError as error:
-        raise ToolError(f'{path}: cannot be written: {error.strerror}') from None
+    write_picture(path, compose_scene(scene, scenario))
     print(path)
 
 
