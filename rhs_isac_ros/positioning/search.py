@@ -34,7 +34,8 @@ EXACT_MARGIN = 7.0
 class _Ascent(NamedTuple):
     """When the steps to a mode end."""
 
-    # Maximum number of exact steps. Few modes need more than two, unless signals are strong.
+    # Maximum number of exact steps. Few modes need more than two, unless signals are strong. At
+    # the border of the region, small gains may alternate.
     steps: int = 8
     # A mode has converged when its last step changed the log-likelihood by less.
     gain: float = 0.05
@@ -166,24 +167,20 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     modes, gain = step(starts)
     # Points that the latest steps started from, and the known log-likelihoods there.
     origins, known = starts, modes.log_likelihood - gain
-    # Whether the latest step raised the likelihood. At the border, steps may alternate.
-    rises = np.ones(len(gain), bool)
     # Shots whose modes have changed. The modes of the others stay, whatever happens to shots that
     # are located together with them.
     changed = starts.shots
     for number in range(n_steps):
         chosen = _prune(likelihood, modes, gain, margin, changed)
         modes, origins = select(modes, chosen), select(origins, chosen)
-        gain, known, rises = gain[chosen], known[chosen], rises[chosen]
-        (moving,) = np.nonzero((np.abs(gain) > _ASCENT.gain) & rises)
+        gain, known = gain[chosen], known[chosen]
+        (moving,) = np.nonzero(np.abs(gain) > _ASCENT.gain)
         if not len(moving) or number == n_steps - 1:
             break
         changed = modes.shots[moving]
         moved, new_gain = step(select(modes, moving).starts())
         reached = moved.log_likelihood - new_gain
-        rise = reached - known[moving]
-        too_long = rise < -_ASCENT.gain
-        rises[moving] = np.abs(rise) >= _ASCENT.gain
+        too_long = reached < known[moving] - _ASCENT.gain
         short, long = moving[~too_long], moving[too_long]
         origins.points[short], origins.values[short] = modes.points[short], modes.values[short]
         known[short], gain[short] = reached[~too_long], new_gain[~too_long]
