@@ -14,7 +14,9 @@ DECLARED = {'walking': {}, 'slow': dict(user_speed_std_mps=0.1), 'at rest': dict
     user_speed_std_mps=0.0, timing_std_s=1e-7, user_gain_std_db=2.0, element_error_rms=0.05)}
 
 
-@pytest.fixture(scope='module', params=DECLARED.values(), ids=list(DECLARED))
+@pytest.fixture(scope='module', params=[
+    pytest.param(changes, id=name, marks=[] if name == 'walking' else pytest.mark.slow)
+    for name, changes in DECLARED.items()])
 def declared(request):
     system = system_of(**request.param)
     return system, BayesEstimator(system)
