@@ -34,6 +34,9 @@ from rhs_isac_ros.ros.run import StartError, init, parse, run, starting
 from rhs_isac_ros.support.arguments import ArgumentParser, HelpFormatter, input_file
 from rhs_isac_ros.support.exits import print_error
 
+# Number of equal requests to another optimizer, until one has a response.
+_N_REQUESTS = 5
+
 
 class CodebookParameterService(ParameterService):
     """Parameter services of a node that holds a codebook.
@@ -81,9 +84,14 @@ def push(node: Node, codebook: Codebook, timeout_s: float = 10.0) -> None:
     client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)
     if not client.wait_for_services(timeout_s):
         raise PushError(f'{optimizer}: not found within {timeout_s:g} s')
-    future = client.set_parameters_atomically(ros_parameters(codebook.to_parameters()))
-    rclpy.spin_until_future_complete(node, future, timeout_sec=timeout_s)
-    if not future.done():
+    parameters = ros_parameters(codebook.to_parameters())
+    # DDS may lose a response to a client that it has just discovered, so the request is repeated.
+    for _ in range(_N_REQUESTS):
+        future = client.set_parameters_atomically(parameters)
+        rclpy.spin_until_future_complete(node, future, timeout_sec=timeout_s / _N_REQUESTS)
+        if future.done():
+            break
+    else:
         raise PushError(f'{optimizer}: no response within {timeout_s:g} s')
     result = future.result().result
     if not result.successful:

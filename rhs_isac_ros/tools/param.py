@@ -22,7 +22,10 @@ _AMBIGUOUS = re.compile(
 # Maximum time to discover a node [s], including the exchange of keys for DDS security.
 _DISCOVERY_TIMEOUT_S = 10.0
 # Maximum time to discover a node's services, and to wait for a response [s].
-_SERVICE_TIMEOUT_S = 5.0
+_SERVICE_TIMEOUT_S = 10.0
+# Time after which a request is repeated [s]: DDS may lose a response to a client that it has just
+# discovered. All requests have the same effect if they are repeated.
+_REPETITION_S = 2.0
 _LABELS = {
     ParameterType.PARAMETER_BOOL: 'Boolean value is:',
     ParameterType.PARAMETER_INTEGER: 'Integer value is:',
@@ -204,10 +207,12 @@ def _call(session: Session, node: str, request: Callable[[AsyncParameterClient],
     if not session.spin_until(client.services_are_ready, _SERVICE_TIMEOUT_S):
         raise ToolError('Wait for service timed out waiting for parameter services for node '
                         f'{node}')
-    future = request(client)
-    if not session.spin_until(future.done, _SERVICE_TIMEOUT_S):
-        raise ToolError(f'{node}: no response within {_SERVICE_TIMEOUT_S:g} s')
-    return future.result()
+    futures: list[Future] = []
+    for _ in range(round(_SERVICE_TIMEOUT_S / _REPETITION_S)):
+        futures.append(request(client))
+        if session.spin_until(lambda: any(map(Future.done, futures)), _REPETITION_S):
+            return next(filter(Future.done, futures)).result()
+    raise ToolError(f'{node}: no response within {_SERVICE_TIMEOUT_S:g} s')
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -10,7 +10,10 @@ import yaml
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.task import Future
 
+from rhs_isac_ros.tools import param
 from rhs_isac_ros.tools.param import main
 
 
@@ -139,6 +142,15 @@ def test_load_sets_the_parameters_of_a_dump(output_of, call, tmp_path):
     out, err, code = call(main, 'load', 'bs', str(path))
     assert (out, code) == ('', 1)
     assert 'expected a parameter file' in err
+
+
+def test_a_request_is_repeated_until_a_response_arrives(output_of, monkeypatch):
+    """DDS may lose a response to a client that it has just discovered."""
+    send, lost = AsyncParameterClient.list_parameters, [Future(), Future()]
+    monkeypatch.setattr(param, '_REPETITION_S', 0.1)
+    monkeypatch.setattr(AsyncParameterClient, 'list_parameters',
+                        lambda client: lost.pop() if lost else send(client))
+    assert '  policy' in output_of(main, 'list', 'bs').splitlines()
 
 
 def test_missing_nodes_and_parameters_are_errors(call):
