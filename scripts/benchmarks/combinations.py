@@ -204,7 +204,8 @@ class SeveralSurfaces:
     """Locates a user from several surfaces, as the role `Fusion` does."""
 
     def __init__(self, setting: Setting, surfaces: Sequence[Surface]) -> None:
-        self._bounds_m = setting.bounds_m
+        self._bounds_m, scenario = setting.bounds_m, surfaces[0].scenario
+        self._users = scenario.outside_probability, scenario.user_speed_std_mps
         self._tracker = MixtureTracker(
             surfaces[0].scenario, setting.bounds_m, Motion(SPEED_MPS)
         ) if setting.n_cycles > 1 else None
@@ -221,8 +222,8 @@ class SeveralSurfaces:
             return Estimate.without_fix('no surface has a position')
         if prior:
             sightings.append(Sighting(Pose(), prior))
-        fused = fuse(sightings, self._bounds_m)
-        if not self._tracker:
+        fused = fuse(sightings, self._bounds_m, *self._users)
+        if fused.reason or not self._tracker:
             return fused
         missing = float(np.prod([one.missing for one in sightings]))
         tracked = self._tracker.update(time_s, fused.mixture, missing)

@@ -52,6 +52,11 @@ def test_users_outside_count_only_for_wrong_fixes():
     assert found['mse_m2'][0] < 1
 
 
+def test_a_site_has_no_positions_of_users_outside():
+    found = cell('site', 'outside', 8, np.random.default_rng(3))
+    assert (found['fix'][0], found['wrong_fix'][0]) == (100, 0)
+
+
 def test_finished_cells_are_kept_until_all_are_measured(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     options = argparse.Namespace(
