@@ -12,7 +12,7 @@ import datetime
 import itertools
 import json
 import math
-import tempfile
+import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -132,11 +132,8 @@ class SampleRecorder:
     def _write(self, found: _Collection) -> None:
         import sigmf
 
-        last = max((path.stem for path in self._folder.glob('part-*.sigmf-collection')),
-                   default='part-0')
-        name = f'part-{int(last.removeprefix("part-")) + 1:06}'
-        with tempfile.TemporaryDirectory(prefix='.', dir=self._folder) as temporary:
-            folder = Path(temporary)
+        with self._part() as folder:
+            name = folder.name.removeprefix('.')
             streams = [self._write_feed(folder / f'{name}-feed{feed}', feed, found)
                        for feed in range(self._scenario.n_feeds)]
             sigmf.SigMFCollection(streams, {'collection': {
@@ -145,6 +142,28 @@ class SampleRecorder:
             # The collection is the last one, because it refers to the others.
             for path in sorted(folder.iterdir(), key=lambda path: (path.stem == name, path)):
                 path.replace(self._folder / path.name)
+
+    @contextlib.contextmanager
+    def _part(self) -> Iterator[Path]:
+        """Create a hidden directory for the files of the next part, and remove it at the end.
+
+        Several recorders may write to one folder: the directory reserves the name of the part.
+        """
+        last = max((path.stem for path in self._folder.glob('part-*.sigmf-collection')),
+                   default='part-0')
+        for number in itertools.count(int(last.removeprefix('part-')) + 1):
+            folder = self._folder / f'.part-{number:06}'
+            try:
+                folder.mkdir()
+            except FileExistsError:
+                continue
+            try:
+                # Another recorder may have completed this part since the search for the last one.
+                if not (self._folder / f'part-{number:06}.sigmf-collection').exists():
+                    yield folder
+                    return
+            finally:
+                shutil.rmtree(folder)
 
     def _write_feed(self, path: Path, feed: int, found: _Collection) -> str:
         """Write the samples of a feed and their metadata; return the name of the latter."""

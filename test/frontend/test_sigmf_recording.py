@@ -1,10 +1,12 @@
 """Recordings of samples: their files, and playback that yields the same signals bit for bit."""
 
+import concurrent.futures
 import dataclasses
 import hashlib
 import json
 import math
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -343,6 +345,24 @@ def test_the_cycles_of_two_recordings_differ(tmp_path):
     _, play = player(tmp_path)
     for cycle, expected in enumerate(feeds):
         np.testing.assert_array_equal(play(cycle, 0), expected[0])
+
+
+def test_recorders_that_write_to_a_folder_at_the_same_time_replace_nothing(tmp_path):
+    start = threading.Barrier(4)
+
+    def record_part(n):
+        rng = np.random.default_rng(n)
+        recorder = SampleRecorder(tmp_path, SCENARIO, Waveform(SCENARIO), pytest.fail)
+        recorder.add(configurations(0), sounding(rng, n, 0), rng.normal(size=(4, 2, 9)), [0] * 4)
+        start.wait(10)
+        recorder.close()
+
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        list(pool.map(record_part, range(4)))
+    found = {json.loads(path.read_text())['annotations'][0]['rhs_isac:cycle_id']
+             for path in tmp_path.glob('part-*-feed0.sigmf-meta')}
+    assert found == {0, 1, 2, 3}
+    assert len([*tmp_path.iterdir()]) == 4 * (1 + 2 * 2)
 
 
 def test_a_failed_recording_ends_and_measurement_continues(tmp_path):
