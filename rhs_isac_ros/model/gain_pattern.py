@@ -1,9 +1,9 @@
 """Gain patterns: the amplitude gain of an antenna as a function of the angle from its boresight.
 
-The boresight of the elements is the x axis, and the user's antenna points in the opposite
-direction. The line between an element and the user therefore makes the same angle theta with both
-boresights: cos theta = x / d, where x and d are the user's distances from the plane of the surface
-and from the element.
+The boresight of the elements is the x axis, unless the scenario declares their normals, and the
+user's antenna points against x. The line between an element and the user makes the same angle
+theta with the x axis and with the boresight of the user: cos theta = x / d, where x and d are the
+user's distances from the plane of the surface and from the element.
 """
 
 from collections.abc import Callable

@@ -45,6 +45,20 @@ def element_positions(scenario: Scenario) -> np.ndarray:
     return read_only(lattice.reshape(-1, 3))
 
 
+@functools.lru_cache(maxsize=16)
+def element_normals(scenario: Scenario) -> np.ndarray:
+    """Return the directions in which the elements face, unit vectors, float64 [N_E, 3], read-only.
+
+    Unless the scenario specifies them, all are the x axis.
+    """
+    if scenario.element_normals is None:
+        return read_only(np.tile([1.0, 0.0, 0.0], (scenario.n_elements, 1)))
+    normals = np.array(scenario.element_normals)
+    # Squares of the given numbers may underflow.
+    normals /= np.abs(normals).max(axis=1, keepdims=True)
+    return read_only(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
 def surface_sides_m(scenario: Scenario) -> np.ndarray:
     """Return the lengths of the surface along y and z, float64 [2] [m]."""
     intervals_m = element_intervals_m(scenario)

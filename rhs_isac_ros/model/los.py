@@ -5,22 +5,26 @@ functions except `los_waves` raise ValueError unless `checked_positions` accepts
 """
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from rhs_isac_ros.model.arrays import checked_positions
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
+from rhs_isac_ros.model.geometry import (
+    element_normals,
+    element_positions,
+    subband_frequencies_hz,
+)
 from rhs_isac_ros.model.scenario import Scenario
 
-# Minimum distance of the user from an element's boresight. On the boresight itself, the direction
+# Minimum distance of the user from a boresight. On the boresight itself, the direction
 # in which the angle grows is undefined.
 _MIN_BORESIGHT_OFFSET_M = 1e-9
-# Gain, radial factor [1/m^2], and boresight term [1/m] or None, all times the frequency [Hz],
-# complex128 [B, N_SB, N, N_E] for B bands.
-Waves: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | None]
+# Gain, radial factor [1/m^2], and a boresight term [1/m] for each of `boresight_axes`, all times
+# the frequency [Hz], complex128 [B, N_SB, N, N_E] for B bands.
+Waves: TypeAlias = tuple[np.ndarray, np.ndarray, list[np.ndarray]]
 # Number of unit phasors in the table of `_phasors`.
 _N_PHASORS = 512
 _TABLE = np.exp(2j * np.pi * np.arange(_N_PHASORS) / _N_PHASORS)
@@ -85,11 +89,11 @@ def los_and_derivative(
     A gain pattern adds a term for the change of the gain with the angle from the boresight.
     """
     positions = checked_positions(positions)
-    *parts, boresight_term = los_waves(scenario, positions, [band])
+    *parts, boresight_terms = los_waves(scenario, positions, [band])
     gain, radial = (_positions_first(scenario, band, part[0]) for part in parts)
     derivative = radial[:, None] * np.moveaxis(_offsets(scenario, positions), 2, 1)[:, :, None]
-    if boresight_term is not None:
-        derivative[:, 0] += _positions_first(scenario, band, boresight_term[0])
+    for axis, term in zip(boresight_axes(scenario), boresight_terms, strict=True):
+        derivative[:, axis] += _positions_first(scenario, band, term[0])
     return gain, derivative
 
 
@@ -97,10 +101,11 @@ def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *
               slopes: bool = True) -> Waves:
     """Compute h^LoS times the frequency, and factors of its derivative.
 
-    The derivative with respect to the user's position p is dh/dp = a (p - p_m) + b e_x. The
-    boresight term b exists only with a gain pattern, which adds (dh/dtheta) (dtheta/dp) for the
-    angle theta from the boresight: dtheta/dp = ((p - p_m) cos theta / d - e_x) / (d sin theta).
-    Without `slopes`, the gain is repeated in place of a, and b is None.
+    The derivative with respect to the user's position p is dh/dp = a (p - p_m) + b. The vector b
+    exists only with a gain pattern, which adds (dh/dtheta) (dtheta/dp) for the angle theta from a
+    boresight n: dtheta/dp = ((p - p_m) cos theta / d - n) / (d sin theta). The terms are the
+    components of b along `boresight_axes`.
+    Without `slopes`, the gain is repeated in place of a, and there are no terms.
     """
     elements = element_positions(scenario)
     distances = np.sqrt(sum(
@@ -108,8 +113,8 @@ def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *
     inverse, turn = 1 / distances, -2 * np.pi / SPEED_OF_LIGHT_MPS * distances
     # Sub-bands are equally spaced: two phasors and a running product replace N_SB phasors.
     step = _phasors(turn * scenario.spacing_hz) if scenario.n_subbands > 1 else turn
-    offsets = _offsets(scenario, positions) if has_pattern(scenario) else np.zeros(0)
-    amplitude = inverse * _amplitude(scenario, offsets)
+    boresights = _boresights(scenario, positions)
+    amplitude = inverse * _amplitude(scenario, boresights)
 
     def over_subbands(first: np.ndarray) -> np.ndarray:
         waves = np.empty((len(first), scenario.n_subbands, *first.shape[1:]), complex)
@@ -122,26 +127,31 @@ def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *
     phasors = _phasors(turn * frequencies[:, :1, None])
     gain = over_subbands(phasors * amplitude)
     if not slopes:
-        return gain, gain, None
+        return gain, gain, []
     radial = np.empty(gain.shape, complex)
     radial.real = -inverse**2
     wavenumbers = 2 * np.pi / SPEED_OF_LIGHT_MPS * frequencies
     np.multiply(-wavenumbers[:, :, None, None], inverse, out=radial.imag)
     radial *= gain
-    if not has_pattern(scenario):
-        return gain, radial, None
-    # On boresight, where dtheta/dp has no direction, a smooth pattern has zero slope.
-    across = np.maximum(np.hypot(offsets[..., 1], offsets[..., 2]), _MIN_BORESIGHT_OFFSET_M)
-    by_angle = _amplitude(scenario, offsets, slope=True)
-    boresight_term = over_subbands(phasors * (-by_angle * inverse / across))
-    radial -= boresight_term * (inverse**2 * offsets[..., 0])
-    return gain, radial, boresight_term
+    terms: dict[int, np.ndarray] = {}
+    for one in boresights:
+        # On boresight, where dtheta/dp has no direction, a smooth pattern has zero slope.
+        across_m = np.maximum(one.across_m, _MIN_BORESIGHT_OFFSET_M)
+        by_angle = _amplitude(scenario, boresights, one)
+        along = over_subbands(phasors * (-by_angle * inverse / across_m))
+        radial -= along * (inverse**2 * one.along_m)
+        for axis, part in enumerate([along] if one.normals is None else (
+                along * component for component in one.normals.T)):
+            terms[axis] = terms[axis] + part if axis in terms else part
+    return gain, radial, [*terms.values()]
 
 
-def has_pattern(scenario: Scenario) -> bool:
-    """Return whether the gain of the elements or of the users depends on the direction."""
-    return isinstance(scenario.element_gain, GainPattern) or isinstance(
-        scenario.user_gain, GainPattern)
+def boresight_axes(scenario: Scenario) -> Sequence[int]:
+    """Return the axes along which a boresight with a gain pattern has components."""
+    gains = scenario.element_gain, scenario.user_gain
+    if scenario.element_normals is not None and isinstance(gains[0], GainPattern):
+        return range(3)
+    return range(any(isinstance(gain, GainPattern) for gain in gains))
 
 
 def _positions_first(scenario: Scenario, band: int, waves: np.ndarray) -> np.ndarray:
@@ -155,18 +165,51 @@ def _offsets(scenario: Scenario, positions: np.ndarray) -> np.ndarray:
     return positions[:, None, :] - element_positions(scenario)
 
 
-def _amplitude(
-        scenario: Scenario, offsets: np.ndarray, *, slope: bool = False) -> float | np.ndarray:
-    """Return abs(h) d f [m Hz] of gains h, a number or [N, N_E], or its derivative in theta."""
-    gains = scenario.element_gain, scenario.user_gain
-    angles = np.zeros(())
-    if has_pattern(scenario):
-        angles = np.arctan2(np.hypot(offsets[..., 1], offsets[..., 2]), offsets[..., 0])
-    element, user = (
-        gain.amplitude(angles) if isinstance(gain, GainPattern) else gain for gain in gains)
-    if slope:
-        by_element, by_user = (
-            gain.slope(angles) if isinstance(gain, GainPattern) else 0.0 for gain in gains)
+class _Boresight(NamedTuple):
+    """A boresight, the components of `_offsets` along and across it, and the gains about it."""
+
+    normals: np.ndarray | None  # Unit vectors, float64 [N_E, 3]; None for x.
+    along_m: np.ndarray  # Float64 [N, N_E].
+    across_m: np.ndarray  # Float64 [N, N_E].
+    gains: tuple[str, ...]  # Names of fields of the scenario.
+
+
+def _boresights(scenario: Scenario, positions: np.ndarray) -> list[_Boresight]:
+    """Return the boresights that have gain patterns; the user's one is parallel to x."""
+    gains = 'element_gain', 'user_gain'
+    normals = None if scenario.element_normals is None else element_normals(scenario)
+    found: list[_Boresight] = []
+    for facing, names in [(None, gains)] if normals is None else [
+            (normals, gains[:1]), (None, gains[1:])]:
+        if not any(isinstance(getattr(scenario, name), GainPattern) for name in names):
+            continue
+        offsets = _offsets(scenario, positions)
+        along_m, across_m = offsets[..., 0], np.hypot(offsets[..., 1], offsets[..., 2])
+        if facing is not None:
+            along_m = np.sum(offsets * facing, axis=-1)
+            across_m = np.linalg.norm(np.cross(offsets, facing), axis=-1)
+        found.append(_Boresight(facing, along_m, across_m, names))
+    return found
+
+
+def _amplitude(scenario: Scenario, boresights: Sequence[_Boresight],
+               turned: _Boresight | None = None) -> float | np.ndarray:
+    """Return abs(h) d f [m Hz] of gains h, a number or [N, N_E].
+
+    With `turned`, return the derivative with respect to the angle from this boresight.
+    """
+    factors: dict[str, Any] = {
+        name: getattr(scenario, name) for name in ('element_gain', 'user_gain')}
+    slopes: dict[str, Any] = dict.fromkeys(factors, 0.0)
+    for one in boresights:
+        angles = np.arctan2(one.across_m, one.along_m)
+        for name in one.gains:
+            if isinstance(gain := factors[name], GainPattern):
+                factors[name] = gain.amplitude(angles)
+                slopes[name] = gain.slope(angles) if one is turned else 0.0
+    element, user = factors.values()
+    if turned is not None:
+        by_element, by_user = slopes.values()
         return SPEED_OF_LIGHT_MPS * (by_element * user + element * by_user) / (4 * np.pi)
     return SPEED_OF_LIGHT_MPS * element * user / (4 * np.pi)
 

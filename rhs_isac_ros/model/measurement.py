@@ -48,9 +48,9 @@ from rhs_isac_ros.model.geometry import (
 from rhs_isac_ros.model.impairments import draw_impairments, nuisance_of
 from rhs_isac_ros.model.los import (
     Waves,
+    boresight_axes,
     direct_gain,
     draw_blocked,
-    has_pattern,
     los_waves,
 )
 from rhs_isac_ros.model.multipath import (
@@ -434,14 +434,15 @@ class ElementSums:
         self._scenario = scenario
         shape = scenario.n_bands, scenario.n_subbands, scenario.n_frames, scenario.n_elements
         self.block = max(_ARRAY_BYTES // (16 * shape[1] * shape[3]), _MIN_BLOCK)
-        self._has_pattern = has_pattern(scenario)
+        self._boresight_axes = boresight_axes(scenario)
         # T_i divided by the frequency, complex128 [N_B, N_SB, N_E, F].
         self._frames = np.ascontiguousarray(
             np.swapaxes(radiation.reshape(shape), 2, 3)
             / subband_frequencies_hz(scenario)[..., None, None])
         self._elements = element_positions(scenario)
-        # The A axes along which elements are not at 0: at most two, as elements lie in a plane.
+        # The A axes along which elements are not at 0.
         self._axes = np.flatnonzero(self._elements.any(axis=0))
+        self._n_sums = len(self._axes) + len(self._boresight_axes)
         coordinates = np.hstack([np.ones((shape[3], 1)), self._elements[:, self._axes]])
         moments = coordinates[:, :, None] * self._frames[..., None, :]
         # `_frames` times 1 and A coordinates [m], complex128 [N_B, N_SB, N_E, (1 + A) F].
@@ -453,7 +454,7 @@ class ElementSums:
         Row 0 is the mean. The other G rows, for the result of `weights`, exist only with `slopes`.
         """
         n, (n_bands, n_subbands, _, n_frames) = len(positions), self._frames.shape
-        n_terms = 2 + len(self._axes) + self._has_pattern if slopes else 1
+        n_terms = 2 + self._n_sums if slopes else 1
         terms = np.empty((n_bands, n, n_terms, n_subbands, n_frames), complex)
         waves = los_waves(self._scenario, positions, range(n_bands), slopes=slopes)
         self._add_up(waves, self._frames, self._moments, terms)
@@ -466,7 +467,7 @@ class ElementSums:
         """
         n, (n_bands, n_subbands, n_elements, n_frames) = len(states), self._frames.shape
         n_slopes = by_coordinate.shape[2]
-        n_terms = 2 + len(self._axes) + self._has_pattern if n_slopes else 1
+        n_terms = 2 + self._n_sums if n_slopes else 1
         rows = np.empty((n_bands, n, 1 + n_slopes, n_subbands, n_frames), complex)
         terms = np.empty((n, n_terms, n_subbands, 1), complex)
         moments = self._moments.reshape(n_bands, n_subbands, n_elements, -1, n_frames)
@@ -486,7 +487,7 @@ class ElementSums:
     def _add_up(self, waves: Waves, frames: np.ndarray, moments: np.ndarray, terms: np.ndarray
                 ) -> None:
         """Write the sums for some frames of B bands to `terms`, [B, N, 1 + G, N_SB, F]."""
-        gain, radial, boresight_term = waves
+        gain, radial, boresight_terms = waves
         rows = terms.transpose(0, 3, 1, 2, 4)
         rows[..., 0, :] = np.matmul(gain, frames)
         if terms.shape[2] == 1:
@@ -494,14 +495,14 @@ class ElementSums:
         sums = np.matmul(radial, moments)
         rows[..., 1:2 + len(self._axes), :] = sums.reshape(
             *gain.shape[:-1], -1, frames.shape[-1])
-        if boresight_term is not None:
-            rows[..., -1, :] = np.matmul(boresight_term, frames)
+        for number, term in enumerate(boresight_terms, 2 + len(self._axes)):
+            rows[..., number, :] = np.matmul(term, frames)
 
     def weights(self, positions: np.ndarray) -> np.ndarray:
         """Compute the weights of the terms for each coordinate's derivative, float64 [N, 3, G]."""
-        weights = np.zeros((len(positions), 3, 1 + len(self._axes) + self._has_pattern))
+        weights = np.zeros((len(positions), 3, 1 + self._n_sums))
         weights[:, :, 0] = positions
         weights[:, self._axes, 1 + np.arange(len(self._axes))] = -1
-        if self._has_pattern:
-            weights[:, 0, -1] = 1
+        for number, axis in enumerate(self._boresight_axes, 1 + len(self._axes)):
+            weights[:, axis, number] = 1
         return weights

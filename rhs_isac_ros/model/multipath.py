@@ -15,7 +15,12 @@ import numpy as np
 from rhs_isac_ros.model.arrays import adjoint, blocks, gauss_legendre, read_only
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.geometry import element_intervals_m, element_positions, frame_lags_s
+from rhs_isac_ros.model.geometry import (
+    element_intervals_m,
+    element_normals,
+    element_positions,
+    frame_lags_s,
+)
 from rhs_isac_ros.model.hall import MultipathEstimate
 from rhs_isac_ros.model.scenario import Scenario
 
@@ -179,6 +184,8 @@ def _lattice(scenario: Scenario) -> np.ndarray:
 def _of_positions(scenario: Scenario) -> np.ndarray:
     """Compute V_i for elements at any positions, complex128 [N_B, N_E, N_E], read-only."""
     elements = element_positions(scenario)
+    # Elements that face along one axis have equal gains.
+    facing = element_normals(scenario)[:1 if scenario.element_normals is None else None]
     matrices = np.zeros((scenario.n_bands, len(elements), len(elements)), complex)
     extent_m = np.linalg.norm(np.ptp(elements, axis=0))
     for band, matrix in enumerate(matrices):
@@ -190,9 +197,9 @@ def _of_positions(scenario: Scenario) -> np.ndarray:
             directions = np.stack([
                 np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
                 np.full(len(azimuth), np.sin(elevation))], axis=1)
-            amplitudes = np.sqrt(weight * azimuth_weights) * _element_gain(
-                scenario, directions[:, 0])
-            waves = amplitudes[:, None] * np.exp(1j * wavenumber * directions @ elements.T)
+            amplitudes = np.sqrt(weight * azimuth_weights)[:, None] * _element_gain(
+                scenario, np.clip(directions @ facing.T, -1, 1))
+            waves = amplitudes * np.exp(1j * wavenumber * directions @ elements.T)
             matrix += waves.T @ np.conj(waves)
         matrix *= _mean_power(scenario, band)
     return read_only(matrices)

@@ -200,9 +200,13 @@ class Extensions:
         'antenna, Phys. Rev. Applied 8, 2017', label='amplitude levels $L$')
     element_positions_m: tuple[tuple[float, float, float], ...] | None = declare(
         None, -1e3, 1e3,
-        'Positions of the elements, such as those of a disc or of a curved panel, all of which '
-        'face along x; if null, they form the grid of elements_per_side.', 'm',
-        label='element positions')
+        'Positions of the elements, such as those of a disc or of a curved panel; if null, they '
+        'form the grid of elements_per_side.', 'm', label='element positions')
+    element_normals: tuple[tuple[float, float, float], ...] | None = declare(
+        None, -1e3, 1e3,
+        'Directions in which the elements of element_positions_m face, vectors of any length but '
+        '0; if null, all face along x. They are the boresights of element_gain.', '',
+        label='element normals')
     board: Board = declare(
         Paper(), 0.0, 0.0,
         'How tunings of the elements determine the transfer from elements to feeds: the name of a '
@@ -275,12 +279,10 @@ class Scenario(Extensions, Table1):
     def __post_init__(self) -> None:
         """Convert every field to its declared type and check it."""
         for field in dataclasses.fields(self):
-            value = checked(field, getattr(self, field.name))
-            object.__setattr__(self, field.name, value)
+            object.__setattr__(self, field.name, checked(field, getattr(self, field.name)))
         if self.feed_positions_m is not None and len(self.feed_positions_m) != self.n_feeds:
-            raise ScenarioError(
-                f'feed_positions_m: {len(self.feed_positions_m)} positions, expected n_feeds = '
-                f'{self.n_feeds}')
+            raise ScenarioError(f'feed_positions_m: {len(self.feed_positions_m)} positions, '
+                                f'expected n_feeds = {self.n_feeds}')
         if self.roi_center_m[0] - self.roi_size_m[0] / 2 <= 0:
             raise ScenarioError(
                 f'roi_center_m: {self.roi_center_m} with roi_size_m {self.roi_size_m} reaches '
@@ -317,17 +319,20 @@ class Scenario(Extensions, Table1):
 
     def _check_elements(self) -> None:
         """Raise ScenarioError if positions of the elements contradict other fields."""
-        if self.element_positions_m is None:
-            return
-        n, foremost = len(self.element_positions_m), max(x for x, _, _ in self.element_positions_m)
-        if n > _MAX_ELEMENTS:
-            raise ScenarioError(f'element_positions_m: {n} positions, expected at most '
-                                f'{_MAX_ELEMENTS}; more only in a grid')
+        positions, normals = self.element_positions_m or (), self.element_normals or ()
+        if normals and len(normals) != len(positions):
+            raise ScenarioError(f'element_normals: {len(normals)} vectors, expected one for each '
+                                f'of the {len(positions)} element_positions_m')
+        if not all(map(any, normals)):
+            raise ScenarioError('element_normals: [0, 0, 0], expected a length other than 0')
+        if len(positions) > _MAX_ELEMENTS:
+            raise ScenarioError(f'element_positions_m: {len(positions)} positions, expected at '
+                                f'most {_MAX_ELEMENTS}; more only in a grid')
+        foremost = max((x for x, _, _ in positions), default=-np.inf)
         if self.roi_center_m[0] - self.roi_size_m[0] / 2 <= foremost:
-            raise ScenarioError(
-                f'element_positions_m: x up to {foremost:g} m, expected all elements in front of '
-                'the region of interest')
-        if self.multipath is not None:
+            raise ScenarioError(f'element_positions_m: x up to {foremost:g} m, expected all '
+                                'elements in front of the region of interest')
+        if positions and self.multipath is not None:
             raise ScenarioError('element_positions_m: with a file multipath, expected a grid')
 
     @classmethod
@@ -384,7 +389,8 @@ class Scenario(Extensions, Table1):
         changes, fields = self.changes(), self.fields()
         for name in ('impairments', 'subband_spacing_hz', 'multipath_direction_deg',
                      'blocked_probability', 'outside_probability', *_FILES, 'pose',
-                     'element_positions_m', 'board', 'retune_s', 'user_speed_std_mps'):
+                     'element_positions_m', 'element_normals', 'board', 'retune_s',
+                     'user_speed_std_mps'):
             # Existing files contain identifiers from before these fields were introduced.
             if name not in changes:
                 del fields[name]
@@ -408,17 +414,14 @@ class Scenario(Extensions, Table1):
     @property
     def n_columns(self) -> int:
         """Number of elements along y; all of them if they do not form a grid."""
-        if self.element_positions_m is not None:
-            return len(self.element_positions_m)
         sides = self.elements_per_side
-        return sides if isinstance(sides, int) else sides[0]
+        return len(self.element_positions_m or ()) or (
+            sides if isinstance(sides, int) else sides[0])
 
     @property
     def n_rows(self) -> int:
         """Number of elements along z; 1 if they do not form a grid."""
-        if self.element_positions_m is not None:
-            return 1
-        sides = self.elements_per_side
+        sides = 1 if self.element_positions_m else self.elements_per_side
         return sides if isinstance(sides, int) else sides[1]
 
     @property
@@ -502,7 +505,7 @@ def _plain(value: Any) -> Any:
 def checked(field: dataclasses.Field[Any], value: Any) -> Any:
     """Convert a field's value to its declared type; raise ScenarioError if it is invalid."""
     name = field.name
-    if name in ('feed_positions_m', 'element_positions_m'):
+    if name in ('feed_positions_m', 'element_positions_m', 'element_normals'):
         return None if value is None else tuple(
             _numbers(field, row, 3) for row in _entries(field, value, '[x, y, z]'))
     if name == 'impairments':

@@ -20,6 +20,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.geometry import (
     element_intervals_m,
+    element_normals,
     element_positions,
     surface_sides_m,
 )
@@ -50,12 +51,17 @@ class Ellipsoids(NamedTuple):
 
 
 class Boxes(NamedTuple):
-    """Cuboids aligned with the coordinate axes, drawn solid or as outlines."""
+    """Cuboids, drawn solid or as outlines.
+
+    The unit quaternions, float64 [N, 4] (x, y, z, w), turn the coordinate axes to the edges; None
+    for edges along the axes.
+    """
 
     centres: np.ndarray
     half_sizes_m: np.ndarray
     colours: np.ndarray
     solid: bool
+    quaternions: np.ndarray | None = None
 
 
 class Lines(NamedTuple):
@@ -152,6 +158,8 @@ _BOARD_SIZE = 0.2
 # Minimum half size: viewers do not show bodies without extent.
 _MIN_HALF_SIZE_M = 1e-3
 _MAX_GREY = 255
+# Distance of a unit vector from -x, along x, below which the turn from x to it is about z.
+_MIN_FORWARD = 1e-9
 
 
 def user_colour(user: int) -> Colour:
@@ -203,7 +211,17 @@ def board(scenario: Scenario, configuration: np.ndarray | None, enlarged: bool =
     level = (np.full(len(positions), 0.5) if configuration is None
              else np.mean(configuration, axis=0))
     return Boxes(positions, np.tile([_MIN_HALF_SIZE_M, half_y_m, half_z_m], (len(positions), 1)),
-                 np.stack([level, level, 0.3 + 0.2 * level], axis=1), solid=True)
+                 np.stack([level, level, 0.3 + 0.2 * level], axis=1), solid=True,
+                 quaternions=None if scenario.element_normals is None else _turns(
+                     element_normals(scenario)))
+
+
+def _turns(normals: np.ndarray) -> np.ndarray:
+    """Return the shortest turns from x to unit vectors [N, 3], unit quaternions [N, 4]."""
+    # Half way to -x, every turn is as short.
+    half = np.where(normals[:, :1] > _MIN_FORWARD - 1, normals + [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    x, y, z = (half / np.linalg.norm(half, axis=1, keepdims=True)).T
+    return np.stack([0 * x, -z, y, x], axis=1)
 
 
 def configurations(scenario: Scenario, bands: Iterable[np.ndarray]) -> Picture:

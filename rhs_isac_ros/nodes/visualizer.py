@@ -25,6 +25,7 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from rhs_isac_ros import model
+from rhs_isac_ros.model.pose import rotation_matrix
 from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState, SceneUser
 from rhs_isac_ros.protocol import messages as m
@@ -36,6 +37,8 @@ from rhs_isac_ros.ros.topics import RHS_FRAME, TF, TF_STATIC
 
 # Opacity of translucent bodies.
 _ELLIPSOID, _OUTLINE, _MESH = 0.35, 0.15, 0.25
+# Corners of the middle of a cuboid, in half sizes, as a grid of points.
+_PLATE = np.array([[[0, -1, -1], [0, 1, -1]], [[0, -1, 1], [0, 1, 1]]])
 # Width in the scene that corresponds to a line width of one screen point [m].
 _LINE_M = 0.02
 # Minimum period of the scene while nobody receives it [s].
@@ -63,6 +66,16 @@ def marker(
                               orientation=Quaternion(x=x, y=y, z=z, w=w))
             found.scale = to_ros(Vector3, 2 * shape.half_sizes_m[0])
             found.color = _colour(shape.colours[0], _ELLIPSOID)
+        case shapes.Boxes(quaternions=np.ndarray() as quaternions):
+            # A marker has one orientation for all its cuboids. Elements are thin.
+            plates = [_triangles(plate) for plate in shape.centres[:, None, None] + [
+                _PLATE * half_m @ rotation_matrix(quaternion).T
+                for half_m, quaternion in zip(shape.half_sizes_m, quaternions, strict=True)]]
+            found = _marker(namespace, number, Marker.TRIANGLE_LIST, stamp)
+            found.scale = Vector3(x=1.0, y=1.0, z=1.0)
+            found.points = [to_ros(Point, corner) for plate in plates for corner in plate]
+            found.colors = [_colour(colour, 1.0) for colour, plate in zip(
+                shape.colours, plates, strict=True) for _ in plate]
         case shapes.Boxes():
             # A marker has one size for all its cuboids.
             found = _marker(namespace, number, Marker.CUBE_LIST, stamp)

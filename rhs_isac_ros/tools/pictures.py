@@ -9,7 +9,12 @@ import numpy as np
 
 from rhs_isac_ros.link import BeamPattern
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import element_positions, feed_positions, surface_sides_m
+from rhs_isac_ros.model.geometry import (
+    element_normals,
+    element_positions,
+    feed_positions,
+    surface_sides_m,
+)
 from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
 from rhs_isac_ros.monitoring.network_state import SceneState, SceneUser
@@ -243,6 +248,9 @@ def _draw_surface(axes: Any, message: m.RhsConfiguration | None, scenario: Scena
     else:
         image = axes.scatter(*(100 * element_positions(scenario)[:, 1:]).T, s=12,
                              c=tunings.ravel(), vmin=0, vmax=1)
+        if scenario.element_normals is not None:
+            axes.quiver(*(100 * element_positions(scenario)[:, 1:]).T,
+                        *element_normals(scenario)[:, 1:].T, color='grey', width=0.004)
         axes.set(aspect='equal')
     axes.plot(*(100 * feed_positions(scenario)[:, 1:]).T, 'D', color='white',
               markeredgecolor='black', markersize=4)

@@ -222,10 +222,10 @@ def _archetype(rr: Any, entity: shapes.Entity) -> Any:
                 centers=centres, half_sizes=half_sizes_m, quaternions=quaternions,
                 colors=_colours(colours), line_radii=_radius(_OUTLINE_WIDTH),
                 fill_mode=mode.MajorWireframe)
-        case shapes.Boxes(centres, half_sizes_m, colours, solid):
+        case shapes.Boxes(centres, half_sizes_m, colours, solid, quaternions):
             return rr.Boxes3D(
-                centers=centres, half_sizes=half_sizes_m, colors=_colours(colours),
-                radii=_radius(_OUTLINE_WIDTH),
+                centers=centres, half_sizes=half_sizes_m, quaternions=quaternions,
+                colors=_colours(colours), radii=_radius(_OUTLINE_WIDTH),
                 fill_mode=mode.Solid if solid else mode.MajorWireframe)
         case shapes.Lines(strips, colour, width):
             is_plane = bool(strips) and strips[0].shape[1] == _PLANE

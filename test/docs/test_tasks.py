@@ -11,8 +11,8 @@ import scipy.io
 from rhs_isac_ros.model import PathChannel
 
 EXAMPLES = Path(__file__).parents[2] / 'docs' / 'examples'
-TASKS = ('own_estimator', 'own_impairment', 'own_board', 'disc', 'comb_pilots', 'nr_grid',
-         'sionna_channel', 'matlab_channel', 'own_jobs', 'own_sweep')
+TASKS = ('own_estimator', 'own_impairment', 'own_board', 'disc', 'curved_panel',
+         'comb_pilots', 'nr_grid', 'sionna_channel', 'matlab_channel', 'own_jobs', 'own_sweep')
 
 
 @pytest.fixture
@@ -56,6 +56,12 @@ def test_an_own_board_is_optimised(run):
 def test_a_disc_is_optimised(run):
     (bound,) = numbers(run('disc'))
     assert 0.05 < bound < 0.2
+
+
+def test_normals_of_a_curved_panel_lower_bounds_at_its_sides(run):
+    facing_x, outward = numbers(run('curved_panel')).reshape(2, 3)
+    assert (outward[[0, 2]] < 0.95 * facing_x[[0, 2]]).all()
+    assert outward[1] > facing_x[1]
 
 
 def test_a_wider_comb_has_a_lower_bound(run):

@@ -38,7 +38,7 @@ def test_defaults_are_table_1_of_the_paper():
         'multipath_direction_deg': (0.0, 0.0), 'impairments': (),
         'blocked_probability': 0.0, 'outside_probability': 0.5, 'multipath': None, 'channel': None,
         'board': {'kind': 'paper', 'loss_db_per_m': 0.0, 'feed_gains': None, 'masked': ()},
-        'element_positions_m': None,
+        'element_positions_m': None, 'element_normals': None,
         'pose': dataclasses.asdict(Pose())}
     assert dataclasses.asdict(Scenario()) == expected
 
@@ -146,6 +146,10 @@ BAD = [
     ('element_positions_m', [], '[]', 'expected a list of [x, y, z]'),
     ('element_positions_m', np.zeros((1025, 3)), '1025 positions', 'expected at most 1024'),
     ('element_positions_m', [[5, 0, 0]], 'x up to 5 m', 'expected all elements in front of'),
+    ('element_normals', [], '[]', 'expected a list of [x, y, z]'),
+    ('element_normals', [[1, 0]], '2 values', 'expected a list of 3 numbers'),
+    ('element_normals', [[1, 0, 'x']], "'x'", 'expected a number'),
+    ('element_normals', [[1, 0, 0]], '1 vectors', 'one for each of the 0 element_positions_m'),
     ('roi_center_m', [5, 0, 0], '(5.0, 0.0, 0.0)', 'expected x > 0'),
     ('roi_center_m', [-10, 0, 0], '(-10.0, 0.0, 0.0)', 'expected x > 0'),
     ('amplitude_levels', 1, '1', 'expected 0 for continuous amplitudes, or at least 2'),
@@ -185,7 +189,7 @@ def test_values_just_outside_the_bounds_are_errors(field, plugin):
     else:
         outside = (np.nextafter(low, -np.inf), np.nextafter(high, np.inf))
     for value in outside:
-        if field.name in ('feed_positions_m', 'element_positions_m'):
+        if field.name in ('feed_positions_m', 'element_positions_m', 'element_normals'):
             value = [[0, 0, 0], [0, 0, 0], [0, value, 0]]
         elif field.name == 'center_frequencies_hz':
             value = [1e9, value]

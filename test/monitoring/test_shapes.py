@@ -10,6 +10,7 @@ from rhs_isac_ros.link import BeamPattern
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.model.hall import PathChannel
+from rhs_isac_ros.model.pose import rotation_matrix
 from rhs_isac_ros.monitoring.shapes import (
     axes_95,
     board,
@@ -74,6 +75,14 @@ def test_the_board_is_to_scale_or_enlarged(small, intervals):
             gap_m = np.diff(np.unique(shown.centres[:, axis])).min()
             assert 0 < 2 * shown.half_sizes_m[0, axis] < gap_m
     assert len(np.unique(board(scenario, None).colours[:, 0])) == 1
+
+
+def test_plates_of_a_board_face_along_the_normals(small):
+    normals = np.array([[1.0, 0, 0], [-1, 0, 0], [0.6, 0, -0.8], [0.6, 0.8, 0]])
+    panel = Scenario(element_positions_m=np.zeros((4, 3)), element_normals=3 * normals)
+    for normal, quaternion in zip(normals, board(panel, None).quaternions, strict=True):
+        assert rotation_matrix(quaternion)[:, 0] == pytest.approx(normal)
+    assert board(small.scenario, None).quaternions is None
 
 
 def test_the_paths_of_a_traced_scenario_are_straight_or_bend_at_the_wall():

@@ -6,11 +6,14 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 import yaml
+from builtin_interfaces.msg import Time
 from nav_msgs.msg import Path
 from ros_messages import position_estimate, to_ros
 from visualization_msgs.msg import Marker, MarkerArray
 
-from rhs_isac_ros.nodes.visualizer import VisualizerNode
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.monitoring import shapes
+from rhs_isac_ros.nodes.visualizer import VisualizerNode, marker
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE
@@ -38,6 +41,19 @@ def shown(bench, probe, bench_files, request):
 def ground_truth(user, x):
     return m.GroundTruth(cycle_id=0, user=user, position=np.array([x, user, 0.0]),
         velocity=np.zeros(3))
+
+
+def test_plates_that_face_along_normals_are_triangles():
+    normals = np.array([[1.0, 0, 0], [0.6, 0.8, 0]])
+    panel = Scenario(element_positions_m=[[0, 0, 0], [0, 0.1, 0]], element_normals=normals)
+    plates = shapes.board(panel, np.array([[0.0, 1.0]]))
+    found = marker('board', 0, plates, Time())
+    assert (found.type, len(found.colors)) == (Marker.TRIANGLE_LIST, 12)
+    corners = np.array([[p.x, p.y, p.z] for p in found.points]).reshape(2, 2, 3, 3)
+    for normal, centre, triangles in zip(normals, plates.centres, corners, strict=True):
+        assert (triangles - centre) @ normal == pytest.approx(0)
+        assert triangles.mean(axis=(0, 1)) == pytest.approx(centre)
+    assert found.colors[0].r < found.colors[6].r
 
 
 def beam(sizes):

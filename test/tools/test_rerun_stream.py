@@ -48,7 +48,8 @@ def read(tmp_path):
         'Radius': [0.1, 0.2]}) for places in (PLACES[:, :2], PLACES)),
     (Ellipsoids(PLACES, SIZES, QUATERNIONS, COLOURS), {
         'HalfSize3D': SIZES, 'RotationQuat': QUATERNIONS, 'Translation3D': PLACES}),
-    (Boxes(PLACES, SIZES, COLOURS, True), {'HalfSize3D': SIZES, 'Translation3D': PLACES}),
+    (Boxes(PLACES, SIZES, COLOURS, True, QUATERNIONS), {
+        'HalfSize3D': SIZES, 'RotationQuat': QUATERNIONS, 'Translation3D': PLACES}),
     # A negative radius is in points of the screen.
     (Lines((PLACES, PLACES + 1), (1.0, 0.0, 0.0), 3.0), {
         'LineStrip3D': (PLACES, PLACES + 1), 'Radius': [-1.5]}),
