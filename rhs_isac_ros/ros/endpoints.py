@@ -375,11 +375,14 @@ class Mismatches:
         may receive a name.
         """
         node = self._node
-        # The lists of the node lack the topics of its actions.
+        # While another node has the same name, the graph may list the topics of that one. The lists
+        # of the node lack the topics of its actions, which are the same for both.
         own = node.get_name(), node.get_namespace()
-        ours = {topic for topic, _ in [
+        actions = [topic for topic, _ in [
             *node.get_publisher_names_and_types_by_node(*own),
-            *node.get_subscriber_names_and_types_by_node(*own)]} - {*_FOREIGN}
+            *node.get_subscriber_names_and_types_by_node(*own)] if '/_action/' in topic]
+        ours = {*actions, *(one.topic_name for one in [*node.publishers, *node.subscriptions])
+                } - {*_FOREIGN}
         counts = [(topic, node.count_publishers(topic), node.count_subscribers(topic))
                   for topic in sorted(ours)]
         if counts != self._counts or not self._are_named:

@@ -108,28 +108,31 @@ def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Pa
 
 def start_network(
         processes: Processes, users: int, scenario: Scenario, *, together: bool = False,
-        surfaces: Collection[str] = (), **given: Any) -> None:
+        composed: bool = False, surfaces: Collection[str] = (), **given: Any) -> None:
     """Start each node of a network, or of a site with `surfaces`, in a separate process.
 
-    If `together`, the users are in one node. Users walk at random, by default at the maximum speed
-    of the scenario, which in a site is that of the first surface. Each parameter in `given`
-    applies to all nodes that have it; None selects its default. A scenario other than Table I must
-    also be given as ``scenario_file``, and a site as ``site_file``. With ``first_cycle=1``, the
-    seed determines multipath and noise.
+    If `together`, the users are in one node; if `composed`, all nodes are in one process. Users
+    walk at random, by default at the maximum speed of the scenario, which in a site is that of the
+    first surface. Each parameter in `given` applies to all nodes that have it; None selects its
+    default. A scenario other than Table I must also be given as ``scenario_file``, and a site as
+    ``site_file``. With ``first_cycle=1``, the seed determines multipath and noise.
     """
+    given = {name: value for name, value in given.items() if value is not None}
+    walking = {'mobility': 'random_walk', 'speed_mps': scenario.max_user_speed_mps}
+    if composed:
+        processes.start('network', users=users, **walking | given)
+        return
     for namespace, role in [(space, role) for space, roles in networks(surfaces)
                             for role in roles]:
         known = {parameter.name for parameter in parameters.NODES[role]}
-        values = {name: value for name, value in given.items()
-                  if name in known and value is not None}
+        values = {name: value for name, value in given.items() if name in known}
         if MEMBERS[role].is_unique:
             processes.start(role, namespace=namespace, **values)
             continue
         for name, first, count in [('users', 1, users)] if together else [
                 (f'user_{user}', user, 1) for user in range(1, users + 1)]:
-            processes.start(
-                role, name, namespace=namespace, user_id=first, user_count=count,
-                mobility='random_walk', **{'speed_mps': scenario.max_user_speed_mps, **values})
+            processes.start(role, name, namespace=namespace, user_id=first, user_count=count,
+                            **walking | values)
 
 
 def watch(

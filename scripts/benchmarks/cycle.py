@@ -129,11 +129,8 @@ def run_cycles(scenario: Scenario, n_cycles: int, composed: bool) -> tuple[list[
     executor.add_node(observer)
     with (tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs,
           TrialProcesses(Path(logs), {'ROS_LOG_DIR': logs}) as processes):
-        if composed:
-            processes.start('network', users=USERS, rest_s=REST_S, mobility='random_walk',
-                            speed_mps=scenario.max_user_speed_mps)
-        else:
-            start_network(processes, USERS, scenario, first_cycle=1, rest_s=REST_S)
+        start_network(
+            processes, USERS, scenario, composed=composed, first_cycle=1, rest_s=REST_S)
         served, end_s, before_s = 0, time.monotonic() + TIMEOUT_S, 0.0
         while observer.served < WARM_UP + n_cycles:
             executor.spin_once(timeout_sec=0.5)

@@ -258,9 +258,7 @@ def graph(monkeypatch):
     """A node that subscribes to acks, the publishers of which a test sets, and its clock."""
     node, clock = mock.MagicMock(), mock.MagicMock(return_value=100.0)
     node.get_fully_qualified_name.return_value = '/bs'
-    node.get_publisher_names_and_types_by_node.return_value = []
-    node.get_subscriber_names_and_types_by_node.return_value = [
-        ('/ack', ['rhs_isac_msgs/msg/Ack'])]
+    node.publishers, node.subscriptions = [], [types.SimpleNamespace(topic_name='/ack')]
     node.count_publishers.return_value = node.count_subscribers.return_value = 1
     node.get_subscriptions_info_by_topic.return_value = [
         endpoint(name, endpoint_type=TopicEndpointTypeEnum.SUBSCRIPTION)

@@ -23,7 +23,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import presences
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, peers, topics
-from rhs_isac_ros.ros.endpoints import LATCHED, PRESENCES
+from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES, Mismatches
 from rhs_isac_ros.ros.peers import Peers
 from rhs_isac_ros.ros.role_node import CodebookClient, RoleNode
 from rhs_isac_ros.ros.roster import ROSTER
@@ -225,6 +225,18 @@ def test_endpoints_of_another_type_on_the_hidden_topics_of_an_action_are_named(b
             observer.create_publisher(String, name, 1)
         keys = {f'conflict.type.{name}.observer' for name in hidden}
         bench.until(lambda: keys <= node.report().details.keys(), 'the report')
+
+
+def test_a_node_examines_its_own_topics_while_another_one_has_its_name(bench):
+    """The graph of ROS lists the topics of either for both."""
+    twin, observer = bench.add(Node, 'twin'), bench.add(Node, 'observer')
+    node = bench.add(Node, 'twin')
+    node.create_publisher(TYPES['feed_signals'], 'feed_signals', EXCHANGE)
+    observer.create_subscription(
+        TYPES['feed_signals'], 'feed_signals', lambda message: None, LATCHED)
+    bench.until(lambda: node.count_subscribers('feed_signals'), 'the observer')
+    assert [*Mismatches(node).update()] == ['conflict.qos.feed_signals.observer']
+    assert not Mismatches(twin).update()
 
 
 def test_compatible_observers_are_no_conflict(bench):

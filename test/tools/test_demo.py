@@ -125,6 +125,13 @@ def test_each_node_has_the_given_parameters_that_it_knows():
         'speed_mps': Scenario().max_user_speed_mps}
 
 
+def test_a_composed_network_has_the_same_parameters_in_one_process():
+    nodes = Started()
+    start_network(nodes, 2, Scenario(), composed=True, seed=3, rest_s=None, speed_mps=1.0)
+    assert nodes == {('', 'network'): {
+        'users': 2, 'mobility': 'random_walk', 'seed': 3, 'speed_mps': 1.0}}
+
+
 def test_a_site_has_users_at_the_first_surface_and_one_fusion():
     nodes = Started()
     start_network(

@@ -56,7 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             with processes:
                 start_network(
-                    processes, 2, scenario, seed=options.seed, scenario_file=options.config,
+                    processes, 2, scenario, composed=options.composed, seed=options.seed,
+                    scenario_file=options.config,
                     codebook_file=codebook_file,
                     rest_s=_FUZZING_REST_S if options.fuzz else _REST_S,
                     **(dataclasses.asdict(soaking.IMPAIRMENTS) if options.soak else {}))
@@ -102,12 +103,16 @@ def _run(
     chosen: list[Iterator[Trial]] = []
     if crashes_chosen or options.intruders is None:
         chosen.append(crashes.crash_all(
-            observer, processes, options.nodes or crashes.NODES, options.repeat * [
+            observer, processes, [crashes.ALL] if options.composed else
+            options.nodes or crashes.NODES, options.repeat * [
                 m.Phase[name.upper()] for name in options.phases or _PHASES]))
     if options.intruders is not None or not crashes_chosen:
         common = {'scenario_file': options.config.resolve()} if options.config else {}
+        # The trial with two users kills the process of the first.
         chosen.append(intruders.intrude_all(
-            observer, processes, options.intruders or intruders.INTRUDERS, options.seconds,
+            observer, processes, options.intruders or [
+                one for one in intruders.INTRUDERS
+                if not (options.composed and one == intruders.USER)], options.seconds,
             common, scenario, Codebook.load(codebook_file)))
     trials = []
     for trial in itertools.chain(*chosen):
@@ -142,6 +147,9 @@ def _parser() -> argparse.ArgumentParser:
     test.add_argument('--fuzz', type=positive_int, metavar='N',
                       help='instead of killing nodes, publish this number of random and mutated '
                       'messages of every type on every topic')
+    parser.add_argument('--composed', action='store_true',
+                        help='run all nodes in one process, which is killed as a whole; '
+                             'without the trial with two users of one number')
     parser.add_argument('--nodes', nargs='+', choices=crashes.NODES, metavar='NODE',
                         help=f'only kill these nodes; one or more of {", ".join(crashes.NODES)}')
     parser.add_argument('--phases', nargs='+', choices=_PHASES, metavar='PHASE',

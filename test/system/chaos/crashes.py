@@ -24,6 +24,9 @@ PUBLISHES = {name if member.is_unique else f'{name}_1': member.role.SENDS if mem
 # Nobody misses a role that no other needs.
 _NEEDED = {name for member in ROSTER.values() for name in member.needed}
 NODES = tuple(name for name in PUBLISHES if name in _NEEDED or name not in ROSTER)
+# The process of a composed network.
+ALL = 'network'
+PUBLISHES[ALL] = tuple(itertools.chain(*PUBLISHES.values()))
 PHASES = tuple(m.Phase)
 # A killed node is restarted after this time [s], or once the other nodes have reported that it is
 # missing: users wait 1.5 s for a beacon, and diagnostics are published once a second.
@@ -65,8 +68,9 @@ def crash(
     observer.warnings.clear()
     observer.spin_for(_DOWNTIME_S)
     # On a busy machine, the reports take longer.
-    observer.spin_until(lambda: bool(
-        observer.warnings and warnings_since(processes, log_lengths, node)), TIMEOUT_S)
+    others = set(processes.names) - {node}
+    observer.spin_until(lambda: bool(not others or (
+        observer.warnings and warnings_since(processes, log_lengths, node))), TIMEOUT_S)
     diagnosed = tuple(sorted(observer.warnings))
     logged = tuple(warnings_since(processes, log_lengths, node))
     observer.invariants.expect_rediscovery(PUBLISHES[node])
@@ -79,8 +83,8 @@ def crash(
         lambda: node != 'optimizer' or observer.n_codebooks > n_codebooks)
     return CrashTrial(
         node=node, phase=phase.name.lower(), kill_delay_s=kill_delay_s, recovery_s=recovery_s,
-        others_running=not processes.ended(), logged=logged, diagnosed=diagnosed,
-        violations=tuple(observer.invariants.violations[n_violations:]))
+        has_others=bool(others), others_running=not processes.ended(), logged=logged,
+        diagnosed=diagnosed, violations=tuple(observer.invariants.violations[n_violations:]))
 
 
 def _wait_until_found(observer: NetworkObserver, node: str) -> None:

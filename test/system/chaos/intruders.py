@@ -35,9 +35,9 @@ INTRUDERS = (*UNIQUE, USER, SCENARIO, OBSERVER)
 SECONDS = 4.0
 _PROCESS = 'intruder'
 _USER_NODE = 'user_1'
-# Texts that name a conflict.
-_NAMES_OF_CONFLICTS = (
-    'two nodes', 'another scenario', 'serves instead of', 'stands by for', 'no messages between')
+# Texts that name a conflict with the intruder, and one with the observer beside it.
+_OF_INTRUDERS = 'two nodes', 'another scenario', 'serves instead of', 'stands by for'
+_NAMES_OF_CONFLICTS = *_OF_INTRUDERS, 'no messages between'
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -63,6 +63,7 @@ def intrude_all(
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
         commands = _commands(Path(folder), parameters, scenario, codebook)
         for intruder in intruders:
+            wait_for_service(observer)
             with _incompatible_observer() if intruder == OBSERVER else contextlib.nullcontext():
                 yield _intrude(observer, processes, intruder, commands[intruder], seconds)
 
@@ -104,7 +105,6 @@ def _commands(
 def _intrude(
         observer: NetworkObserver, processes: TrialProcesses, intruder: str,
         command: tuple[str, str, dict[str, Any]], seconds: float) -> IntrusionTrial:
-    wait_for_service(observer)
     executable, node, parameters = command
     n_violations = len(observer.invariants.violations)
     log_lengths = {_PROCESS: 0, **{name: len(processes.log(name)) for name in processes.names}}
@@ -114,7 +114,7 @@ def _intrude(
     first = len(observer.log.ended)
     processes.start(executable, node, _PROCESS, **parameters)
     # A process takes seconds to start on a loaded machine.
-    observer.spin_until(lambda: bool(_diagnosed(observer)), TIMEOUT_S)
+    observer.spin_until(lambda: bool(_diagnosed(observer, _OF_INTRUDERS)), TIMEOUT_S)
     observer.spin_for(seconds)
     served = sum(record.outcome == 'served' for record in observer.log.ended[first:])
     # A user number belongs to the first node that has it, and a role to the last.
@@ -135,8 +135,9 @@ def _intrude(
         violations=tuple(observer.invariants.violations[n_violations:]))
 
 
-def _diagnosed(observer: NetworkObserver) -> tuple[str, ...]:
+def _diagnosed(
+        observer: NetworkObserver, texts: Iterable[str] = _NAMES_OF_CONFLICTS) -> tuple[str, ...]:
     """Return the nodes whose diagnostics named a conflict."""
     return tuple(sorted(
         name for name, summaries in observer.warnings.items()
-        if any(text in summary for text in _NAMES_OF_CONFLICTS for summary in summaries)))
+        if any(text in summary for text in texts for summary in summaries)))

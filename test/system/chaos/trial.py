@@ -23,6 +23,7 @@ class Trial:
     #: Time from the end of the fault to the end of the first cycle served after it [s]; if the
     #: fault concerns a user, the first cycle of this user. None if there was none.
     recovery_s: float | None
+    has_others: bool = True  #: Whether there are other nodes, which can report the fault.
     others_running: bool  #: Whether all other processes kept running.
     logged: tuple[str, ...]  #: Warnings that name the fault, each as ``<node>: <text>``.
     diagnosed: tuple[str, ...]  #: Nodes whose diagnostics reported the fault.
@@ -36,9 +37,9 @@ class Trial:
 
     @property
     def reported(self) -> bool:
-        """Whether logs and diagnostics reported the fault, without repeated warnings."""
-        return bool(self.logged and self.diagnosed
-                    and len(set(self.logged)) == len(self.logged))
+        """Whether logs and diagnostics of others reported the fault, without repeated warnings."""
+        return bool(self.logged and self.diagnosed or not self.has_others
+                    ) and len(set(self.logged)) == len(self.logged)
 
 
 def both_served(observer: NetworkObserver, first: int) -> bool:
@@ -73,10 +74,10 @@ def measure_recovery(
 
 def warnings_since(
         processes: Processes, log_lengths: dict[str, int], excluded: str = '') -> list[str]:
-    """Return new warnings in the logs of all nodes but one, each with the name of its node.
+    """Return new warnings in the logs of all processes but one, each with process and node.
 
     `log_lengths` contains the length of each old log, by name of the process.
     """
-    return [f'{name}: {line.split("]: ", 1)[-1]}'
+    return [f'{name}: {line.rpartition("[WARN] ")[2].split(" ", 1)[-1]}'
             for name, length in log_lengths.items() if name != excluded
             for line in processes.log(name)[length:].splitlines() if '[WARN]' in line]
