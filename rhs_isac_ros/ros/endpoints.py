@@ -375,8 +375,8 @@ class Mismatches:
         may receive a name.
         """
         node = self._node
-        # While another node has the same name, the graph may list the topics of that one. The lists
-        # of the node lack the topics of its actions, which are the same for both.
+        # While another node has the same name, the graph may list the topics of that one. Only the
+        # topics of actions are read there: they are the same, and the node does not list them.
         own = node.get_name(), node.get_namespace()
         actions = [topic for topic, _ in [
             *node.get_publisher_names_and_types_by_node(*own),

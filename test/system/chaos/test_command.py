@@ -147,7 +147,8 @@ SOAK = SoakResult(
     ({}, True, True), ({'recovery_s': 3.01}, False, True), ({'recovery_s': None}, False, True),
     ({'others_running': False}, False, True), ({'logged': ()}, True, False),
     ({'diagnosed': ()}, True, False),
-    ({'logged': (), 'diagnosed': (), 'has_others': False}, True, True), ({'logged': ('bs: missing',) * 2}, True, False)])
+    ({'logged': (), 'diagnosed': (), 'has_others': False}, True, True),
+    ({'logged': ('bs: missing',) * 2}, True, False)])
 def test_a_trial_fails_if_recovery_is_late_a_process_ends_or_the_report_is_missing_or_repeated(
         changed, recovered, reported):
     trial = dataclasses.replace(CRASH, **changed)
