@@ -381,8 +381,8 @@ class Mismatches:
         actions = [topic for topic, _ in [
             *node.get_publisher_names_and_types_by_node(*own),
             *node.get_subscriber_names_and_types_by_node(*own)] if '/_action/' in topic]
-        ours = {*actions, *(one.topic_name for one in [*node.publishers, *node.subscriptions])
-                } - {*_FOREIGN}
+        ours = {*actions, *(one.topic_name for one in node.publishers),
+                *(one.topic_name for one in node.subscriptions)} - {*_FOREIGN}
         counts = [(topic, node.count_publishers(topic), node.count_subscribers(topic))
                   for topic in sorted(ours)]
         if counts != self._counts or not self._are_named:

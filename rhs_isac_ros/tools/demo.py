@@ -118,7 +118,7 @@ def start_network(
     ``site_file``. With ``first_cycle=1``, the seed determines multipath and noise.
     """
     given = {name: value for name, value in given.items() if value is not None}
-    walking = {'mobility': 'random_walk', 'speed_mps': scenario.max_user_speed_mps}
+    walking: dict[str, Any] = {'mobility': 'random_walk', 'speed_mps': scenario.max_user_speed_mps}
     if composed:
         processes.start('network', users=users, **walking | given)
         return
