@@ -10,7 +10,7 @@ from rhs_isac_ros.model.elementwise import Elementwise
 class Disc(Elementwise):
     """Amplitudes as in the paper, on the largest disc in the surface."""
 
-    kind = id = 'disc'
+    kind = 'disc'
 
     def coefficients(self, ports, tunings):
         """Return the tunings, and 0 outside of the disc, [B, 1, Q, N_E]."""

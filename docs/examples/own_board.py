@@ -10,7 +10,7 @@ from rhs_isac_ros.model.elementwise import Elementwise
 class Squared(Elementwise):
     """Amplitudes that are the squares of tunings."""
 
-    kind = id = 'squared'
+    kind = 'squared'
 
     def coefficients(self, ports, tunings):
         """Return the coefficients, [B, 1, Q, N_E]."""

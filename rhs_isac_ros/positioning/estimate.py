@@ -141,11 +141,6 @@ class Estimate:
         """What the signals alone say; None unless this is a result of `posterior`; see `of`."""
         return self.see() if callable(self.see) else None
 
-    @property
-    def estimate(self) -> 'Estimate':
-        """The estimate itself, for programs that expect it as a part of a posterior."""
-        return self
-
     @classmethod
     def without_fix(cls, reason: str, **statistics: Any) -> 'Estimate':
         """Return an estimate of one shot that has a reason in place of a position."""
@@ -229,8 +224,9 @@ _OBJECTS = ('reason', 'density', 'unbounded', 'see')
 class Fit(NamedTuple):
     """The posterior of one shot, for a user who is inside the region and in sight."""
 
-    mean: np.ndarray  # Float64 [3] [m].
-    covariance: np.ndarray  # Float64 [3, 3] [m^2].
+    # Of the position [m]; if the velocity is unknown, of both [m, m/s]: float64 [D] and [D, D].
+    mean: np.ndarray
+    covariance: np.ndarray
     log_evidence: float  # Logarithm of the likelihood averaged over the region.
     residual: float  # Energy of the whitened residual at the best position.
     expected: float  # Expected residual of signals that match the model.

@@ -115,8 +115,8 @@ class SearchEstimator(abc.ABC):
     reject_outside
         Whether the user may also be outside of the region, with the prior probability
         `Scenario.outside_probability`. The estimate then contains the probability of this; if it
-        exceeds `alternatives.LIMIT`, there is no fix. Position and covariance always apply to a
-        user inside.
+        exceeds `alternatives.LIMIT`, or all other alternatives are likely, too, there is no fix;
+        see `alternatives.rejection`. Position and covariance always apply to a user inside.
     progress
         Called with the completed share while a table is computed, from any thread.
     lazy
@@ -310,7 +310,7 @@ class SearchEstimator(abc.ABC):
 
     @abc.abstractmethod
     def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions, [N, 3], and covariances, [N, 3, 3], of N shots."""
+        """Return means, [N, D], and covariances, [N, D, D], of N shots; D is 6 with velocities."""
 
     def _locate(self, batch: np.ndarray) -> Iterator[Estimate]:
         signals = self._likelihood.signals(batch)

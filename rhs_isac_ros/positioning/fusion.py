@@ -96,8 +96,8 @@ def fuse(sightings: Sequence[Sighting], bounds_m: np.ndarray, outside_probabilit
     """Multiply the likelihoods of the surfaces, for a user between the bounds of the region.
 
     The bounds, float64 [2, 3] [m], and the result are in the frame of the site. The prior
-    probability of a user outside of the region is from 0 to less than 1. If that of all sightings
-    exceeds `alternatives.LIMIT`, the result is a reason; with 0, users are inside. Velocities have
+    probability of a user outside of the region is from 0 to less than 1; with 0, users are inside.
+    If `alternatives.rejection` refuses the posterior one, the result is a reason. Velocities have
     the given prior. Raises ValueError without sightings, or if one has no density in the region.
     """
     return Fuser(bounds_m, outside_probability, user_speed_std_mps).fuse(sightings)

@@ -77,7 +77,7 @@ class Samples(NamedTuple):
         return self.of_shot.sum(self.weights.sum(axis=1) * values)
 
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the mean, float64 [N, 3] [m], and the covariance, [N, 3, 3], of the posterior.
+        """Compute the means, float64 [N, D], and covariances, [N, D, D], of the posteriors.
 
         The covariance includes the uncertainty of a mean of few samples.
         """

@@ -34,20 +34,19 @@ class _Limits(NamedTuple):
     # Smallest standard deviation of the position that range and directions have, relative to the
     # extent of the region. If they are known better, rounding exceeds the floor.
     exact: float = 3e-7
-    # The others are in standard deviations. Distance from a Gaussian's centre beyond which samples
-    # follow a Gaussian that is nearer. Its distribution function is then accurate.
+    # In standard deviations: distance from a Gaussian's centre beyond which samples follow a
+    # Gaussian that is nearer, whose distribution function is then accurate; distance beyond which
+    # limits do not change the samples; and width of an interval in which the density is constant.
     deviation: float = 6.0
-    # Distance beyond which limits do not change the samples.
     distant: float = 5.0
-    # Width of an interval below which the density in it is constant.
     constant: float = 1e-4
     # Share of the whole precision of an axis that counts like that of the range in its order.
     least: float = 1e-6
     # Standard deviation across the line of sight, relative to the diagonal of the region, above
     # which a plane does not approximate the sphere.
     wide: float = 0.5
-    # Distance between both sides of the last axis on the sphere from which they are separate, and
-    # decrease of the log-likelihood up to which the far side counts.
+    # Distance in standard deviations between both sides of the last axis on the sphere from which
+    # they are separate, and decrease of the log-likelihood up to which the far side counts.
     separate: float = 1.0
     far_side: float = 8.0
     # Smallest cosine of the angle from boresight in curvatures.

@@ -190,6 +190,17 @@ def test_a_board_that_is_invalid_or_does_not_fit_is_refused_by_name(changes, exp
     assert expected in str(caught.value)
 
 
+def test_plug_ins_that_differ_in_a_field_are_different_boards():
+    class Own(Paper):
+        kind = 'own'
+
+    board, masked = Own(), Own(masked=(0, 3))
+    assert (board == Own(), board == masked) == (True, False)
+    assert Scenario(board=board).id != Scenario(board=masked).id
+    assert not masked.paths(ports_of(Scenario()))[..., [0, 3]].any()
+    assert board.paths(ports_of(Scenario())).all()
+
+
 COUPLED = '''
 import numpy as np
 from rhs_isac_ros.model.board import Board
