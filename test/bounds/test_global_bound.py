@@ -18,14 +18,12 @@ def bound_and_codebook(n_phases=1024, **fields):
     return scenario, codebook, bound
 
 
-@pytest.mark.slow
 def test_without_signal_the_bound_is_the_variance_of_the_region():
     scenario, _, bound = bound_and_codebook(256, max_power_w=1e-15, noise_psd_dbm_hz=0.0)
     assert bound.value == pytest.approx(
         np.sum(np.square(scenario.roi_size_m)) / 12, rel=0.02)
 
 
-@pytest.mark.slow
 def test_with_strong_signals_the_bound_is_the_cramer_rao_bound():
     scenario, codebook, bound = bound_and_codebook(
         256, multipath_to_los_db=-33.0, roi_center_m=(5.0, 0.3, 0.2), roi_size_m=(0.1, 0.4, 0.4))
@@ -36,7 +34,6 @@ def test_with_strong_signals_the_bound_is_the_cramer_rao_bound():
     assert bound.coarseness == 1
 
 
-@pytest.mark.slow
 def test_ambiguous_ranges_are_as_in_a_brute_force_posterior():
     # In a thin region, only the range is unknown. Its phases repeat every 0.6 m.
     scenario, codebook, bound = bound_and_codebook(
@@ -64,7 +61,6 @@ def crlb_of_range(model, truth):
     return np.mean(1 / (2 * np.sum(np.abs(slope)**2, axis=(1, 2))))
 
 
-@pytest.mark.slow
 def test_squared_errors_have_the_mean_of_the_bound():
     scenario, _, bound = bound_and_codebook(128, roi_size_m=(2.0, 2.0, 1.0))
     spread = np.std(bound.squared_errors) / np.sqrt(len(bound.squared_errors))
@@ -102,7 +98,6 @@ def test_too_few_phases_are_an_error():
         bound_and_codebook(1)
 
 
-@pytest.mark.slow
 def test_a_flat_region_is_the_limit_of_thin_ones():
     flat, thin = (bound_and_codebook(
         512, multipath_to_los_db=-20.0, roi_center_m=(5.0, 0.0, 1.2),

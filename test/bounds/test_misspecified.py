@@ -30,6 +30,7 @@ def compare(assumed, true, codebook, positions):
                         positions)
 
 
+@pytest.mark.slow
 def test_without_a_wrong_assumption_it_is_the_bound(plan, positions):
     scenario, codebook = plan
     result = compare(scenario, scenario, codebook, positions)

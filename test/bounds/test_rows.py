@@ -150,7 +150,6 @@ def test_compressed_evaluations_match_exact_ones_to_the_tolerance(
     assert_same(compressed, evaluate(make(wide, items), model, items.shape[1]), 10 * tolerance)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('tolerance', [1e-7, 1e-6, 1e-4, 1e-2, 0.3])
 def test_the_tolerance_is_met_with_the_minimum_rank_or_one_more(wide, items, tolerance):
     compressed = make(wide, items, tolerance)
@@ -204,7 +203,6 @@ def test_a_tolerance_out_of_range_is_an_error(wide, items, tolerance):
             RowSource(wide, source_of(items), len(items), items.shape[1]), tolerance)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('size', [1, 7, 30, 60, 100])
 def test_results_do_not_depend_on_the_blocks(wide, items, model, size):
     expected = plain_evaluation(wide, items, model)
@@ -244,7 +242,6 @@ def test_exact_rows_are_kept_only_within_the_memory_limit(
             assert set(source.calls) == every
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('rank', [20, 400])
 def test_few_rows_that_need_a_large_basis_are_kept_in_single_precision(rank):
     scenario = Scenario(n_subbands=40, n_frames=2, n_feeds=2, elements_per_side=6)

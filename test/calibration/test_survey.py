@@ -62,7 +62,6 @@ def estimate(beams):
     return survey(DECLARED, beams, *send(HALL, beams, 100))
 
 
-@pytest.mark.slow
 def test_fields_are_those_of_the_hall(estimate):
     assert estimate.multipath_to_los_db == pytest.approx(-5, abs=1)
     assert estimate.delay_spread_s == pytest.approx(200e-9, rel=0.2)
@@ -71,7 +70,6 @@ def test_fields_are_those_of_the_hall(estimate):
     assert estimate.about['prior_weight'] > 200
 
 
-@pytest.mark.slow
 def test_the_covariance_is_that_of_the_hall(estimate, beams):
     measured = MeasurementModel(dataclasses.replace(DECLARED, multipath=estimate), beams)
     true = MeasurementModel(HALL, beams)
@@ -81,7 +79,6 @@ def test_the_covariance_is_that_of_the_hall(estimate, beams):
     assert 1 <= estimate.about['inflation'] < 1.4
 
 
-@pytest.mark.slow
 def test_estimates_after_a_survey_are_in_their_regions(shipped):
     """Directions of arrival that no fields describe, learnt from 100 positions."""
     rng, declared = np.random.default_rng(4), Scenario()
@@ -107,7 +104,6 @@ def test_estimates_after_a_survey_are_in_their_regions(shipped):
     assert min(shares['declared']) < 0.8
 
 
-@pytest.mark.slow
 def test_positions_behind_obstacles_are_left_out(beams):
     """A third of the positions receives multipath alone, 6 dB weaker than that of the others."""
     positions, received = send(HALL, beams, 30)
@@ -121,7 +117,6 @@ def test_positions_behind_obstacles_are_left_out(beams):
         estimate.excess, alone.excess, atol=1e-3 * np.abs(alone.excess).max())
 
 
-@pytest.mark.slow
 def test_users_in_sight_with_strong_multipath_take_part(beams):
     """The level of the multipath has a standard deviation of 3 dB among users."""
     positions, received = send(HALL, beams, 60)
@@ -132,7 +127,6 @@ def test_users_in_sight_with_strong_multipath_take_part(beams):
     assert estimate.about['level_std_db'] > 2
 
 
-@pytest.mark.slow
 def test_impairments_are_estimated_with_the_multipath(beams):
     """The region has no extent along z."""
     impaired = {'user_gain_std_db': 3.0, 'phase_std_rad': 6.2832, 'timing_std_s': 5e-9,
@@ -151,7 +145,6 @@ def test_impairments_are_estimated_with_the_multipath(beams):
     assert errors[0] < 1.1 * errors[1]
 
 
-@pytest.mark.slow
 def test_a_calibrated_surface_takes_part(beams):
     """A gain of a band is not multipath if the surface explains it."""
     rng = np.random.default_rng(0)
@@ -165,7 +158,6 @@ def test_a_calibrated_surface_takes_part(beams):
     assert levels[1] > levels[0] + 1
 
 
-@pytest.mark.slow
 def test_one_position_yields_nearly_the_fields_and_a_warning(beams):
     with pytest.warns(SurveyWarning, match='expected at least 20'):
         estimate = survey(DECLARED, beams, *send(HALL, beams, 1))
@@ -176,7 +168,6 @@ def test_one_position_yields_nearly_the_fields_and_a_warning(beams):
     assert 1.2 < estimate.about['inflation'] < 2
 
 
-@pytest.mark.slow
 def test_repeated_signals_add_nothing(beams):
     """A survey of 10 places whose signals were recorded six times is one of 10 places."""
     positions, received = send(HALL, beams, 10)
@@ -199,7 +190,6 @@ def test_repeated_signals_add_nothing(beams):
         one.about['inflation'], rel=0.1)
 
 
-@pytest.mark.slow
 def test_a_walk_is_divided_into_places(shipped, monkeypatch):
     """Positions 3 cm apart, in a hall whose paths do not fade."""
     trace = runpy.run_path(str(EXAMPLES / 'box_hall.py'))['trace']
@@ -224,14 +214,12 @@ def test_a_walk_is_divided_into_places(shipped, monkeypatch):
     assert shares[1][1] < 0.85
 
 
-@pytest.mark.slow
 def test_shifted_positions_cause_a_warning(beams):
     positions, received = send(HALL, beams, 60)
     with pytest.warns(SurveyWarning, match=r'positions: \d+ of 60 do not fit a direct path'):
         survey(DECLARED, beams, positions + [0.0, 1.0, 0.0], received)
 
 
-@pytest.mark.slow
 def test_a_declared_share_of_blocked_users_causes_no_warning(beams):
     positions, received = send(HALL, beams, 60)
     model = MeasurementModel(HALL, beams)

@@ -349,6 +349,7 @@ def test_levels_are_equally_spaced_from_0_to_1():
     assert on_levels(SCENARIO, analog) is analog
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('levels', [2, 4])
 def test_optimised_levels_beat_rounding(continuous, levels):
     scenario = with_levels(levels)

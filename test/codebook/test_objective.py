@@ -21,7 +21,6 @@ from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
 
 
-@pytest.mark.slow
 def test_the_relative_error_of_the_average_bound_is_below_a_thousandth(table1, shipped):
     scenario = table1.scenario
     positions = scenario.sample_positions(200, np.random.default_rng(0))
@@ -54,7 +53,6 @@ def test_ambiguity_is_the_pairwise_error_cost_of_the_plain_equations(
 PHASES = {'phase_std_rad': 0.4, 'band_phase_std_rad': 0.8}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize(('name', 'phases'), [
     *((name, {}) for name in OBJECTIVES), ('ambiguity', PHASES), ('error', PHASES)])
@@ -95,7 +93,6 @@ def test_error_weights_pairs_by_a_power_of_their_volumes(scenario, random_beams,
     assert value == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('name', ['ambiguity', 'error'])
 @pytest.mark.parametrize(('change', 'greater'), [
     ({'band_phase_std_rad': 2 * np.pi}, 1.05), ({'phase_std_rad': 2 * np.pi}, 1.0)])
@@ -108,7 +105,6 @@ def test_unknown_phases_raise_the_cost_of_confusions(
     assert unknown > greater * known
 
 
-@pytest.mark.slow
 def test_optimising_the_ambiguity_lowers_it_on_held_out_pairs(scenario):
     result = optimize(scenario, method='lbfgs', objective='ambiguity', n_positions=128, seed=1,
                       max_steps=30)
@@ -180,7 +176,6 @@ def test_sobol_puts_one_point_in_each_slice(n, seed):
         np.sort(np.floor(unit * n), axis=0), np.tile(np.arange(n)[:, None], 3))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('bands', BANDS)
 @pytest.mark.parametrize('region', [LOPSIDED, Scenario()], ids=['lopsided', 'table1'])
 def test_confusable_positions_differ_and_are_in_the_region(region, bands):

@@ -75,7 +75,6 @@ def evaluated(monkeypatch):
     return seen
 
 
-@pytest.mark.slow
 def test_the_best_codebook_is_feasible_and_has_the_reported_bound(
         scenario, positions, result, plain):
     result.codebook.check(scenario)
@@ -101,7 +100,6 @@ def assert_consistent(history):
         assert after.elapsed_s >= before.elapsed_s
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('objective', OBJECTIVES)
 @pytest.mark.parametrize('method', SEARCHING)
 def test_every_method_lowers_every_objective(scenario, positions, method, objective, evaluated):
@@ -321,7 +319,6 @@ def steps_of(history):
     return [(entry.step, entry.evaluations) for entry in history]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('method', SEARCHING)
 def test_a_result_can_be_resumed(scenario, positions, method):
     half = max(FEW_STEPS[method] // 2, 1)

@@ -15,6 +15,7 @@ from rhs_isac_ros.support.pictures import write_picture
 HISTORY = [Progress(0, 1, 3.0, 0.1), Progress(1, 2, 1.0, 0.2)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('n_bands', [1, 4])
 def test_draws_any_number_of_bands(scenario, n_bands, tmp_path):
     pytest.importorskip('matplotlib')

@@ -66,7 +66,6 @@ def test_each_reason_leaves_out_a_command(by_page):
         assert any(re.match(pattern, command) for command in every), pattern
 
 
-@pytest.mark.slow
 def test_quick_commands_run_as_the_pages_state(by_page, built_scripts, tmp_path):
     n_run = 0
     for name, found in by_page.items():

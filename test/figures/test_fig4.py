@@ -52,7 +52,6 @@ def test_a_verdict_follows_from_the_interval_of_enough_results(
     assert fig4_report.verdict(42, *interval, positions, trainings) == expected
 
 
-@pytest.mark.slow
 def test_the_claims_have_the_measured_reductions(results):
     (condition,) = results.conditions
     for benchmark, claimed, percent, expected in (
@@ -98,7 +97,6 @@ def test_trials_may_share_the_positions():
     assert results.without_fix[condition, 'random'] == 2
 
 
-@pytest.mark.slow
 def test_the_report_has_tables_picture_and_data(results, tmp_path, capsys):
     options = argparse.Namespace(trials=3, pairs=7, output=tmp_path, format='png')
     fig4_report.write(results, options)
@@ -139,7 +137,6 @@ def test_options_select_the_conditions(monkeypatch, arguments, conditions):
     assert seen[0].rows == (fig4.QUICK_ROWS if '--quick' in arguments else fig4.ROWS)
 
 
-@pytest.mark.slow
 def test_the_command_writes_all_files_and_repeats_no_job(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(fig4, 'optimize', functools.partial(fig4.optimize, max_steps=8))
     monkeypatch.setattr(fig4, 'SAMPLES', 4)

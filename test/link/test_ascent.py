@@ -49,7 +49,6 @@ def ascended(scenario, link, n=10):
             yield (band, *each)
 
 
-@pytest.mark.slow
 def test_the_capacity_never_decreases(scenario, link):
     for band, start, digital, found, better in ascended(scenario, link):
         assert found.min() >= 0
@@ -65,7 +64,6 @@ def test_an_ascent_does_not_depend_on_the_others(scenario, link):
         np.testing.assert_array_equal(ascend(link, before[:, n:n + 1])[0], found[:, n:n + 1])
 
 
-@pytest.mark.slow
 def test_no_single_element_at_an_end_of_its_range_increases_the_capacity(scenario, link):
     for band, start, _, found, digital in ascended(scenario, link, 1):
         if not start.any():

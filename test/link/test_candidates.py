@@ -49,7 +49,6 @@ def test_an_ascent_from_the_best_configuration_increases_the_capacity_little(tab
     assert (after < before * 1.001).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('width_hz', [1e5, 1e8, 4e8])
 @pytest.mark.parametrize('multipath_db', [-20.0, 0.0, 20.0])
 def test_the_best_capacity_is_close_to_that_of_all_corners(width_hz, multipath_db):

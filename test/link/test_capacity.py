@@ -137,7 +137,6 @@ def test_invalid_moments_are_errors_that_name_the_field(table1, mean, covariance
         posterior_points(table1.scenario, mean, covariance)
 
 
-@pytest.mark.slow
 def test_a_measured_covariance_has_its_own_capacity(table1, reference_link, shipped):
     """Multipath of one direction: the covariance is complex, unlike a declared one."""
     scenario, rng = table1.scenario, np.random.default_rng(0)
@@ -217,7 +216,6 @@ def test_both_cuts_contain_the_strongest_direction(small):
     assert (elevation_cut == found.relative[:, column]).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('azimuth_deg', [-30.0, 25.0])
 def test_the_strongest_direction_is_the_direction_of_steering(azimuth_deg):
     scenario, azimuth = Scenario(), np.radians(azimuth_deg)

@@ -80,7 +80,6 @@ def test_no_beam_waits_for_tables_after_the_preparation(small):
     assert [cache.cache_info().misses for cache in caches] == before
 
 
-@pytest.mark.slow
 def test_a_beam_of_a_small_surface_is_close_to_the_optimum(small, reference_link):
     """The optimum is a corner of the box; water-filling divides the power evenly here."""
     scenario, link = small.scenario, reference_link(small)
@@ -146,7 +145,6 @@ def test_choosing_from_no_band_is_an_error(table1):
         choose_beam(table1.scenario, POSITION, np.eye(3), [])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('band', [0, 1])
 def test_capacities_of_the_outcome_match_the_reference(table1, reference_link, band):
     scenario, link = table1.scenario, reference_link(table1, band)

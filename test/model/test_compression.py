@@ -49,6 +49,7 @@ def test_the_whitener_whitens_combined_signals():
                                atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('simulate', [
     lambda model, positions, rng: simulate_received(WIDE, model.beams, positions, rng),
     MeasurementModel.sample], ids=['simulate_received', 'sample'])

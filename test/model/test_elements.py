@@ -64,7 +64,6 @@ def test_a_higher_share_adds_failures():
     np.testing.assert_array_equal(many.stuck[failed], few.stuck[failed])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('errors', ERRORS, ids=str)
 def test_mean_and_covariance_are_those_over_surfaces(small, errors):
     scenario = dataclasses.replace(small.scenario, **errors)

@@ -56,7 +56,6 @@ def test_the_regression_follows_the_maximum_over_the_parameters(joint):
         marginal.gradient - np.einsum('nab,nb->na', marginal.information, fixed), atol=1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('n', [1, 2])
 def test_the_volume_is_the_integral_over_the_parameters(n):
     """Of exp(g . x - x I x / 2) for other unknowns at several points, as a sum over a grid."""

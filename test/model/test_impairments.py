@@ -208,7 +208,6 @@ def every() -> Scenario:
     return Scenario(**BUILT_IN_STRENGTHS)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('check', CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize('field', [one.field for one in BUILT_IN])
 def test_every_built_in_impairment(field, check):

@@ -164,7 +164,6 @@ def sampled(case, positions, seed):
     return model.sample(positions, np.random.default_rng(seed))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(('draw', 'n'), [(simulated, N_PHASES), (sampled, 20_000)])
 def test_both_simulations_have_the_mean_and_covariance_of_the_vectors(case, draw, n):
     position = case.vectors['positions'][2]
@@ -173,7 +172,6 @@ def test_both_simulations_have_the_mean_and_covariance_of_the_vectors(case, draw
     assert_distributed_as_vectors(signals, case)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('draw', [simulated, sampled])
 def test_each_drawn_signal_belongs_to_its_position(case, model, draw):
     """300 positions make two blocks."""

@@ -39,7 +39,6 @@ def test_mean_los_power_is_the_adaptive_integral(other, band):
     assert mp.mean_los_power(other, band) == pytest.approx(expected, rel=1e-8)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(('band', 'm', 'n'), [(0, 0, 8), (1, 0, 1), (1, 7, 3), (1, 2, 6)])
 @pytest.mark.parametrize('direction', [(0.0, 0.0), (40.0, 0.0), (0.0, -25.0), (-60.0, 80.0)])
 def test_covariance_is_the_adaptive_integral(other, plain, direction, band, m, n):
@@ -105,7 +104,6 @@ def test_products_with_many_elements_are_convolutions(rectangle, by_convolution)
     assert_products(rectangle)
 
 
-@pytest.mark.slow
 def test_many_gains_are_drawn_as_plane_waves(rectangle, by_convolution, monkeypatch):
     monkeypatch.setattr(mp, '_ANGLE_NODES', 16)
     n, v = 4000, mp.multipath_covariance(rectangle)[1]

@@ -66,7 +66,6 @@ def reference(setting):
     return signals, positions, -np.sum(np.abs(signals - means)**2, axis=(1, 2))
 
 
-@pytest.mark.slow
 def test_evidence_is_the_average_likelihood(setting, reference):
     scenario, _, arrays = setting
     signals, _, exponent = reference
@@ -146,7 +145,6 @@ def test_templates_cover_all_ranges():
     assert counts[1] > counts[0] < counts[2]
 
 
-@pytest.mark.slow
 def test_users_around_the_region_get_no_fix_or_a_probability_outside(shipped, table1_estimator):
     """The shell extends from 0.5 m to 20 m."""
     scenario, rng = Scenario(), np.random.default_rng(2)
@@ -182,7 +180,6 @@ def test_users_around_the_region_get_no_fix_or_a_probability_outside(shipped, ta
         found.outside_probability[found.fix] <= 0.05)
 
 
-@pytest.mark.slow
 def test_the_prior_shifts_the_odds_of_a_user_outside(shipped):
     received = System(Scenario(), shipped).pairs(40, 6)[1]
     log_odds = {}
@@ -199,7 +196,6 @@ def test_the_prior_shifts_the_odds_of_a_user_outside(shipped):
     assert np.isnan(found.outside_probability).all()
 
 
-@pytest.mark.slow
 def test_no_position_is_less_probable_than_its_alternatives(shipped):
     """Also if users may be outside or blocked, and in a track."""
     scenario = dataclasses.replace(Scenario(), blocked_probability=0.1)
@@ -253,7 +249,6 @@ def test_blocked_users_have_the_multipath_alone(shipped):
         (element_by_element != before).any(axis=(1, 2)), blocked)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(('name', 'change', 'reject_outside'), [
     ('bayes', {}, True), ('ml', {}, False), ('bayes', {'user_gain_std_db': 3.0}, False),
     ('bayes', {'carrier_offset_std_hz': 500.0, 'phase_std_rad': 6.3}, False),
@@ -275,7 +270,6 @@ def test_the_probability_of_blocked_users_is_calibrated(name, change, reject_out
     assert probability[blocked].mean() > probability[~blocked].mean() + 0.3
 
 
-@pytest.mark.slow
 def test_the_inflation_of_a_survey_makes_no_user_in_sight_blocked(shipped):
     """The residuals are weaker than the inflated covariance, as those of a blocked user are."""
     declared = Scenario(multipath_to_los_db=-8.0)

@@ -33,7 +33,6 @@ def squared_normalised(errors, covariances):
     return np.einsum('nu,nu->n', errors, np.linalg.solve(covariances, errors[..., None])[..., 0])
 
 
-@pytest.mark.slow
 def test_the_covariance_describes_the_errors_on_table_1(table1_estimates):
     """The squared normalised error of three coordinates is 3 on average."""
     positions, _, estimate = table1_estimates
@@ -96,7 +95,6 @@ def test_a_position_just_outside_the_region_gives_one_inside(single_mode):
     assert np.linalg.eigvalsh(estimate.covariance).min() > 0
 
 
-@pytest.mark.slow
 def test_moments_match_a_brute_force_posterior(plain, random_beams):
     """The reference weights 65 536 points of a small region with the plain likelihood.
 
@@ -145,7 +143,6 @@ def share_covered(estimate, positions) -> float:
     return np.sum(normalised <= 7.815) / len(positions)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('changes', [
     {'user_gain_std_db': 3.0}, {'carrier_offset_std_hz': 2e3}, {'timing_std_s': 5e-8},
     {'phase_std_rad': 7.0}, {'band_phase_std_rad': 0.2},
@@ -221,7 +218,6 @@ def strong(random_beams):
     return scenario, codebook, positions, received
 
 
-@pytest.mark.slow
 def test_no_position_nearby_is_more_likely(strong, plain):
     """A search with the plain likelihood, from the true position, ends at the estimate."""
     scenario, codebook, positions, received = strong
@@ -306,7 +302,6 @@ def test_posteriors_of_several_shots_are_those_of_each(table1_estimator, phases)
     assert found[3].mixture is None
 
 
-@pytest.mark.slow
 def test_a_region_far_shorter_than_the_wavelength_has_a_mode_for_all_signals(random_beams):
     """The likelihood has no maximum along the range in the few cells near the prior of a track."""
     scenario = Scenario(
@@ -337,7 +332,6 @@ def test_few_and_strong_measurements_locate_users(random_beams):
     assert np.mean(squares < chdtri(3, 0.05)) > 0.88
 
 
-@pytest.mark.slow
 def test_regions_contain_the_range_within_a_wavelength(shipped):
     """With strong signals and partly known phases, most of the variance is within it."""
     scenario = Scenario(multipath_to_los_db=-40.0, band_phase_std_rad=1.0)
@@ -350,7 +344,6 @@ def test_regions_contain_the_range_within_a_wavelength(shipped):
     assert np.mean(squares < chdtri(3, 0.05)) > 0.85
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('changes', [
     {'roi_size_m': (10, 0, 0)}, {'roi_size_m': (0, 10, 2)}, {'roi_size_m': (0, 10, 0)},
     {'roi_size_m': (10, 10, 0), 'roi_center_m': (10, 0, -2)}, {'delay_spread_s': 0.0},

@@ -58,7 +58,6 @@ def test_arrays_of_the_table_match_their_definitions(random_beams):
     np.testing.assert_allclose(table['curvature'] / scale, expected / scale, atol=0.02)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('changes', [
     {}, {'delay_spread_s': 0.0}, {'delay_spread_s': 5e-9},
     {'delay_spread_s': 0.0, 'multipath_to_los_db': -20.0}], ids=str)
@@ -164,7 +163,6 @@ def test_starts_are_sorted_separate_and_within_the_margin(scenario, likelihood, 
      'roi_center_m': (1.0, 0.0, 0.0), 'roi_size_m': (1.0, 1.0, 0.5)},
     {'roi_center_m': (30.0, 0.0, 0.0), 'roi_size_m': (50.0, 40.0, 4.0)},
 ], ids=['aperture', 'bandwidth', 'near field', 'large region'])
-@pytest.mark.slow
 def test_the_search_finds_the_true_mode_at_every_scale(changes, random_beams):
     scenario = Scenario(n_frames=4, multipath_to_los_db=-10.0, **changes)
     likelihood = Likelihood(System(scenario, random_beams(scenario, np.random.default_rng(0))))

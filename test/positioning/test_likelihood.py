@@ -92,7 +92,6 @@ def test_the_gradient_is_that_of_the_log_likelihood(codebook, changes):
         assert difference == pytest.approx(gradient[0, index], rel=1e-3, abs=1e-3 / scale[index])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('changes', [{}, ALL, NOISY], ids=['position', 'all parameters', 'noise'])
 def test_the_information_is_the_covariance_of_the_gradient(codebook, changes):
     """Averaged over signals at the true parameters, without the prior.
@@ -116,7 +115,6 @@ def test_the_information_is_the_covariance_of_the_gradient(codebook, changes):
     np.testing.assert_allclose(found, information / np.outer(scale, scale), atol=0.15)
 
 
-@pytest.mark.slow
 def test_the_signals_alone_reveal_the_offsets_of_carrier_and_timing(codebook):
     scenario = declaring(carrier_offset_std_hz=2e3, timing_std_s=1e-7)
     likelihood = Likelihood(System(scenario, codebook))

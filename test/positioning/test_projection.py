@@ -52,7 +52,6 @@ def test_means_outside_of_the_basis_have_hardly_any_energy(system, model):
     assert np.mean(all_of_it - kept) < 2 * projection.MAX_LOSS + 1e-9 * all_of_it.mean()
 
 
-@pytest.mark.slow
 def test_estimates_are_those_from_all_signals(monkeypatch, system, shots):
     _, received = shots
     few = make_estimator('bayes', WIDE, system.codebook, reject_outside=True)

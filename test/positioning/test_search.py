@@ -70,7 +70,6 @@ def test_the_true_position_is_not_more_likely_than_the_best_mode(setting):
     assert 0.5 < np.mean(best - truths) < 4
 
 
-@pytest.mark.slow
 def test_no_ascent_ends_below_its_start(random_beams):
     """With few measurements, the likelihood is far from quadratic."""
     scenario = dataclasses.replace(
@@ -134,7 +133,6 @@ def test_steps_continue_until_they_gain_nothing(codebook):
     assert np.abs(modes.points - points[modes.shots]).max() < 5e-5
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('changes', [{'user_gain_std_db': 1.0}, {'phase_std_rad': 0.5}], ids=str)
 def test_the_likelihood_of_a_mode_is_the_average_over_the_parameter(codebook, changes):
     """The reference integrates numerically at the position of the mode."""

@@ -13,7 +13,6 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BsState
 from rhs_isac_ros.protocol.settings import TRACK, PositionerSettings
 
-pytestmark = pytest.mark.slow
 # Messages of one cycle with two bands of two frames.
 OF_A_CYCLE = [m.Beacon, m.Ack, m.Grant, m.RhsCommand, m.RhsCommand, m.RhsConfiguration,
               m.RhsConfiguration, m.PilotRequest, m.Pilot, m.Pilot, m.FeedSignals, m.FeedSignals,

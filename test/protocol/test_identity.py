@@ -8,8 +8,6 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BsState
 from rhs_isac_ros.protocol.events import PauseRequested, PeersChanged, Resumed, StoodBy
 
-pytestmark = pytest.mark.slow
-
 
 def grants(net, since=0):
     return [grant.user_instance for grant in net.sent(m.Grant, since=since)]

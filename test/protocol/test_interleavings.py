@@ -13,8 +13,6 @@ from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BsState
 
-pytestmark = pytest.mark.slow
-
 STEP_S, ACK_S, REST_S = 0.2, 0.05, 0.08
 # Duration of the faults, and the time within which every user must be served after it.
 FAULTS_END_S, RECOVERY_S = 1.0, 3.0

@@ -9,8 +9,6 @@ from in_memory_network import LATENCY_S, SUBSCRIPTIONS, Fault, Noisy, faults, on
 
 from rhs_isac_ros.protocol import messages as m
 
-pytestmark = pytest.mark.slow
-
 POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
 DOWN = {'direction': m.Direction.DOWNLINK}
 UP = {'direction': m.Direction.UPLINK}
