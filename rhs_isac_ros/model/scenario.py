@@ -110,6 +110,9 @@ class Table1:
         label='size of the region')
 
 
+_WRAPPED = 'wrapped normal distribution, Mardia and Jupp, Directional Statistics, 2000, sec. 3.5'
+
+
 @dataclasses.dataclass(frozen=True)
 class Extensions:
     """Effects beyond the paper's model; with the defaults, none of them changes it.
@@ -150,14 +153,12 @@ class Extensions:
         0.0, 0.0, 1e3,
         'Standard deviation of a phase that all bands of a cycle share; 6.2832 for a uniform '
         'phase.', 'rad',
-        'wrapped normal distribution, Mardia and Jupp, Directional Statistics, 2000, '
-        'section 3.5', label='common phase, standard deviation', has_unknown=True)
+        _WRAPPED, label='common phase, standard deviation', has_unknown=True)
     band_phase_std_rad: float = declare(
         0.0, 0.0, 1e3,
         'Standard deviation of a phase that each band of a cycle draws independently, as after '
         'retuning an oscillator; 6.2832 for a uniform phase.', 'rad',
-        'wrapped normal distribution, Mardia and Jupp, Directional Statistics, 2000, '
-        'section 3.5', label='phase of a band, standard deviation', has_unknown=True)
+        _WRAPPED, label='phase of a band, standard deviation', has_unknown=True)
     timing_std_s: float = declare(
         0.0, 0.0, 1.0,
         'Standard deviation of the sampling-time offset of a cycle, which adds a phase that is '
@@ -236,8 +237,7 @@ class Extensions:
         None, 0.0, 0.0,
         'File of propagation paths of users at known positions. Simulated signals then follow '
         'these paths instead of a direct path and random multipath. Estimators and bounds '
-        'ignore the file.',
-        '', label='channel')
+        'ignore the file.', '', label='channel')
     pose: Pose = declare(
         Pose(), -1e6, 1e6,
         'Pose of the surface in the frame of the site: a mapping of position_m, quaternion '
@@ -253,6 +253,10 @@ _EXTERNAL: dict[str, type[External]] = {
     'element_gain': GainPattern, 'user_gain': GainPattern, 'multipath': MultipathEstimate,
     'channel': PathChannel}
 _FILES = [name for name, kind in _EXTERNAL.items() if issubclass(kind, ArrayFile)]
+# Fields of `Extensions` that the identifier contains although they have their default values.
+_OF_EVERY_ID = {
+    'amplitude_levels', 'multipath_to_los_db', 'user_gain_std_db', 'phase_std_rad', 'timing_std_s',
+    'band_phase_std_rad', 'carrier_offset_std_hz', 'element_error_rms', 'failed_element_share'}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -310,11 +314,9 @@ class Scenario(Extensions, Table1):
         if self.amplitude_levels == 1:
             raise ScenarioError(
                 'amplitude_levels: 1, expected 0 for continuous amplitudes, or at least 2')
-        if misfit := self.board.misfit(self):
-            raise ScenarioError(f'board: {misfit}')
-        for name in _FILES:
-            arrays = getattr(self, name)
-            if arrays is not None and (misfit := arrays.misfit(self)):
+        for name in ('board', *_FILES):
+            part = getattr(self, name)
+            if part is not None and (misfit := part.misfit(self)):
                 raise ScenarioError(f'{name}: {misfit}')
 
     def _check_elements(self) -> None:
@@ -387,11 +389,8 @@ class Scenario(Extensions, Table1):
     def id(self) -> str:
         """Hash of the fields: ``sc`` and 16 hex digits, which YAML never parses as a number."""
         changes, fields = self.changes(), self.fields()
-        for name in ('impairments', 'subband_spacing_hz', 'multipath_direction_deg',
-                     'blocked_probability', 'outside_probability', *_FILES, 'pose',
-                     'element_positions_m', 'element_normals', 'board', 'retune_s',
-                     'user_speed_std_mps'):
-            # Existing files contain identifiers from before these fields were introduced.
+        # A field that is introduced later must leave the identifiers in existing files valid.
+        for name in {field.name for field in dataclasses.fields(Extensions)} - _OF_EVERY_ID:
             if name not in changes:
                 del fields[name]
             elif name in _FILES:
