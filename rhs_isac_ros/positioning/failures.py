@@ -384,7 +384,10 @@ class FailureModel:
         """Return places at points [P, 3] with parameters [P, Q], for the signals of one shot."""
         prior = self.likelihood.nuisance
         mean, slopes = self.surfaces.intact.mean_and_jacobian(*prior.states(points, values))
-        columns = prior.columns(values, signals.received, mean, slopes)[:, :4 + len(prior)]
+        divided = prior.divide(signals.received, values)
+        columns = np.concatenate([
+            (divided - mean)[:, None], slopes,
+            prior.derivatives(divided, mean)[:, prior.velocity.shape[1]:]], axis=1)
         return [Place(self, *each) for each in zip(points, values, columns, strict=True)]
 
     def elements_at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -26,6 +26,8 @@ UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
 # density then has many peaks along the range, too narrow for Gaussians. Its information is added
 # to the samples of the posterior afterwards.
 COARSE_STD_RAD = 0.75
+# Share of the multipath in derivatives above which it counts as 1, to save a product.
+_WHOLE_SHARE = 0.7
 # Largest logarithm of the power of noise relative to signals, which keeps it finite.
 _MAX_EXPONENT = 300.0
 
@@ -56,6 +58,9 @@ class NuisancePrior(Exponents):
     #: Half of the change of a parameter that does not change the signals, float64 [Q].
     half_period: np.ndarray
     information: np.ndarray  #: Contribution of the model's covariance, float64 [Q, Q].
+    #: Factor of the received multipath in derivatives with respect to the parameters, so that the
+    #: expected information about each of them is that of the covariance, float64 [Q].
+    multipath_share: np.ndarray
     noise_share: float  #: Largest share of thermal noise in a whitened measurement.
 
     def __init__(self, model: MeasurementModel) -> None:
@@ -93,6 +98,9 @@ class NuisancePrior(Exponents):
         self.gains, self.has_gain = self.scaled_patterns.real.mean(axis=2).T, declared.has_gain
         self._operators = self._multiplying(model.root, model.whitener)
         self.information = self.information_of(model.root, model.whitener)
+        energy = 2 * np.sum(np.abs(self._operators)**2, axis=(1, 2, 3))
+        share = np.sqrt(np.diagonal(self.information) / np.where(energy, energy, 1.0))
+        self.multipath_share = self.moves_multipath * np.where(share > _WHOLE_SHARE, 1.0, share)
         self.noise_share = self.scenario.noise_power_w * float(
             np.sum(np.abs(model.whitener)**2, axis=2).max())
 
@@ -188,10 +196,11 @@ class NuisancePrior(Exponents):
         """
         divided, n_moving = self.divide(received, values), self.velocity.shape[1]
         n_points = slopes.shape[1] - n_moving
+        share = self.multipath_share[:, None, None]
+        expected = self.scaled_patterns * ((1 - share) * mean[:, None] + share * divided[:, None])
         return np.concatenate([
-            (divided - mean)[:, None], slopes, self.derivatives(divided, mean)[:, n_moving:],
-            *linear, slopes[:, n_points:], (self.scaled_patterns * divided[:, None])[:, n_moving:]
-        ], axis=1)
+            (divided - mean)[:, None], slopes, expected[:, n_moving:], *linear,
+            slopes[:, n_points:], (self.scaled_patterns * divided[:, None])[:, n_moving:]], axis=1)
 
     def slopes(self, whitened: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Multiply whitened signals and means, [M, N_B, N_SB F], by W P W^-1.
@@ -200,15 +209,17 @@ class NuisancePrior(Exponents):
         they are equal.
         """
         # P is the same in all measurements of a band, unless it moves the multipath.
-        constants, moves = self.scaled_patterns[:, :, :1], self.moves_multipath
+        constants, shares = self.scaled_patterns[:, :, :1], self.multipath_share
         observed = constants * np.broadcast_to(whitened, mean.shape)[:, None]
-        for row in np.flatnonzero(moves):
+        expected = observed if (shares == 1).all() else constants * mean[:, None]
+        for row in np.flatnonzero(self.moves_multipath):
             observed[:, row] = multiply_rows(self._operators[row], whitened)
-        observed = observed.reshape(*observed.shape[:2], mean[0].size)
-        if moves.all():
-            return observed, observed
-        expected = (constants * mean[:, None]).reshape(observed.shape)
-        return np.where(moves[:, None], observed, expected), observed
+            expected[:, row] = observed[:, row] if shares[row] == 1 else (
+                shares[row] * observed[:, row]
+                + (1 - shares[row]) * multiply_rows(self._operators[row], mean))
+        shape = (*observed.shape[:2], mean[0].size)
+        flat = observed.reshape(shape)
+        return flat if expected is observed else expected.reshape(shape), flat
 
     def log_prior(self, values: np.ndarray) -> np.ndarray:
         """Return the logarithm of the prior times the change of volume, float64 [M]."""
