@@ -469,19 +469,24 @@ class ElementSums:
         n_slopes = by_coordinate.shape[2]
         n_terms = 2 + self._n_sums if n_slopes else 1
         rows = np.empty((n_bands, n, 1 + n_slopes, n_subbands, n_frames), complex)
-        terms = np.empty((n, n_terms, n_subbands, 1), complex)
         moments = self._moments.reshape(n_bands, n_subbands, n_elements, -1, n_frames)
-        for (band, frame), time_s in np.ndenumerate(frame_times_s(self._scenario)):
-            places = states[:, :3] + time_s * states[:, 3:]
+        # Users at rest are at one place in all frames.
+        n_same = 1 if states[:, 3:].any() else n_frames
+        terms = np.empty((n, n_terms, n_subbands, n_same), complex)
+        for band, first in np.ndindex(n_bands, n_frames // n_same):
+            same = slice(first, first + n_same)
+            times_s = frame_times_s(self._scenario)[band, same]
+            places = states[:, :3] + times_s[0] * states[:, 3:]
             waves = los_waves(self._scenario, places, [band], slopes=n_slopes > 0)
-            self._add_up(
-                waves, self._frames[[band], ..., frame, None], moments[[band], ..., frame],
-                terms[None])
-            rows[band, :, 0, :, frame] = terms[:, 0, :, 0]
+            self._add_up(waves, self._frames[[band], ..., same], moments[
+                [band], ..., same].reshape(1, n_subbands, n_elements, -1), terms[None])
+            rows[band, :, 0, :, same] = terms[:, 0]
             if n_slopes:
-                by_place = by_coordinate[:, :3] + time_s * by_coordinate[:, 3:]
-                weights = np.matmul(np.swapaxes(by_place, 1, 2), self.weights(places))
-                rows[band, :, 1:, :, frame] = np.matmul(weights, terms[:, 1:, :, 0])
+                weights = self.weights(places)
+                for frame, time_s in enumerate(times_s):
+                    by_place = by_coordinate[:, :3] + time_s * by_coordinate[:, 3:]
+                    rows[band, :, 1:, :, first + frame] = np.matmul(np.matmul(
+                        np.swapaxes(by_place, 1, 2), weights), terms[:, 1:, :, frame])
         return rows.reshape(n_bands, n, 1 + n_slopes, -1)
 
     def _add_up(self, waves: Waves, frames: np.ndarray, moments: np.ndarray, terms: np.ndarray

@@ -26,7 +26,7 @@ from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.grid import Starts
 from rhs_isac_ros.positioning.lattice import Resolution, subband_wavenumbers, unit_points
 from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
-from rhs_isac_ros.positioning.search import Modes, ascend
+from rhs_isac_ros.positioning.search import Modes, ascend, one_step
 from rhs_isac_ros.system import System
 
 # Speeds of users whose scenario declares none [m/s]: one at which frames are long, and the
@@ -35,6 +35,8 @@ _WALKING_MPS, _WALKING_STD_MPS = 1.5, 1.0
 # Prior probability that a user moves otherwise, and largest probability with a fix: above it, a
 # 95 % region cannot attain its coverage.
 _PRIOR, _LIMIT = 0.05, 0.05
+# Log ratio of evidences, predicted at a mode, below which an exact one is never above the limit.
+_IMPROBABLE = -3.0
 # Probability of a residual and a velocity below which the user may be faster than declared.
 _TOO_FAST = 2e-3
 # Numbers of powers of the direct path, and of positions from whose means these follow; largest
@@ -109,8 +111,10 @@ class MovementTest:
             self._system.scenario.user_speed_std_mps / _WALKING_STD_MPS)
         values[:, n_wide:n_wide + others.shape[1]] = others
         starts = Starts(np.zeros(len(others), int), modes.points, values)
-        found = ascend(self._conditional, walking, starts, walking.signals(signals.received), 1)
-        return _log_mass(found) - _log_mass(modes)
+        args = self._conditional, walking, starts, walking.signals(signals.received)
+        mass = _log_mass(modes)
+        predicted = _log_mass(one_step(*args)[0]) - mass
+        return predicted if predicted < _IMPROBABLE else _log_mass(ascend(*args, 1)) - mass
 
     def _too_fast(self, fit: Fit) -> str:
         """Return the reason if residual and velocity are improbable together, or ''."""

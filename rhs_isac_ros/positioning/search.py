@@ -161,8 +161,8 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     is the negative logarithm of the share of the posterior that discarded modes may have.
     """
     def step(starts: Starts, moves: bool = True) -> tuple[Modes, np.ndarray]:
-        return _step(conditional, likelihood, starts, select(signals, starts.shots), state,
-                     moves)
+        return one_step(conditional, likelihood, starts, select(signals, starts.shots), state,
+                        moves)
 
     modes, gain = step(starts)
     # Points that the latest steps started from, and the known log-likelihoods there.
@@ -254,9 +254,12 @@ def _settled(conditional: Conditional, likelihood: Likelihood, points: np.ndarra
     return located, values
 
 
-def _step(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
-          state: int, moves: bool = True) -> tuple[Modes, np.ndarray]:
-    """Take a Gauss-Newton step, or none without `moves`; return the modes and gains, [M]."""
+def one_step(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
+             state: int = 0, moves: bool = True) -> tuple[Modes, np.ndarray]:
+    """Take a Gauss-Newton step, or none without `moves`; return the modes and gains, [M].
+
+    Takes the signals of one shot or of each start. The modes are as predicted at the starts.
+    """
     points = starts.points
     located, values = _settled(conditional, likelihood, points, starts.values, signals)
     local = located.local(values, signals)
