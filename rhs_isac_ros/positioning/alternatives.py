@@ -76,8 +76,9 @@ class OutsideGrid(NamedTuple):
     # Quadrature over the gain: spacing [nepers], and reach in standard deviations.
     gain_step: float = 0.04
     gain_reach: float = 4.0
-    # Number of templates to compute at a time.
+    # Numbers of templates, and of shots, to compute at a time.
     block: int = 512
+    shots: int = 16
 
 
 GRID = OutsideGrid()
@@ -100,20 +101,20 @@ class Blocked:
         self.log_odds = log_odds_of(scenario.blocked_probability)
         self._median_db, self._std_db = scenario.multipath_level_db
 
-    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
-                        prior: NuisancePrior) -> float:
-        """Compute the log evidence from the energies of the signals; see `Outside`."""
-        energy = np.array([residual, np.sum(np.abs(whitened)**2)])
+    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residuals: np.ndarray,
+                        prior: NuisancePrior) -> np.ndarray:
+        """Compute log evidences from the energies of the signals; see `Outside`."""
+        energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
         # The gain of the user is part of the level.
         gain_db = min(prior.gain_std / NEPERS_PER_DB, _UNKNOWN_GAIN_DB)
         std_db = math.hypot(BLOCKED_STD_DB, self._std_db, gain_db)
         in_sight, blocked = (
-            float(log_evidence_of_level(energy[[index]], self._n, std, self._median_db)[0])
-            for index, std in enumerate((self._std_db, std_db)))
+            log_evidence_of_level(energy, self._n, std, self._median_db)
+            for energy, std in ((residuals, self._std_db), (energies, std_db)))
         if prior.gain_std:
             # Relative to the density of an unknown gain that positions assume.
             blocked += math.log(gain_db * NEPERS_PER_DB / prior.gain_unit)
-        return blocked - (in_sight + residual) + prior.log_evidence_of_aligned(aligned)
+        return blocked - (in_sight + residuals) + prior.log_evidence_of_aligned(aligned)
 
     def seen(self, model: MeasurementModel, received: np.ndarray, whitened: np.ndarray
              ) -> np.ndarray:
@@ -215,30 +216,36 @@ class Outside:
         changed.log_odds = log_odds_of(wrong * self._probability)
         return changed
 
-    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
-                        prior: NuisancePrior) -> float:
-        """Compute the logarithm of the evidence with the nuisance parameters integrated out.
+    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residuals: np.ndarray,
+                        prior: NuisancePrior) -> np.ndarray:
+        """Compute logarithms of evidences with the nuisance parameters integrated out, [N].
 
-        `aligned`, float64 [Q], contains the parameters that follow from the signals alone, and 0
-        for the others. `whitened`, complex128 [N_B, N_SB F], are the signals of one shot without
-        the factors of `aligned`. `residual` is the residual energy at the best position inside.
+        `aligned`, float64 [N, Q], contains the parameters that follow from the signals alone, and
+        0 for the others. `whitened`, complex128 [N, N_B, N_SB F], are the signals of N shots
+        without the factors of `aligned`. `residuals`, [N], are the residual energies at the best
+        positions inside.
         """
-        known = prior.log_evidence_of_aligned(aligned)
-        if not prior.gain_std:
-            return float(self.log_evidence(whitened)[0]) + known
+        found = np.concatenate([
+            self._over_gain(whitened[block], prior) if prior.gain_std
+            else self.log_evidence(whitened[block])[:, 0]
+            for block in blocks(len(whitened), 1 if prior.gain_std else GRID.shots)])
+        return found + prior.log_evidence_of_aligned(aligned)
+
+    def _over_gain(self, whitened: np.ndarray, prior: NuisancePrior) -> np.ndarray:
+        """Return the log evidence of one shot, N = 1, averaged over an unknown gain, [1]."""
         low, high = self._gain_limits(whitened, prior.gain_std)
         gain, step = np.linspace(
             low, high, 3 + int(np.ceil((high - low) / GRID.gain_step)), retstep=True)
         log_density = -(gain / prior.gain_std)**2 / 2 - 2 * whitened.size * gain
-        evidence = self.log_evidence(whitened, np.exp(-gain), log_density)
-        return log_sum(evidence) + math.log(step / prior.gain_unit / math.sqrt(2 * np.pi)) + known
+        log_total = log_sum(self.log_evidence(whitened, np.exp(-gain), log_density))
+        return np.array([log_total + math.log(step / prior.gain_unit / math.sqrt(2 * np.pi))])
 
     def _gain_limits(self, whitened: np.ndarray, std: float) -> tuple[float, float]:
         """Return limits of the gain [nepers] beyond which its posterior is negligible."""
         # Without a prior, the most likely gain makes the energy of all signals, or of what no
         # position explains in them, equal to that of noise.
         energy, n = float(np.sum(np.abs(whitened)**2)), whitened.size
-        filtered = np.sum(self._filter(whitened), axis=0)**2 / self._node_energy
+        filtered = np.sum(self._filter(whitened), axis=1)**2 / self._node_energy
         rest = max(energy - float(filtered.max()), n * _MIN_PROBABILITY)
         reach, margin = GRID.gain_reach * std, GRID.gain_reach / math.sqrt(n)
         low, high = (math.log(part / n) / 2 for part in (rest, energy))
@@ -246,51 +253,53 @@ class Outside:
 
     def log_evidence(self, whitened: np.ndarray, scales: np.ndarray = _ONE,
                      log_weights: np.ndarray = _ZERO) -> np.ndarray:
-        """Return the log of the weighted mean of ``exp(-|s y - t|^2)`` over the prior.
+        """Return the log of the weighted mean of ``exp(-|s y - t|^2)`` over the prior, [N, S].
 
-        The signals y are `whitened`, and t is the whitened mean for a user outside. Returns a
-        value for each scale s, up to what is negligible among all of them.
+        The signals y of N shots are `whitened`, and t is the whitened mean for a user outside.
+        Returns a value for each scale s, up to what is negligible among all S of a shot.
         """
-        filtered, energy = self._filter(whitened), float(np.sum(np.abs(whitened)**2))
+        filtered = self._filter(whitened)
         # At any range, the log-likelihood is highest if the outputs of all bands are in phase.
-        bound = (np.sum(filtered, axis=0)**2 / self._node_energy).max(axis=0)
-        constants = log_weights - scales**2 * energy
-        least = float((scales**2 * bound.max() + constants).max()) - GRID.margin
-        likely = np.multiply.outer(scales**2, bound) >= (least - constants)[:, None]
-        directions = np.flatnonzero(likely.any(axis=0))
-        arguments, offset = (
-            filtered[:, :, directions][:, self._index] * self._scale, self._offset[:, directions])
-        row, column = np.nonzero(likely[:, directions])
-        factors = scales.astype(np.float32)
-        # A Bessel function I_0(x) is at most exp(x), so few places need its value.
-        highest = arguments.sum(axis=0).T[column] * factors[row, None]
-        highest += offset.T[column]
-        highest += constants[row, None].astype(np.float32)
-        best, at = np.unravel_index(np.argmax(highest), highest.shape)
-        amplitudes = factors[row[best]] * arguments[:, at, column[best]]
-        least = float(highest[best, at] - np.sum(amplitudes - _log_bessel(amplitudes)))
-        pair, place = np.nonzero(highest >= least - GRID.margin)
-        row, column = row[pair], column[pair]
-        logs = _log_bessel(factors[row] * arguments[:, place, column]).sum(axis=0)
-        logs = logs + offset[place, column] + constants[row]
-        largest = logs.max(initial=np.finfo(float).min)
+        bound = (np.sum(filtered, axis=1)**2 / self._node_energy).max(axis=1)
+        constants = log_weights - np.multiply.outer(
+            np.sum(np.abs(whitened)**2, axis=(1, 2)), scales**2)
+        bound = bound[:, None] * scales[:, None]**2 + constants[..., None]
+        shot, scale, direction = np.nonzero(
+            bound >= bound.max(axis=(1, 2), keepdims=True) - GRID.margin)
+        arguments = filtered[shot, :, :, direction][..., self._index].swapaxes(0, 1)
+        arguments = arguments * self._scale[:, 0] * scales.astype(np.float32)[scale, None]
+        of_shot, offset = Segments.of_keys(shot), self._offset.T[direction]
+        # A Bessel function I_0(x) is at most exp(x), and its logarithm is convex. So few places
+        # need its value.
+        total = arguments.sum(axis=0)
+        highest = total + offset
+        highest += constants[shot, scale, None].astype(np.float32)
+        least = of_shot.max(highest.max(axis=1)) - GRID.margin
+        mean = of_shot.max(total.max(axis=1)) / len(arguments)
+        least -= len(arguments) * (mean - _log_bessel(mean))
+        pair, place = np.nonzero(highest >= of_shot.repeat(least)[:, None])
+        shot, scale = shot[pair], scale[pair]
+        logs = _log_bessel(arguments[:, pair, place]).sum(axis=0)
+        logs = logs + offset[pair, place] + constants[shot, scale]
+        largest = np.maximum(Segments.of_keys(shot).max(logs), np.finfo(float).min)
+        sums = np.bincount(shot * len(scales) + scale, np.exp(logs - largest[shot]),
+                           minlength=constants.size).reshape(constants.shape)
         with np.errstate(divide='ignore'):
-            return largest + np.log(
-                np.bincount(row, np.exp(logs - largest), minlength=len(scales)))
+            return largest[:, None] + np.log(sums)
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some position explains the signals up to this residual energy."""
-        amplitude = np.sum(self._filter(whitened), axis=0)[self._index] * self._scale
+        amplitude = np.sum(self._filter(whitened[None])[0], axis=0)[self._index] * self._scale
         residual = np.sum(np.abs(whitened)**2) - amplitude + self._energy
         tolerated = max_residual + GRID.error * self._energy
         return bool(((residual <= tolerated) & np.isfinite(self._offset)).any())
 
     def _filter(self, whitened: np.ndarray) -> np.ndarray:
-        """Return filter output magnitudes by template and direction, [N_B, T, V] [m]."""
+        """Return filter output magnitudes by template and direction, [N, N_B, T, V] [m]."""
         # The energy outside of a basis is not part of a template.
-        signals = whitened[:, :self._filters.shape[2], None].astype(np.complex64)
+        signals = whitened[..., :self._filters.shape[2], None].astype(np.complex64)
         filtered = np.abs(np.matmul(self._filters, signals)[..., 0])
-        return filtered.reshape(len(filtered), -1, self._energy.shape[1])
+        return filtered.reshape(*filtered.shape[:2], -1, self._energy.shape[1])
 
 
 Alternative: TypeAlias = Outside | Blocked

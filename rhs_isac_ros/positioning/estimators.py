@@ -339,10 +339,16 @@ class SearchEstimator(abc.ABC):
             seen = whitened
             for alternative in scope.alternatives:
                 seen = alternative.seen(self._likelihood.model, signals.received, seen)
+            residuals = np.array([one.fit.residual for one in fits])
+            evidence = [one.log_evidence_of(seen, aligned, residuals, self._likelihood.nuisance)
+                        for one in scope.alternatives]
             for n, (row, searched, one, values) in enumerate(zip(
                     usable, fits, seen, aligned, strict=True)):
-                estimate, log_ratios = self._judge(
-                    scope.alternatives, searched, select(signals, [n]), one, values)
+                log_ratios = {alternative.name: float(log[n]) - searched.fit.log_evidence
+                              for alternative, log in zip(
+                                  scope.alternatives, evidence, strict=True)}
+                estimate = self._judge(
+                    scope.alternatives, log_ratios, searched, select(signals, [n]), one, values)
                 found[row] = _Found(self, estimate, log_ratios, *searched)
         return found
 
@@ -411,14 +417,11 @@ class SearchEstimator(abc.ABC):
                 self._bounds)
             yield shot, _Searched(Fit._make((*fit, describe)), of_shot, conditionals[shot])
 
-    def _judge(self, alternatives: Sequence[Alternative], searched: '_Searched',
-               signals: Signals, whitened: np.ndarray, aligned: np.ndarray
-               ) -> tuple[Estimate, dict[str, float]]:
-        """Return the position of one shot, or the reason why there is none; and `log_ratios`."""
+    def _judge(self, alternatives: Sequence[Alternative], log_ratios: Mapping[str, float],
+               searched: '_Searched', signals: Signals, whitened: np.ndarray, aligned: np.ndarray
+               ) -> Estimate:
+        """Return the position of one shot, or the reason why there is none."""
         fit = searched.fit
-        log_ratios = {one.name: one.log_evidence_of(
-            whitened, aligned, fit.residual, self._likelihood.nuisance) - fit.log_evidence
-            for one in alternatives}
         probabilities, _ = mixture_weights(np.array([0.0, *(
             one.log_odds + log_ratios[one.name] for one in alternatives)]))
         weights = self._likelihood.weights_at(np.array([fit.gain]))[0]
@@ -436,12 +439,12 @@ class SearchEstimator(abc.ABC):
             **{f'{one.name}_probability': float(share) for one, share in zip(
                 alternatives, probabilities[1:], strict=True)}}
         if reason:
-            return Estimate.without_fix(reason, **statistics), log_ratios
+            return Estimate.without_fix(reason, **statistics)
         covariance = self._scale(fit) * fit.covariance
         if len(covariance) > 3:
             statistics.update(velocity=fit.mean[3:], velocity_covariance=covariance[3:, 3:],
                               cross_covariance=covariance[:3, 3:])
-        return Estimate(fit.mean[:3], covariance[:3, :3], reason, **statistics), log_ratios
+        return Estimate(fit.mean[:3], covariance[:3, :3], reason, **statistics)
 
     def _scale(self, fit: Fit) -> float:
         """Return the factor of the covariance for the multipath level that the residual shows."""

@@ -232,7 +232,9 @@ class TemplateTable:
         by_subband = query.outputs[shots, :, :, self.grid.node[cells]]
         of_band = np.einsum('wis,isw->iw', by_subband, self._range_windows.turns[:, :, window])
         energy = self.cells.template_energy_at(cells, range_m)
-        return self._finder.find(Candidates(shots, cells, range_m, of_band, energy), query)
+        margin = (query.margin + self.cells.loss)[cells]
+        return self._finder.find(
+            Candidates(shots, cells, range_m, of_band, energy, margin), query)
 
     def evaluate_windows(self, query: Query, shot: int, cells: np.ndarray, directions: np.ndarray
                 ) -> Windows:

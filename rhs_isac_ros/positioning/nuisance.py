@@ -225,13 +225,12 @@ class NuisancePrior(Exponents):
         """Return the logarithm of the prior times the change of volume, float64 [M]."""
         return -(values**2 @ self.precision / 2 + values @ self.volume)
 
-    def log_evidence_of_aligned(self, aligned: np.ndarray) -> float:
-        """Return the log of Laplace's integral over the parameters that `Alignment` estimates."""
+    def log_evidence_of_aligned(self, aligned: np.ndarray) -> np.ndarray:
+        """Return the log of Laplace's integral over the parameters [..., Q] of `Alignment`."""
         (moves,) = np.nonzero(self.moves_multipath)
-        if not len(moves):
-            return 0.0
         curvature = self.information[np.ix_(moves, moves)] + np.diag(self.precision[moves])
-        return float(-self.precision @ aligned**2 - np.linalg.slogdet(curvature)[1]) / 2
+        found: np.ndarray = -(aligned**2 @ self.precision + np.linalg.slogdet(curvature)[1]) / 2
+        return found
 
     def amplitude(self, outputs: np.ndarray) -> np.ndarray:
         """Add up the bands' matched-filter outputs, [N_B, ...], rotated as in `_in_phase`."""

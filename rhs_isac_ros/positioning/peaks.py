@@ -14,6 +14,8 @@ from rhs_isac_ros.positioning.templates import Query, turns_at
 
 # Fine range steps per shortest wavelength; at least four are needed to resolve the posterior.
 _STEPS_PER_WAVELENGTH = 8
+# Error of an amplitude at the vertex of a parabola through three steps, as a share of it.
+_VERTEX_ERROR = 0.01
 
 
 class RangeWindows:
@@ -52,6 +54,8 @@ class Candidates(NamedTuple):
     range_m: np.ndarray  # Centre, float64 [W] [m].
     outputs: np.ndarray  # Matched-filter outputs of the bands at the centre, complex64 [N_B, W].
     energy: np.ndarray  # Energy of the template at the centre, float32 [W].
+    # Decrease from the best value of the shot up to which peaks count, float64 [W].
+    margin: np.ndarray
 
 
 class Peaks(NamedTuple):
@@ -84,7 +88,7 @@ class PeakFinder:
         self._rotation = (2 * np.hstack([turns.real, -turns.imag])).astype(np.float32)
 
     def find(self, candidates: Candidates, query: Query) -> Peaks:
-        """Find all peaks, at least one of each shot, in the order of the windows."""
+        """Find the probable peaks, at least one of each shot, in the order of the windows."""
         if query.prior.is_coarse:
             return self._centres(candidates, query)
         return self._maxima(candidates, query)
@@ -103,25 +107,34 @@ class PeakFinder:
         else:
             outputs = candidates.outputs
             along = self._rotation @ np.concatenate([outputs.real, outputs.imag])
-        along, _ = _over_gain(along, candidates, query)
-        step, window = _inner_maxima(along, Segments.of_keys(candidates.shots))
+        step, window = _inner_maxima(
+            along, candidates.energy, Segments.of_keys(candidates.shots))
         # The vertex of a parabola through a maximum and the steps beside it.
         before, highest, after = (along[step + side, window] for side in (-1, 0, 1))
         slope, bend = (after - before) / 2, 2 * highest - after - before
-        offset_m = slope / np.maximum(bend, np.abs(slope) + 1e-9) * self._step_m
+        change = slope / np.maximum(bend, np.abs(slope) + 1e-9)
         found = select(candidates._replace(outputs=candidates.outputs.T), window)
         centre_m = found.range_m
-        range_m = centre_m + self._offsets_m[step] + offset_m
+        range_m = centre_m + self._offsets_m[step] + change * self._step_m
         # Within a window, amplitudes decrease with the range.
         scale = centre_m / range_m
-        outputs = found.outputs * np.exp(1j * self._carriers * (range_m - centre_m)[:, None])
-        amplitude = scale * query.prior.amplitude(outputs.T)
         found = found._replace(range_m=range_m, energy=scale**2 * found.energy)
+        amplitude = scale * (highest + slope * change / 2) / 2
         value, gain = _valued(amplitude, found, query)
-        return Peaks(found.shots, found.cell, centre_m, range_m, value, gain, outputs)
+        # Most peaks are far below the best one.
+        error, of_shot = np.abs(np.exp(-gain) * amplitude), Segments.of_keys(found.shots)
+        error = 2 * _VERTEX_ERROR * (error + of_shot.repeat(of_shot.max(error)))
+        kept = value + error >= of_shot.repeat(of_shot.max(value)) - found.margin
+        found, centre_m = select(found, kept), centre_m[kept]
+        outputs = found.outputs * np.exp(
+            1j * self._carriers * (found.range_m - centre_m)[:, None])
+        amplitude = scale[kept] * query.prior.amplitude(outputs.T)
+        value, gain = _valued(amplitude, found, query)
+        return Peaks(found.shots, found.cell, centre_m, found.range_m, value, gain, outputs)
 
 
-def _inner_maxima(along: np.ndarray, of_shot: Segments) -> tuple[np.ndarray, np.ndarray]:
+def _inner_maxima(along: np.ndarray, energy: np.ndarray, of_shot: Segments
+                  ) -> tuple[np.ndarray, np.ndarray]:
     """Return step and window of the local maxima of values [S, W], by window, int [P] each.
 
     The values of a shot have no maximum if the wavelength is far longer than the region. Its
@@ -132,7 +145,7 @@ def _inner_maxima(along: np.ndarray, of_shot: Segments) -> tuple[np.ndarray, np.
     is_peak &= inner > along[2:]
     lacking = ~of_shot.max(np.logical_or.reduce(is_peak))
     for rows in select(of_shot, lacking).slices:
-        values = inner[:, rows]
+        values = inner[:, rows] - energy[rows]
         is_peak[:, rows][np.unravel_index(values.argmax(), values.shape)] = True
     step, window = np.nonzero(is_peak)
     order = np.argsort(window, kind='stable')

@@ -71,7 +71,7 @@ def test_evidence_is_the_average_likelihood(setting, reference):
     signals, _, exponent = reference
     highest = exponent.max()
     expected = highest + np.log(np.mean(np.exp(exponent - highest)))
-    found = Outside(scenario, arrays).log_evidence(signals)[0]
+    found = Outside(scenario, arrays).log_evidence(signals[None])[0, 0]
     assert found == pytest.approx(expected, abs=0.5)
 
 
@@ -88,23 +88,23 @@ def test_the_evidence_is_the_average_over_an_unknown_gain(random_beams):
     std = 0.5 * np.log(10) / 20
     gains = np.linspace(-6, 6, 601) * std
     signals = likelihood.model.whiten(received * np.exp(-gains)[:, None, None])
-    exponent = np.array([table.log_evidence(one)[0] for one in signals])
+    exponent = table.log_evidence(signals)[:, 0]
     exponent += norm(scale=std).logpdf(gains) - 2 * received.size * gains
     expected = logsumexp(exponent) + np.log(gains[1] - gains[0])
-    found = table.log_evidence_of(
-        likelihood.model.whiten(received)[0], np.zeros(1), 0.0, likelihood.nuisance)
+    (found,) = table.log_evidence_of(
+        likelihood.model.whiten(received), np.zeros((1, 1)), np.zeros(1), likelihood.nuisance)
     assert found == pytest.approx(expected, abs=0.1)
 
 
 def test_a_factor_is_that_of_the_signals(setting, reference):
     """Weak signals make directions more alike, so that more of them matter."""
     scenario, _, arrays = setting
-    table, signals = Outside(scenario, arrays), 3 * reference[0]
+    table, signals = Outside(scenario, arrays), 3 * reference[0][None]
     scales = np.array([0.02, 0.2, 1.0, 3.0])
-    expected = [table.log_evidence(scale * signals)[0] for scale in scales]
+    expected = table.log_evidence(np.concatenate([scale * signals for scale in scales]))[:, 0]
     # With these weights, no factor is negligible among the others.
     np.testing.assert_allclose(
-        table.log_evidence(signals, scales, -np.array(expected)), 0, atol=1e-3)
+        table.log_evidence(signals, scales, -expected), 0, atol=1e-3)
 
 
 def test_bessel_function():
@@ -127,7 +127,7 @@ def test_a_region_that_leaves_no_space_outside_is_always_accepted(setting):
     arrays['outer_weights'][:] = 0
     table = Outside(model.scenario, arrays)
     signals = model.whiten(model.mean(np.array([[5.0, -2.0, 1.0]])))[0]
-    assert table.log_evidence(signals)[0] == -np.inf
+    assert table.log_evidence(signals[None])[0, 0] == -np.inf
     assert not table.explain(signals, 1e9)
 
 
