@@ -138,10 +138,23 @@ def log_evidence(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
     Impairments are integrated out by the method of Laplace.
     """
     nuisance, (values, aligned, mean) = nuisance_of(model.scenario), _aligned(model, pilots)
+    gains = nuisance.scaled_patterns.real.reshape(len(nuisance), mean[0].size)
+    for _ in range(_ALIGNMENT_STEPS if gains.any() else 0):
+        # The energy of the multipath tells gains as well as the direct path does.
+        residual = model.whiten(aligned - mean)
+        gradient = 2 * np.einsum('nqir,nir->nq', np.conj(model.whiten(
+            nuisance.scaled_patterns * aligned[:, None])), residual).real
+        excess = np.maximum(np.mean(np.abs(residual)**2, axis=(1, 2)), 1)
+        values = values + step_to_maximum(
+            _curvature(nuisance, model.whiten(nuisance.derivatives(aligned, mean)))
+            + 4 * excess[:, None, None] * (gains @ gains.T),
+            gradient - 2 * gains.sum(axis=1) - nuisance.precision * values)
+        aligned = nuisance.divide(pilots.received, values)
     energy = np.sum(np.abs(model.whiten(aligned - mean))**2, axis=(1, 2))
     log_root = np.sum(np.linalg.slogdet(model.combined_root)[1])
     log_gain = np.sum(np.log(np.abs(nuisance.divide(np.ones_like(mean), values))), axis=(1, 2))
-    curvature = _curvature(nuisance, model.whiten(nuisance.derivatives(aligned, mean)))
+    curvature = 4 * gains @ gains.T + _curvature(
+        nuisance, model.whiten(nuisance.derivatives(aligned, mean)))
     evidence: np.ndarray = 2 * (log_gain - log_root) - energy - (
         values**2 @ nuisance.precision + np.linalg.slogdet(curvature)[1]) / 2
     return evidence

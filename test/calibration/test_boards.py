@@ -8,8 +8,9 @@ import pytest
 from scipy.special import chdtri
 
 from rhs_isac_ros.calibration import Pilots, board_evidence, fit_board
+from rhs_isac_ros.calibration.estimate import log_evidence
 from rhs_isac_ros.codebook import random_codebook
-from rhs_isac_ros.model import Scenario, simulate_received
+from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
 from rhs_isac_ros.model.boards import board_of
 from rhs_isac_ros.positioning import make_estimator
 
@@ -48,6 +49,27 @@ def test_parameters_have_the_errors_that_their_covariance_states():
     error, n = fit.values - truth, len(truth)
     square = error @ np.linalg.solve(fit.covariance, error)
     assert chdtri(n, 0.995) < square < chdtri(n, 0.005)
+
+
+@pytest.mark.parametrize('changes', [{}, UNKNOWN])
+def test_slopes_of_the_evidence_have_the_covariance_of_its_curvature(changes):
+    """So that errors of fits have the stated covariance; gains also scale the multipath."""
+    scenario, n = dataclasses.replace(GRID, **changes), 1500
+    pilots, units = pilots_of(scenario, n, seed=7), np.diag([0.05, 0.25, 1e5])
+
+    def evidence(shift):
+        quality, loss, band = np.array([30.0, 4.0, 2.5e9]) + shift
+        board = board_of(TRUE | {'quality_factor': quality, 'loss_db_per_m': loss,
+                                 'resonances_hz': [band, 3e9]})
+        return log_evidence(MeasurementModel(
+            dataclasses.replace(scenario, board=board), pilots.beams), pilots)
+    slopes = np.array([evidence(unit) - evidence(-unit) for unit in units]) / 2
+    curvature = np.array([[-np.sum(evidence(one + other) - evidence(one - other)
+                                   - evidence(other - one) + evidence(-one - other)) / 4
+                           for one in units] for other in units])
+    ratios = np.linalg.eigvals(np.linalg.solve(curvature, n * np.cov(slopes))).real
+    assert (0.85 < ratios).all()
+    assert (ratios < 1.15).all()
 
 
 def test_two_groups_of_pilots_are_one_survey():
