@@ -150,12 +150,12 @@ def share_covered(estimate, positions) -> float:
     {'element_error_rms': 0.02},
     {'carrier_offset_std_hz': 'unknown', 'phase_std_rad': 'unknown', 'timing_std_s': 'unknown'},
 ], ids=lambda changes: ' '.join(changes))
-def test_declared_impairments_leave_consistent_estimates(codebook, changes):
+def test_declared_impairments_leave_consistent_estimates(single_mode, codebook, changes):
     """Undeclared, many of these signals have no fix or a wrong one."""
     scenario, rng = dataclasses.replace(SINGLE_MODE, **changes), np.random.default_rng(2)
     positions = scenario.sample_positions(25, rng)
     received = MeasurementModel(scenario, codebook).sample(positions, rng)
-    silent = make_estimator('bayes', SINGLE_MODE, codebook).estimate(received)
+    silent = single_mode[2].estimate(received)
     estimate = make_estimator('bayes', scenario, codebook).estimate(received)
     assert share_covered(silent, positions) < 0.8
     assert share_covered(estimate, positions) >= 0.88
@@ -197,13 +197,13 @@ def test_an_unknown_timing_requires_an_unknown_phase(codebook):
 
 
 @pytest.mark.parametrize('std', [1e-300, 1e-12])
-def test_negligible_impairments_change_no_estimate(codebook, std):
+def test_negligible_impairments_change_no_estimate(single_mode, codebook, std):
     scenario = dataclasses.replace(
         SINGLE_MODE, user_gain_std_db=std, timing_std_s=std * 1e-7, band_phase_std_rad=std)
     rng = np.random.default_rng(2)
     positions = SINGLE_MODE.sample_positions(5, rng)
     received = MeasurementModel(SINGLE_MODE, codebook).sample(positions, rng)
-    expected = make_estimator('bayes', SINGLE_MODE, codebook).estimate(received)
+    expected = single_mode[2].estimate(received)
     found = make_estimator('bayes', scenario, codebook).estimate(received)
     np.testing.assert_allclose(found.mean, expected.mean, atol=0.02)
     np.testing.assert_allclose(found.residual, expected.residual, rtol=0.02)
@@ -355,11 +355,11 @@ def test_regions_contain_the_range_within_a_wavelength(shipped):
 def test_regions_contain_users_on_lines_in_flat_channels_at_wide_angles_and_with_strong_signals(
         changes, shipped):
     scenario, rng = Scenario(**changes), np.random.default_rng(1)
-    positions = scenario.sample_positions(400, rng)
+    positions = scenario.sample_positions(200, rng)
     estimate = make_estimator('bayes', scenario, shipped).estimate(
         simulate_received(scenario, shipped, positions, rng))
     assert estimate.fix.mean() > 0.995
     squares = squared_normalised(estimate.mean - positions, estimate.covariance)
     inside = squares <= chdtri(np.count_nonzero(scenario.roi_size_m), 0.05)
-    # Posteriors are not Gaussian; the standard error is 0.011.
+    # Posteriors are not Gaussian; the standard error is 0.015.
     assert 0.9 < np.mean(inside) < 0.985

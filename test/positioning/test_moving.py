@@ -49,7 +49,7 @@ def test_gradient_and_information_are_those_of_the_likelihood(declared, moves):
 def test_positions_and_velocities_are_in_their_regions(walking):
     system, estimator = walking
     rng = np.random.default_rng(2)
-    states = np.vstack([users_of(system.scenario, 16, speed, rng) for speed in (0, 0.3, 1, 2)])
+    states = np.vstack([users_of(system.scenario, 10, speed, rng) for speed in (0, 0.3, 1, 2)])
     estimate = estimator.estimate(system.sample(states, rng))
     assert estimate.fix.all()
     errors = np.hstack([estimate.mean, estimate.velocity]) - states

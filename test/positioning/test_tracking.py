@@ -222,10 +222,10 @@ def test_a_walk_of_metres_between_phases(tracker, sample):
 
 @pytest.mark.slow
 def test_a_gap_widens_the_prior_and_a_longer_one_ends_the_track(follow, tracker, sample):
-    times_s = np.arange(20) * PERIOD_S
+    times_s = np.arange(10) * PERIOD_S
     before = follow(times_s)
     after = follow([times_s[-1] + 2.0])
-    assert after.n_phases == 21
+    assert after.n_phases == 11
     assert np.trace(after.velocity_covariance) > np.trace(before.velocity_covariance)
     assert error(after, START + (times_s[-1] + 2.0) * VELOCITY) < 3.0
     again = follow([times_s[-1] + 2.1 + MAX_GAP_S], velocity=np.zeros(3))
@@ -234,14 +234,14 @@ def test_a_gap_widens_the_prior_and_a_longer_one_ends_the_track(follow, tracker,
 
 def test_a_prediction_moves_with_the_velocity_and_leaves_the_track(tracker, follow, sample):
     assert tracker.predict(0.0) is None
-    times_s = np.arange(25) * PERIOD_S
+    times_s = np.arange(10) * PERIOD_S
     before = follow(times_s)
     mean, covariance = tracker.predict(times_s[-1] + 0.2)
     assert np.linalg.norm(mean - before.mean - 0.2 * before.velocity) < 0.05
     assert np.trace(covariance) > np.trace(before.covariance)
     assert tracker.predict(times_s[-1]) is None
     assert tracker.predict(times_s[-1] + MAX_GAP_S + 0.1) is None
-    assert follow([times_s[-1] + PERIOD_S]).n_phases == 26
+    assert follow([times_s[-1] + PERIOD_S]).n_phases == 11
 
 
 def test_an_earlier_phase_does_not_change_the_track(tracker, sample, table1_estimator):
@@ -273,9 +273,9 @@ def test_signals_without_a_position_do_not_change_the_track(tracker, follow, sam
 @pytest.mark.slow
 def test_a_track_finds_a_user_that_is_suddenly_elsewhere(tracker, sample):
     elsewhere = np.array([12.0, 3.0, -0.3])
-    for k in range(15):
+    for k in range(10):
         tracker.update(k * PERIOD_S, sample(START))
-    for k in range(15, 35):
+    for k in range(10, 25):
         estimate = tracker.update(k * PERIOD_S, sample(elsewhere))
     assert error(estimate, elsewhere) < 0.7
 
@@ -285,7 +285,7 @@ def test_estimates_are_inside_the_region(tracker, sample):
     scenario = Scenario()
     low, high = scenario.roi_bounds_m
     corner = high - [0.05, 0.05, 0.02]
-    for k in range(20):
+    for k in range(10):
         estimate = tracker.update(k * PERIOD_S, sample(corner))
         assert (estimate.mean >= low - 1e-9).all()
         assert (estimate.mean <= high + 1e-9).all()
@@ -368,17 +368,16 @@ def test_correlated_multipath_does_not_narrow_the_covariance(table1_estimator, s
     assert again.n_phases == 1
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize('bad_s', [np.nan, np.inf, -np.inf, 1j, None])
 def test_a_time_that_is_not_finite_is_an_error_and_does_not_change_the_track(
-        table1, table1_estimator, bad_s):
+        table1, table1_estimator):
+    bad_s = np.nan, np.inf, -np.inf, 1j, None
     place = np.array([[9.0, 1.0, 0.2]])
     received = MeasurementModel(table1.scenario, table1.codebook).sample(
-        np.repeat(place, 4, axis=0), np.random.default_rng(3))
+        np.repeat(place, len(bad_s), axis=0), np.random.default_rng(3))
     tracker, other = Tracker(table1_estimator), Tracker(table1_estimator)
     for step, signals in enumerate(received):
         with pytest.raises(ValueError, match='^time_s: .*expected'):
-            tracker.update(bad_s, signals)
+            tracker.update(bad_s[step], signals)
         found, expected = (each.update(0.3 * step, signals) for each in (tracker, other))
         np.testing.assert_array_equal(found.mean, expected.mean)
         assert found.n_phases == expected.n_phases
