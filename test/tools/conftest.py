@@ -79,8 +79,9 @@ def network(tmp_path_factory):
     """A running network of the small scenario, two users in one process."""
     logs = tmp_path_factory.mktemp('logs')
     with Processes(logs, {'ROS_LOG_DIR': str(logs)}) as processes:
-        # Most tests need no new cycles. On a busy machine, an estimate may take seconds.
-        processes.start('network', scenario_file=CONFIG / 'quick.yaml', rest_s=0.3,
+        # Most tests need no new cycles, which take CPU time. On a busy machine, an estimate may
+        # take seconds.
+        processes.start('network', scenario_file=CONFIG / 'quick.yaml', rest_s=1.0,
                         codebook_file=CONFIG / 'codebook_quick.yaml', step_timeout_s=10.0)
         yield processes
 

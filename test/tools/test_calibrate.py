@@ -36,7 +36,7 @@ TIMEOUT_S = 60.0
 @pytest.fixture(scope='module')
 def process(module_processes):
     return module_processes.start(
-        'network', namespace=NAMESPACE, users=4, rest_s=0.03, scenario_file=CONFIG / 'quick.yaml',
+        'network', namespace=NAMESPACE, users=4, rest_s=0.1, scenario_file=CONFIG / 'quick.yaml',
         codebook_file=CONFIG / 'codebook_quick.yaml', **ERRORS)
 
 
@@ -100,40 +100,6 @@ def test_a_calibration_finds_failed_elements_and_restores_the_accuracy(calibrate
     assert int(before[1]) > 0.8 * int(before[2])
     assert re.search(r'pilots after: [\d.]+ m rms, 0 of \d+ without a fix', done.out)
     assert done.out.endswith(f'{file}: calibration {Calibration.load(file).id}\n')
-
-
-def test_a_running_network_takes_a_calibration(process, calibrated, watch):
-    """It then estimates and steers as the library does with the calibrated surface."""
-    file, _ = calibrated
-    watch.until(lambda: 'bayes is ready' in process.log, 'the first estimator', [process])
-    for node in ('positioner', 'transmission'):
-        result = watch.set_parameters(node, {'calibration_file': file}, [process])
-        assert result.successful, result.reason
-    watch.until(lambda: process.log.count('bayes is ready') == 2, 'the estimator', [process])
-    # A cycle that had begun keeps the former surface.
-    watch.until_served(1, processes=[process])
-    calibrated_surface = Calibration.load(file).surface
-    estimator = make_estimator('bayes', SCENARIO, CODEBOOK, surface=calibrated_surface)
-    for end in watch.until_served(N_SERVED, processes=[process]):
-        signals, estimate, beam = (watch.until(
-            lambda kind=kind, n=end.cycle_id: watch.of_cycle(kind, n), kind.__name__)[0]
-            for kind in (m.ReceivedSignals, m.PositionEstimate, m.Beam))
-        expected = estimator.estimate(signals.stacked).to_site(SCENARIO.pose)
-        assert estimate.position == pytest.approx(expected.mean, abs=1e-6)
-        assert estimate.covariance_m2 == pytest.approx(expected.covariance, abs=1e-6)
-        choice = choose_beam(SCENARIO, estimate.position, estimate.covariance_m2,
-                             range(SCENARIO.n_bands), calibrated_surface)
-        assert beam.band == choice.beam.band
-        assert beam.analog == pytest.approx(choice.beam.analog, abs=1e-6)
-
-
-def test_the_pilots_may_come_from_the_running_network(built_scripts, process, tmp_path):
-    done = subprocess.run(
-        [CONFIG.parent / 'scripts' / 'calibrate', '--config', CONFIG / 'quick.yaml', '--cycles',
-         '5', '--output', 'live.npz', '--ros-args', '-r', f'__ns:={NAMESPACE}'], cwd=tmp_path,
-        capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
-    assert done.returncode == 0, done.stderr
-    assert 5 <= Calibration.load(tmp_path / 'live.npz').about['pilots'] < 50
 
 
 def test_a_recording_is_a_survey_of_the_multipath(recording, calibrated, two_folds, tmp_path):
@@ -242,3 +208,39 @@ def test_states_are_two_numbers(states, capsys):
     with pytest.raises(SystemExit):
         calibrate.main([f'--states={states}'])
     assert f'--states: {states!r}, expected two numbers such as 1,-1' in capsys.readouterr().err
+
+
+# The network starts for these tests, and runs until the last one has ended.
+
+def test_a_running_network_takes_a_calibration(process, calibrated, watch):
+    """It then estimates and steers as the library does with the calibrated surface."""
+    file, _ = calibrated
+    watch.until(lambda: 'bayes is ready' in process.log, 'the first estimator', [process])
+    for node in ('positioner', 'transmission'):
+        result = watch.set_parameters(node, {'calibration_file': file}, [process])
+        assert result.successful, result.reason
+    watch.until(lambda: process.log.count('bayes is ready') == 2, 'the estimator', [process])
+    # A cycle that had begun keeps the former surface.
+    watch.until_served(1, processes=[process])
+    calibrated_surface = Calibration.load(file).surface
+    estimator = make_estimator('bayes', SCENARIO, CODEBOOK, surface=calibrated_surface)
+    for end in watch.until_served(N_SERVED, processes=[process]):
+        signals, estimate, beam = (watch.until(
+            lambda kind=kind, n=end.cycle_id: watch.of_cycle(kind, n), kind.__name__)[0]
+            for kind in (m.ReceivedSignals, m.PositionEstimate, m.Beam))
+        expected = estimator.estimate(signals.stacked).to_site(SCENARIO.pose)
+        assert estimate.position == pytest.approx(expected.mean, abs=1e-6)
+        assert estimate.covariance_m2 == pytest.approx(expected.covariance, abs=1e-6)
+        choice = choose_beam(SCENARIO, estimate.position, estimate.covariance_m2,
+                             range(SCENARIO.n_bands), calibrated_surface)
+        assert beam.band == choice.beam.band
+        assert beam.analog == pytest.approx(choice.beam.analog, abs=1e-6)
+
+
+def test_the_pilots_may_come_from_the_running_network(built_scripts, process, tmp_path):
+    done = subprocess.run(
+        [CONFIG.parent / 'scripts' / 'calibrate', '--config', CONFIG / 'quick.yaml', '--cycles',
+         '5', '--output', 'live.npz', '--ros-args', '-r', f'__ns:={NAMESPACE}'], cwd=tmp_path,
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    assert done.returncode == 0, done.stderr
+    assert 5 <= Calibration.load(tmp_path / 'live.npz').about['pilots'] < 50
