@@ -10,7 +10,7 @@ board itself (`with`) and once for the same elements without their coupling (`wi
 
 import dataclasses
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,37 +26,39 @@ from rhs_isac_ros.support.arguments import integer
 from rhs_isac_ros.support.files import read_arrays, write_archive
 from rhs_isac_ros.system import System
 
+CASES = (('paper', 'own'), ('resonant', 'own'), ('resonant', 'shipped'), ('coupled', 'own'),
+         ('coupled', 'shipped'))
+
 
 def main() -> None:
     """Run the benchmark."""
-    parser = frame.benchmark_parser('boards', __doc__, 3000)
+    parser = frame.benchmark_parser('boards', __doc__, 3000, has_jobs=True)
     parser.add_argument('--steps', type=integer(0, 10**4), default=0,
                         help='steps of the optimisations for the coupled board; 0 to omit')
     options = parser.parse_args()
+    cases = [*CASES, *(('coupled', name) for name in ('with', 'without') if options.steps)]
+    found = frame.measured(options, 'boards', figures, {
+        f'{board} {codebook}': {
+            'board': board, 'codebook': codebook, 'steps': options.steps,
+            'n': options.positions, 'seed': options.seed} for board, codebook in cases})
     print(f'{options.positions} positions, seed {options.seed}\n')
     table = frame.Table(['board', 'codebook'], {
         'MSE [m²]': ('mse_m2', 3), 'average CRLB [m²]': ('crlb_m2', 4),
         '95 % regions [%]': ('in_region', 1), 'without a fix': ('no_fix', 0)})
     results: dict[str, dict[str, Any]] = {}
-    for board, scenario, codebooks in cases(options.steps):
-        for name, codebook in codebooks:
-            results.setdefault(board, {})[name] = table.row(
-                board, name, **figures(scenario, codebook, options.positions, options.seed))
+    for (board, codebook), row in zip(cases, found.values(), strict=True):
+        results.setdefault(board, {})[codebook] = table.row(board, codebook, **row)
     frame.write_results(options.json, results)
 
 
-def cases(steps: int) -> Iterator[tuple[str, Scenario, list[tuple[str, Codebook]]]]:
-    """Yield boards with their scenarios and codebooks."""
-    shipped = Codebook.default()
-    yield 'paper', Scenario(), [('own', shipped)]
-    for board in ('resonant', 'coupled'):
-        scenario = Scenario.from_yaml(frame.CONFIG / f'{board}.yaml')
-        own = Codebook.load(frame.CONFIG / f'codebook_{board}.yaml', scenario)
-        yield board, scenario, [('own', own), ('shipped', shipped)]
-    if steps:
-        yield 'coupled', scenario, [
-            (name, optimize(known, objective='error', max_steps=steps).codebook)
-            for name, known in (('with', scenario), ('without', without_coupling(scenario)))]
+def codebook_of(board: str, name: str, scenario: Scenario, steps: int) -> Codebook:
+    """Return a codebook for a board; optimise it if it is not in a file."""
+    if name == 'shipped' or board == 'paper':
+        return Codebook.default()
+    if name == 'own':
+        return Codebook.load(frame.CONFIG / f'codebook_{board}.yaml', scenario)
+    known = scenario if name == 'with' else without_coupling(scenario)
+    return optimize(known, objective='error', max_steps=steps).codebook
 
 
 def without_coupling(scenario: Scenario) -> Scenario:
@@ -73,14 +75,17 @@ def without_coupling(scenario: Scenario) -> Scenario:
     return dataclasses.replace(scenario, board=alone)
 
 
-def figures(scenario: Scenario, codebook: Codebook, n: int, seed: int) -> dict[str, Any]:
+def figures(board: str, codebook: str, steps: int, n: int, seed: int) -> Mapping[str, Any]:
     """Return the error of `bayes` and the bound at random positions."""
-    system = System(scenario, codebook)
+    scenario = Scenario() if board == 'paper' else Scenario.from_yaml(
+        frame.CONFIG / f'{board}.yaml')
+    system = System(scenario, codebook_of(board, codebook, scenario, steps))
     positions, received = system.pairs(n, seed)
     fixes = frame.Fixes.of(BayesEstimator(system).estimate(received), positions)
     return {
         'mse_m2': frame.mean_interval(fixes.squared), 'in_region': 100 * fixes.inside.mean(),
-        'crlb_m2': crlb(scenario, codebook, positions).mean(), 'no_fix': int(np.sum(~fixes.fix))}
+        'crlb_m2': crlb(scenario, system.beams, positions).mean(),
+        'no_fix': int(np.sum(~fixes.fix))}
 
 
 if __name__ == '__main__':
