@@ -379,7 +379,7 @@ def _cluster(address: str, worker_timeout_s: float) -> Iterator[Executor]:
 
     with contextlib.ExitStack() as stack:
         try:
-            client = stack.enter_context(Client(  # type: ignore[no-untyped-call]
+            client = stack.enter_context(Client(
                 address, timeout=_SCHEDULER_TIMEOUT_S, set_as_default=False))
             client.wait_for_workers(1, timeout=worker_timeout_s)
         except (OSError, TimeoutError, ValueError) as error:
