@@ -25,6 +25,11 @@ def positions(plan):
     return plan[0].sample_positions(30, np.random.default_rng(0))
 
 
+@pytest.fixture(scope='module')
+def estimator(plan):
+    return make_estimator('ml', *plan)
+
+
 def compare(assumed, true, codebook, positions):
     return misspecified(MeasurementModel(assumed, codebook), MeasurementModel(true, codebook),
                         positions)
@@ -42,21 +47,22 @@ def test_without_a_wrong_assumption_it_is_the_bound(plan, positions):
 @pytest.mark.slow
 @pytest.mark.parametrize(('field', 'value', 'has_bias'), [
     ('angular_spread_deg', 14.0, False), ('refractive_index', 2.102, True)])
-def test_where_valid_it_is_the_error_of_the_estimator(plan, positions, field, value, has_bias):
+def test_where_valid_it_is_the_error_of_the_estimator(
+        plan, estimator, positions, field, value, has_bias):
     scenario, codebook = plan
     true = dataclasses.replace(scenario, **{field: value})
     result = compare(scenario, true, codebook, positions)
     assert result.valid.sum() >= 15
     assert (np.linalg.norm(result.bias, axis=1) > 1e-4).any() == has_bias
-    estimator, model = make_estimator('ml', scenario, codebook), MeasurementModel(true, codebook)
+    model = MeasurementModel(true, codebook)
     chosen = np.flatnonzero(result.valid)[:15]
-    places = np.repeat(positions[chosen], 80, axis=0)
+    places = np.repeat(positions[chosen], 40, axis=0)
     estimate = estimator.estimate(model.sample(places, np.random.default_rng(1)))
     assert estimate.fix.mean() > 0.99
     squares = np.sum((estimate.mean - places)[estimate.fix]**2, axis=1)
     assert np.mean(squares) == pytest.approx(result.mse_m2[chosen].mean(), rel=0.1)
-    bias = (estimate.mean - places).reshape(len(chosen), 80, 3)
-    own = np.sqrt(np.trace(result.covariance[chosen], axis1=1, axis2=2) / 80)
+    bias = (estimate.mean - places).reshape(len(chosen), 40, 3)
+    own = np.sqrt(np.trace(result.covariance[chosen], axis1=1, axis2=2) / 40)
     error = np.linalg.norm(np.nanmean(bias, axis=1) - result.bias[chosen], axis=1)
     assert np.mean(error / own) < 1.5
 
@@ -79,12 +85,12 @@ def test_an_ambiguity_on_the_border_of_the_region_counts(shipped, before_m, behi
 
 
 @pytest.mark.slow
-def test_it_does_not_claim_validity_where_signals_are_refused(plan, positions):
+def test_it_does_not_claim_validity_where_signals_are_refused(plan, estimator, positions):
     scenario, codebook = plan
     loud = dataclasses.replace(scenario, user_gain=2.0)
     result = compare(scenario, loud, codebook, positions)
     assert not result.valid.any()
-    estimate = make_estimator('ml', scenario, codebook).estimate(
+    estimate = estimator.estimate(
         MeasurementModel(loud, codebook).sample(positions, np.random.default_rng(0)))
     assert estimate.fix.mean() < 0.2
 

@@ -43,19 +43,18 @@ def normalised_error(found):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(('n', 'seeds'), [(40, range(6)), (MIN_USERS, range(2))])
+@pytest.mark.parametrize(('n', 'seeds'), [(40, range(4)), (MIN_USERS, range(2))])
 def test_a_pose_is_found_with_a_covariance_that_fits_its_error(n, seeds):
     squares = [normalised_error(estimate_pose(
         *sightings(np.random.default_rng(seed), n), BOUNDS)) for seed in seeds]
-    # The mean of 6 chi-square variables with 6 degrees of freedom has a deviation of 1.4.
+    # The mean of 4 chi-square variables with 6 degrees of freedom has a deviation of 1.7.
     assert 2.0 < np.mean(squares) < 11.0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(('n_candidates', 'n_outliers'), [(4, 0), (1, 6), (3, 4)])
-def test_wrong_candidates_and_outliers_do_not_matter(n_candidates, n_outliers):
+def test_wrong_candidates_and_outliers_do_not_matter():
     found = estimate_pose(*sightings(
-        np.random.default_rng(1), n_candidates=n_candidates, n_outliers=n_outliers), BOUNDS)
+        np.random.default_rng(1), n_candidates=4, n_outliers=6), BOUNDS)
     assert np.linalg.norm(found.error_of(SIDE)[:3]) < 0.15
     assert normalised_error(found) < 25
 

@@ -165,7 +165,7 @@ def without_warning(values, *arguments, expected=EXPECTED):
 
 @pytest.mark.slow
 def test_residuals_of_the_model_cause_no_warning():
-    test = without_warning(energies(5000))
+    test = without_warning(energies(2500))
     assert test.n_residuals == WINDOW
     assert test.ratio == pytest.approx(1, abs=0.03)
 
@@ -267,7 +267,7 @@ def test_the_expectation_accounts_for_the_choice_of_the_best_mode(
     """With few measurements, there are many modes, of which the best leaves less energy."""
     codebook = random_beams(small.scenario, np.random.default_rng(0))
     estimator = make_estimator('bayes', small.scenario, codebook, reject_outside=reject_outside)
-    estimate = estimator.estimate(System(small.scenario, codebook).pairs(400, 1)[1])
+    estimate = estimator.estimate(System(small.scenario, codebook).pairs(200, 1)[1])
     known = np.isfinite(estimate.expected_residual)
     residual, expected = estimate.residual[known], estimate.expected_residual[known]
     error = 4 * residual.std() / np.sqrt(len(residual))
