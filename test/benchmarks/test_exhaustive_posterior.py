@@ -12,7 +12,7 @@ from rhs_isac_ros.model.impairments import nuisance_of
 
 SCENARIO = Scenario(n_subbands=2, n_frames=3, elements_per_side=4, angular_spread_deg=5.0,
                     roi_center_m=(4, 0, 0), roi_size_m=(1, 1, 0.5))
-N_SHOTS, LOG2_POINTS, N_VALUES = 2, 9, 300
+N_SHOTS, LOG2_POINTS, N_VALUES = 2, 8, 300
 
 
 @pytest.fixture(scope='module')

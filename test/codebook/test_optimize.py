@@ -31,9 +31,9 @@ from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.support import threads
 
 STEPS = 30
-# Many evaluations. Ubuntu has no package of pymoo.
-MARKS = {'genetic': [pytest.mark.slow, pytest.mark.skipif(
-    importlib.util.find_spec('pymoo') is None, reason='needs pymoo')]}
+# Ubuntu has no package of pymoo.
+MARKS = {'genetic': pytest.mark.skipif(
+    importlib.util.find_spec('pymoo') is None, reason='needs pymoo')}
 # A new method needs a number of steps that suffices to lower every objective, but no test.
 FEW_STEPS = {'alternating': 24, 'direct': 12, 'genetic': 2, 'lbfgs': 10}
 SEARCHING = [pytest.param(name, marks=MARKS.get(name, ()))
