@@ -22,6 +22,7 @@ user beyond its own region, or in the part of it that is outside of the region o
 """
 
 import functools
+import statistics
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -60,7 +61,7 @@ class _Limits(NamedTuple):
     extent: float = 1e-3
     # Passes in which the width of a Gaussian is found, step of its second differences in standard
     # deviations, and factor by which sheets are thicker, as they bend more in the tails.
-    passes: int = 3
+    passes: int = 2
     step: float = 1.5
     tails: float = 3.0
     # Largest distance of another place where two sheets meet, in standard deviations of the first
@@ -251,7 +252,7 @@ class _Factor(NamedTuple):
                 np.append(inside.log_weights - log_total, np.log(sighting.missing)),
                 np.append(inside.means, centre[None], axis=0),
                 np.append(inside.covariances, regular(np.diag(size**2 / 12))[None], axis=0))),
-            log_share, -float(np.median(np.append(curvature[:, 0, 0], 0.0))))
+            log_share, -statistics.median([*curvature[:, 0, 0].tolist(), 0.0]))
 
     def term(self, chosen: np.ndarray) -> _Term:
         """Return the rows with these indices, int [T], as factors of products."""
@@ -369,9 +370,7 @@ class _Products(NamedTuple):
         owners, moments = np.flatnonzero(single), select(mass, single)
         parts = _Parts(np.flatnonzero(~single), mass.means[~single], *np.repeat(
             bounds_m[:, None], np.count_nonzero(~single), axis=1))
-        for left in reversed(range(_LIMITS.halvings + 1)):
-            if not len(parts.owners):
-                break
+        for left in reversed(range(_LIMITS.halvings + 1) if len(parts.owners) else ()):
             samples = parts.sampled(found.select(parts.owners), factors, bounds_m)
             inside = _moments(samples.positions, samples.logs)
             best = max(inside.log_weights.max(), moments.log_weights.max(initial=-np.inf))
@@ -382,6 +381,8 @@ class _Products(NamedTuple):
             kept = np.delete(np.arange(len(poor)), halved)
             owners = np.append(owners, parts.owners[kept])
             moments = concatenate(moments, select(inside, kept))
+            if not len(halved):
+                break
             parts = select(parts, halved).halved(select(samples, halved))
         kept = np.flatnonzero(_has_mass(moments))
         names, groups = np.unique(owners[kept], return_inverse=True)

@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from rhs_isac_ros.model.arrays import log_sum, mixture_weights, numbers, read_only
-from rhs_isac_ros.model.gaussian import moments, symmetric
+from rhs_isac_ros.model.gaussian import moments, step_to_maximum, symmetric
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.segments import concatenate, select
 
@@ -269,10 +269,10 @@ class Mixture(_Arrays):
         The log-weights of the terms are within `margin` of the heaviest one.
         """
         size = other.means.shape[1]
-        log_weights, _ = overlap(
-            other.means[:, None] - self.means[:, :size],
-            self.covariances[:, :size, :size] + other.covariances[:, None])
-        log_weights += other.log_weights[:, None] + self.log_weights
+        offsets = other.means[:, None] - self.means[:, :size]
+        covariances = self.covariances[:, :size, :size] + other.covariances[:, None]
+        log_weights = other.log_weights[:, None] + self.log_weights - log_volume(covariances)
+        log_weights -= np.sum(offsets * step_to_maximum(covariances, offsets), axis=2) / 2
         order = np.argsort(-log_weights, axis=None, kind='stable')[:number]
         kept = log_weights.ravel()[order] >= log_weights.max() - margin
         second, first = np.unravel_index(order[kept], log_weights.shape)

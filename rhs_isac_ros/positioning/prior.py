@@ -16,6 +16,7 @@ their covariance is added to its result. Between modes, the evidence of phases w
 grows more slowly than their number. `fusion` treats errors of poses in the same way.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -76,14 +77,14 @@ _FLOOR = -(EXACT_MARGIN + PRIOR_MARGIN)
 
 def cells_of(bent: Sheets, grid: Grid, resolution: Resolution) -> np.ndarray:
     """Mark the cells in which a prior in (r [m], u, v) requires a search, bool [C]."""
-    half = np.column_stack([
-        grid.widths_m[grid.range_bin] / 2,
-        np.tile(PHASE_ERROR * resolution.direction, (len(grid.node), 1))])
+    widths_m, (u, v) = grid.widths_m[grid.range_bin], 2 * PHASE_ERROR * resolution.direction
     merged = bent.position().reduce(_LIMITS.boxes, _LIMITS.same_box)
-    points, chosen = grid.points, np.zeros(len(grid.node), bool)
+    coordinates, chosen = np.ascontiguousarray(grid.points.T), np.zeros(len(grid.node), bool)
     for mean, covariance in zip(merged.means, merged.covariances, strict=True):
         reach = _LIMITS.reach * np.sqrt(np.diagonal(covariance))
-        chosen |= (np.abs(points - mean) <= reach + half).all(axis=1)
+        chosen |= functools.reduce(np.logical_and, (
+            np.abs(values - centre) <= far + width / 2 for values, centre, far, width in zip(
+                coordinates, mean, reach, (widths_m, u, v), strict=True)))
     return chosen
 
 

@@ -219,13 +219,22 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
     Newton steps start from the approximate parameters `values`, [M, Q]. Also returns the
     information about the parameters, [M, Q, Q].
     """
-    located, values = _settled(conditional, likelihood, points, values, signals, moves=False)
+    return _maximised(
+        *_settled(conditional, likelihood, points, values, signals, moves=False),
+        likelihood, signals)[:3]
+
+
+def _maximised(located: Located, values: np.ndarray, likelihood: Likelihood, signals: Signals
+               ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Local]:
+    """Return the results of `marginal_at`, and the likelihood before the last step."""
     for _ in range(2 if values.shape[1] and not likelihood.nuisance.velocity.size else 1):
         local = located.local(values, signals)
-        marginal = marginalise(local.information, local.gradient, 0)
+        first = local.gradient.shape[1] - values.shape[1]
+        information, gradient = local.information[:, first:, first:], local.gradient[:, first:]
+        marginal = marginalise(information, gradient, 0)
         values = values + marginal.offset
-    rise = np.sum(local.gradient * marginal.offset, axis=1) / 2
-    return local.value + rise + marginal.log_volume, values, local.information
+    rise = np.sum(gradient * marginal.offset, axis=1) / 2
+    return local.value + rise + marginal.log_volume, values, information, local
 
 
 def expanded_at(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
@@ -235,8 +244,10 @@ def expanded_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
 
     The arguments are those of `marginal_at`.
     """
-    value, values, _ = marginal_at(conditional, likelihood, points, values, signals)
-    local = conditional.local(points, values, signals)
+    located, values = _settled(conditional, likelihood, points, values, signals)
+    value, values, _, local = _maximised(located, values, likelihood, signals)
+    if values.shape[1]:
+        local = located.local(values, signals)
     marginal = marginalise(local.information, local.gradient)
     return value, marginal.gradient, marginal.information
 
