@@ -148,6 +148,19 @@ def draw_broad_samples(
         values = prior.carried(values, centres, points)
         evidence, values, information = marginal_at(
             conditionals[state], likelihood, points, values, signals)
+        if n_moving:
+            # Velocities are drawn around the best ones, and have the weights of the likelihood.
+            joint = marginalise(information, np.zeros(values.shape), n_moving)
+            among = joint.information / widening
+            white = np.tile(normal[:, 3:3 + n_moving], (len(rows), 1))
+            drawn = np.matmul(
+                np.linalg.cholesky(symmetric(np.linalg.inv(among))), white[..., None])
+            values += np.hstack([drawn, np.matmul(joint.regression, drawn)])[..., 0]
+            evidence, values, _ = marginal_at(
+                conditionals[state], likelihood, points, values, signals, n_moving)
+            evidence += np.sum(white**2, axis=1) / 2 - np.linalg.slogdet(among)[1] / 2
+            velocities[rows] = (values[:, :n_moving] @ prior.velocity.T).reshape(
+                len(rows), -1, 3)
         evidence += _log_share(points.reshape(len(rows), -1, 3), select(modes, rows)).ravel()
         if phases.is_informative:
             likely = evidence >= evidence.max() - _SAMPLING.margin
@@ -160,12 +173,6 @@ def draw_broad_samples(
             positions[rows] = np.clip(
                 to_positions(points), *bounds).reshape(len(rows), -1, 3)
         log_weights[rows] += evidence.reshape(len(rows), -1)
-        if n_moving:
-            among = marginalise(information, np.zeros(values.shape), n_moving).information
-            roots = np.linalg.cholesky(symmetric(np.linalg.inv(among)))
-            white = np.tile(normal[:, 3:3 + n_moving], (len(rows), 1))
-            drawn = values[:, :n_moving] + np.matmul(roots, white[..., None])[..., 0]
-            velocities[rows] = (drawn @ prior.velocity.T).reshape(len(rows), -1, 3)
     return np.concatenate([positions, velocities], axis=2), log_weights
 
 

@@ -212,27 +212,27 @@ def _halve(modes: Modes, origins: Starts, gain: np.ndarray, rows: np.ndarray) ->
 
 
 def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
-                values: np.ndarray, signals: Signals
+                values: np.ndarray, signals: Signals, n_held: int = 0
                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the marginal log-likelihood at M points, [M], and the best parameters, [M, Q].
 
-    Newton steps start from the approximate parameters `values`, [M, Q]. Also returns the
-    information about the parameters, [M, Q, Q].
+    Newton steps start from the approximate parameters `values`, [M, Q], of which the first
+    `n_held` do not change. Also returns the information about the others, [M, Q, Q].
     """
     return _maximised(
         *_settled(conditional, likelihood, points, values, signals, moves=False),
-        likelihood, signals)[:3]
+        likelihood, signals, n_held)[:3]
 
 
-def _maximised(located: Located, values: np.ndarray, likelihood: Likelihood, signals: Signals
-               ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Local]:
+def _maximised(located: Located, values: np.ndarray, likelihood: Likelihood, signals: Signals,
+               n_held: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, Local]:
     """Return the results of `marginal_at`, and the likelihood before the last step."""
     for _ in range(2 if values.shape[1] and not likelihood.nuisance.velocity.size else 1):
         local = located.local(values, signals)
-        first = local.gradient.shape[1] - values.shape[1]
+        first = local.gradient.shape[1] - values.shape[1] + n_held
         information, gradient = local.information[:, first:, first:], local.gradient[:, first:]
         marginal = marginalise(information, gradient, 0)
-        values = values + marginal.offset
+        values = np.hstack([values[:, :n_held], values[:, n_held:] + marginal.offset])
     rise = np.sum(gradient * marginal.offset, axis=1) / 2
     return local.value + rise + marginal.log_volume, values, information, local
 
