@@ -6,14 +6,11 @@ positions.
 """
 
 import argparse
-import dataclasses
 import functools
 import sys
 import time
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 import yaml
@@ -22,27 +19,22 @@ from rclpy.node import Node
 from rhs_isac_ros.calibration import (
     Calibration,
     CalibrationError,
-    CalibrationWarning,
     Pilots,
-    SurveyWarning,
-    calibrate,
     known_states,
     load_surface,
     report,
-    survey,
     survey_report,
 )
-from rhs_isac_ros.calibration.boards import board_evidence, fit_board
 from rhs_isac_ros.calibration.estimate import places_of
 from rhs_isac_ros.calibration.survey import PLACE_WAVELENGTHS
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
+from rhs_isac_ros.experiments.pilots import Found, PilotWork
 from rhs_isac_ros.model import MultipathEstimate, Scenario
 from rhs_isac_ros.model.board import Board
 from rhs_isac_ros.model.boards import board_of
-from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.geometry import stands_still
 from rhs_isac_ros.monitoring.cycle_log import SignalLog
-from rhs_isac_ros.positioning import Sighting, Site, make_estimator
+from rhs_isac_ros.positioning import Sighting, Site
 from rhs_isac_ros.positioning.alignment import PoseError, estimate_pose
 from rhs_isac_ros.positioning.site import SiteError, site_text
 from rhs_isac_ros.protocol import messages as m
@@ -65,6 +57,7 @@ from rhs_isac_ros.support.files import (
     save_or_rescue,
     write_whole,
 )
+from rhs_isac_ros.support.jobs import JobError, Workers, add_run_options, unfinished
 from rhs_isac_ros.tools import command
 
 # The messages that pilots consist of.
@@ -72,11 +65,6 @@ _RECEIVES = (m.GroundTruth, m.ReceivedSignals)
 _CYCLES = 200
 _OUTPUT, _SITE_OUTPUT = Path('calibration.npz'), Path('site_calibrated.yaml')
 _TIMEOUT_S = 600.0
-# Maximum number of pilots whose errors before and after the calibration are compared, and number
-# of groups of places that are left out one by one.
-_N_COMPARED, _N_FOLDS = 200, 5
-# Function that returns the scenario and the surface that an estimator assumes, from pilots.
-Assumption: TypeAlias = Callable[[list[Pilots]], tuple[Scenario, SurfaceEstimate | None]]
 
 
 class PilotLog(SignalLog):
@@ -219,46 +207,48 @@ def _calibrate(options: argparse.Namespace, arguments: list[str]) -> int:
             return _save(known_states(scenario, *options.states), options.output)
         pilots = ([_arrays(options, scenario)] if has_arrays
                   else _collected(options, scenario, arguments))
-        with warnings.catch_warnings():
-            # The reports contain these warnings.
-            warnings.simplefilter('ignore', CalibrationWarning)
-            warnings.simplefilter('ignore', SurveyWarning)
+        with unfinished(options.output, options) as workers:
             if options.board is not None:
-                _compare(scenario, pilots, options)
-                return 0
-            if options.multipath:
-                _survey(scenario, pilots, options)
-                return 0
-            calibration = calibrate(scenario, pilots)
-            print(report(calibration, scenario), flush=True)
-            _print_errors(scenario, pilots, lambda _: (scenario, None),
-                          lambda some: (scenario, calibrate(scenario, some).surface))
-        return _save(calibration, options.output)
+                _compare(scenario, pilots, workers, options)
+            elif options.multipath:
+                _survey(scenario, pilots, workers, options)
+            else:
+                found = PilotWork(workers, scenario, pilots).estimate(multipath=False)
+                save_or_rescue(lambda path: write_whole(path, found.archive), options.output)
+                calibration = Calibration.load(options.output)
+                print(report(calibration, scenario), flush=True)
+                _print_errors(found)
+                print(f'{options.output}: calibration {calibration.id}')
+        return 0
+    except JobError as error:
+        raise command.ToolError(f'{error}; repeat the command to resume') from None
     except ValueError as error:
         raise CalibrationError(str(error)) from None
 
 
-def _compare(scenario: Scenario, pilots: Sequence[Pilots], options: argparse.Namespace) -> None:
+def _compare(scenario: Scenario, pilots: Sequence[Pilots], workers: Workers,
+             options: argparse.Namespace) -> None:
     """Print the evidence of boards, and fit parameters of the best one."""
-    found = {board: board_evidence(scenario, pilots, board)
-             for board in dict.fromkeys([scenario.board, *options.board])}
+    work = PilotWork(workers, scenario, pilots)
+    boards = [*dict.fromkeys([scenario.board, *options.board])]
+    found = dict(zip(boards, work.evidence([board.plain for board in boards]), strict=True))
     best = max(found, key=lambda board: found[board])
     for board, value in sorted(found.items(), key=lambda item: -item[1]):
-        print(f'{_board_text(board)}: log evidence {value - found[best]:.1f}', flush=True)
+        print(f'{_board_text(board.plain)}: log evidence {value - found[best]:.1f}', flush=True)
     if options.fit:
-        fit = fit_board(dataclasses.replace(scenario, board=best), pilots, options.fit)
-        std = np.sqrt(np.diagonal(fit.covariance))
+        fit = work.fit(best.plain, options.fit)
+        std = np.sqrt(np.diagonal(fit['covariance']))
         for name, value, deviation, row in zip(
-                fit.names, fit.values, std, fit.covariance, strict=True):
+                fit['names'], fit['values'], std, fit['covariance'], strict=True):
             print(f'{name}: {value:.8g} +- {deviation:.3g}; row of the covariance: '
                   f'{", ".join(f"{entry:.3g}" for entry in row)}')
-        gain = board_evidence(scenario, pilots, fit.board) - found[best]
-        print(f'log evidence {gain:.1f} with the line "board: {_board_text(fit.board)}" in the '
+        gain = fit['log_evidence'] - found[best]
+        print(f'log evidence {gain:.1f} with the line "board: {_board_text(fit["board"])}" in the '
               'scenario file')
 
 
-def _board_text(board: Board) -> str:
-    return yaml.safe_dump(board.plain, default_flow_style=True, width=10**6).split('\n')[0]
+def _board_text(plain: object) -> str:
+    return yaml.safe_dump(plain, default_flow_style=True, width=10**6).split('\n')[0]
 
 
 def _save(calibration: Calibration, output: Path) -> int:
@@ -304,67 +294,31 @@ def _collected(
     return pilots
 
 
-def _survey(scenario: Scenario, pilots: Sequence[Pilots], options: argparse.Namespace) -> None:
+def _survey(scenario: Scenario, pilots: Sequence[Pilots], workers: Workers,
+            options: argparse.Namespace) -> None:
     """Estimate the multipath from pilots with the codebook that was used at the most places."""
     group = max(pilots, key=lambda group: len(
         places_of(scenario, group.positions, PLACE_WAVELENGTHS)))
     n_other = sum(len(one.positions) for one in pilots) - len(group.positions)
     if n_other:
         print(f'{n_other} pilots with other codebooks have no effect')
-    surface = load_surface(str(options.calibration or ''), scenario)
-
-    def surveyed(group: Pilots) -> MultipathEstimate:
-        return survey(scenario, group.beams, group.positions, group.received, surface)
-
-    estimate = surveyed(group)
+    load_surface(str(options.calibration or ''), scenario)
+    found = PilotWork(workers, scenario, [group]).estimate(True, options.calibration)
+    save_or_rescue(lambda path: write_whole(path, found.archive), options.output)
+    estimate = MultipathEstimate.load(str(options.output))
     print(survey_report(estimate), flush=True)
-    _print_errors(scenario, [group], lambda _: (scenario, surface), lambda some: (
-        dataclasses.replace(scenario, multipath=surveyed(*some)), surface))
-    save_or_rescue(estimate.save, options.output)
+    _print_errors(found)
     print(f'{options.output}: multipath {estimate.digest}; use it with the line '
           f'"multipath: {options.output.name}" in a scenario file beside it')
 
 
-def _print_errors(scenario: Scenario, pilots: Sequence[Pilots], *assumptions: Assumption) -> None:
+def _print_errors(found: Found) -> None:
     """Print position errors at places that were left out, before and after a calibration."""
-    for text, assumption in zip(('before', 'after'), assumptions, strict=True):
-        distances = [np.empty(0)]
-        for others, left_out in _folds(scenario, pilots):
-            assumed, surface = assumption(others)
-            for group in left_out:
-                assert isinstance(group.beams, Codebook)
-                estimator = make_estimator('bayes', assumed, group.beams, surface=surface)
-                errors = estimator.estimate(group.received).mean - group.positions
-                distances.append(np.linalg.norm(errors, axis=1))
-        every = np.concatenate(distances)
+    for text, every in (('before', found.before_m), ('after', found.after_m)):
         fixes = every[np.isfinite(every)]
         rms = f'{np.sqrt(np.mean(fixes**2)):.3f} m rms' if len(fixes) else 'none'
         print(f'position error of left-out pilots {text}: {rms}, {len(every) - len(fixes)} of '
               f'{len(every)} without a fix', flush=True)
-
-
-def _folds(scenario: Scenario, pilots: Sequence[Pilots]
-           ) -> Iterator[tuple[list[Pilots], list[Pilots]]]:
-    """Leave groups of places out one by one; yield the pilots at other places, and those left out.
-
-    At most about `_N_COMPARED` pilots are left out in total.
-    """
-    positions = np.concatenate([group.positions for group in pilots])
-    fold_of = np.empty(len(positions), int)
-    for number, place in enumerate(places_of(scenario, positions, PLACE_WAVELENGTHS)):
-        fold_of[place] = number % _N_FOLDS
-    step = -(-len(positions) // _N_COMPARED)
-    parts = np.split(fold_of, np.cumsum([len(group.positions) for group in pilots])[:-1])
-
-    def chosen(rows: list[np.ndarray]) -> list[Pilots]:
-        return [Pilots(group.beams, group.positions[some], group.received[some])
-                for group, some in zip(pilots, rows, strict=True) if len(some)]
-
-    for fold in range(_N_FOLDS):
-        others = chosen([np.flatnonzero(part != fold) for part in parts])
-        left_out = chosen([np.flatnonzero(part == fold)[::step] for part in parts])
-        if others and left_out:
-            yield others, left_out
 
 
 def _board(text: str) -> Board:
@@ -438,6 +392,7 @@ def _parser() -> argparse.ArgumentParser:
         f'(default: {_CYCLES})')
     add('--timeout', type=positive_float, default=_TIMEOUT_S, metavar='S',
         help=f'maximum time to collect the pilots (default: {_TIMEOUT_S:g} s)')
+    add_run_options(parser)
     return parser
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from rhs_isac_ros.calibration import Calibration
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.experiments import pilots
 from rhs_isac_ros.link import choose_beam
 from rhs_isac_ros.model import Scenario, draw_surface, simulate_received
 from rhs_isac_ros.positioning import make_estimator
@@ -67,7 +68,7 @@ def recording(surface, write_recording, tmp_path_factory):
 @pytest.fixture
 def two_folds(monkeypatch):
     """Two instead of five groups of places are left out: each is a survey, which takes long."""
-    monkeypatch.setattr(calibrate, '_N_FOLDS', 2)
+    monkeypatch.setattr(pilots, '_N_FOLDS', 2)
 
 
 @pytest.fixture(scope='module')
@@ -80,8 +81,10 @@ def surface():
 def call(*arguments):
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = calibrate.main([*map(str, arguments)])
-    return types.SimpleNamespace(code=code, out=out.getvalue(), err=err.getvalue())
+        code = calibrate.main(['--jobs', '1', *map(str, arguments)])
+    # On a slow machine, the progress of the jobs appears.
+    err = re.sub(r'job \d+ of \d+: .*\n', '', err.getvalue())
+    return types.SimpleNamespace(code=code, out=out.getvalue(), err=err)
 
 
 @pytest.fixture(scope='module')
@@ -147,7 +150,7 @@ def test_boards_are_compared_and_the_best_one_is_fitted(tmp_path, capsys):
     np.savez(tmp_path / 'arrays.npz', positions=positions,
              received=simulate_received(lossy, CODEBOOK, positions, rng))
     options = (tmp_path / 'arrays.npz', '--config', CONFIG / 'quick.yaml', '--codebook',
-               CONFIG / 'codebook_quick.yaml', '--board')
+               CONFIG / 'codebook_quick.yaml', '--output', tmp_path / 'x.npz', '--board')
     done = call(*options, 'resonant', '{kind: paper, loss_db_per_m: 9}', '--fit', 'loss_db_per_m')
     assert (done.code, done.err) == (0, '')
     lines = done.out.splitlines()
@@ -160,14 +163,36 @@ def test_boards_are_compared_and_the_best_one_is_fitted(tmp_path, capsys):
     board = re.fullmatch(r'log evidence [\d.]+ with the line "board: (.*)" in the scenario file',
                          lines[4])[1]
     assert float(re.search('loss_db_per_m: ([^}]+)}', board)[1]) == pytest.approx(value)
+    assert not (tmp_path / 'x.npz.jobs').exists()
     done = call(*options, '--fit', 'masked')
     assert (done.code, done.out) == (2, 'paper: log evidence 0.0\n')
     assert "masked: expected a field of the board 'paper'" in done.err
+    assert len(done.err.splitlines()) == 1
     for wrong, error in (((*options, 'none'), "argument --board: 'none', expected a plug-in"),
                          ((*options[:-1], '--fit', 'masked'), 'together with --board')):
         with pytest.raises(SystemExit):
             calibrate.main([*map(str, wrong)])
         assert error in capsys.readouterr().err
+
+
+def test_an_interrupted_calibration_continues_in_other_processes(calibrated, recording, tmp_path,
+                                                                 monkeypatch):
+    pytest.importorskip('joblib')
+    file, answered, calls = tmp_path / 'surface.npz', pilots.answered, []
+
+    def interrupted(**options):
+        calls.append(options)
+        if len(calls) > 3:
+            raise KeyboardInterrupt
+        return answered(**options)
+    with monkeypatch.context() as patch:
+        patch.setattr(pilots, 'answered', interrupted)
+        call(recording, '--namespace', NAMESPACE, '--output', file)
+    assert len([*(tmp_path / 'surface.npz.jobs').glob('*.json')]) == 3
+    done = call(recording, '--namespace', NAMESPACE, '--output', file, '--jobs', '2')
+    assert done.out.splitlines()[:-1] == calibrated[1].out.splitlines()[:-1]
+    assert file.read_bytes() == calibrated[0].read_bytes()
+    assert not (tmp_path / 'surface.npz.jobs').exists()
 
 
 @pytest.mark.parametrize(('arguments', 'error'), [
