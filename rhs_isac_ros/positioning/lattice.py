@@ -139,11 +139,11 @@ def subband_wavenumbers(scenario: Scenario) -> np.ndarray:
 
 
 @functools.cache
-def unit_points() -> np.ndarray:
-    """Return quasi-random points in the unit cube, float64 [1024, 3], read-only."""
+def unit_points(size: int = 3) -> np.ndarray:
+    """Return quasi-random points in the unit cube, float64 [1024, size], read-only."""
     from scipy.stats import qmc
 
-    return read_only(qmc.Sobol(3, seed=0).random(_N_POINTS))
+    return read_only(qmc.Sobol(size, seed=0).random(_N_POINTS))
 
 
 class Shell(NamedTuple):

@@ -29,7 +29,7 @@ from rhs_isac_ros.model.geometry import jacobian, region_information, to_polar
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.estimate import regular
-from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Grid, Resolution
+from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Grid, Resolution, unit_points
 from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
 from rhs_isac_ros.positioning.mixture import Mixture, overlap
 from rhs_isac_ros.positioning.search import EXACT_MARGIN, Modes, expanded_at
@@ -60,9 +60,9 @@ class _Limits(NamedTuple):
     density: float = 0.01
     # Share of true priors that are doubted.
     doubt: float = 0.02
-    # Shares of variances that errors of elements cause: base-2 logarithm of the number of
-    # positions over which they are averaged, and the largest share.
-    log2_nodes: int = 5
+    # Shares of variances that errors of elements cause: number of positions over which they are
+    # averaged, and the largest share.
+    nodes: int = 32
     most: float = 0.98
 
 
@@ -213,10 +213,8 @@ def constant_shares(model: MeasurementModel) -> np.ndarray:
     """
     if model.elements.is_exact:
         return np.zeros(3)
-    from scipy.stats import qmc
-
     scenario, (low, high) = model.scenario, model.scenario.roi_bounds_m
-    positions = low + qmc.Sobol(3, seed=0).random(2**_LIMITS.log2_nodes) * (high - low)
+    positions = low + unit_points()[:_LIMITS.nodes] * (high - low)
     by_point = jacobian(to_polar(positions))
     mean, slopes = model.mean_and_jacobian(positions, by_point)
     nuisance = nuisance_of(scenario)

@@ -12,7 +12,7 @@ _Rows = TypeVar('_Rows', bound=tuple[np.ndarray, ...])
 def select(rows: _Rows, chosen: Any) -> _Rows:
     """Select rows of a named tuple of arrays by their indices or by a mask."""
     kind: Any = type(rows)
-    return kind._make(field[chosen] for field in rows)
+    return kind._make([field[chosen] for field in rows])
 
 
 def concatenate(*parts: _Rows) -> _Rows:

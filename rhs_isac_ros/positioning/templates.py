@@ -155,15 +155,14 @@ def _moments(model: MeasurementModel, positions: np.ndarray) -> tuple[np.ndarray
 
 @functools.cache
 def standard_normal(n: int, size: int = 3) -> np.ndarray:
-    """Return points that represent a Gaussian, float64 [n, size]; n is a power of two.
+    """Return points that represent a Gaussian, float64 [n, size]; n is 1, 2, 4, ..., or 1024.
 
     The array is read-only.
     """
     # The points are kept with the table because these imports take longer than loading a table.
     from scipy.special import ndtri
-    from scipy.stats import qmc
 
-    return read_only(ndtri(np.clip(qmc.Sobol(size, seed=0).random(n), 1e-6, 1 - 1e-6)))
+    return read_only(ndtri(np.clip(unit_points(size)[:n], 1e-6, 1 - 1e-6)))
 
 
 class Filters(NamedTuple):
