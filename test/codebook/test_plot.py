@@ -15,12 +15,9 @@ from rhs_isac_ros.support.pictures import write_picture
 HISTORY = [Progress(0, 1, 3.0, 0.1), Progress(1, 2, 1.0, 0.2)]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize('n_bands', [1, 4])
-def test_draws_any_number_of_bands(scenario, n_bands, tmp_path):
+def test_draws_a_single_band(scenario, tmp_path):
     pytest.importorskip('matplotlib')
-    changed = Scenario(**scenario.changes() | {
-        'center_frequencies_hz': [2.5e9 + 1e8 * i for i in range(n_bands)]})
+    changed = Scenario(**scenario.changes() | {'center_frequencies_hz': [2.5e9]})
     write_picture(tmp_path / 'p.png', plot_optimization(
         changed, directional_codebook(changed), HISTORY))
     assert (tmp_path / 'p.png').read_bytes().startswith(b'\x89PNG')
