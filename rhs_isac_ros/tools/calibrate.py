@@ -7,6 +7,8 @@ positions.
 
 import argparse
 import functools
+import itertools
+import posixpath
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -41,7 +43,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.fusion import sighting_of
 from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
-from rhs_isac_ros.ros.recording import RecordingError
+from rhs_isac_ros.ros.recording import RecordingError, read_networks
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
@@ -271,8 +273,14 @@ def _collected(
         options: argparse.Namespace, scenario: Scenario, arguments: list[str]) -> list[Pilots]:
     log = PilotLog(scenario)
     if options.file:
-        for found, _ in command.recorded(
-                options.file, options.namespace, scenario, [*_RECEIVES, Codebook]):
+        # Only the leading surface of a site records true positions, in the frame of the site.
+        others = read_networks(options.file).surfaces
+        for found, _ in itertools.chain(
+                command.recorded(
+                    options.file, options.namespace, scenario, [*_RECEIVES, Codebook]),
+                *(command.recorded(options.file, posixpath.join(posixpath.dirname(
+                    options.namespace.rstrip('/')), name), other, [m.GroundTruth])
+                  for name, other in others.items())):
             log.add(found)
     else:
         _collect(lambda: CalibratorNode(log, scenario), lambda: log.n_pilots, 'pilots',

@@ -51,8 +51,11 @@ def make_cycles(example):
 
 @pytest.fixture(scope='session')
 def write_recording():
-    """Function that writes messages to a recording of the small scenario, 0.1 s apart."""
-    def write(path, messages, namespace=''):
+    """Function that writes messages to a recording of the small scenario, 0.1 s apart.
+
+    `elsewhere` contains the namespaces of kinds of messages that are not in `namespace`.
+    """
+    def write(path, messages, namespace='', elsewhere=None):
         from mcap.writer import Writer
         names = {**topics.NAMES, convert.CodebookMessage: topics.CODEBOOK}
         writer, channels = Writer(str(path)), {}
@@ -63,7 +66,8 @@ def write_recording():
             kind, own = type(message), convert.ros_type(type(message))
             if kind not in channels:
                 channels[kind] = writer.register_channel(
-                    f'{namespace}/{names[kind]}', 'cdr', writer.register_schema(
+                    f'{(elsewhere or {}).get(kind, namespace)}/{names[kind]}', 'cdr',
+                    writer.register_schema(
                         type_name(own), 'ros2msg', schema(own).encode()))
             time_ns = number * 10**8
             identity = message.sender, message.scenario_id

@@ -20,6 +20,7 @@ from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.settings import Impairments
 from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros.recording import Recorded
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.tools import calibrate
 
@@ -173,6 +174,30 @@ def test_boards_are_compared_and_the_best_one_is_fitted(tmp_path, capsys):
         with pytest.raises(SystemExit):
             calibrate.main([*map(str, wrong)])
         assert error in capsys.readouterr().err
+
+
+def test_pilots_of_a_site_have_the_true_positions_of_its_leading_surface(
+        write_recording, tmp_path, monkeypatch):
+    """The other surfaces record none."""
+    rng = np.random.default_rng(0)
+    positions = SCENARIO.sample_positions(4, rng)
+    sizes, about = (SCENARIO.n_bands, SCENARIO.n_subbands, SCENARIO.n_frames), {
+        'scenario_id': SCENARIO.id, 'user': 1}
+    file = write_recording(tmp_path / 'site.mcap', [
+        convert.CodebookMessage.of(CODEBOOK, scenario_id=SCENARIO.id), *(
+            message for number, (position, signals) in enumerate(zip(
+                positions, simulate_received(SCENARIO, CODEBOOK, positions, rng), strict=True), 1)
+            for message in (
+                m.GroundTruth(cycle_id=number, position=position, velocity=np.zeros(3), **about),
+                m.ReceivedSignals(cycle_id=number, codebook_id=CODEBOOK.id,
+                                  signals=signals.reshape(sizes), **about)))],
+        '/lab/side', {m.GroundTruth: '/lab/front'})
+    monkeypatch.setattr(calibrate, 'read_networks', lambda path: Recorded(
+        None, dict.fromkeys(('front', 'side'), SCENARIO), SCENARIO.roi_bounds_m))
+    done = call(file, '--namespace', '/lab/side', '--board', 'phase', '--output',
+                tmp_path / 'x.npz')
+    assert (done.code, done.err) == (0, '')
+    assert done.out.startswith('paper: log evidence 0.0\nphase: log evidence -')
 
 
 def test_an_interrupted_calibration_continues_in_other_processes(calibrated, recording, tmp_path,
