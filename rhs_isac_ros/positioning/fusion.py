@@ -13,8 +13,7 @@ region is halved, and each half has a proposal of its own.
 
 To each likelihood, a constant is added: the user may be blocked from the surface, the search may
 have missed a mode, or the surface may be elsewhere. A surface that disagrees with the others thus
-makes the posterior broader. All masses are averages over the region, in as many dimensions as the
-region has.
+makes the posterior broader. All masses are averages over the region, in all of its dimensions.
 
 All surfaces together decide whether a user is outside of the region. The product for a user inside
 is compared with the product of what each surface says about a user outside. A surface may see the
