@@ -117,7 +117,8 @@ def test_hz_reports_until_it_is_interrupted(built_scripts, shared_session):
         assert process.wait(30) == 0
     found = re.fullmatch(r'average rate: ([\d.]+)\n\tmin: [\d.]+s max: [\d.]+s '
                          r'std dev: [\d.]+s window: \d+\n', report)
-    assert float(found[1]) > 1
+    # The network rests for a second between two cycles.
+    assert float(found[1]) > 0.3
 
 
 def test_topic_exits_when_the_reader_closes_the_pipe(run_script):
