@@ -257,6 +257,10 @@ class MeasurementModel:
         """
         return with_direct_errors(*self._constant, checked_positions(positions))
 
+    def covariance_in_shadow(self) -> np.ndarray:
+        """Return the covariance without a direct path, complex128 [N_B, N_SB F, N_SB F] [W]."""
+        return self._constant[0]
+
     @functools.cached_property
     def _constant(self) -> tuple[np.ndarray, DirectErrors]:
         """The part of `covariance_at` that is the same everywhere, and errors of the rest."""

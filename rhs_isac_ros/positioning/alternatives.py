@@ -2,6 +2,10 @@
 
 Each alternative has prior odds and an evidence, the likelihood averaged over its own unknowns. A
 comparison with the evidence for a user in the region gives the probability of the alternative.
+Both average over errors and failures of the elements in the same way, without regard to what the
+signals reveal about single elements. All parameters, such as an offset of the timing, are those
+that fit the alternative.
+
 There is a fix only if a user in the region and in sight is at least as probable as all
 alternatives together, which is the decision with the least error, and if the probability of each
 alternative, compared with such a user alone, is within the limit of the alternative.
@@ -10,7 +14,7 @@ alternative, compared with such a user alone, is within the limit of the alterna
 import copy
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -20,6 +24,7 @@ from rhs_isac_ros.model.arrays import blocks, log_sum
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
 from rhs_isac_ros.model.geometry import element_positions, to_positions
+from rhs_isac_ros.positioning.dispersed import ONE_STATE, SurfaceState
 from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.projection import (
@@ -94,23 +99,25 @@ class Blocked:
     The attributes are those of `Outside`.
     """
 
-    name, reason, limit = 'blocked', 'blocked', BLOCKED_LIMIT
+    name, reason, limit, strength = 'blocked', 'blocked', BLOCKED_LIMIT, 0.0
 
-    def __init__(self, scenario: Scenario, n_measurements: int) -> None:
-        self._n = n_measurements
+    def __init__(self, scenario: Scenario, n_measurements: int,
+                 states: Sequence[SurfaceState] = ONE_STATE) -> None:
+        self._n, self._states = n_measurements, states
         self.log_odds = log_odds_of(scenario.blocked_probability)
         self._median_db, self._std_db = scenario.multipath_level_db
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residuals: np.ndarray,
                         prior: NuisancePrior) -> np.ndarray:
         """Compute log evidences from the energies of the signals; see `Outside`."""
-        energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
         # The gain of the user is part of the level.
         gain_db = min(prior.gain_std / NEPERS_PER_DB, _UNKNOWN_GAIN_DB)
         std_db = math.hypot(BLOCKED_STD_DB, self._std_db, gain_db)
-        in_sight, blocked = (
-            log_evidence_of_level(energy, self._n, std, self._median_db)
-            for energy, std in ((residuals, self._std_db), (energies, std_db)))
+        in_sight = log_evidence_of_level(residuals, self._n, self._std_db, self._median_db)
+        blocked = np.logaddexp.reduce([
+            state.offset + log_evidence_of_level(
+                state.energy(whitened), self._n, std_db, self._median_db)
+            for state in self._states])
         if prior.gain_std:
             # Relative to the density of an unknown gain that positions assume.
             blocked += math.log(gain_db * NEPERS_PER_DB / prior.gain_unit)
@@ -187,20 +194,17 @@ class Outside:
     reason = 'position outside of the region'  # Beginning of the reason why there is no fix.
     # Largest probability at which there is a fix, if no other alternative is considered.
     limit = LIMIT
+    # Weight of a direct path as in the region in the parameters that move the multipath, which are
+    # between those that fit such a path and those that fit the multipath alone.
+    strength = 0.5
 
-    def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
+    def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray],
+                 states: Sequence[SurfaceState] = ONE_STATE) -> None:
         # Logarithm of the prior odds relative to a user inside and in sight.
         self._probability = scenario.outside_probability
         self.log_odds = log_odds_of(self._probability)
-        self._filters, self._index = arrays['outer_filters'], arrays['outer_index']
         self._basis = arrays['outer_basis']
-        ranges = _ranges(scenario)[:, None]
-        self._scale = (2 / ranges).astype(np.float32)
-        self._node_energy = np.maximum(arrays['outer_energy'], np.finfo(np.float32).tiny)
-        self._energy = (arrays['outer_energy'][self._index] / ranges**2).astype(np.float32)
-        with np.errstate(divide='ignore'):
-            log_prior = np.log(arrays['outer_weights'])
-        self._offset = (log_prior - self._energy).astype(np.float32)
+        self._templates = [_Templates(scenario, arrays, state) for state in states]
 
     def seen(self, model: MeasurementModel, received: np.ndarray, whitened: np.ndarray
              ) -> np.ndarray:
@@ -225,11 +229,42 @@ class Outside:
         without the factors of `aligned`. `residuals`, [N], are the residual energies at the best
         positions inside.
         """
-        found = np.concatenate([
+        found: np.ndarray = np.logaddexp.reduce([
+            one.log_evidence_of(whitened, prior) for one in self._templates])
+        return found + prior.log_evidence_of_aligned(aligned)
+
+    def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
+        """Return whether some position explains the signals up to this residual energy."""
+        return any(one.explain(whitened, max_residual) for one in self._templates)
+
+
+class _Templates:
+    """The templates of `tabulate_outside` for one state of the surface."""
+
+    def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray],
+                 state: SurfaceState = ONE_STATE[0]) -> None:
+        self._state = state
+        self._filters, self._index = arrays['outer_filters'], arrays['outer_index']
+        ranges = _ranges(scenario)[:, None]
+        self._scale = (2 / ranges).astype(np.float32)
+        energy = arrays['outer_energy']
+        if state.operator is not None:
+            operator = state.operator.astype(np.complex64)
+            energy = np.sum([np.sum(one.conj() * (one @ of_band), axis=1).real
+                             for one, of_band in zip(self._filters, operator, strict=True)],
+                            axis=0).reshape(energy.shape)
+        self._node_energy = np.maximum(energy, np.finfo(np.float32).tiny)
+        self._energy = (energy[self._index] / ranges**2).astype(np.float32)
+        with np.errstate(divide='ignore'):
+            log_prior = np.log(arrays['outer_weights'])
+        self._offset = (log_prior - self._energy).astype(np.float32)
+
+    def log_evidence_of(self, whitened: np.ndarray, prior: NuisancePrior) -> np.ndarray:
+        """Compute logarithms of the evidence of whitened signals, [N]; see `Outside`."""
+        return np.concatenate([
             self._over_gain(whitened[block], prior) if prior.gain_std
             else self.log_evidence(whitened[block])[:, 0]
             for block in blocks(len(whitened), 1 if prior.gain_std else GRID.shots)])
-        return found + prior.log_evidence_of_aligned(aligned)
 
     def _over_gain(self, whitened: np.ndarray, prior: NuisancePrior) -> np.ndarray:
         """Return the log evidence of one shot, N = 1, averaged over an unknown gain, [1]."""
@@ -244,7 +279,7 @@ class Outside:
         """Return limits of the gain [nepers] beyond which its posterior is negligible."""
         # Without a prior, the most likely gain makes the energy of all signals, or of what no
         # position explains in them, equal to that of noise.
-        energy, n = float(np.sum(np.abs(whitened)**2)), whitened.size
+        energy, n = float(self._state.energy(whitened)[0]), whitened.size
         filtered = np.sum(self._filter(whitened), axis=1)**2 / self._node_energy
         rest = max(energy - float(filtered.max()), n * _MIN_PROBABILITY)
         reach, margin = GRID.gain_reach * std, GRID.gain_reach / math.sqrt(n)
@@ -261,8 +296,8 @@ class Outside:
         filtered = self._filter(whitened)
         # At any range, the log-likelihood is highest if the outputs of all bands are in phase.
         bound = (np.sum(filtered, axis=1)**2 / self._node_energy).max(axis=1)
-        constants = log_weights - np.multiply.outer(
-            np.sum(np.abs(whitened)**2, axis=(1, 2)), scales**2)
+        constants = self._state.offset + log_weights - np.multiply.outer(
+            self._state.energy(whitened), scales**2)
         bound = bound[:, None] * scales[:, None]**2 + constants[..., None]
         shot, scale, direction = np.nonzero(
             bound >= bound.max(axis=(1, 2), keepdims=True) - GRID.margin)
@@ -290,14 +325,15 @@ class Outside:
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some position explains the signals up to this residual energy."""
         amplitude = np.sum(self._filter(whitened[None])[0], axis=0)[self._index] * self._scale
-        residual = np.sum(np.abs(whitened)**2) - amplitude + self._energy
+        residual = self._state.energy(whitened) - amplitude + self._energy
         tolerated = max_residual + GRID.error * self._energy
         return bool(((residual <= tolerated) & np.isfinite(self._offset)).any())
 
     def _filter(self, whitened: np.ndarray) -> np.ndarray:
         """Return filter output magnitudes by template and direction, [N, N_B, T, V] [m]."""
         # The energy outside of a basis is not part of a template.
-        signals = whitened[..., :self._filters.shape[2], None].astype(np.complex64)
+        seen = self._state.apply(whitened)
+        signals = seen[..., :self._filters.shape[2], None].astype(np.complex64)
         filtered = np.abs(np.matmul(self._filters, signals)[..., 0])
         return filtered.reshape(*filtered.shape[:2], -1, self._energy.shape[1])
 

@@ -1,15 +1,14 @@
 """The likelihood with the covariance of element errors at each position."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.model.arrays import mixture_weights
-from rhs_isac_ros.model.gaussian import (
-    covariance_root,
-)
+from rhs_isac_ros.model.arrays import adjoint, mixture_weights, multiply_rows
+from rhs_isac_ros.model.gaussian import covariance_root
 from rhs_isac_ros.positioning.likelihood import (
     Columns,
     Conditional,
@@ -48,11 +47,25 @@ class DispersedLikelihood(Conditional):
         self._intact = MeasurementModel(intact, likelihood.codebook, likelihood.surface)
         self._scales, log_weights = _failure_counts(scenario.n_elements, share)
         self._offsets = log_weights + likelihood.log_det
-        average, least = self._average.covariance(), self._intact.covariance()
-        roots = covariance_root(
-            scenario, least + self._scales[:, None, None, None] * (average - least))
+        roots = covariance_root(scenario, self._covariances(MeasurementModel.covariance))
         self._information = [likelihood.nuisance.information_of(*both)
                              for both in zip(roots, np.linalg.inv(roots), strict=True)]
+
+    def _covariances(self, of: Callable[[MeasurementModel], np.ndarray]) -> np.ndarray:
+        """Return a covariance for each number of failures, [K, N_B, N_SB F, N_SB F]."""
+        average, least = of(self._average), of(self._intact)
+        covariances: np.ndarray = (
+            least + self._scales[:, None, None, None] * (average - least))
+        return covariances
+
+    def states(self, of: Callable[[MeasurementModel], np.ndarray]) -> 'list[SurfaceState]':
+        """Return the states of the surface with covariances `of` a model, for all positions."""
+        covariances, root = self._covariances(of), self._base.model.combined_root
+        operators = np.matmul(adjoint(root), np.linalg.solve(covariances, root))
+        offsets = self._offsets - np.linalg.slogdet(covariances)[1].sum(axis=1)
+        unit = np.eye(root.shape[-1])
+        return [SurfaceState(offset, None if np.allclose(one, unit) else one)
+                for offset, one in zip(offsets.tolist(), operators, strict=True)]
 
     @classmethod
     def of(cls, likelihood: Likelihood) -> 'DispersedLikelihood | None':
@@ -83,6 +96,28 @@ class DispersedLikelihood(Conditional):
             states.append((factors, offset - factors.log_det, information))
         mean, slopes = self._average.mean_and_jacobian(users, by_unknown)
         return LocatedStates(self._base.nuisance, mean, slopes, slopes[:, :0], states)
+
+
+class SurfaceState(NamedTuple):
+    """A state of the surface with one covariance for all positions; by default, the only state.
+
+    For whitened signals y and a whitened mean t, its log-likelihood is ``offset - d^H M d`` with
+    d = y - t, up to the constant of `Likelihood`.
+    """
+
+    offset: float = 0.0
+    operator: np.ndarray | None = None  #: M, complex128 [N_B, n, n]; None for the identity.
+
+    def apply(self, whitened: np.ndarray) -> np.ndarray:
+        """Multiply whitened signals [..., N_B, n] by M."""
+        return whitened if self.operator is None else multiply_rows(self.operator, whitened)
+
+    def energy(self, whitened: np.ndarray) -> np.ndarray:
+        """Return ``y^H M y`` of whitened signals [..., N_B, n], float64 [...]."""
+        return np.sum((whitened.conj() * self.apply(whitened)).real, axis=(-2, -1))
+
+
+ONE_STATE = (SurfaceState(),)
 
 
 class LocatedStates(NamedTuple):

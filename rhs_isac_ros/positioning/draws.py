@@ -145,9 +145,9 @@ class DrawnPosterior:
         covariance += (along[:, None] * rays.direction).T @ rays.direction
         # The log-likelihoods of the rays omit the energy of the signals.
         energy, best = float(query.energies[shot]), float(rays.highest[weights > 0].max())
+        log_evidence = float(log_total) - np.log(total_share) - energy - self._log_region
         return Fit(
-            mean, regular(covariance * (1 + variance)),
-            float(log_total) - np.log(total_share) - energy - self._log_region,
+            mean, regular(covariance * (1 + variance)), log_evidence, log_evidence,
             energy - best, self._n_measurements + float(weights @ rays.average) - best, 0.0,
             functools.partial(_described, rays, weights, 1 + variance, self._bounds))
 

@@ -228,6 +228,8 @@ class Fit(NamedTuple):
     mean: np.ndarray
     covariance: np.ndarray
     log_evidence: float  # Logarithm of the likelihood averaged over the region.
+    # The same, with failures of elements averaged over all surfaces.
+    averaged_evidence: float
     residual: float  # Energy of the whitened residual at the best position.
     expected: float  # Expected residual of signals that match the model.
     gain: float  # Gain of the signals at the best position [nepers].

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model import Pose
+from rhs_isac_ros.model import MeasurementModel, Pose
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.gaussian import share_of_level
 from rhs_isac_ros.model.geometry import jacobian
@@ -51,7 +51,7 @@ from rhs_isac_ros.positioning.prior import (
     multiply,
     uniform,
 )
-from rhs_isac_ros.positioning.search import GRID_MARGIN, Modes, modes_from
+from rhs_isac_ros.positioning.search import GRID_MARGIN, Modes, OneState, modes_from
 from rhs_isac_ros.positioning.segments import Segments, concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.positioning.store import load_table
@@ -92,14 +92,12 @@ class SearchScope(NamedTuple):
     drawn: DrawnPosterior | None = None
 
     @classmethod
-    def of(cls, likelihood: Likelihood, arrays: Mapping[str, np.ndarray], grid: Grid
-           ) -> 'SearchScope':
+    def of(cls, likelihood: Likelihood, arrays: Mapping[str, np.ndarray], grid: Grid,
+           alternatives: Sequence[Alternative]) -> 'SearchScope':
         """Take the templates of a grid, which may be part of the region's."""
         scenario = likelihood.scenario
         kind = MovingTable if scenario.user_speed_std_mps else TemplateTable
         table = kind(scenario, arrays, grid=grid)
-        alternatives = ([Blocked(scenario, likelihood.model.n_whitened)]
-                        if scenario.blocked_probability else [])
         return cls(table, Alignment(likelihood, table.spread), alternatives, np.zeros(1, bool))
 
 
@@ -149,7 +147,13 @@ class SearchEstimator(abc.ABC):
         self._bounds = likelihood.resolution.bounds_m
         self._prior_m2 = float(np.sum((self._bounds[1] - self._bounds[0])**2)) / 12
         self._phases = BandPhases(likelihood)
-        self._refinement = refinement_of(likelihood)
+        self._refinement, self._averaging = refinement_of(likelihood), OneState(likelihood)
+        # What distinguishes users without a direct path, and their parameters.
+        self._blocked = [Blocked(
+            scenario, n_measurements,
+            self._averaging.states(MeasurementModel.covariance_in_shadow))
+        ] if scenario.blocked_probability else []
+        self._shadow = Alignment(likelihood, np.zeros_like(likelihood.model.root))
         # Twice an energy has two degrees of freedom for each complex measurement, less one for
         # each fitted coordinate or parameter.
         n_fitted = 3 + len(prior)
@@ -167,9 +171,11 @@ class SearchEstimator(abc.ABC):
     def _region(self) -> SearchScope:
         """The whole region."""
         scenario = self._likelihood.scenario
-        scope = SearchScope.of(self._likelihood, self._load(), lay_grid(scenario))
+        scope = SearchScope.of(
+            self._likelihood, self._load(), lay_grid(scenario), self._blocked)
         if self._rejects_outside:
-            outside = Outside(scenario, self._load(outside=True))
+            outside = Outside(scenario, self._load(outside=True),
+                              self._averaging.states(MeasurementModel.covariance))
             scope = scope._replace(alternatives=[outside, *scope.alternatives])
         if self.averages and self._is_plain:
             scope = scope._replace(drawn=DrawnPosterior(
@@ -191,7 +197,8 @@ class SearchEstimator(abc.ABC):
         # A cached property is in vars() once it is computed.
         if '_region' not in vars(self) and chosen.any():
             part = grid.within(chosen)
-            scope = SearchScope.of(likelihood, tabulate(likelihood.model, grid=part), part)
+            scope = SearchScope.of(
+                likelihood, tabulate(likelihood.model, grid=part), part, self._blocked)
             yield scope._replace(favoured=np.ones(1, bool))
         yield self._region._replace(
             alternatives=[one.given(wrong) for one in self._region.alternatives], favoured=chosen)
@@ -340,11 +347,11 @@ class SearchEstimator(abc.ABC):
             for alternative in scope.alternatives:
                 seen = alternative.seen(self._likelihood.model, signals.received, seen)
             residuals = np.array([one.fit.residual for one in fits])
-            evidence = [one.log_evidence_of(seen, aligned, residuals, self._likelihood.nuisance)
-                        for one in scope.alternatives]
+            evidence = self._log_evidence(
+                scope.alternatives, signals, seen, aligned, residuals)
             for n, (row, searched, one, values) in enumerate(zip(
                     usable, fits, seen, aligned, strict=True)):
-                log_ratios = {alternative.name: float(log[n]) - searched.fit.log_evidence
+                log_ratios = {alternative.name: float(log[n]) - searched.fit.averaged_evidence
                               for alternative, log in zip(
                                   scope.alternatives, evidence, strict=True)}
                 estimate = self._judge(
@@ -390,16 +397,12 @@ class SearchEstimator(abc.ABC):
     def _fits_of(self, scope: SearchScope, modes: Modes, signals: Signals
                  ) -> Iterator[tuple[int, '_Searched']]:
         """Yield each shot that has modes, with its posterior."""
-        likelihood = self._likelihood
-        modes, conditionals = self._refinement.refine(modes, signals, scope.table)
-        if likelihood.nuisance.is_coarse:
-            drawn = (draw_broad_samples(
-                likelihood, of_shot, self._phases, select(signals, [shot]), modes.of_shot(shot),
-                self._mode_normal) for shot, of_shot in conditionals.items())
-            positions, log_weights = map(np.concatenate, zip(*drawn, strict=True))
-            samples = Samples.of(positions, log_weights, modes.shots)
-        else:
-            samples = draw_samples(modes, self._mode_normal, self._bounds)
+        likelihood, coarse = self._likelihood, modes
+        modes, conditionals = self._refinement.refine(coarse, signals, scope.table)
+        samples = averaged = self._samples(modes, conditionals, signals)
+        if not isinstance(self._refinement, OneState):
+            averaged = self._samples(
+                *self._averaging.refine(coarse, signals, scope.table), signals)
         means, covariances = self._moments(modes, samples)
         # If the model holds, twice the residual energy, averaged over the posterior, has the mean
         # of a chi-square variable. At the best of several modes, it is smaller than the average.
@@ -409,13 +412,38 @@ class SearchEstimator(abc.ABC):
         gains = samples.of_shot.first(modes.values) @ likelihood.nuisance.gain
         for n, (shot, *fit) in enumerate(zip(
                 conditionals, means, covariances, samples.log_evidence.tolist(),
-                residuals.tolist(), expected.tolist(), gains.tolist(), strict=True)):
+                averaged.log_evidence.tolist(), residuals.tolist(), expected.tolist(),
+                gains.tolist(), strict=True)):
             of_shot = modes.of_shot(shot)
             # Broad modes are not Gaussian, so their sheets have the moments of the samples.
             describe = functools.partial(
                 samples.described, n, None if likelihood.nuisance.is_coarse else of_shot,
                 self._bounds)
             yield shot, _Searched(Fit._make((*fit, describe)), of_shot, conditionals[shot])
+
+    def _samples(self, modes: Modes, conditionals: Mapping[int, Sequence[Conditional]],
+                 signals: Signals) -> Samples:
+        """Represent the posteriors with these modes by samples."""
+        if not self._likelihood.nuisance.is_coarse:
+            return draw_samples(modes, self._mode_normal, self._bounds)
+        drawn = (draw_broad_samples(
+            self._likelihood, of_shot, self._phases, select(signals, [shot]), modes.of_shot(shot),
+            self._mode_normal) for shot, of_shot in conditionals.items())
+        positions, log_weights = map(np.concatenate, zip(*drawn, strict=True))
+        return Samples.of(positions, log_weights, modes.shots)
+
+    def _log_evidence(self, alternatives: Sequence[Alternative], signals: Signals,
+                      seen: np.ndarray, aligned: np.ndarray, residuals: np.ndarray
+                      ) -> list[np.ndarray]:
+        """Return logarithms of the evidence of each alternative, [N] each."""
+        prior, found = self._likelihood.nuisance, []
+        shadow = self._shadow.values_of_each(signals.received, aligned)
+        for one in alternatives:
+            values = shadow + one.strength * (aligned - shadow)
+            if prior.moves_multipath.any():
+                seen = self._likelihood.whitened(values, signals)
+            found.append(one.log_evidence_of(seen, values, residuals, prior))
+        return found
 
     def _judge(self, alternatives: Sequence[Alternative], log_ratios: Mapping[str, float],
                searched: '_Searched', signals: Signals, whitened: np.ndarray, aligned: np.ndarray

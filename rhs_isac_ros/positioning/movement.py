@@ -99,7 +99,7 @@ class MovementTest:
                 np.log(4 * n) / 2 + np.log(prior.gain_unit))
         rest = (fit.residual - np.sum(np.abs(whitened)**2)) / level - fit.residual
         return (log_sum(values) - np.log(values.size) + constant + float(rest)
-                + prior.log_evidence_of_aligned(aligned) - fit.log_evidence)
+                + prior.log_evidence_of_aligned(aligned) - fit.averaged_evidence)
 
     def _walks(self, walking: Likelihood, modes: Modes, signals: Signals) -> float:
         """Return the log evidence of a user who walks, relative to that of the modes."""

@@ -53,17 +53,21 @@ class Alignment:
             precision, self._prior.direct_information(spread)[moves])) / 2
         self.margin = min(_SEARCH.deviation**2 * float(loss), _SEARCH.margin)
 
-    def values_of_each(self, received: np.ndarray) -> np.ndarray:
-        """Estimate the parameters [N, Q] that move the multipath; all others are 0."""
+    def values_of_each(self, received: np.ndarray, starts: np.ndarray | None = None
+                       ) -> np.ndarray:
+        """Estimate the parameters [N, Q] that move the multipath; all others are 0.
+
+        Without `starts`, approximate parameters [N, Q], they are searched for on a grid.
+        """
         if not self._prior.moves_multipath.any():
             return np.zeros((len(received), len(self._prior)))
-        return np.stack([self._values(one) for one in received])
+        if starts is None:
+            starts = np.stack([self._best_on_grid(one) for one in received])
+        return np.stack([self._refined(*each) for each in zip(received, starts, strict=True)])
 
-    def _values(self, received: np.ndarray) -> np.ndarray:
+    def _refined(self, received: np.ndarray, values: np.ndarray) -> np.ndarray:
         prior, moves = self._prior, self._prior.moves_multipath
-        values = np.zeros(len(prior))
-        if prior.needs_search.any():
-            values = self._best_on_grid(received)
+        values = values.copy()
         for _ in range(_SEARCH.refinements):
             divided = prior.divide(received, values)
             residual = self._whitened(divided[None]).reshape(-1)
@@ -82,6 +86,8 @@ class Alignment:
         """Return the best grid values of parameters whose likelihood has several maxima."""
         prior = self._prior
         (searched,) = np.nonzero(prior.needs_search)
+        if not len(searched):
+            return np.zeros(len(prior))
         n_grid = _SEARCH.points[min(len(searched), len(_SEARCH.points)) - 1]
         # Beyond half a period, the signals repeat.
         reach = np.minimum(_SEARCH.reach, prior.half_period[searched])

@@ -5,14 +5,19 @@ treated as Gaussian (Laplace's method). The information about the position is th
 complement, and the mass of the mode contains the determinant of the parameters' information.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.gaussian import Marginal, likelihood_loss, marginalise, step_to_maximum
 from rhs_isac_ros.model.geometry import polar_derivative, to_polar, to_positions
-from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
+from rhs_isac_ros.positioning.dispersed import (
+    ONE_STATE,
+    DispersedLikelihood,
+    SurfaceState,
+)
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable, heaviest, separate
 from rhs_isac_ros.positioning.likelihood import (
     Conditional,
@@ -119,8 +124,13 @@ class OneState:
 
     def __init__(self, likelihood: Likelihood) -> None:
         self._likelihood = likelihood
-        self._conditional: Conditional = DispersedLikelihood.of(likelihood) or likelihood
+        self._dispersed = DispersedLikelihood.of(likelihood)
+        self._conditional: Conditional = self._dispersed or likelihood
         self.is_exact = self._conditional is likelihood
+
+    def states(self, of: Callable[[MeasurementModel], np.ndarray]) -> Sequence[SurfaceState]:
+        """Return the states of the surface; see `DispersedLikelihood.states`."""
+        return self._dispersed.states(of) if self._dispersed else ONE_STATE
 
     def refine(self, modes: Modes, signals: Signals, table: TemplateTable
                ) -> tuple[Modes, dict[int, Sequence[Conditional]]]:

@@ -1,13 +1,16 @@
 """Users outside of the region, and users without a direct path."""
 
+import copy
 import dataclasses
 
 import numpy as np
 import pytest
 from scipy.special import ive, logsumexp
-from scipy.stats import norm
+from scipy.stats import binom, norm
 
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
+from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.geometry import to_positions
 from rhs_isac_ros.model.hall import CONDITIONS, MultipathEstimate
 from rhs_isac_ros.model.impairments import draw_impairments
@@ -15,6 +18,7 @@ from rhs_isac_ros.model.los import draw_blocked
 from rhs_isac_ros.positioning import Mixture, Tracker, alternatives, make_estimator
 from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT, LIMIT, Outside, tabulate_outside
 from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.positioning.search import OneState
 from rhs_isac_ros.system import System
 
 
@@ -71,7 +75,7 @@ def test_evidence_is_the_average_likelihood(setting, reference):
     signals, _, exponent = reference
     highest = exponent.max()
     expected = highest + np.log(np.mean(np.exp(exponent - highest)))
-    found = Outside(scenario, arrays).log_evidence(signals[None])[0, 0]
+    found = alternatives._Templates(scenario, arrays).log_evidence(signals[None])[0, 0]
     assert found == pytest.approx(expected, abs=0.5)
 
 
@@ -84,14 +88,15 @@ def test_the_evidence_is_the_average_over_an_unknown_gain(random_beams):
         np.array([[8.0, 1.0, 0.5]]), np.random.default_rng(6))
     declared = dataclasses.replace(scenario, user_gain_std_db=0.5)
     likelihood = Likelihood(System(declared, codebook))
-    table = Outside(declared, tabulate_outside(likelihood.model))
+    arrays = tabulate_outside(likelihood.model)
+    table = alternatives._Templates(declared, arrays)
     std = 0.5 * np.log(10) / 20
     gains = np.linspace(-6, 6, 601) * std
     signals = likelihood.model.whiten(received * np.exp(-gains)[:, None, None])
     exponent = table.log_evidence(signals)[:, 0]
     exponent += norm(scale=std).logpdf(gains) - 2 * received.size * gains
     expected = logsumexp(exponent) + np.log(gains[1] - gains[0])
-    (found,) = table.log_evidence_of(
+    (found,) = Outside(declared, arrays).log_evidence_of(
         likelihood.model.whiten(received), np.zeros((1, 1)), np.zeros(1), likelihood.nuisance)
     assert found == pytest.approx(expected, abs=0.1)
 
@@ -99,12 +104,78 @@ def test_the_evidence_is_the_average_over_an_unknown_gain(random_beams):
 def test_a_factor_is_that_of_the_signals(setting, reference):
     """Weak signals make directions more alike, so that more of them matter."""
     scenario, _, arrays = setting
-    table, signals = Outside(scenario, arrays), 3 * reference[0][None]
+    table, signals = alternatives._Templates(scenario, arrays), 3 * reference[0][None]
     scales = np.array([0.02, 0.2, 1.0, 3.0])
     expected = table.log_evidence(np.concatenate([scale * signals for scale in scales]))[:, 0]
     # With these weights, no factor is negligible among the others.
     np.testing.assert_allclose(
         table.log_evidence(signals, scales, -expected), 0, atol=1e-3)
+
+
+@pytest.fixture(scope='module')
+def failing(setting):
+    """The likelihood if elements may have failed, their states, and some signals."""
+    scenario, model, _ = setting
+    declared = dataclasses.replace(scenario, failed_element_share=0.04, element_error_rms=0.02)
+    likelihood = Likelihood(System(declared, model.beams))
+    signals = model.sample(np.array([[7.0, 2.0, 1.0]]), np.random.default_rng(1))
+    return likelihood, OneState(likelihood), signals
+
+
+def test_blocked_users_have_no_errors_of_the_direct_path(failing):
+    likelihood, elements, signals = failing
+    states = elements.states(MeasurementModel.covariance_in_shadow)
+    assert len(states) > 2
+    # Users at a great distance have a negligible direct path.
+    far, failures = np.array([[1e7, 0.0, 0.0]]), np.arange(len(states))
+    intact, declared = (
+        MeasurementModel(dataclasses.replace(likelihood.scenario, failed_element_share=share),
+                         likelihood.codebook).covariance_at(far)[0] for share in (0.0, 0.04))
+    (whitened,) = likelihood.model.whiten(signals)
+    for n, state in zip(failures, states, strict=True):
+        covariance = intact + n / (25 * 0.04) * (declared - intact)
+        energy = np.sum(signals[0].conj() * np.linalg.solve(
+            covariance, signals[0][..., None])[..., 0]).real
+        assert state.energy(whitened) == pytest.approx(energy)
+        log_det = np.linalg.slogdet(covariance)[1].sum()
+        assert state.offset == pytest.approx(
+            binom.logpmf(n, 25, 0.04) + likelihood.log_det - log_det, abs=1e-3)
+
+
+def test_templates_have_the_covariance_of_their_state(failing):
+    """As if the signals were whitened by this covariance."""
+    likelihood, elements, signals = failing
+    state = elements.states(MeasurementModel.covariance)[2]
+    model, arrays = likelihood.model, tabulate_outside(likelihood.model)
+    root = np.linalg.inv(adjoint(np.linalg.cholesky(state.operator)))
+    changed = copy.copy(model)
+    vars(changed).update(
+        combined_root=model.combined_root @ root, root=model.root @ root,
+        combined_whitener=np.linalg.inv(model.combined_root @ root),
+        whitener=np.linalg.inv(model.root @ root))
+    found, expected = (
+        alternatives._Templates(model.scenario, *args).log_evidence(one.whiten(signals))[0, 0]
+        for one, args in ((model, (arrays, state)), (changed, (tabulate_outside(changed),))))
+    assert found == pytest.approx(expected + state.offset, abs=0.02)
+
+
+@pytest.mark.parametrize('change, n', [
+    ({'failed_element_share': 0.01}, 2), ({'timing_std_s': 1e-7}, 16)], ids=['failures', 'timing'])
+def test_neither_failures_nor_offsets_explain_users_elsewhere(change, n, pytestconfig):
+    config, rng = pytestconfig.rootpath / 'config', np.random.default_rng(3)
+    scenario = dataclasses.replace(
+        Scenario.from_yaml(config / 'bandplan.yaml'), blocked_probability=0.2, **change)
+    codebook = Codebook.load(config / 'codebook_bandplan.yaml')
+    estimator = make_estimator('bayes', scenario, codebook, reject_outside=True)
+    inside = scenario.sample_positions(n, rng)
+
+    def n_fixes(positions, blocked):
+        model = MeasurementModel(
+            dataclasses.replace(scenario, blocked_probability=blocked), codebook)
+        return estimator.estimate(model.sample(positions, rng)).fix.sum()
+    assert n_fixes(inside, 0.0) >= n - n // 8
+    assert n_fixes(inside * [1, 0, 1] + [0, 8, 0], 0.0) <= n // 8
+    assert n_fixes(inside, 1.0) == 0
 
 
 def test_bessel_function():
@@ -125,7 +196,7 @@ def test_a_region_that_leaves_no_space_outside_is_always_accepted(setting):
     _, model, _ = setting
     arrays = tabulate_outside(model)
     arrays['outer_weights'][:] = 0
-    table = Outside(model.scenario, arrays)
+    table = alternatives._Templates(model.scenario, arrays)
     signals = model.whiten(model.mean(np.array([[5.0, -2.0, 1.0]])))[0]
     assert table.log_evidence(signals[None])[0, 0] == -np.inf
     assert not table.explain(signals, 1e9)
