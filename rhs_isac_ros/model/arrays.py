@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike
 
 # Largest coordinate of a position [m]; sums of squares of larger ones lose all digits of others.
 _MAX_COORDINATE_M = 1e12
-# Number of rows in the products of `multiply_rows`.
-_ROWS = 8
 # Relative difference of values that are equal up to rounding.
 _TIE = 1e-6
 # For each axis, the two that follow it.
@@ -42,14 +40,9 @@ def multiply_rows(matrices: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
     A row is rounded in the same way among any number of other rows.
     """
-    # BLAS rounds by the sizes of a product, so all products have the same size.
-    shape = rows.shape[rows.ndim - matrices.ndim + 1:]
-    flat = rows.reshape(-1, *shape)
-    padded = np.zeros((-(-len(flat) // _ROWS), _ROWS, *shape), rows.dtype)
-    padded.reshape(-1, *shape)[:len(flat)] = flat
-    products = np.matmul(np.moveaxis(padded, 1, -2), np.swapaxes(matrices, -2, -1))
-    found = np.moveaxis(products, -2, 1).reshape(-1, *shape[:-1], matrices.shape[-2])
-    return found[:len(flat)].reshape(*rows.shape[:-1], matrices.shape[-2])
+    # BLAS rounds by the sizes of a product, so each row has a product of its own.
+    products: np.ndarray = np.matmul(matrices, rows[..., None])[..., 0]
+    return products
 
 
 def mixture_weights(log_weights: np.ndarray, axis: int | tuple[int, ...] = -1
