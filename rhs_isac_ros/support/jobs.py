@@ -206,7 +206,7 @@ class Workers:
                 0, 'job', quiet=self.quiet, label=self.label))
             state, done = _State(strands, self.folder), queue.SimpleQueue[Future[JobResult]]()
             running: dict[Future[JobResult], Job] = {}
-            executor, slots = None, 0
+            executor, slots, has_started = None, 0, False
             while state.ready or running:
                 if not executor:
                     executor, slots = stack.enter_context(self._executor())
@@ -214,12 +214,12 @@ class Workers:
                     function, job = state.ready.popleft()
                     try:
                         # The first call starts the processes. Later ones must not lose Ctrl-C.
-                        with (_interrupts_ignored() if slots > 1 and not running
+                        with (_interrupts_ignored() if slots > 1 and not has_started
                               else contextlib.nullcontext()):
                             future = executor.submit(*self._call(function, job))
                     except Exception as error:
                         raise _failure(job, error) from error
-                    running[future] = job
+                    running[future], has_started = job, True
                     future.add_done_callback(done.put)
                 future = done.get()
                 job = running.pop(future)
