@@ -153,7 +153,7 @@ class SearchEstimator(abc.ABC):
             scenario, n_measurements,
             self._averaging.states(MeasurementModel.covariance_in_shadow))
         ] if scenario.blocked_probability else []
-        self._shadow = Alignment(likelihood, np.zeros_like(likelihood.model.root))
+        self._shadow = Alignment(likelihood, np.zeros_like(likelihood.model.combined_root))
         # Twice an energy has two degrees of freedom for each complex measurement, less one for
         # each fitted coordinate or parameter.
         n_fitted = 3 + len(prior)
