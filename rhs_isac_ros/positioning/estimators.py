@@ -163,8 +163,9 @@ class SearchEstimator(abc.ABC):
         # Points that represent a standard Gaussian, float64 [128, 3].
         self.normal = standard_normal(N_NORMAL) if lazy else self._region.table.normal
         self._mode_normal = (
-            standard_normal(_LIMITS.moving, 6) if prior.velocity.size
-            else standard_normal(_LIMITS.informative) if self._phases.is_informative
+            standard_normal(_LIMITS.informative, 3 + 3 * bool(prior.velocity.size))
+            if self._phases.is_informative
+            else standard_normal(_LIMITS.moving, 6) if prior.velocity.size
             else self.normal if prior.is_coarse else self.normal[:_LIMITS.narrow])
 
     @functools.cached_property

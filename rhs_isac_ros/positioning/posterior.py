@@ -43,7 +43,9 @@ class _Sampling(NamedTuple):
     # Golden ratio, for the draws of a range.
     ratio: float = 0.6180339887498949
     # Largest standard deviation of a wrapped phase: it is nearly uniform, and one wrap suffices.
+    # Smallest one: with phases that are known better, few samples would carry the weight.
     phase_std_rad: float = 3.0
+    least_std_rad: float = 0.05
 
 
 _SAMPLING = _Sampling()
@@ -206,7 +208,7 @@ class BandPhases:
 
     def __init__(self, likelihood: Likelihood) -> None:
         prior = likelihood.nuisance
-        self._std = prior.relative_phase_std_rad
+        self._std = max(prior.relative_phase_std_rad, _SAMPLING.least_std_rad)
         # Whether there is information that the search ignores; if not, there are no factors.
         self.is_informative = prior.is_coarse and self._std <= UNIFORM_STD_RAD
         if not self.is_informative:
@@ -269,7 +271,6 @@ def _log_density(angle: np.ndarray, std: np.ndarray) -> np.ndarray:
     """Return the log-density of the wrapped normal distribution relative to the uniform one."""
     angle = angle - 2 * np.pi * np.round(angle / (2 * np.pi))
     # The wraps by one turn, relative to the term without a wrap.
-    ratio = np.exp(-2 * np.pi**2 / std**2)
-    slope = 2 * np.pi / std**2 * angle
-    wraps = ratio * (np.exp(slope) + np.exp(-slope))
+    slope, constant = 2 * np.pi / std**2 * angle, -2 * np.pi**2 / std**2
+    wraps = np.exp(constant + slope) + np.exp(constant - slope)
     return (np.log(np.sqrt(2 * np.pi) / std) - angle**2 / (2 * std**2) + np.log1p(wraps))

@@ -62,6 +62,16 @@ def test_positions_and_velocities_are_in_their_regions(walking):
     assert np.sqrt(np.mean(errors[:, 2:]**2)) < 0.3
 
 
+@pytest.mark.slow
+def test_users_who_walk_are_located_with_known_phases_of_bands():
+    system, rng = system_of(band_phase_std_rad=0.0), np.random.default_rng(2)
+    states = users_of(system.scenario, 8, 1.0, rng)
+    estimate = BayesEstimator(system).estimate(system.sample(states, rng))
+    assert estimate.fix.all()
+    errors = estimate.mean - states[:, :3]
+    assert inside(errors[:, :2], estimate.covariance[:, :2, :2], 2) >= 7 / 8
+
+
 def test_without_the_phases_of_bands_range_and_radial_speed_are_ambiguous():
     """A range step that the phases of the bands explain leaves the signals as they are."""
     system, rng = system_of(multipath_to_los_db=-40.0), np.random.default_rng(4)
