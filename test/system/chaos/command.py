@@ -41,6 +41,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options = parser.parse_args(arguments)
+    if options.composed and (options.nodes or intruders.USER in (options.intruders or ())):
+        parser.error('argument --composed: not allowed with --nodes or --intruders user, which '
+                     'kill a single node')
     check_environment(parser)
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
@@ -103,8 +106,8 @@ def _run(
     chosen: list[Iterator[Trial]] = []
     if crashes_chosen or options.intruders is None:
         chosen.append(crashes.crash_all(
-            observer, processes, [crashes.ALL] if options.composed else
-            options.nodes or crashes.NODES, options.repeat * [
+            observer, processes, options.nodes or (
+                [crashes.ALL] if options.composed else crashes.NODES), options.repeat * [
                 m.Phase[name.upper()] for name in options.phases or _PHASES]))
     if options.intruders is not None or not crashes_chosen:
         common = {'scenario_file': options.config.resolve()} if options.config else {}

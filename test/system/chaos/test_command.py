@@ -114,6 +114,7 @@ def test_cycles_are_served_over_an_impaired_channel(chaos):
 
 @pytest.mark.parametrize('arguments', [
     ['--soak', '0'], ['--soak', 'inf'], ['--fuzz', '-3'], ['--soak', '1', '--fuzz', '1'],
+    ['--composed', '--nodes', 'bs'], ['--composed', '--intruders', 'bs', 'user'],
     ['--nodes', 'unknown'], ['--intruders', 'unknown'], ['--phases', 'unknown']])
 def test_invalid_arguments_are_rejected(arguments, capsys):
     with pytest.raises(SystemExit):
