@@ -60,6 +60,9 @@ class _Limits(NamedTuple):
 
 _LIMITS = _Limits()
 
+# By default, regions are in the frame of the surface.
+_AT_SURFACE = Pose()
+
 # Returns coordinates, given the number of the axis, and mean, standard deviation and both limits
 # of the Gaussians, [M, 1] or [M, S] [m].
 _Choice = Callable[[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -183,7 +186,7 @@ class Sheets(Mixture):
         """Return the density of r, u and v for a uniform prior on the positions."""
         return self.weighted(np.log(np.linalg.det(jacobian(self.means))))
 
-    def inside(self, bounds: np.ndarray, pose: Pose | None = None,
+    def inside(self, bounds: np.ndarray, pose: Pose = _AT_SURFACE,
                around: np.ndarray | None = None) -> 'Inside':
         """Restrict the first three coordinates to a region; see `Inside`.
 
@@ -192,9 +195,8 @@ class Sheets(Mixture):
         """
         precision = np.linalg.inv(self.covariances[:, :3, :3])
         if around is None:
-            positions = to_positions(self.means[:, :3])
-            around = positions if pose is None else pose.to_site(positions)
-        points = _polar(np.clip(around, *bounds), pose)
+            around = pose.to_site(to_positions(self.means[:, :3]))
+        points = to_polar(pose.to_surface(np.clip(around, *bounds)))
         offsets = self.means[:, :3] - points
         log_values = self.position().log_peaks - likelihood_loss(offsets, precision)
         return Inside.of(points, np.matmul(precision, offsets[..., None])[..., 0], precision,
@@ -225,10 +227,10 @@ def _moments_of_square(matrices: np.ndarray, covariances: np.ndarray
 class Inside(NamedTuple):
     """M Gaussians ``exp(a + g^T d - d^T C d / 2)`` of offsets d in (r, u, v), in a region.
 
-    Positions and the region are in the frame of the surface or, with its pose, of the site.
+    Positions and the region are in the frame in which the surface has the pose.
     """
 
-    pose: Pose | None
+    pose: Pose
     log_values: np.ndarray  # a, float64 [M].
     points: np.ndarray  # (r [m], u, v), float64 [M, 3].
     gradient: np.ndarray  # g, float64 [M, 3].
@@ -245,7 +247,7 @@ class Inside(NamedTuple):
 
     @classmethod
     def of(cls, points: np.ndarray, gradient: np.ndarray, curvature: np.ndarray,
-           bounds: np.ndarray, pose: Pose | None = None, log_values: np.ndarray | None = None
+           bounds: np.ndarray, pose: Pose = _AT_SURFACE, log_values: np.ndarray | None = None
            ) -> 'Inside':
         """Restrict Gaussians to the region between the bounds, [2, 3] or [2, M, 3] [m].
 
@@ -253,12 +255,10 @@ class Inside(NamedTuple):
         """
         if log_values is None:
             log_values = np.zeros(len(points))
-        positions, derivative = to_positions(points), polar_derivative(points)
-        if pose is not None:
-            positions, derivative = pose.vectors_to_site(positions), derivative @ pose.rotation.T
-            bounds = bounds - pose.origin
+        positions = pose.vectors_to_site(to_positions(points))
+        derivative = polar_derivative(points) @ pose.rotation.T
         transposed = np.swapaxes(derivative, 1, 2)
-        low, high = (np.broadcast_to(limit, points.shape) for limit in bounds)
+        low, high = (np.broadcast_to(limit, points.shape) for limit in bounds - pose.origin)
         extent = high - low
         # Metres per unit of r, u and v.
         metres = np.repeat(points[:, :1], 3, axis=1)
@@ -314,15 +314,12 @@ class Inside(NamedTuple):
             # The other axes may compensate for a limit of the last one.
             fixed = self.rows(ends)._at_end(last[ends])
             positions[ends] = fixed._positions(clipped, 1)[..., 0].T
-        return self._placed(positions)
+        return positions + self.pose.origin
 
     def rows(self, chosen: np.ndarray) -> 'Inside':
         """Return the Gaussians with these indices or in a mask."""
         return self._replace(**{name: field[chosen] for name, field in self._asdict().items()
                                if name != 'pose'})
-
-    def _placed(self, positions: np.ndarray) -> np.ndarray:
-        return positions if self.pose is None else positions + self.pose.origin
 
     def _at_end(self, last_m: np.ndarray) -> 'Inside':
         """Give the last axis a single value, [M] [m], and choose it first."""
@@ -358,7 +355,7 @@ class Inside(NamedTuple):
             share = (high_m - low_m)[two_sided] / (self.high_m - self.low_m)[two_sided, 2:]
             log_ratio[two_sided] = np.log(2 * share)
         positions = self._positions(truncated, len(normal), sides)
-        return self._placed(positions.transpose(1, 2, 0)), log_ratio
+        return positions.transpose(1, 2, 0) + self.pose.origin, log_ratio
 
     def _is_two_sided(self) -> np.ndarray:
         """Mark Gaussians with samples on either side of the last axis' zero, bool [M].
@@ -373,11 +370,10 @@ class Inside(NamedTuple):
         found &= 2 * by_range * range_m * np.abs(last) > _LIMITS.separate * np.sqrt(total)
         rows = np.flatnonzero(found)
         if len(rows):
-            far_side = to_positions(self.points[rows])
-            if self.pose is not None:
-                far_side = self.pose.vectors_to_site(far_side)
+            far_side = self.pose.vectors_to_site(to_positions(self.points[rows]))
             far_side[np.arange(len(rows)), axis[rows]] *= -1
-            likelihood = self.rows(rows).logarithm(self._placed(far_side)[:, None])[:, 0]
+            likelihood = self.rows(rows).logarithm(
+                (far_side + self.pose.origin)[:, None])[:, 0]
             found[rows] = likelihood - self.log_values[rows] > -_LIMITS.far_side
         return found
 
@@ -393,9 +389,6 @@ class Inside(NamedTuple):
 
     def logarithm(self, positions: np.ndarray) -> np.ndarray:
         """Evaluate the logarithms of the Gaussians at positions [M, S, 3] [m], float64 [M, S]."""
-        if self.pose is None:
-            return log_values(
-                positions, self.points, self.curvature, self.log_values, self.gradient)
         positions = self.pose.to_surface(positions)
         # No user behind the surface is in sight.
         return np.where(positions[..., 0] > 0, log_values(
@@ -453,7 +446,7 @@ class Inside(NamedTuple):
 
         They follow from the derivatives of range and directions at these values.
         """
-        rotation = np.eye(3) if self.pose is None else self.pose.rotation
+        rotation = self.pose.rotation
         positions, rows = np.empty((3, *last.shape)), np.arange(len(last))
         for axis, values in enumerate((*chosen[:2], last)):
             positions[self.order[:, axis], rows] = values
@@ -507,22 +500,18 @@ def _is_wide(points: np.ndarray, curvature: np.ndarray, extent: np.ndarray) -> n
 
 
 def move_inside(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,
-                pose: Pose | None = None) -> np.ndarray:
+                pose: Pose = _AT_SURFACE) -> np.ndarray:
     """Return the most likely points inside the region for Gaussians around points [M, 3]."""
-    positions = to_positions(points) if pose is None else pose.to_site(to_positions(points))
+    positions = pose.to_site(to_positions(points))
     (outside,) = np.nonzero(((positions < bounds[0]) | (positions > bounds[1])).any(axis=1))
     moved = points.copy()
     if len(outside):
-        start = _polar(np.clip(positions[outside], *bounds), pose)
+        start = to_polar(pose.to_surface(np.clip(positions[outside], *bounds)))
         curvature = curvature[outside]
         gradient = np.matmul(curvature, (points[outside] - start)[..., None])[..., 0]
-        moved[outside] = _polar(
-            Inside.of(start, gradient, curvature, bounds, pose).nearest(), pose)
+        moved[outside] = to_polar(pose.to_surface(
+            Inside.of(start, gradient, curvature, bounds, pose).nearest()))
     return moved
-
-
-def _polar(positions: np.ndarray, pose: Pose | None) -> np.ndarray:
-    return to_polar(positions if pose is None else pose.to_surface(positions))
 
 
 def _truncated(normal: np.ndarray, low: np.ndarray, high: np.ndarray
