@@ -490,11 +490,11 @@ class FailureSearch:
         """Return whether the deviance of any of these hypotheses is no higher than usual."""
         return any(self._deviances[key] <= self._usual for key in keys)
 
-    def add(self, points: np.ndarray, values: np.ndarray, failed: Failed = ()) -> list[Key]:
+    def add(self, points: np.ndarray, values: np.ndarray) -> list[Key]:
         """Add a place at each point [P, 3] with parameters [P, Q]; return keys, the best first."""
         first = len(self.places)
         self.places += self._model.places(points, values, self._signals)
-        return self._weigh((failed, index) for index in range(first, len(self.places)))
+        return self._weigh(((), index) for index in range(first, len(self.places)))
 
     def grow(self, parents: list[Key], remainder: float = 0.0) -> None:
         """Add failures to hypotheses until the results are improbable; see `FailureSearch`.
@@ -513,7 +513,7 @@ class FailureSearch:
             if self.log_probabilities[exact[0]] < limit and self.explains(found):
                 break
             found += exact
-            parents = _diverse(ranked, LIMITS)
+            parents = _diverse(ranked)
 
     def try_neighbours(self, key: Key) -> None:
         """Weigh the sets in which one element is added, removed or replaced."""
@@ -550,13 +550,13 @@ class FailureSearch:
         return sorted(children, key=lambda key: -children[key])
 
 
-def _diverse(ranked: list[Key], limits: FailureLimits) -> list[Key]:
+def _diverse(ranked: list[Key]) -> list[Key]:
     """Choose the best hypotheses to extend, but only a few per set and per place."""
     chosen: list[Key] = []
     for failed, index in ranked:
-        if (sum(other == failed for other, _ in chosen) < limits.per_set
-                and sum(other == index for _, other in chosen) < limits.per_place):
+        if (sum(other == failed for other, _ in chosen) < LIMITS.per_set
+                and sum(other == index for _, other in chosen) < LIMITS.per_place):
             chosen.append((failed, index))
-        if len(chosen) == limits.extended:
+        if len(chosen) == LIMITS.extended:
             break
     return chosen

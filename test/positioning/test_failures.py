@@ -246,11 +246,12 @@ def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):
 
 def test_few_hypotheses_of_each_set_and_of_each_site_are_extended():
     ranked = [((1,), site) for site in range(10)] + [((set_,), 0) for set_ in range(2, 20)]
-    chosen = _diverse(ranked, LIMITS._replace(extended=len(ranked)))
+    chosen = _diverse(ranked)
     sets, sites = (collections.Counter(one) for one in zip(*chosen, strict=True))
     assert max(sets.values()) == LIMITS.per_set
     assert max(sites.values()) == LIMITS.per_place
-    assert _diverse(ranked, LIMITS._replace(extended=2)) == ranked[:2]
+    different = [((number,), number) for number in range(2 * LIMITS.extended)]
+    assert _diverse(different) == different[:LIMITS.extended]
 
 
 def test_neighbours_differ_by_one_element(ambiguous):
