@@ -61,19 +61,11 @@ class Sighting:
         """The sheets; raises ValueError if those of the mixture are behind the surface."""
         return self.sheets or Sheets.tangent(self.mixture.position(), self.pose)
 
-    @classmethod
-    def of(cls, estimate: 'Estimate', pose: Pose | None = None) -> 'Sighting | None':
-        """Return the likelihood for the signals of one shot, or None.
-
-        None without a position, unless the reason is a user outside of the region, which is
-        evidence, too. `estimate` is the result of `posterior`. By default, the pose is that of its
-        scenario.
-        """
-        found = estimate.sighting
-        if found is None or pose in (None, found.pose):
-            return found
-        return dataclasses.replace(
-            found, pose=pose, mixture=found.mixture.moved(found.pose, pose))
+    def at(self, pose: Pose) -> 'Sighting':
+        """Return what the same signals say if the surface has another pose."""
+        if pose == self.pose:
+            return self
+        return dataclasses.replace(self, pose=pose, mixture=self.mixture.moved(self.pose, pose))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -138,7 +130,11 @@ class Estimate:
 
     @property
     def sighting(self) -> Sighting | None:
-        """What the signals alone say; None unless this is a result of `posterior`; see `of`."""
+        """What the signals of one shot alone say; None unless `posterior` returned the estimate.
+
+        Without a position, it is None, too, unless the reason is a user outside of the region,
+        which is evidence.
+        """
         return self.see() if callable(self.see) else None
 
     @classmethod

@@ -118,7 +118,7 @@ class SiteEstimator:
                             for name, one in site.surfaces.items()}
 
     def sightings(self, received: Mapping[str, np.ndarray]) -> dict[str, Sighting]:
-        """Return the likelihoods of the surfaces, by name; see `Sighting.of`.
+        """Return the likelihoods of the surfaces, by name; see `Estimate.sighting`.
 
         `received` contains signals, complex128 [N_B, N_SB F], of some or all surfaces.
         """
@@ -136,7 +136,7 @@ class SiteEstimator:
         for n in range(max(lengths.values(), default=0)):
             posteriors = {name: one[n] for name, one in found.items()}
             yield posteriors, {name: sighting for name, one in posteriors.items()
-                               if (sighting := Sighting.of(one))}
+                               if (sighting := one.sighting)}
 
     def draw_agreements(self, n: int, rng: np.random.Generator
                         ) -> tuple[list[dict[Pair, float]], np.ndarray]:

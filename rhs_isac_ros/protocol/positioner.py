@@ -19,7 +19,6 @@ from rhs_isac_ros.positioning import (
     Estimator,
     Motion,
     SearchEstimator,
-    Sighting,
     SignalError,
     Tracker,
 )
@@ -382,7 +381,7 @@ class Positioner(Role):
             self._publish_track(received, of_site)
         else:
             self._no_fix(received, f'position: {problem}' if problem else str(estimate.reason))
-        if self._is_observed() and not problem and (sighting := Sighting.of(estimate)):
+        if self._is_observed() and not problem and (sighting := estimate.sighting):
             self.send(posterior_of(
                 received, sighting, stamp_ns=received.stamp_ns, **probabilities))
         text, begins = self._residuals.add(received.user, estimate)

@@ -32,7 +32,6 @@ from rhs_isac_ros.positioning import (
     Estimator,
     EstimatorKind,
     Motion,
-    Sighting,
     Site,
     fuse,
 )
@@ -429,7 +428,7 @@ class SiteRecording(Recording):
                 if signals is None:
                     continue
                 posterior = find(name, signals.codebook_id).posterior(signals.stacked)
-                if sighting := Sighting.of(posterior):
+                if sighting := posterior.sighting:
                     sightings.append(sighting)
                 if posterior.fix:
                     again[name][key] = _state(posterior.to_site(scenario.pose))

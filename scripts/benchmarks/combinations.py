@@ -215,9 +215,8 @@ class SeveralSurfaces:
 
     def locate(self, time_s: float, looks: Sequence[Look], prior: Mixture | None) -> Estimate:
         """Return the position in the frame of the site; a prior counts like a surface."""
-        found = [Sighting.of(look.estimator.posterior(look.signals, prior),
-                             look.surface.scenario.pose) for look in looks]
-        sightings = [one for one in found if one]
+        sightings = [one.at(look.surface.scenario.pose) for look in looks
+                     if (one := look.estimator.posterior(look.signals, prior).sighting)]
         if not sightings:
             return Estimate.without_fix('no surface has a position')
         if prior:

@@ -179,9 +179,8 @@ def make_world(scenario: Scenario, codebook: Codebook, positions: np.ndarray) ->
 def sightings_of(found: Sequence[Mapping[int, Estimate]], poses: Sequence[Pose], row: int
                  ) -> list[Sighting]:
     """Return the sightings of the surfaces with a position."""
-    both = (Sighting.of(posteriors[row], pose)
-            for posteriors, pose in zip(found, poses, strict=True))
-    return [one for one in both if one is not None]
+    return [one.at(pose) for posteriors, pose in zip(found, poses, strict=True)
+            if (one := posteriors[row].sighting)]
 
 
 def compare(world: World, found: Sequence[Mapping[int, Estimate]], poses: list[Pose], rows: range
@@ -228,8 +227,8 @@ def agreements(found: Mapping[str, Mapping[int, Estimate]], scenario: Scenario, 
         declared = poses | {'side': poses['side'].displaced(error)}
         last = n_wrong(n) * (1 if name in WRONG else 2)
         cycles = [pair_agreements({
-            surface: one for surface, pose in declared.items()
-            if (one := Sighting.of(found[surface][row], pose))},
+            surface: one.at(pose) for surface, pose in declared.items()
+            if (one := found[surface][row].sighting)},
             Fuser(scenario.roi_bounds_m)) for row in rows if row < last]
         results[name] = [{' '.join(pair): value for pair, value in cycle.items()}
                          for cycle in cycles]

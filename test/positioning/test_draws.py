@@ -8,7 +8,7 @@ from scipy.stats import qmc
 
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.model.arrays import log_sum
-from rhs_isac_ros.positioning import Sighting, fuse, make_estimator
+from rhs_isac_ros.positioning import fuse, make_estimator
 from rhs_isac_ros.positioning.draws import SAMPLING, DrawnPosterior
 from rhs_isac_ros.positioning.grid import TemplateTable
 from rhs_isac_ros.positioning.likelihood import Likelihood
@@ -129,7 +129,7 @@ def test_the_estimate_of_a_posterior_is_that_of_the_estimator(codebook):
             np.testing.assert_allclose(mean, found, atol=1e-6)
         np.testing.assert_allclose(covariance, posterior.covariance, atol=1e-3)
         # The groups of rays are broad, but the likelihood as a whole is in the right place.
-        fused = fuse([Sighting.of(posterior)], WEAK.roi_bounds_m)
+        fused = fuse([posterior.sighting], WEAK.roi_bounds_m)
         error = fused.mean - mean
         assert error @ np.linalg.solve(covariance, error) < 0.01
         np.testing.assert_allclose(

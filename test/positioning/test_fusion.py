@@ -283,7 +283,7 @@ def test_one_surface_has_the_moments_of_its_modes(world):
     positions = scenario.sample_positions(20, np.random.default_rng(2))
     for signals in drawn(world, SIDE, positions, 3):
         alone = estimator.posterior(signals)
-        fused = fuse([Sighting.of(alone, SIDE)], BOUNDS)
+        fused = fuse([alone.sighting.at(SIDE)], BOUNDS)
         assert_moments(fused, SIDE.to_site(alone.mean), SIDE.covariances_to_site(alone.covariance),
                        tolerance=0.12)
 
