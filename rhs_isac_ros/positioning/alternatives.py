@@ -20,7 +20,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import blocks, log_sum
+from rhs_isac_ros.model.arrays import blocks
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
 from rhs_isac_ros.model.geometry import element_positions, to_positions
@@ -45,7 +45,6 @@ _LEVEL_REACH = 3.0
 # Standard deviation that represents an unknown gain in the level of a blocked user [dB].
 _UNKNOWN_GAIN_DB = 40.0
 _MIN_PROBABILITY = 1e-12
-_ONE, _ZERO = np.ones(1), np.zeros(1)
 # Smallest probability of an alternative that is reported.
 _MIN_DOUBT = 0.01
 
@@ -78,9 +77,6 @@ class OutsideGrid(NamedTuple):
     gain_error: float = 0.01
     # Directions with a log-likelihood below the best by more than this at all ranges are ignored.
     margin: float = 20.0
-    # Quadrature over the gain: spacing [nepers], and reach in standard deviations.
-    gain_step: float = 0.04
-    gain_reach: float = 4.0
     # Numbers of templates, and of shots, to compute at a time.
     block: int = 512
     shots: int = 16
@@ -260,67 +256,46 @@ class _Templates:
         self._offset = (log_prior - self._energy).astype(np.float32)
 
     def log_evidence_of(self, whitened: np.ndarray, prior: NuisancePrior) -> np.ndarray:
-        """Compute logarithms of the evidence of whitened signals, [N]; see `Outside`."""
-        return np.concatenate([
-            self._over_gain(whitened[block], prior) if prior.gain_std
-            else self.log_evidence(whitened[block])[:, 0]
-            for block in blocks(len(whitened), 1 if prior.gain_std else GRID.shots)])
+        """Return the log of the mean of ``exp(-|h y - t|^2)`` over the prior, [N]; see `Outside`.
 
-    def _over_gain(self, whitened: np.ndarray, prior: NuisancePrior) -> np.ndarray:
-        """Return the log evidence of one shot, N = 1, averaged over an unknown gain, [1]."""
-        low, high = self._gain_limits(whitened, prior.gain_std)
-        gain, step = np.linspace(
-            low, high, 3 + int(np.ceil((high - low) / GRID.gain_step)), retstep=True)
-        log_density = -(gain / prior.gain_std)**2 / 2 - 2 * whitened.size * gain
-        log_total = log_sum(self.log_evidence(whitened, np.exp(-gain), log_density))
-        return np.array([log_total + math.log(step / prior.gain_unit / math.sqrt(2 * np.pi))])
-
-    def _gain_limits(self, whitened: np.ndarray, std: float) -> tuple[float, float]:
-        """Return limits of the gain [nepers] beyond which its posterior is negligible."""
-        # Without a prior, the most likely gain makes the energy of all signals, or of what no
-        # position explains in them, equal to that of noise.
-        energy, n = float(self._state.energy(whitened)[0]), whitened.size
-        filtered = np.sum(self._filter(whitened), axis=1)**2 / self._node_energy
-        rest = max(energy - float(filtered.max()), n * _MIN_PROBABILITY)
-        reach, margin = GRID.gain_reach * std, GRID.gain_reach / math.sqrt(n)
-        low, high = (math.log(part / n) / 2 for part in (rest, energy))
-        return max(min(low - margin, 0.0), -reach), min(max(high + margin, 0.0), reach)
-
-    def log_evidence(self, whitened: np.ndarray, scales: np.ndarray = _ONE,
-                     log_weights: np.ndarray = _ZERO) -> np.ndarray:
-        """Return the log of the weighted mean of ``exp(-|s y - t|^2)`` over the prior, [N, S].
-
-        The signals y of N shots are `whitened`, and t is the whitened mean for a user outside.
-        Returns a value for each scale s, up to what is negligible among all S of a shot.
+        The signals y of N shots are `whitened`, t is the whitened mean for a user outside, and h
+        divides by the gain.
         """
-        filtered = self._filter(whitened)
+        return np.concatenate([self._log_evidence(whitened[block], prior)
+                               for block in blocks(len(whitened), GRID.shots)])
+
+    def _log_evidence(self, whitened: np.ndarray, prior: NuisancePrior) -> np.ndarray:
+        filtered, energy = self._filter(whitened), self._state.energy(whitened)
+        n_shots, n = len(whitened), whitened[0].size
         # At any range, the log-likelihood is highest if the outputs of all bands are in phase.
-        bound = (np.sum(filtered, axis=1)**2 / self._node_energy).max(axis=1)
-        constants = self._state.offset + log_weights - np.multiply.outer(
-            self._state.energy(whitened), scales**2)
-        bound = bound[:, None] * scales[:, None]**2 + constants[..., None]
-        shot, scale, direction = np.nonzero(
-            bound >= bound.max(axis=(1, 2), keepdims=True) - GRID.margin)
+        explained = (np.sum(filtered, axis=1)**2 / self._node_energy).max(axis=1)
+        rest = np.maximum(energy[:, None] - explained, n * _MIN_PROBABILITY)
+        bound, _ = _best_gain(prior, np.zeros_like(rest), rest, n)
+        shot, direction = np.nonzero(bound >= bound.max(axis=1, keepdims=True) - GRID.margin)
+        of_shot, energy = Segments.of_keys(shot), energy[shot, None]
         arguments = filtered[shot, :, :, direction][..., self._index].swapaxes(0, 1)
-        arguments = arguments * self._scale[:, 0] * scales.astype(np.float32)[scale, None]
-        of_shot, offset = Segments.of_keys(shot), self._offset.T[direction]
+        arguments *= self._scale[:, 0]
         # A Bessel function I_0(x) is at most exp(x), and its logarithm is convex. So few places
         # need its value.
+        highest, gain = _best_gain(prior, arguments.sum(axis=0) / 2, energy, n)
+        highest += self._offset.T[direction]
+        arguments *= np.exp(-gain).astype(np.float32)
         total = arguments.sum(axis=0)
-        highest = total + offset
-        highest += constants[shot, scale, None].astype(np.float32)
-        least = of_shot.max(highest.max(axis=1)) - GRID.margin
         mean = of_shot.max(total.max(axis=1)) / len(arguments)
-        least -= len(arguments) * (mean - _log_bessel(mean))
+        least = of_shot.max(highest.max(axis=1)) - GRID.margin - len(arguments) * (
+            mean - _log_bessel(mean))
         pair, place = np.nonzero(highest >= of_shot.repeat(least)[:, None])
-        shot, scale = shot[pair], scale[pair]
-        logs = _log_bessel(arguments[:, pair, place]).sum(axis=0)
-        logs = logs + offset[pair, place] + constants[shot, scale]
+        arguments, shot = arguments[:, pair, place], shot[pair]
+        logs = highest[pair, place] + np.sum(_log_bessel(arguments) - arguments, axis=0)
+        if prior.gain_std:
+            # Laplace's integral over the gain, which hardly changes the Bessel functions.
+            power = np.exp(-2 * gain[pair, place]) * energy[pair, 0]
+            logs -= np.log(4 * power - total[pair, place] + prior.gain_std**-2) / 2 + math.log(
+                prior.gain_unit)
         largest = np.maximum(Segments.of_keys(shot).max(logs), np.finfo(float).min)
-        sums = np.bincount(shot * len(scales) + scale, np.exp(logs - largest[shot]),
-                           minlength=constants.size).reshape(constants.shape)
         with np.errstate(divide='ignore'):
-            return largest[:, None] + np.log(sums)
+            return self._state.offset + largest + np.log(
+                np.bincount(shot, np.exp(logs - largest[shot]), minlength=n_shots))
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some position explains the signals up to this residual energy."""
@@ -375,6 +350,13 @@ def rejection(alternative: Alternative | type[Alternative], probability: float, 
 def log_odds_of(probability: float) -> float:
     """Return the logarithm of the odds of a probability; the odds are within 1e-12 and 1e12."""
     return math.log(max(probability, _MIN_PROBABILITY) / max(1 - probability, _MIN_PROBABILITY))
+
+
+def _best_gain(prior: NuisancePrior, amplitude: np.ndarray, energy: np.ndarray, n: int
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Return `maximised_over_gain` of n measurements, less their energy if the gain is known."""
+    value, gain = prior.maximised_over_gain(amplitude, energy, n)
+    return value if prior.gain_std else value - energy, gain
 
 
 def _log_bessel(argument: np.ndarray) -> np.ndarray:

@@ -240,8 +240,8 @@ class NuisancePrior(Exponents):
                  for output, std in zip(outputs, self.phase_std_rad, strict=True)]
         return np.sum(parts, axis=0)
 
-    def maximised_over_gain(self, amplitude: np.ndarray, energy: float, n_measurements: int
-                            ) -> tuple[np.ndarray, np.ndarray]:
+    def maximised_over_gain(self, amplitude: np.ndarray, energy: float | np.ndarray,
+                            n_measurements: int) -> tuple[np.ndarray, np.ndarray]:
         """Maximise the log-likelihood, without the template's energy, over the gain.
 
         If signals y are multiplied by h, the log-likelihood for an amplitude A, an array of any
