@@ -14,7 +14,7 @@ import dataclasses
 import functools
 import hashlib
 import json
-from typing import Any, ClassVar, Protocol, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -33,15 +33,6 @@ class BoardError(ValueError):
     """A board is unknown or invalid, or does not support what a caller needs."""
 
 
-class Medium(Protocol):
-    """Something with the refractive index of a board, such as a scenario."""
-
-    @property
-    def refractive_index(self) -> float:
-        """Refractive index n_r."""
-        ...
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ports:
     """What a transfer depends on apart from the tunings."""
@@ -53,14 +44,14 @@ class Ports:
 
 
 def onboard_gain(
-        medium: Medium, frequency_hz: float | np.ndarray, source: np.ndarray,
+        refractive_index: float, frequency_hz: float | np.ndarray, source: np.ndarray,
         sink: np.ndarray) -> np.ndarray:
     """Implements Eq. (6). Propagation kappa on the board between two points, complex128.
 
     Frequencies [Hz] and positions, float64 [..., 3] [m], may have any shapes that broadcast.
     """
     distance = np.linalg.norm(sink - source, axis=-1)
-    wavenumber = 2 * np.pi * medium.refractive_index * frequency_hz / SPEED_OF_LIGHT_MPS
+    wavenumber = 2 * np.pi * refractive_index * frequency_hz / SPEED_OF_LIGHT_MPS
     return np.exp(-1j * wavenumber * distance)
 
 
@@ -74,6 +65,21 @@ class Board(abc.ABC):
     kind: str  #: Name in a scenario file.
     #: Whether the coefficient of an element is its tuning, apart from a constant factor.
     is_amplitude: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Convert the fields declared with `limited`; raise BoardError if one is out of range."""
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            value, limits = getattr(self, field.name), field.metadata.get('limits')
+            if limits is None or value is None and field.default is None:
+                continue
+            with translated(ValueError, BoardError):
+                if not field.metadata['is_list']:
+                    value = limits.checked(field.name, value)
+                elif not isinstance(value, list | tuple | np.ndarray):
+                    raise BoardError(f'{field.name}: {value!r}, expected a list of numbers')
+                else:
+                    value = tuple(limits.checked(field.name, entry) for entry in value)
+            object.__setattr__(self, field.name, value)
 
     @property
     def is_affine(self) -> bool:
@@ -187,18 +193,10 @@ def rounded(tunings: np.ndarray, n_levels: int) -> np.ndarray:
     return np.rint(tunings * (n_levels - 1)) / (n_levels - 1) if n_levels else tunings
 
 
-def number_of(name: str, value: Any, low: float, high: float) -> float:
-    """Return a number within limits; raise BoardError if it is none."""
-    with translated(ValueError, BoardError):
-        number: float = Field(float, low=low, high=high).checked(name, value)
-    return number
-
-
-def numbers_of(name: str, values: Any, low: float, high: float) -> tuple[float, ...]:
-    """Return numbers within limits; raise BoardError if one of them is none."""
-    if not isinstance(values, list | tuple | np.ndarray):
-        raise BoardError(f'{name}: {values!r}, expected a list of numbers')
-    return tuple(number_of(name, value, low, high) for value in values)
+def limited(default: float | None, low: float, high: float, *, is_list: bool = False) -> Any:
+    """Declare a field of a board, a number or a list of numbers; None is valid if the default."""
+    return dataclasses.field(default=default, metadata={
+        'limits': Field(float, low=low, high=high), 'is_list': is_list})
 
 
 def _lists(entry: Any) -> Any:

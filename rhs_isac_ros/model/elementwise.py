@@ -13,13 +13,11 @@ from rhs_isac_ros.model.board import (
     BoardError,
     Factor,
     Ports,
-    number_of,
-    numbers_of,
+    limited,
     onboard_gain,
     rounded,
 )
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
-from rhs_isac_ros.support.errors import translated
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -29,23 +27,17 @@ class Elementwise(Board):
     A subclass defines `coefficients` and `slopes`.
     """
 
-    loss_db_per_m: float = 0.0  #: Attenuation of the waves on the board.
+    loss_db_per_m: float = limited(0.0, 0.0, 1e6)  #: Attenuation of the waves on the board.
     #: Amplitude gain of each feed, or None if all are 1.
-    feed_gains: tuple[float, ...] | None = None
+    feed_gains: tuple[float, ...] | None = limited(None, 0.0, 1e6, is_list=True)
     #: Indices of elements that have no effect, whatever their tuning, as those outside of a disc.
     masked: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raise BoardError unless loss, gains and indices are in range."""
-        self._set('loss_db_per_m', number_of('loss_db_per_m', self.loss_db_per_m, 0.0, 1e6))
-        if self.feed_gains is not None:
-            self._set('feed_gains', numbers_of('feed_gains', self.feed_gains, 0.0, 1e6))
-        with translated(ValueError, BoardError):
-            masked = numbers('masked', self.masked, int)
-        self._set('masked', tuple(sorted({*masked.ravel().tolist()})))
-
-    def _set(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value)
+        """Convert and check the fields; raise BoardError if one is invalid."""
+        super().__post_init__()
+        masked = numbers('masked', self.masked, int, BoardError)
+        object.__setattr__(self, 'masked', tuple(sorted({*masked.ravel().tolist()})))
 
     def misfit(self, scenario: Any) -> str:
         """Return the reason why the board does not fit a scenario, or ''."""
@@ -73,8 +65,8 @@ class Elementwise(Board):
         distances = np.linalg.norm(ports.elements_m - feeds, axis=-1)
         amplitudes = gains[:, None] * np.exp(-self.loss_db_per_m * NEPERS_PER_DB * distances)
         amplitudes[:, list(self.masked)] = 0.0
-        return read_only(
-            amplitudes * onboard_gain(ports, frequencies, ports.elements_m, feeds))
+        return read_only(amplitudes * onboard_gain(
+            ports.refractive_index, frequencies, ports.elements_m, feeds))
 
     def transfer(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
         """Return the transfer; see `Board.transfer`."""
@@ -140,12 +132,8 @@ class PhaseShift(Elementwise):
     """Elements with an adjustable phase: the coefficient is exp(i phase_range_rad c)."""
 
     kind: str = dataclasses.field(default='phase', init=False)
-    phase_range_rad: float = 2 * np.pi  #: Phase of the tuning 1, relative to the tuning 0.
-
-    def __post_init__(self) -> None:
-        """Raise BoardError unless the values are in range."""
-        super().__post_init__()
-        self._set('phase_range_rad', number_of('phase_range_rad', self.phase_range_rad, 1e-6, 1e3))
+    #: Phase of the tuning 1, relative to the tuning 0.
+    phase_range_rad: float = limited(2 * np.pi, 1e-6, 1e3)
 
     def coefficients(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
         """Return unit phasors, complex128 [B, 1, Q, N_E]."""
@@ -173,17 +161,9 @@ class Resonant(Elementwise):
 
     kind: str = dataclasses.field(default='resonant', init=False)
     #: Resonance f_r of the tuning 1/2 in each band [Hz], or None for the centres of the bands.
-    resonances_hz: tuple[float, ...] | None = None
-    quality_factor: float = 40.0  #: Quality factor Q of an element.
-    tuning_range: float = 0.3  #: Range of f_0 relative to f_r.
-
-    def __post_init__(self) -> None:
-        """Raise BoardError unless the values are in range."""
-        super().__post_init__()
-        self._set('quality_factor', number_of('quality_factor', self.quality_factor, 1.0, 1e6))
-        self._set('tuning_range', number_of('tuning_range', self.tuning_range, 1e-6, 1.9))
-        if self.resonances_hz is not None:
-            self._set('resonances_hz', numbers_of('resonances_hz', self.resonances_hz, 1e6, 1e13))
+    resonances_hz: tuple[float, ...] | None = limited(None, 1e6, 1e13, is_list=True)
+    quality_factor: float = limited(40.0, 1.0, 1e6)  #: Quality factor Q of an element.
+    tuning_range: float = limited(0.3, 1e-6, 1.9)  #: Range of f_0 relative to f_r.
 
     def misfit(self, scenario: Any) -> str:
         """Return the reason why the board does not fit a scenario, or ''."""
@@ -225,13 +205,13 @@ class States(Elementwise):
     states: Any = ((0.0, 0.0), (1.0, 0.0))
 
     def __post_init__(self) -> None:
-        """Raise BoardError unless the values are in range."""
+        """Convert and check the fields; raise BoardError if one is invalid."""
         super().__post_init__()
         table = numbers('states', self.states, error=BoardError)
         if not 2 <= table.ndim <= 4 or table.shape[-1] != 2 or table.shape[-2] < 2:
             raise BoardError(f'states: shape {table.shape}, expected [L, 2], [N_B, L, 2] or '
                              '[N_B, N_E, L, 2] with at least two states')
-        self._set('states', _tuples(table.tolist()))
+        object.__setattr__(self, 'states', _tuples(table.tolist()))
 
     @functools.cached_property
     def _table(self) -> np.ndarray:

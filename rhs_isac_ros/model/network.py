@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model.arrays import adjoint, digest, numbers
-from rhs_isac_ros.model.board import Board, BoardError, Ports, number_of
+from rhs_isac_ros.model.board import Board, BoardError, Ports, limited
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import ArchiveError, read_arrays, read_once
 from rhs_isac_ros.support.optional import optional_import
@@ -164,12 +164,14 @@ class CoupledNetwork(Board):
 
     kind: str = dataclasses.field(default='network', init=False)
     file: str = ''  #: Path of the file, which may be followed by ``@`` and the digest.
-    gain: float = 1.0  #: Factor of the transfer.
-    load_conductance_s: float | None = None  #: Conductance of a load, or None as in the file.
-    load_susceptance_slope_s: float | None = None  #: As in the formula, or None as in the file.
+    gain: float = limited(1.0, 1e-12, 1e12)  #: Factor of the transfer.
+    #: Conductance of a load, and slope as in the formula, or None as in the file.
+    load_conductance_s: float | None = limited(None, 0.0, 1e12)
+    load_susceptance_slope_s: float | None = limited(None, 0.0, 1e12)
 
     def __post_init__(self) -> None:
         """Read the file; raise BoardError if it or a number is invalid."""
+        super().__post_init__()
         if not isinstance(self.file, str | Path) or not str(self.file):
             raise BoardError(f'file: {self.file!r}, expected the path of a file of admittances')
         path, expected = re.fullmatch(  # type: ignore[union-attr]
@@ -180,12 +182,9 @@ class CoupledNetwork(Board):
             raise BoardError(f'file: {path}: digest {network.digest}, expected {expected}: the '
                              'content has changed')
         object.__setattr__(self, 'file', f'{path}@{network.digest}')
-        object.__setattr__(self, 'gain', number_of('gain', self.gain, 1e-12, 1e12))
         for name, own in zip(
                 _LOADS, (network.conductance_s, network.susceptance_slope_s), strict=True):
-            if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, number_of(name, value, 0.0, 1e12))
-            elif np.isnan(own).any():
+            if getattr(self, name) is None and np.isnan(own).any():
                 raise BoardError(f'{name}: None, expected a number, as {path} has none')
 
     @functools.cached_property
