@@ -1,7 +1,6 @@
 """Priors of the position for which a codebook is optimised: the region, or a cell of it."""
 
 import dataclasses
-from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -13,42 +12,27 @@ _REACH = 3.0
 _TINY = 1e-9
 
 
-class Prior(Protocol):
-    """Where the user may be."""
+class Prior:
+    """Where the user may be: a uniform density in the region of interest, unless overridden."""
 
     def positions(self, scenario: Scenario, uniform: np.ndarray) -> np.ndarray:
         """Map positions that are uniform in the region, float64 [N, 3] [m], to the prior."""
-        ...
-
-    def box(self, scenario: Scenario) -> Scenario:
-        """Return a scenario whose region contains the prior; only the region is changed."""
-        ...
-
-    def ratios(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return by how much more probable second positions are than first ones, at most 1."""
-        ...
-
-
-class Region:
-    """A uniform density in the region of interest."""
-
-    def positions(self, scenario: Scenario, uniform: np.ndarray) -> np.ndarray:
-        """Return the positions."""
         return uniform
 
     def box(self, scenario: Scenario) -> Scenario:
-        """Return the scenario."""
+        """Return a scenario whose region contains the prior; only the region is changed."""
         return scenario
 
     def ratios(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return ones, float64 [N]."""
+        """Return by how much more probable second positions are than first ones, at most 1."""
         return np.ones(len(first))
 
 
-REGION = Region()
+REGION = Prior()
 
 
-class Cell(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Cell(Prior):
     """A Gaussian with the same variance in all directions, cut off at the border of the region."""
 
     centre_m: tuple[float, float, float]  #: In the frame of the surface [m].

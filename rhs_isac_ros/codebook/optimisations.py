@@ -23,7 +23,7 @@ def optimisation(
 
     Every worker must be able to read the file of a calibration.
     """
-    given = {'start': start and start.to_parameters(), 'cell': cell,
+    given = {'start': start and start.to_parameters(), 'cell': cell and dataclasses.astuple(cell),
              'calibration': calibration and (
                  str(calibration.resolve()), Calibration.load(calibration).id)}
     return Job.of('optimisation', {
