@@ -78,7 +78,7 @@ def misspecified(
     white = np.matmul(assumed.whitener @ true.covariance(), adjoint(assumed.whitener))
     gradients = 2 * np.einsum('nair,irs,nbis->nab', slopes.conj(), white, slopes,
                               optimize=True).real
-    curvature = _curvature(slopes) - _bending(assumed, places, residual)
+    curvature = quadratic_form(slopes) - _bending(assumed, places, residual)
     inverse = inverse_information(curvature)
     covariance = inverse @ gradients @ inverse
     bias = places - positions
@@ -87,10 +87,6 @@ def misspecified(
     valid[finite] = _is_valid(
         assumed, places[finite], bias[finite], covariance[finite], residual[finite], white)
     return Misspecified(bias, covariance, valid)
-
-
-def _curvature(slopes: np.ndarray) -> np.ndarray:
-    return quadratic_form(slopes.reshape(len(slopes), 3, -1))
 
 
 def _projections(slopes: np.ndarray, signals: np.ndarray) -> np.ndarray:
@@ -108,7 +104,7 @@ def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndar
     costs = cost(positions)
     for _ in range(_MAX_STEPS):
         mean, slopes = model.mean_and_jacobian(places, whitened=True)
-        information, gradient = _curvature(slopes), 2 * _projections(slopes, target - mean)
+        information, gradient = quadratic_form(slopes), 2 * _projections(slopes, target - mean)
         ridge = 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         step = step_to_maximum(information + ridge, gradient)
         for _ in range(_HALVINGS):
@@ -182,7 +178,7 @@ def _ambiguities(model: MeasurementModel, place: np.ndarray, mean: np.ndarray,
                      & (points[:, None] * direction <= high)).all(axis=1)]
     means, slopes = model.mean_and_jacobian(points[:, None] * direction, whitened=True)
     # The maximum of an ambiguity lies beside the ray.
-    information = _curvature(slopes) / 2 + np.diag([_MAX_OFFSET_M**-2] * 3)
+    information = quadratic_form(slopes) / 2 + np.diag([_MAX_OFFSET_M**-2] * 3)
     gradient = _projections(slopes, mean + residual - means)
     offset = step_to_maximum(information, gradient)
     difference = means + np.einsum('na,nair->nir', offset, slopes) - mean

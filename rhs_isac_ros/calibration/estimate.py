@@ -223,9 +223,7 @@ def refined_values(nuisance: Nuisance, values: np.ndarray, signals: np.ndarray, 
 
 def _curvature(nuisance: Nuisance, slopes: np.ndarray) -> np.ndarray:
     """Return the curvature [N, Q, Q] that results from whitened slopes and the prior."""
-    size = slopes.shape[2] * slopes.shape[3]
-    curvature = quadratic_form(slopes.reshape(*slopes.shape[:2], size))
-    return curvature + np.diag(nuisance.precision)
+    return quadratic_form(slopes) + np.diag(nuisance.precision)
 
 
 def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:

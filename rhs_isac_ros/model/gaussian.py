@@ -1,5 +1,6 @@
 """Energy, information and moments of Gaussians, and elimination of nuisance parameters."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -114,10 +115,12 @@ def share_of_level(n: float, std_db: float) -> float:
 def quadratic_form(whitened: np.ndarray) -> np.ndarray:
     """Compute 2 Re(D^H Lambda^-1 D), float64 [N, G, G], as in Eq. (12).
 
-    Takes the transpose of L^-1 D, complex128 [N, G, R], where L L^H = Lambda.
+    Takes the transpose of L^-1 D, complex128 [N, G, ...], where L L^H = Lambda.
     """
+    size = math.prod(whitened.shape[2:])
+    rows = np.ascontiguousarray(whitened.reshape(*whitened.shape[:2], size))
     # Re(a^H b) is the inner product of real and imaginary parts.
-    parts = np.ascontiguousarray(whitened).view(whitened.real.dtype)
+    parts = rows.view(whitened.real.dtype)
     return 2 * np.matmul(parts, np.swapaxes(parts, 1, 2))
 
 

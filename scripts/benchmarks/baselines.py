@@ -136,7 +136,7 @@ class ArrayReceiver:
         bounds = []
         for start in range(0, len(positions), _BLOCK):
             _, slopes = self.mean_and_jacobian(positions[start:start + _BLOCK])
-            information = quadratic_form(slopes.reshape(len(slopes), 3, -1))
+            information = quadratic_form(slopes)
             bounds.append(np.trace(inverse_information(information), axis1=1, axis2=2))
         return np.concatenate(bounds)
 
