@@ -7,7 +7,6 @@ do not depend on the codebook, it calls `tick` repeatedly, which may end them wi
 """
 
 import dataclasses
-import threading
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -20,6 +19,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import checked_positions
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.geometry import surface_sides_m
+from rhs_isac_ros.support import streams
 
 # Relative error of the rows (see `bounds.rows`) of an objective. The error of the objective is
 # then below 0.1 %, far less than the sampling error. The gradient is exact for the value returned.
@@ -98,18 +98,11 @@ def sobol(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
     SciPy scrambles them with a child of the seed of the generator, not with its next numbers: a
     second call gives other points, but numbers drawn in between make no difference.
     """
-    # A slow import, which loading a codebook does not need.
-    from scipy.stats import qmc
-
-    # SciPy has no lock for the table that the first sequence loads.
-    with _FIRST_SOBOL:
-        sequence = qmc.Sobol(3, scramble=True, seed=rng)
-    points = sequence.random_base2(max(n - 1, 0).bit_length())[:n]
+    points = streams.sobol(3, rng).random_base2(max(n - 1, 0).bit_length())[:n]
     low, high = scenario.roi_bounds_m
     return low + (high - low) * points
 
 
-_FIRST_SOBOL = threading.Lock()
 # The paper draws independent uniform positions.
 SAMPLINGS: Mapping[str, Callable[[Scenario, int, np.random.Generator], np.ndarray]] = {
     'monte_carlo': Scenario.sample_positions, 'sobol': sobol}

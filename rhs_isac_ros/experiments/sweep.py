@@ -5,14 +5,12 @@ import dataclasses
 import functools
 import io
 import json
-import threading
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
-from scipy.stats import qmc
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import global_bound
@@ -58,7 +56,6 @@ _QUANTITIES = {
     CRLB: ('crlb_m2',), BOUND: ('bound_m2',), ERROR: ('squared_error_m2', 'inside', 'fix'),
     CAPACITY: ('capacity_bps',), LOSS: ('perfect_bps', 'loss_bps')}
 _INCLUSIVE = (ERROR, CAPACITY, LOSS)
-_FIRST_SOBOL = threading.Lock()
 
 
 def families(quantities: Iterable[str]) -> list[str]:
@@ -145,15 +142,8 @@ def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, An
 @functools.lru_cache(maxsize=1)
 def _estimator(name: str, scenario: str, codebook: str) -> Estimator:
     """Return an estimator for a scenario and codebook in JSON; successive jobs share it."""
-    _initialise_sobol()
     return make_estimator(name, Scenario(**json.loads(scenario)),
                           Codebook.from_parameters(json.loads(codebook)))
-
-
-def _initialise_sobol() -> None:
-    """Create a Sobol sequence under a lock: SciPy has none for the table that it then loads."""
-    with _FIRST_SOBOL:
-        qmc.Sobol(1)
 
 
 # Fields that decide whether a codebook fits a scenario.

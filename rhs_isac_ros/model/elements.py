@@ -33,6 +33,7 @@ from rhs_isac_ros.model.multipath import (
 )
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming, Response, radiation_matrix
+from rhs_isac_ros.support import streams
 
 # Quadrature nodes along each side of the region of interest. A few suffice, because the carrier
 # cancels in the product of the gain in one sub-band and the conjugate gain in another.
@@ -78,10 +79,8 @@ class SurfaceModel:
         It is an average over the region of interest, and includes the errors of the direct path
         and of the multipath.
         """
-        from scipy.stats import qmc
-
         low, high = scenario.roi_bounds_m
-        nodes = low + qmc.Sobol(3, seed=0).random(2**_LOG2_NODES) * (high - low)
+        nodes = low + streams.sobol(3, 0).random(2**_LOG2_NODES) * (high - low)
         scattered, direct = self.errors(scenario, beams)
         return np.mean([
             with_direct_errors(scattered, direct, block).mean(axis=0)

@@ -22,6 +22,7 @@ from rhs_isac_ros.model.geometry import (
     to_positions,
 )
 from rhs_isac_ros.positioning.segments import Segments
+from rhs_isac_ros.support import streams
 
 # Phase error of a template at the edge of the aperture or of the band [rad] at which the next
 # template or range bin takes over. The slopes of the templates correct the error to first order.
@@ -141,9 +142,7 @@ def subband_wavenumbers(scenario: Scenario) -> np.ndarray:
 @functools.cache
 def unit_points(size: int = 3) -> np.ndarray:
     """Return quasi-random points in the unit cube, float64 [1024, size], read-only."""
-    from scipy.stats import qmc
-
-    return read_only(qmc.Sobol(size, seed=0).random(_N_POINTS))
+    return read_only(streams.sobol(size, 0).random(_N_POINTS))
 
 
 class Shell(NamedTuple):

@@ -1,7 +1,11 @@
 """Random generators that depend on their purpose, not on the order in which they are used."""
 
+import threading
+from typing import Any
+
 import numpy as np
 
+_FIRST_SOBOL = threading.Lock()
 (CHANNEL, RECEIVER, USER, BASE_STATION, SAMPLES, START, HELD_OUT, SKETCH, PAIRS,
  METHOD, PHASES, TRAINING, AIR, SURFACE, USER_DEVIATION, CYCLE_DEVIATION, PLANS,
  BLOCKAGE, AGREEMENTS, RADIO) = range(20)
@@ -14,3 +18,13 @@ def generator(seed: int, stream: int, *key: int) -> np.random.Generator:
     numbers of a user and a cycle, distinguish the uses of a stream.
     """
     return np.random.default_rng([seed, stream, *key])
+
+
+def sobol(n_dimensions: int, seed: int | np.random.Generator) -> Any:
+    """Return a scrambled Sobol sequence of SciPy."""
+    # A slow import, which loading a codebook does not need.
+    from scipy.stats import qmc
+
+    # SciPy has no lock for the table that the first sequence loads.
+    with _FIRST_SOBOL:
+        return qmc.Sobol(n_dimensions, scramble=True, seed=seed)
