@@ -48,9 +48,10 @@ from rhs_isac_ros.support.arguments import (
     positive_int,
     seed,
 )
-from rhs_isac_ros.support.exits import exit_code_of, print_error
+from rhs_isac_ros.support.exits import exit_code_of, finished
 from rhs_isac_ros.support.files import save_or_rescue, write_whole
-from rhs_isac_ros.support.jobs import JobError, Workers, add_run_options, unfinished
+from rhs_isac_ros.support.job_commands import add_run_options, unfinished
+from rhs_isac_ros.support.jobs import JobError, Workers
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.pictures import write_picture
 from rhs_isac_ros.support.progress import progress_bar
@@ -79,14 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_options(parser)
     options = parser.parse_args(arguments)
     check(parser, options)
-    try:
+
+    def work() -> None:
         run(options)
-    except KeyboardInterrupt:
-        return 130
-    except ERRORS as error:
-        print_error(error, parser.prog)
-        return 2
-    return 0
+    return finished(work, ERRORS, parser.prog)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

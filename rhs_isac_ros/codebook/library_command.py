@@ -19,9 +19,10 @@ from rhs_isac_ros.support.arguments import (
     output_file,
     positive_float,
 )
-from rhs_isac_ros.support.exits import print_error
+from rhs_isac_ros.support.exits import finished
 from rhs_isac_ros.support.files import save_or_rescue
-from rhs_isac_ros.support.jobs import JobError, add_run_options, unfinished
+from rhs_isac_ros.support.job_commands import add_run_options, unfinished
+from rhs_isac_ros.support.jobs import JobError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,14 +32,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options = parser.parse_args(arguments)
-    try:
-        _run(options)
-    except KeyboardInterrupt:
-        return 130
-    except (JobError, ValueError, ConnectionError, MemoryError) as error:
-        print_error(error, parser.prog)
-        return 2
-    return 0
+    return finished(lambda: _run(options), (JobError, ValueError, ConnectionError, MemoryError),
+                    parser.prog)
 
 
 def _parser() -> ArgumentParser:

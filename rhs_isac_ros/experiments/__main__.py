@@ -43,8 +43,9 @@ from rhs_isac_ros.support.arguments import (
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import write_whole
-from rhs_isac_ros.support.jobs import add_run_options, markdown_table, run_command
+from rhs_isac_ros.support.job_commands import add_run_options, run_command
 from rhs_isac_ros.support.pictures import write_picture
+from rhs_isac_ros.support.texts import markdown_table
 
 # The bootstrap keeps 2000 weights for each position in memory.
 _MAX_POSITIONS = 10**5

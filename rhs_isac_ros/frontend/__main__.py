@@ -13,7 +13,7 @@ from rhs_isac_ros.frontend.opensourceris import COLUMNS, ROWS, OpenSourceRis
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.frontend.surface import SurfaceFault
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float, positive_float
-from rhs_isac_ros.support.exits import exit_code_of, print_error
+from rhs_isac_ros.support.exits import exit_code_of, finished
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,20 +41,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
             command.add_argument('--interval', type=nonnegative_float, default=0.2,
                                  help='time for each element [s]')
     options = parser.parse_args(arguments)
-    try:
-        with _board(options.port, options.timeout) as board:
-            if options.command == 'check':
-                return _check(board)
-            if options.command == 'sweep':
-                _sweep(board, options.interval)
-            else:
-                print(picture(board.read()))
-    except KeyboardInterrupt:
-        return 130
-    except SurfaceFault as fault:
-        print_error(fault, parser.prog)
-        return 2
-    return 0
+    return finished(lambda: _run(options), (SurfaceFault,), parser.prog)
+
+
+def _run(options: argparse.Namespace) -> int:
+    with _board(options.port, options.timeout) as board:
+        if options.command == 'check':
+            return _check(board)
+        if options.command == 'sweep':
+            _sweep(board, options.interval)
+        else:
+            print(picture(board.read()))
+        return 0
 
 
 def picture(configuration: np.ndarray) -> str:

@@ -22,7 +22,7 @@ from rhs_isac_ros.support.arguments import (
     positive_int,
     seed,
 )
-from rhs_isac_ros.support.exits import exit_code_of, print_error
+from rhs_isac_ros.support.exits import exit_code_of, finished
 from rhs_isac_ros.support.files import save_or_rescue
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.progress import progress_bar
@@ -55,15 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add('--quiet', action='store_true', help='show no progress')
     options = parser.parse_args(arguments)
     check_distinct(parser, options)
-    try:
-        _run(options)
-    except KeyboardInterrupt:
-        return 130
     # Errors of scenario and codebook are ValueErrors.
-    except (ValueError, MemoryError, MissingLibraryError) as error:
-        print_error(error, parser.prog)
-        return 2
-    return 0
+    return finished(
+        lambda: _run(options), (ValueError, MemoryError, MissingLibraryError), parser.prog)
 
 
 def _run(options: argparse.Namespace) -> None:

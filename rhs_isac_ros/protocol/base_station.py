@@ -23,6 +23,7 @@ from rhs_isac_ros.protocol.role import ANY, AnyRow, Drops, Row, on
 from rhs_isac_ros.protocol.service_log import ServiceLog, join_users
 from rhs_isac_ros.protocol.settings import BaseStationSettings, PendingSettings
 from rhs_isac_ros.protocol.user_registry import UserRegistry
+from rhs_isac_ros.support.texts import counted
 
 
 class BsState(enum.Enum):
@@ -147,7 +148,7 @@ class BaseStation(SignalCollector):
             if self.outcome:
                 return self._service.gives_up(
                     cycle.cycle_id, cycle.user, cycle.user_instance, self.outcome)
-            users = f'{len(self._users)} user{"s"[:len(self._users) != 1]}'
+            users = counted(len(self._users), 'user')
             return self._service.serves(
                 cycle.cycle_id, cycle.user, f'codebook {cycle.codebook_id}, {users}')
         elif self.state is BsState.PAUSED and before is not BsState.PAUSED:

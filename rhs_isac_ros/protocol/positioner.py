@@ -34,6 +34,7 @@ from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.service_log import MAX_NAMED
 from rhs_isac_ros.protocol.settings import TRACK, PendingSettings, PositionerSettings
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
+from rhs_isac_ros.support.texts import counted
 from rhs_isac_ros.system import System
 
 
@@ -174,7 +175,7 @@ class ResidualWatch:
         parts = [_deviation('', self._all)] if self._all.drifts else []
         parts += [_deviation(f'user {user}: ', self._users[user]) for user in users[:MAX_NAMED]]
         if len(users) > MAX_NAMED:
-            parts.append(f'{len(users) - MAX_NAMED} more users')
+            parts.append(counted(len(users) - MAX_NAMED, 'more user'))
         return f'the signals do not match the scenario: {"; ".join(parts)}' if parts else ''
 
 

@@ -6,6 +6,7 @@ import math
 
 from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.role import NewestDict
+from rhs_isac_ros.support.texts import counted
 
 # Period of the announcements of a node, and the silence after which the node counts as gone [s].
 # Shorter times would load large networks, and nodes on a busy machine would count as gone although
@@ -128,9 +129,9 @@ class Presences:
                                       f'{rival.node}, {started(rival.sender)}')
         if strangers := [other for other in present if self._is_stranger(other)]:
             first = min(strangers, key=lambda other: (other.node, other.scenario_id))
-            others = f' (and {len(strangers) - 1} others)' if len(strangers) > 1 else ''
             found['conflict.scenario'] = (
-                f'{first.node}{others} uses another scenario, {first.scenario_id}, with '
+                f'{first.node}{_others(len(strangers) - 1)} uses another scenario, '
+                f'{first.scenario_id}, with '
                 f'{_differences(own.scenario, first.scenario) or "unknown differences"}; '
                 'its messages are dropped')
         if divergent := [other for other in present if self._has_other_library(other)]:
@@ -146,9 +147,8 @@ class Presences:
                    if self.now_s < one.end_s and len(one.ahead_s) > 1
                    and not own.use_sim_time and min(map(abs, one.ahead_s)) > _MAX_DIFFERENCE_S]:
             node, ahead_s = min(off)
-            others = f' (and {len(off) - 1} others)' if len(off) > 1 else ''
             found['conflict.host_clock'] = (
-                f'clock of the host of {node}{others}: {abs(ahead_s):.0f} s '
+                f'clock of the host of {node}{_others(len(off) - 1)}: {abs(ahead_s):.0f} s '
                 f'{"ahead of" if ahead_s > 0 else "behind"} that of this node, expected the same '
                 'time on all hosts')
         return found
@@ -166,6 +166,10 @@ class Presences:
 
     def _is_stranger(self, other: Presence) -> bool:
         return other.scenario_id not in ('', self.own.scenario_id)
+
+
+def _others(n: int) -> str:
+    return f' (and {counted(n, "other")})' if n else ''
 
 
 def _differences(own_text: str, other_text: str) -> str:

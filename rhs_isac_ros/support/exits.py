@@ -74,6 +74,22 @@ def exit_code_of(
         return 1
 
 
+def finished(
+        work: Callable[[], int | None], errors: tuple[type[Exception], ...], program: str) -> int:
+    """Do the work of a command, and return the exit code.
+
+    The code is the result of `work` (0 for None), 2 after one of the `errors`, which is printed,
+    or 130 after Ctrl-C.
+    """
+    try:
+        return work() or 0
+    except KeyboardInterrupt:
+        return 130
+    except errors as error:
+        print_error(error, program)
+        return 2
+
+
 def discard_stdout() -> None:
     """Redirect the standard output to `os.devnull`, so that Python can flush it at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -5,7 +5,6 @@ generator that yields a function with its next jobs, receives their results, and
 `Workers.run` runs strands side by side. Each continues as soon as its own jobs are done.
 """
 
-import argparse
 import contextlib
 import ctypes
 import dataclasses
@@ -16,8 +15,6 @@ import inspect
 import json
 import os
 import queue
-import re
-import shutil
 import signal
 import sys
 import threading
@@ -34,8 +31,6 @@ import numpy as np
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.support import plugins
-from rhs_isac_ros.support.arguments import integer, output_folder
-from rhs_isac_ros.support.exits import print_error
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 from rhs_isac_ros.support.progress import progress_bar
@@ -191,7 +186,6 @@ class Workers:
     folder: Path | None = None  #: Folder of a file for each result; None to keep no results.
     label: str = ''  #: Text beside the progress.
     quiet: bool = False  #: Whether to show no progress.
-    worker_timeout_s: float = _WORKER_TIMEOUT_S  #: Time in which a cluster must have a worker [s].
 
     def run(self, strands: Sequence[Strand[_End]]) -> list[_End]:
         """Run strands until all have returned; return what they return.
@@ -237,7 +231,7 @@ class Workers:
     def _executor(self) -> Iterator[tuple[Executor, int]]:
         """Yield an executor, and the number of jobs that it should have at a time."""
         if self.dask:
-            with _cluster(self.dask, self.worker_timeout_s) as executor:
+            with _cluster(self.dask) as executor:
                 # The scheduler balances the load only among jobs that it knows.
                 yield executor, sys.maxsize
             return
@@ -369,7 +363,7 @@ class _ThisProcess(Executor):
 
 
 @contextlib.contextmanager
-def _cluster(address: str, worker_timeout_s: float) -> Iterator[Executor]:
+def _cluster(address: str) -> Iterator[Executor]:
     """Yield an executor on a Dask cluster; at the end, cancel its jobs.
 
     This function uses `distributed` directly: joblib would never return if a worker died.
@@ -381,7 +375,7 @@ def _cluster(address: str, worker_timeout_s: float) -> Iterator[Executor]:
         try:
             client = stack.enter_context(Client(
                 address, timeout=_SCHEDULER_TIMEOUT_S, set_as_default=False))
-            client.wait_for_workers(1, timeout=worker_timeout_s)
+            client.wait_for_workers(1, timeout=_WORKER_TIMEOUT_S)
         except (OSError, TimeoutError, ValueError) as error:
             raise ConnectionError(f'Dask cluster {address}: {error}') from error
         yield client.get_executor()
@@ -449,16 +443,14 @@ def _interrupts_ignored() -> Iterator[None]:
 
 def run_jobs(
         function: Callable[..., dict[str, Any]], jobs: Sequence[Job], folder: Path | None = None,
-        n_jobs: int = -1, dask: str | None = None, label: str = '',
-        worker_timeout_s: float = _WORKER_TIMEOUT_S) -> list[dict[str, Any]]:
+        n_jobs: int = -1, dask: str | None = None) -> list[dict[str, Any]]:
     """Run the jobs that have no stored result; return all results in order, decoded from JSON.
 
     `function` takes the arguments of a job and returns a dict that JSON or NumPy can represent.
     Each result is stored as soon as it is available, in a file in `folder`. After an interruption
     or an error, the same call resumes the experiment. `n_jobs` jobs run in parallel on this
     machine, by default one per core; `dask` is the address of the scheduler of a Dask cluster to
-    use instead, whose first worker may take `worker_timeout_s` to appear. Progress, with the
-    label, appears on stderr.
+    use instead. Progress appears on stderr.
 
     Raises JobError if a job fails, its process dies or its worker has other sources of this
     package, ConnectionError if the cluster does not respond, OSError if a result cannot be read or
@@ -471,8 +463,7 @@ def run_jobs(
     def strand() -> Strand[list[dict[str, Any]]]:
         return (yield function, jobs)
 
-    (results,) = Workers(n_jobs, dask, folder, label,
-                         worker_timeout_s=worker_timeout_s).run([strand()])
+    (results,) = Workers(n_jobs, dask, folder).run([strand()])
     return results
 
 
@@ -485,61 +476,3 @@ def _decoded(job_result: JobResult) -> dict[str, Any]:
         raise JobError(f'job {name}: the worker has rhs_isac_ros {job_result.sources}, expected '
                        f'{sources_of()}, that of this machine')
     return json.loads(job_result.text)
-
-
-def add_run_options(parser: argparse.ArgumentParser, output: str = '') -> None:
-    """Add the options of `run_jobs`; `output` is the default folder of the results, if any."""
-    parser.add_argument('--jobs', type=integer(1, 1024), default=-1, metavar='N',
-                        help='number of parallel jobs (default: one per core)')
-    parser.add_argument('--dask', type=_address, metavar='ADDRESS',
-                        help='scheduler of a Dask cluster to use instead of this machine; '
-                             'its workers need this package, and one thread each for '
-                             'accurate timing')
-    if output:
-        parser.add_argument('--output', type=output_folder, default=output, metavar='DIR',
-                            help='folder of the results (default: %(default)s); jobs that have '
-                                 'results there are not repeated')
-
-
-@contextlib.contextmanager
-def unfinished(output: Path, options: argparse.Namespace, quiet: bool = False
-               ) -> Iterator[Workers]:
-    """Yield workers whose results are kept in OUTPUT.jobs until the block succeeds.
-
-    The options are those of `add_run_options`.
-    """
-    folder = output.with_name(output.name + '.jobs')
-    yield Workers(options.jobs, options.dask, folder, quiet=quiet)
-    shutil.rmtree(folder, ignore_errors=True)
-
-
-def _address(text: str) -> str:
-    if not re.fullmatch(r'(\w+://)?[^\s/:]+:\d{1,5}', text):
-        raise argparse.ArgumentTypeError(f'{text!r}, expected HOST:PORT')
-    return text
-
-
-def run_command(experiment: Callable[[], None]) -> int:
-    """Run an experiment; return 0, 130 after Ctrl-C, or 1 after a job, file or library error."""
-    try:
-        experiment()
-    except KeyboardInterrupt:
-        print('interrupted: finished jobs are kept; repeat the command to resume',
-              file=sys.stderr)
-        # The exit code by which shells report Ctrl-C.
-        return 130
-    except (JobError, MissingLibraryError, OSError) as error:
-        print_error(f'{error}; finished jobs are kept; repeat the command to resume')
-        return 1
-    return 0
-
-
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Format a Markdown table: the first column is left-aligned, the others right-aligned."""
-    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
-    rule = ['-' * widths[0], *('-' * (width - 1) + ':' for width in widths[1:])]
-    lines = [
-        [entry.ljust(width) if column == 0 else entry.rjust(width)
-         for column, (entry, width) in enumerate(zip(row, widths, strict=True))]
-        for row in (header, rule, *rows)]
-    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)

@@ -5,6 +5,8 @@ import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from rhs_isac_ros.support.texts import counted
+
 # Time in which repeated changes of a state, or repetitions of an event, are only counted [s].
 PERIOD_S = 60.0
 # Maximum number of states and events, which bounds the memory, and maximum number of texts of a
@@ -81,8 +83,7 @@ class StateLog:
                 continue
             text, *severity = record.suppressed
             what = 'time' if record.holds is None else 'change'
-            times = (f' ({record.n} {what}{"s"[:record.n != 1]} in {PERIOD_S:.0f} s)'
-                     if record.n else '')
+            times = f' ({counted(record.n, what)} in {PERIOD_S:.0f} s)' if record.n else ''
             lines.append(Line(text + times, *severity))
             record.until_s, record.suppressed, record.n = now_s + PERIOD_S, None, 0
         return lines

@@ -59,7 +59,8 @@ from rhs_isac_ros.support.files import (
     save_or_rescue,
     write_whole,
 )
-from rhs_isac_ros.support.jobs import JobError, Workers, add_run_options, unfinished
+from rhs_isac_ros.support.job_commands import add_run_options, unfinished
+from rhs_isac_ros.support.jobs import JobError, Workers
 from rhs_isac_ros.tools import command
 
 # The messages that pilots consist of.
@@ -290,8 +291,7 @@ def _collected(
         log.codebooks.update(dict.fromkeys(log.missing_codebooks, codebook))
     source = options.file or 'network'
     if log.missing_codebooks:
-        raise RecordingError(f'{source}: codebook {log.missing_codebooks[0]}: not in the '
-                             'recording; give its file with --codebook FILE')
+        raise command.missing_codebook(source, log.missing_codebooks[0])
     if log.n_moving:
         print(f'calibrate: {source}: {log.n_moving} cycles of users who moved are left out',
               file=sys.stderr)

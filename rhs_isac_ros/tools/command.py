@@ -2,12 +2,11 @@
 
 import argparse
 import contextlib
-import itertools
 import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -124,19 +123,16 @@ def print_now(*values: object, end: str = '\n') -> None:
     print(*values, end=end, flush=True)
 
 
-def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> str:
-    """Return a text table; heads may have line breaks; `align` has a ``<`` or ``>`` per column."""
-    lines = [*itertools.zip_longest(*(head.split('\n') for head in heads), fillvalue=''), *rows]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return '\n'.join('  '.join(
-        f'{cell:{side}{width}}' for cell, side, width in zip(line, align, widths, strict=True)
-    ).rstrip() for line in lines)
-
-
 def none_within(what: str, timeout_s: float) -> ToolError:
     """Return the error for a network that did not provide something within a time [s]."""
     return ToolError(f'{what} within {timeout_s:g} s, in the domain '
                      f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace')
+
+
+def missing_codebook(source: object, codebook_id: str) -> RecordingError:
+    """Return the error for a codebook that is neither in a source nor an option."""
+    return RecordingError(f'{source}: codebook {codebook_id}: not in the recording; give its file '
+                          'with --codebook FILE')
 
 
 def observe(

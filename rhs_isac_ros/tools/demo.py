@@ -62,8 +62,9 @@ from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.exits import on_end_signals, print_error
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.pictures import write_picture
+from rhs_isac_ros.support.texts import counted, text_table
 from rhs_isac_ros.system import SystemFileError
-from rhs_isac_ros.tools.command import add_files, choose_scenario, fill_in, text_table
+from rhs_isac_ros.tools.command import add_files, choose_scenario, fill_in
 from rhs_isac_ros.tools.pictures import compose_cycles, prepare_drawing
 
 # Maximum time between two complete cycles [s].
@@ -280,7 +281,7 @@ def _carriage(observer: SiteObserver, cycles: Sequence[CompleteCycle]) -> str:
         latest[cycle.user] = carrier
     carried = collections.Counter(observer.carriers[cycle.cycle_id] for cycle in cycles)
     return (f'data: {", ".join(f"{n} over {name}" for name, n in sorted(carried.items()))}; '
-            f'{n_handovers} handover{"s" * (n_handovers != 1)}')
+            f'{counted(n_handovers, "handover")}')
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -21,6 +21,7 @@ from rhs_isac_ros.monitoring.network_state import SceneState, SceneUser
 from rhs_isac_ros.monitoring.shapes import MIN_LEVEL_DB
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.support.pictures import PAGE_IN, label_decades, look, new_figure, paper_style
+from rhs_isac_ros.support.texts import counted
 
 # Height of the panel of errors, and of everything around the panels [in]; share of the width for
 # the view from above.
@@ -326,4 +327,5 @@ def _patch(label: str, **style: Any) -> Any:
 
 def _further(users: Sequence[int], n_shown: int) -> list[Any]:
     """Return a legend entry with the number of users that are not shown, if there are any."""
-    return [_mark(f'and {len(users) - n_shown} more users')] if len(users) > n_shown else []
+    n_others = len(users) - n_shown
+    return [_mark(f'and {counted(n_others, "more user")}')] if n_others > 0 else []

@@ -58,6 +58,7 @@ from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.texts import text_table
 from rhs_isac_ros.system import System
 from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.command import ToolError
@@ -529,7 +530,7 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
 def _print_table(rows: Sequence[Sequence[str]]) -> None:
     heads = ['', 'median error', 'root mean square', 'no fix', 'velocity, rms']
     n = 5 if any(row[-1] for row in rows) else 4
-    print(command.text_table(heads[:n], [row[:n] for row in rows], '<>>>>'[:n]))
+    print(text_table(heads[:n], [row[:n] for row in rows], '<>>>>'[:n]))
 
 
 def _row(name: str, recording: Recording, positions: _Positions) -> list[str]:

@@ -30,7 +30,8 @@ from rhs_isac_ros.support.arguments import (
 )
 from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import write_whole
-from rhs_isac_ros.support.jobs import Job, JobError, Strand, add_run_options, unfinished
+from rhs_isac_ros.support.job_commands import add_run_options, unfinished
+from rhs_isac_ros.support.jobs import Job, JobError, Strand
 from rhs_isac_ros.support.pictures import PICTURE_FORMATS, write_picture
 
 CONFIG = Path(__file__).parents[2] / 'config'

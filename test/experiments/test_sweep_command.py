@@ -41,7 +41,7 @@ def test_a_cluster_and_an_interrupted_run_write_the_same_files(
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False,
                                   dashboard_address=':0') as cluster:
         # Addresses in the same process are no HOST:PORT.
-        monkeypatch.setattr('rhs_isac_ros.support.jobs._address', str)
+        monkeypatch.setattr('rhs_isac_ros.support.job_commands._address', str)
         assert sweep('dask', '--dask', cluster.scheduler_address) == 0
     shown = capsys.readouterr().out
     assert 'written: dask/sweep.csv and dask/sweep.png' in shown

@@ -123,7 +123,7 @@ def test_another_scenario_is_named_and_neither_serves_nor_supersedes(presences):
     assert presences.conflicts() == {'conflict.scenario': text}
     presences.add(dataclasses.replace(stranger, sender=NOW_NS - 1, role='bs'), NOW_NS, 0.0)
     assert presences.conflicts() == {
-        'conflict.scenario': text.replace('/channel', '/channel (and 1 others)')}
+        'conflict.scenario': text.replace('/channel', '/channel (and 1 other)')}
     assert not presences.stands_by
     assert presences.newest('channel') == 0
     presences.now_s = SILENCE_S * SLOW_PERIOD_S / PERIOD_S

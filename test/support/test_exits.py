@@ -27,6 +27,18 @@ def test_an_error_of_the_user_names_the_program(capsys):
     assert capsys.readouterr().err == 'lab: error: no such place\n'
 
 
+@pytest.mark.parametrize(('result', 'code', 'text'), [
+    (None, 0, ''), (1, 1, ''), (LookupError('no such place'), 2, 'lab: error: no such place\n'),
+    (KeyboardInterrupt(), 130, '')])
+def test_the_end_of_a_command(result, code, text, capsys):
+    def work():
+        if isinstance(result, BaseException):
+            raise result
+        return result
+    assert exits.finished(work, (LookupError,), 'lab') == code
+    assert capsys.readouterr().err == text
+
+
 @pytest.mark.parametrize(('setup', 'ends'), [
     ('', 'True True True'),
     # As under nohup.

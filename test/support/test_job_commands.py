@@ -1,8 +1,9 @@
-"""The command line of an experiment: exit codes and tables."""
+"""The end of a command that runs jobs: exit codes and messages."""
 
 import pytest
 
-from rhs_isac_ros.experiments import JobError, markdown_table, run_command
+from rhs_isac_ros.support.job_commands import run_command
+from rhs_isac_ros.support.jobs import JobError
 from rhs_isac_ros.support.optional import MissingLibraryError
 
 
@@ -18,9 +19,3 @@ def test_exit_codes_and_messages(error, code, text, capsys):
             raise error
     assert run_command(experiment) == code
     assert text in capsys.readouterr().err
-
-
-def test_a_table_is_aligned_markdown():
-    table = markdown_table(['method', 'm²'], [['direct', '1.5'], ['ga', '12.25']])
-    assert table.splitlines() == [
-        '| method |    m² |', '| ------ | ----: |', '| direct |   1.5 |', '| ga     | 12.25 |']
