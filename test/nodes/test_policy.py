@@ -13,11 +13,11 @@ from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.positioning import Site
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.recording import Recorder, recorded_topics
-from rhs_isac_ros.tools import replay
+from rhs_isac_ros.tools import republish
 from rhs_isac_ros.tools.calibrate import CalibratorNode, PilotLog
 from rhs_isac_ros.tools.command import Session
 from rhs_isac_ros.tools.record import RecorderNode
-from rhs_isac_ros.tools.replay import RepublisherNode
+from rhs_isac_ros.tools.republish import RepublisherNode
 from rhs_isac_ros.tools.snapshot import SnapshotNode
 from rhs_isac_ros.tools.view import ViewNode
 from rhs_isac_ros.tools.watch import WatchNode
@@ -123,9 +123,9 @@ def test_the_tools_use_no_more_than_the_permissions_of_the_operator(tmp_path):
         nodes = [session.node, view, CalibratorNode(PilotLog(scenario), scenario), WatchNode(),
                  SnapshotNode(scenario), RecorderNode(recorder),
                  RepublisherNode([], [*recorded_topics()], 1.0, 1.0),
-                 replay._optimizer(scenario, Codebook.default())]
+                 republish._optimizer(scenario, Codebook.default())]
         # It creates the clients.
-        replay._optimizer_present(nodes[-2])
+        republish._optimizer_present(nodes[-2])
         for node in nodes:
             rights = allowed['/replay' if node in nodes[-2:] else '/operator']
             found = used(session.node, f'/{node.get_name()}')

@@ -22,7 +22,7 @@ from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE, OBSERVATION
 from rhs_isac_ros.ros.recording import read
 from rhs_isac_ros.support import plugins
-from rhs_isac_ros.tools import replay
+from rhs_isac_ros.tools import republish
 from rhs_isac_ros.tools.replay import load, locate, main
 
 pytest.importorskip('mcap', reason='mcap is not installed')
@@ -340,7 +340,7 @@ def test_signals_that_nobody_answers_are_counted(many, bench):
     ([0, 100, 101, 201], [0, 1, 2, 3], ['a pause of 100 s', 'a pause of 100 s'])])
 def test_gaps_of_a_recording_are_shortened_and_printed(times_s, due_s, lines, capsys):
     messages = [('codebook', b'', -1e6), *(('ack', b'', time_s) for time_s in times_s)]
-    found = list(replay._without_gaps(messages))
+    found = list(republish._without_gaps(messages))
     assert [time_s for _, _, time_s in found] == [0, *due_s]
     assert [line.removeprefix('replay: ').partition(' in the')[0]
             for line in capsys.readouterr().err.splitlines()] == lines
