@@ -5,14 +5,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import rclpy
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rcl_interfaces.srv import SetParameters
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.parameter_service import ParameterService
-from rclpy.utilities import remove_ros_args, try_shutdown
+from rclpy.utilities import remove_ros_args
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
@@ -26,16 +24,13 @@ from rhs_isac_ros.ros.endpoints import LATCHED, create_publisher
 from rhs_isac_ros.ros.parameters import (
     CODEBOOK,
     CODEBOOK_PREFIX,
-    WITHOUT_SERVICES,
     same_value,
 )
 from rhs_isac_ros.ros.role_node import RoleNode
-from rhs_isac_ros.ros.run import StartError, init, parse, run, starting
+from rhs_isac_ros.ros.run import StartError, parse, run
+from rhs_isac_ros.ros.session import Session
 from rhs_isac_ros.support.arguments import ArgumentParser, HelpFormatter, input_file
 from rhs_isac_ros.support.exits import print_error
-
-# Number of equal requests to another optimizer, until one has a response.
-_N_REQUESTS = 5
 
 
 class CodebookParameterService(ParameterService):
@@ -74,28 +69,23 @@ class PushError(RuntimeError):
     """No optimizer has accepted a codebook."""
 
 
-def push(node: Node, codebook: Codebook, timeout_s: float = 10.0) -> None:
-    """Send a codebook to the optimizer in the namespace of a node, by setting its parameters.
+def push(session: Session, codebook: Codebook, timeout_s: float = 10.0) -> None:
+    """Send a codebook to the optimizer in the namespace of a session, by setting its parameters.
 
-    This function spins the node, so it must not be called from a callback. It raises PushError if
-    no optimizer is found, or responds, within `timeout_s`, or if it rejects the codebook.
+    Raises PushError if no optimizer is found, or responds, within `timeout_s`, or if it rejects
+    the codebook.
     """
-    optimizer = f'{node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
-    client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)
-    if not client.wait_for_services(timeout_s):
+    optimizer = f'{session.node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
+    client = AsyncParameterClient(session.node, topics.OPTIMIZER_NODE)
+    if not session.spin_until(client.services_are_ready, timeout_s):
         raise PushError(f'{optimizer}: not found within {timeout_s:g} s')
     parameters = ros_parameters(codebook.to_parameters())
-    # DDS may lose a response to a client that it has just discovered, so the request is repeated.
-    for _ in range(_N_REQUESTS):
-        future = client.set_parameters_atomically(parameters)
-        rclpy.spin_until_future_complete(node, future, timeout_sec=timeout_s / _N_REQUESTS)
-        if future.done():
-            break
-    else:
+    response = session.response(
+        lambda: client.set_parameters_atomically(parameters), timeout_s)
+    if response is None:
         raise PushError(f'{optimizer}: no response within {timeout_s:g} s')
-    result = future.result().result
-    if not result.successful:
-        raise PushError(f'{optimizer}: codebook rejected: {result.reason}')
+    if not response.result.successful:
+        raise PushError(f'{optimizer}: codebook rejected: {response.result.reason}')
 
 
 class Holder(Role):
@@ -240,20 +230,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _push(codebook: Codebook, args: Sequence[str]) -> int:
-    node = None
     try:
-        init(['', *args])
-        with starting():
-            node = Node('codebook_pusher', **WITHOUT_SERVICES)
-        push(node, codebook)
+        with Session(['', *args]) as session:
+            push(session, codebook)
     except (PushError, StartError) as error:
         print_error(error, topics.OPTIMIZER_NODE)
         return 1 if isinstance(error, PushError) else 2
     except KeyboardInterrupt:
         return 0
-    finally:
-        if node is not None:
-            node.destroy_node()
-        try_shutdown()
     print(f'codebook {codebook.id} is set')
     return 0

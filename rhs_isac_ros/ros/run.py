@@ -15,6 +15,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import rclpy
 from rclpy.exceptions import InvalidHandle, NameValidationException, ParameterException
@@ -56,6 +57,9 @@ _DESTRUCTION_S = 10
 # Maximum time between two checks of `done`, and of a wait without it [s]. A wait without an end
 # would take all of a processor.
 _POLL_S, _WAIT_S = 0.1, 60.0
+
+
+_NodeT = TypeVar('_NodeT', bound=Node)
 
 
 class StartError(Exception):
@@ -160,17 +164,16 @@ def _wake_on_signals(executor: Executor) -> None:
     threading.Thread(target=wake, daemon=True).start()
 
 
-def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
-        done: Callable[[], bool] | None = None) -> int:
+def spin(make: Callable[[], Sequence[_NodeT]], args: Sequence[str],
+         done: Callable[[Sequence[_NodeT]], bool] | None = None) -> Sequence[_NodeT]:
     """Create nodes, spin them until a signal arrives or `done` returns True, and destroy them.
 
-    `args` is a command line with the name of the program, by default that of the process. The
-    returned exit code is 2 if the nodes cannot start, otherwise 0.
+    `args` is a command line with the name of the program. Returns the nodes. Raises StartError if
+    they cannot start.
     """
     signals: list[int] = []
     on_end_signals(lambda number, _: signals.append(number))
-    args = sys.argv if args is None else args
-    nodes: Sequence[Node] = ()
+    nodes: Sequence[_NodeT] = ()
     executor = None
     try:
         init(args)
@@ -184,7 +187,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         gc.collect()
         gc.freeze()
         _wake_on_signals(executor)
-        while ok() and not signals and not (done and done()):
+        while ok() and not signals and not (done and done(nodes)):
             # Other ways of spinning return, and react to signals, only when the queue is empty.
             try:
                 executor.spin_once(timeout_sec=_POLL_S if done else _WAIT_S)
@@ -192,16 +195,13 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
             # stand-by.
             except InvalidHandle:
                 pass
-    except StartError as error:
-        print_error(error, os.path.basename(args[0]))
-        return 2
     finally:
         signal.set_wakeup_fd(-1)
         # In a deadlocked middleware, a Python handler of SIGALRM would never run.
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(_DESTRUCTION_S)
         for node in nodes:
-            node.destroy_node()
+            node.destroy_node()  # type: ignore[no-untyped-call]
         if executor is not None:
             executor.shutdown()
         try_shutdown()
@@ -209,6 +209,16 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         # Python restores the default handlers at exit. A further signal, for instance from
         # `ros2 launch` after Ctrl-C, would then kill a process that is about to exit normally.
         on_end_signals(signal.SIG_IGN)
+    return nodes
+
+
+def run(make: Callable[[], Sequence[Node]], args: Sequence[str]) -> int:
+    """Spin nodes until a signal arrives; return exit code 0, or 2 if they cannot start."""
+    try:
+        spin(make, args)
+    except StartError as error:
+        print_error(error, os.path.basename(args[0]))
+        return 2
     return 0
 
 

@@ -1,22 +1,15 @@
 """What all commands use: their entry point, nodes, recordings and tables."""
 
 import argparse
-import contextlib
 import os
-import signal
 import sys
-import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.exceptions import InvalidTopicNameException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.expand_topic_name import expand_topic_name
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.utilities import try_shutdown
-from rclpy.validate_full_topic_name import validate_full_topic_name
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.calibration import CalibrationError
@@ -28,22 +21,16 @@ from rhs_isac_ros.positioning import ModelError, Site, SiteError
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, diagnostics, endpoints, topics
 from rhs_isac_ros.ros.endpoints import subscribe
-from rhs_isac_ros.ros.environment import is_secure
-from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import RecordingError, read, read_networks
-from rhs_isac_ros.ros.run import StartError, init, parse, run, starting
+from rhs_isac_ros.ros.run import StartError, parse, spin, starting
+from rhs_isac_ros.ros.session import Session
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import check_distinct, input_file
 from rhs_isac_ros.support.errors import translated
-from rhs_isac_ros.support.exits import discard_stdout, on_end_signals, print_error
+from rhs_isac_ros.support.exits import discard_stdout, print_error
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.system import SystemFileError, SystemFiles
 
-# Period of polling the graph [s], because changes to the graph do not wake the executor.
-_POLL_PERIOD_S = 0.02
-# Discovery is complete when the graph has not changed for this time [s]. With DDS security,
-# discovery pauses while keys are exchanged.
-_SETTLE_S = 1.0 if is_secure() else 0.4
 # Errors in arguments and files.
 INVALID = (StartError, RecordingError, ScenarioError, SiteError, SystemFileError, CodebookError,
            CalibrationError, ModelError, plugins.PluginError)
@@ -137,18 +124,10 @@ def missing_codebook(source: object, codebook_id: str) -> RecordingError:
 
 def observe(
         make: Callable[[], _NodeT], arguments: Sequence[str],
-        done: Callable[[_NodeT], bool] = lambda node: False) -> tuple[int, _NodeT | None]:
-    """Create a node, and spin it until a signal arrives or `done` returns True.
-
-    Returns the exit code of `run`, and the node, or None if its creation failed.
-    """
-    nodes: list[_NodeT] = []
-
-    def create() -> list[_NodeT]:
-        nodes.append(make())
-        return nodes
-    code = run(create, arguments, lambda: done(nodes[0]))
-    return code, nodes[0] if nodes else None
+        done: Callable[[_NodeT], bool] = lambda node: False) -> _NodeT:
+    """Create a node, spin it until a signal arrives or `done` returns True, and return it."""
+    (node,) = spin(lambda: [make()], arguments, lambda nodes: done(nodes[0]))
+    return node
 
 
 def subscribe_codebooks(
@@ -214,60 +193,6 @@ def recorded(
                 message: m.Message = convert.from_bytes(kind, content)
                 m.check(message, scenario)
                 yield message, time_s
-
-
-class Session(contextlib.AbstractContextManager['Session']):
-    """A context manager with a node, which `spin_until` and `discover` spin."""
-
-    def __init__(self, arguments: Sequence[str] = ('',)) -> None:
-        init(arguments)
-        on_end_signals(signal.default_int_handler)
-        with starting():
-            self.node = Node(f'_rhs_isac_cli_{os.getpid()}', **WITHOUT_SERVICES)
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self.node)
-
-    def __exit__(self, *_: object) -> None:
-        """Destroy the node and shut the context down."""
-        self._executor.shutdown()
-        self.node.destroy_node()
-        try_shutdown()
-
-    def spin_until(self, condition: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Spin until a condition holds or `timeout_s` has passed; return whether it holds."""
-        end_s = None if timeout_s is None else time.monotonic() + timeout_s
-        while not condition():
-            if end_s is not None and time.monotonic() >= end_s:
-                return False
-            self._executor.spin_once(timeout_sec=_POLL_PERIOD_S)
-        return True
-
-    def discover(self, timeout_s: float) -> None:
-        """Spin until the graph has other nodes and has settled, or `timeout_s` has passed."""
-        graph, changed_s = self._graph(), time.monotonic()
-
-        def settled() -> bool:
-            nonlocal graph, changed_s
-            previous, graph = graph, self._graph()
-            if graph != previous:
-                changed_s = time.monotonic()
-            return (len(self.node.get_node_names()) > 1
-                    and time.monotonic() - changed_s > _SETTLE_S)
-        self.spin_until(settled, timeout_s)
-
-    def _graph(self) -> list[Any]:
-        return sorted([*self.node.get_topic_names_and_types(),
-                       *self.node.get_node_names_and_namespaces()], key=repr)
-
-    def full_name(self, topic: str) -> str:
-        """Return the full name of a topic, or raise `ToolError` if its name is invalid."""
-        try:
-            name = expand_topic_name(topic, self.node.get_name(), self.node.get_namespace())
-            validate_full_topic_name(name)
-        except (ValueError, InvalidTopicNameException) as error:
-            # The text ends with a location in the source code of ROS.
-            raise ToolError(str(error).partition(', at /')[0]) from None
-        return name
 
 
 def run_verb(options: argparse.Namespace, arguments: list[str]) -> int:

@@ -13,8 +13,9 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
+from rhs_isac_ros.ros.session import Session
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
-from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run_verb
+from rhs_isac_ros.tools.command import ToolError, entry, print_now, run_verb
 
 # Texts that the parser of rcl, unlike that of Python, reads as something else.
 _AMBIGUOUS = re.compile(
@@ -23,9 +24,6 @@ _AMBIGUOUS = re.compile(
 _DISCOVERY_TIMEOUT_S = 10.0
 # Maximum time to discover a node's services, and to wait for a response [s].
 _SERVICE_TIMEOUT_S = 10.0
-# Time after which a request is repeated [s]: DDS may lose a response to a client that it has just
-# discovered. All requests have the same effect if they are repeated.
-_REPETITION_S = 2.0
 _LABELS = {
     ParameterType.PARAMETER_BOOL: 'Boolean value is:',
     ParameterType.PARAMETER_INTEGER: 'Integer value is:',
@@ -207,12 +205,10 @@ def _call(session: Session, node: str, request: Callable[[AsyncParameterClient],
     if not session.spin_until(client.services_are_ready, _SERVICE_TIMEOUT_S):
         raise ToolError('Wait for service timed out waiting for parameter services for node '
                         f'{node}')
-    futures: list[Future] = []
-    for _ in range(round(_SERVICE_TIMEOUT_S / _REPETITION_S)):
-        futures.append(request(client))
-        if session.spin_until(lambda: any(map(Future.done, futures)), _REPETITION_S):
-            return next(filter(Future.done, futures)).result()
-    raise ToolError(f'{node}: no response within {_SERVICE_TIMEOUT_S:g} s')
+    response = session.response(lambda: request(client), _SERVICE_TIMEOUT_S)
+    if response is None:
+        raise ToolError(f'{node}: no response within {_SERVICE_TIMEOUT_S:g} s')
+    return response
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -6,6 +6,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from typing import Any
 
 import yaml
 from rclpy.duration import Duration
@@ -27,7 +28,7 @@ from rhs_isac_ros.ros.endpoints import (
 from rhs_isac_ros.ros.environment import is_secure
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import RecordingError, read, recorded_topics
-from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.ros.run import spin
 from rhs_isac_ros.support.arguments import positive_float
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.tools import command
@@ -240,12 +241,10 @@ def republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     first_codebook = _first_codebook(options) if _SIGNALS in names else None
     if first_codebook:
         first_codebook.check(scenario)
-    nodes: list[RepublisherNode] = []
 
-    def create() -> list[Node]:
+    def create() -> list[Any]:
         node = RepublisherNode(_messages(options, [*names, topics.CODEBOOK]), names,
                                options.rate, options.timeout)
-        nodes.append(node)
         if first_codebook is None:
             return [node]
         if _optimizer_present(node):
@@ -255,14 +254,13 @@ def republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         node.optimizer = _optimizer(scenario, first_codebook)
         return [node, node.optimizer]
 
-    code = run(create, arguments, lambda: nodes[0].is_done())
-    if nodes:
-        print(f'{nodes[0].count} messages published')
-        if nodes[0].unanswered:
-            raise ToolError(f'{nodes[0].unanswered} signals without {_ESTIMATES} or no_fix')
-        if nodes[0].unconfirmed:
-            raise ToolError(f'not all acknowledged: {", ".join(sorted(nodes[0].unconfirmed))}')
-    return code
+    node, *_ = spin(create, arguments, lambda nodes: nodes[0].is_done())
+    print(f'{node.count} messages published')
+    if node.unanswered:
+        raise ToolError(f'{node.unanswered} signals without {_ESTIMATES} or no_fix')
+    if node.unconfirmed:
+        raise ToolError(f'not all acknowledged: {", ".join(sorted(node.unconfirmed))}')
+    return 0
 
 
 def _messages(

@@ -75,14 +75,14 @@ def _snapshot(options: argparse.Namespace, arguments: list[str]) -> int:
     def done(node: SnapshotNode) -> bool:
         return (node.is_ready(options.wait) or node.has_other_scenario
                 or time.monotonic() > end_s)
-    code, node = command.observe(lambda: SnapshotNode(scenario), arguments, done)
-    if node and done(node):
+    node = command.observe(lambda: SnapshotNode(scenario), arguments, done)
+    if done(node):
         if node.mismatch and node.scene.configuration is None:
             raise ToolError(f'{node.mismatch}{command.OTHER_SCENARIO}')
         if not node.scene.users:
             raise command.none_within('no user found', options.timeout)
         draw(node.scene, scenario, options.output)
-    return code
+    return 0
 
 
 def draw(scene: SceneState, scenario: Scenario, path: Path) -> None:

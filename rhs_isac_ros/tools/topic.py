@@ -11,6 +11,9 @@ from typing import Any
 
 import numpy as np
 import yaml
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.expand_topic_name import expand_topic_name
+from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
     QoSProfile,
@@ -19,13 +22,15 @@ from rclpy.qos import (
 )
 from rclpy.subscription import Subscription
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
+from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from rhs_isac_ros.protocol.messages import MessageError
 from rhs_isac_ros.protocol.role import NewestDict
 from rhs_isac_ros.ros.convert import deserialize
 from rhs_isac_ros.ros.endpoints import OBSERVATION, log_dropped, steady_timer
+from rhs_isac_ros.ros.session import Session
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
-from rhs_isac_ros.tools.command import Session, ToolError, entry, print_now, run_verb
+from rhs_isac_ros.tools.command import ToolError, entry, print_now, run_verb
 
 _MAX_LENGTH = 128
 # Number of latest messages that are not printed twice.
@@ -83,7 +88,7 @@ def show_list(session: Session, options: argparse.Namespace) -> None:
 def show_info(session: Session, options: argparse.Namespace) -> None:
     """Print the type, the publishers and the subscriptions of a topic, or raise `ToolError`."""
     session.discover(options.spin_time)
-    node, name = session.node, session.full_name(options.topic_name)
+    node, name = session.node, _full_name(session.node, options.topic_name)
     types = dict(node.get_topic_names_and_types()).get(name)
     if types is None:
         raise ToolError(f"Unknown topic '{options.topic_name}'")
@@ -99,7 +104,7 @@ def show_info(session: Session, options: argparse.Namespace) -> None:
 
 def echo(session: Session, options: argparse.Namespace) -> None:
     """Print the messages of a topic, or raise `ToolError`."""
-    name = session.full_name(options.topic_name)
+    name = _full_name(session.node, options.topic_name)
     kind = _published_type(session, name, options.topic_name, options.spin_time)
     max_length = None if options.full_length else _MAX_LENGTH
     printed = 0
@@ -148,7 +153,7 @@ def echo(session: Session, options: argparse.Namespace) -> None:
 
 def show_rate(session: Session, options: argparse.Namespace) -> None:
     """Print the rate of the messages of a topic once a second, or raise `ToolError`."""
-    name = session.full_name(options.topic_name)
+    name = _full_name(session.node, options.topic_name)
     kind = _published_type(session, name, options.topic_name, None)
     times_ns: collections.deque[int] = collections.deque(maxlen=_MAX_TIMES)
     reported_ns = 0
@@ -164,6 +169,17 @@ def show_rate(session: Session, options: argparse.Namespace) -> None:
             print_now(rate_text(times_ns))
     steady_timer(session.node, 1.0, report)
     session.spin_until(lambda: False)
+
+
+def _full_name(node: Node, topic: str) -> str:
+    """Return the full name of a topic, or raise `ToolError` if its name is invalid."""
+    try:
+        name = expand_topic_name(topic, node.get_name(), node.get_namespace())
+        validate_full_topic_name(name)
+    except (ValueError, InvalidTopicNameException) as error:
+        # The text ends with a location in the source code of ROS.
+        raise ToolError(str(error).partition(', at /')[0]) from None
+    return name
 
 
 def _published_type(

@@ -167,14 +167,13 @@ def _view(options: argparse.Namespace, arguments: list[str]) -> int:
         scenario = command.choose_scenario(options.config, options.file, options.namespace)
         _open(stream, options)
         if options.file:
-            code = _show_recording(stream, scenario, options)
+            _show_recording(stream, scenario, options)
         else:
-            code = _show_live(stream, scenario, options, arguments)
-        if not code:
-            stream.close()
-            if options.save:
-                print(options.save)
-        return code
+            _show_live(stream, scenario, options, arguments)
+        stream.close()
+        if options.save:
+            print(options.save)
+        return 0
     finally:
         # This has no effect after `close`.
         stream.discard()
@@ -194,24 +193,22 @@ def _open(stream: RerunStream, options: argparse.Namespace) -> None:
 
 def _show_live(
         stream: RerunStream, scenario: Scenario, options: argparse.Namespace,
-        arguments: Sequence[str]) -> int:
-    code, node = command.observe(
+        arguments: Sequence[str]) -> None:
+    node = command.observe(
         lambda: ViewNode(scenario, stream.write), arguments,
         lambda node: bool(options.cycles) and node.view.n_ended >= options.cycles)
-    if options.save and node and not node.view.n_cycles:
+    if options.save and not node.view.n_cycles:
         raise ToolError(f'{options.save} is not written: {node.silence}')
-    return code
 
 
 def _show_recording(
-        stream: RerunStream, scenario: Scenario, options: argparse.Namespace) -> int:
+        stream: RerunStream, scenario: Scenario, options: argparse.Namespace) -> None:
     signals: list[int] = []
     on_end_signals(lambda number, _: signals.append(number))
     stream.write(itertools.takewhile(lambda _: not signals, entries(
         options.file, options.namespace or '/', scenario, options.cycles)))
     while not (signals or options.save):
         time.sleep(_POLL_S)
-    return 0
 
 
 def _parser() -> argparse.ArgumentParser:

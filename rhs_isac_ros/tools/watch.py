@@ -167,8 +167,8 @@ def _show_live(arguments: Sequence[str]) -> int:
                         console.print(view)
                     print_now(text.get())
             return False
-        code, _ = observe(WatchNode, arguments, refresh)
-        return code
+        observe(WatchNode, arguments, refresh)
+    return 0
 
 
 def _print_once(timeout_s: float, arguments: Sequence[str]) -> int:
@@ -181,12 +181,12 @@ def _print_once(timeout_s: float, arguments: Sequence[str]) -> int:
         return now_s > end_s or bool(
             any(node.overview.users.values())
             and now_s > node.overview.began_s + _DIAGNOSTICS_TIMEOUT_S)
-    code, node = observe(WatchNode, arguments, done)
-    if node and any(node.overview.users.values()):
+    node = observe(WatchNode, arguments, done)
+    if any(node.overview.users.values()):
         Console().print(render(node.overview, time.monotonic()))
     elif time.monotonic() > end_s:
         raise none_within('no complete cycle', timeout_s)
-    return code
+    return 0
 
 
 def _parser() -> argparse.ArgumentParser:

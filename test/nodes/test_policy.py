@@ -13,9 +13,9 @@ from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.positioning import Site
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.recording import Recorder, recorded_topics
+from rhs_isac_ros.ros.session import Session
 from rhs_isac_ros.tools import republish
 from rhs_isac_ros.tools.calibrate import CalibratorNode, PilotLog
-from rhs_isac_ros.tools.command import Session
 from rhs_isac_ros.tools.record import RecorderNode
 from rhs_isac_ros.tools.republish import RepublisherNode
 from rhs_isac_ros.tools.snapshot import SnapshotNode

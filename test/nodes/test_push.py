@@ -1,15 +1,13 @@
 """The optimizer as a command, which optimises and holds a codebook or pushes it to a network."""
 
 import pytest
-import rclpy
-from rclpy.context import Context
-from rclpy.node import Node
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.nodes.optimizer import PushError, push
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import LATCHED
+from rhs_isac_ros.ros.session import Session
 
 
 @pytest.fixture(scope='module')
@@ -74,12 +72,6 @@ def test_a_codebook_of_another_scenario_is_rejected(
 
 
 def test_the_error_names_a_missing_optimizer(small_files):
-    context = Context()
-    rclpy.init(args=[], context=context)
-    node = Node('pusher', namespace='/nobody', context=context)
-    try:
-        with pytest.raises(PushError, match='^/nobody/optimizer: not found within 0.2 s'):
-            push(node, Codebook.load(small_files / 'first.yaml'), timeout_s=0.2)
-    finally:
-        node.destroy_node()
-        rclpy.shutdown(context=context)
+    with Session(['', '--ros-args', '-r', '__ns:=/nobody']) as session, pytest.raises(
+            PushError, match='^/nobody/optimizer: not found within 0.2 s'):
+        push(session, Codebook.load(small_files / 'first.yaml'), timeout_s=0.2)

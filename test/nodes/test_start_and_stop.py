@@ -89,7 +89,7 @@ class Stuck(Node):
 
 
 run._DESTRUCTION_S = 1
-run.run(lambda: [Stuck('stuck')], done=lambda: True)
+run.spin(lambda: [Stuck('stuck')], ['stuck'], lambda nodes: True)
 '''
     done = subprocess.run([sys.executable, '-c', code], timeout=60, check=False,
                           capture_output=True, text=True)

@@ -16,7 +16,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.processes import Processes
 from rhs_isac_ros.ros.recording import CycleObserver, Recorder, schema, type_name
-from rhs_isac_ros.tools.command import Session
+from rhs_isac_ros.ros.session import Session
 
 CONFIG = Path(__file__).parents[2] / 'config'
 TIMEOUT_S = 60.0

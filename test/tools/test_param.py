@@ -147,7 +147,7 @@ def test_load_sets_the_parameters_of_a_dump(output_of, call, tmp_path):
 def test_a_request_is_repeated_until_a_response_arrives(output_of, monkeypatch):
     """DDS may lose a response to a client that it has just discovered."""
     send, lost = AsyncParameterClient.list_parameters, [Future(), Future()]
-    monkeypatch.setattr(param, '_REPETITION_S', 0.1)
+    monkeypatch.setattr(param, '_SERVICE_TIMEOUT_S', 2.5)
     monkeypatch.setattr(AsyncParameterClient, 'list_parameters',
                         lambda client: lost.pop() if lost else send(client))
     assert '  policy' in output_of(main, 'list', 'bs').splitlines()
