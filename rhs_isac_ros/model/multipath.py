@@ -24,10 +24,10 @@ from rhs_isac_ros.model.geometry import (
 from rhs_isac_ros.model.hall import MultipathEstimate
 from rhs_isac_ros.model.scenario import Scenario
 
-# Gauss-Legendre nodes in each interval of angles, on a grid of elements or at any positions, and
-# the largest change of phase over the surface that a node resolves.
-_ANGLE_NODES, _FEW_NODES = 160, 64
-_PHASE_PER_NODE_RAD = 2.5
+# Gauss-Legendre nodes in each interval of angles, of integrals and of random plane waves, and the
+# largest change of phase over the surface that a node resolves.
+_ANGLE_NODES, _WAVE_NODES = 64, 160
+_PHASE_PER_NODE_RAD = 2.0
 # Number of elements above which products with V_i are computed as convolutions.
 _MAX_MATRIX = 1024
 # Target number of complex numbers to process at a time.
@@ -164,7 +164,7 @@ def _lattice(scenario: Scenario) -> np.ndarray:
                        complex)
     for band in range(scenario.n_bands):
         total = np.zeros((1, 1, 1))
-        for waves in _plane_waves(scenario, band, is_even):
+        for waves in _plane_waves(scenario, band, is_even, _ANGLE_NODES):
             along_y = np.einsum('a,eay->ey', waves.azimuth_weights,
                                 waves.along_y * np.square(waves.gain)[..., None])
             # Offsets of both signs along z, but only non-negative ones along y.
@@ -192,7 +192,7 @@ def _of_positions(scenario: Scenario) -> np.ndarray:
         wavenumber = 2 * np.pi * scenario.center_frequencies_hz[band] / SPEED_OF_LIGHT_MPS
         (azimuth, azimuth_weights), (elevations, elevation_weights) = (
             _profile_quadrature(scenario.angular_spread_deg, mean, False, wavenumber * extent_m,
-                                _FEW_NODES) for mean in scenario.multipath_direction_deg)
+                                _ANGLE_NODES) for mean in scenario.multipath_direction_deg)
         for elevation, weight in zip(elevations, elevation_weights, strict=True):
             directions = np.stack([
                 np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
@@ -226,7 +226,7 @@ class _PlaneWaves(NamedTuple):
 
 
 def _plane_waves(
-        scenario: Scenario, band: int, is_even: Sequence[bool], n_draws: int = 1
+        scenario: Scenario, band: int, is_even: Sequence[bool], n_nodes: int, n_draws: int = 1
 ) -> Iterator[_PlaneWaves]:
     """Yield plane waves in blocks of elevations, sized for `n_draws` amplitudes per wave."""
     wavenumber = 2 * np.pi * scenario.center_frequencies_hz[band] / SPEED_OF_LIGHT_MPS
@@ -236,7 +236,7 @@ def _plane_waves(
     lengths = columns[-1], math.hypot(columns[-1], rows[-1])
     (azimuth, azimuth_weights), (elevations, elevation_weights) = (
         _profile_quadrature(
-            _fields(scenario).angular_spread_deg, mean, even, wavenumber * length, _ANGLE_NODES)
+            _fields(scenario).angular_spread_deg, mean, even, wavenumber * length, n_nodes)
         for mean, even, length in zip(
             scenario.multipath_direction_deg, is_even, lengths, strict=True))
     phasors = [np.cos if even else lambda phase: np.exp(1j * phase) for even in is_even]
@@ -369,7 +369,7 @@ def _draw_plane_waves(
         scenario: Scenario, band: int, n: int, rng: np.random.Generator) -> np.ndarray:
     """Draw n vectors of gains as sums of independent plane waves, without a factor of V_i."""
     drawn = np.zeros((1, 1, 1))
-    for waves in _plane_waves(scenario, band, (False, False), n):
+    for waves in _plane_waves(scenario, band, (False, False), _WAVE_NODES, n):
         amplitudes = complex_normal(
             (len(waves.elevation_weights), n, len(waves.azimuth_weights)), rng)
         amplitudes *= (waves.gain * np.sqrt(

@@ -105,7 +105,7 @@ def test_products_with_many_elements_are_convolutions(rectangle, by_convolution)
 
 
 def test_many_gains_are_drawn_as_plane_waves(rectangle, by_convolution, monkeypatch):
-    monkeypatch.setattr(mp, '_ANGLE_NODES', 16)
+    monkeypatch.setattr(mp, '_WAVE_NODES', 16)
     n, v = 4000, mp.multipath_covariance(rectangle)[1]
     gains = mp.draw_multipath(rectangle, 1, n, np.random.default_rng(2))
     assert gains.shape == (n, 2, 28)
