@@ -230,8 +230,15 @@ def test_an_exception_of_a_job_is_raised_where_the_node_spins(each_bench, backgr
         each_bench.until(lambda: False)
 
 
-def test_closing_waits_for_the_running_job_and_discards_the_others(each_bench, background):
+def test_closing_waits_for_the_running_job_and_discards_the_others(
+        each_bench, background, monkeypatch):
     begun, released, done, results = threading.Event(), threading.Event(), [], []
+    shut_down = background._pool.shutdown
+
+    def release(wait, cancel_futures):
+        shut_down(wait=False, cancel_futures=cancel_futures)
+        released.set()
+        shut_down(wait=wait)
 
     def first():
         begun.set()
@@ -240,7 +247,8 @@ def test_closing_waits_for_the_running_job_and_discards_the_others(each_bench, b
     background.run(first, results.append)
     background.run(lambda: done.append(2), results.append)
     assert begun.wait(10)
-    threading.Timer(0.01, released.set).start()
+    # Until the others are cancelled, the first one runs.
+    monkeypatch.setattr(background._pool, 'shutdown', release)
     background.close()
     assert done == [1]
     assert not results
