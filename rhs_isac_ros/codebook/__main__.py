@@ -28,7 +28,6 @@ from rhs_isac_ros.codebook.optimize import (
     DEFAULT_POSITIONS,
     METHODS,
     OptimizeResult,
-    check_start,
     optimize,
 )
 from rhs_isac_ros.codebook.plot import plot_optimization
@@ -173,7 +172,7 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     start = _start(options.start, scenario, options.seed, calibration)
     resumed = Codebook.load(partial if partial.exists() else output) if options.resume else None
     for codebook in filter(None, (start, resumed)):
-        check_start(codebook, scenario)
+        codebook.check(scenario, discrete=False)
 
     given: dict[str, Any] = {
         'method': options.method, 'objective': objective, 'sampling': options.sampling,

@@ -197,7 +197,8 @@ class _Design:
         surface = calibration.surface if calibration else None
         first = resume or start or STARTS[method if method in STARTS else 'random'](
             scenario, streams.generator(seed, streams.START), surface)
-        check_start(first, scenario)
+        # Even a search over levels begins with continuous amplitudes.
+        first.check(scenario, discrete=False)
         return cls(scenario, positions, first, surface, provenance, done,
                    max_steps or METHODS[method].steps, max_evaluations, prior,
                    used_elements(scenario, resume or start))
@@ -245,14 +246,6 @@ def _unsearched(design: _Design, report: '_Report', reason: str) -> OptimizeResu
     entry = Progress(design.done.steps, design.done.evaluations, value_m2, 0.0)
     report(entry)
     return design.result(best, [entry], reason)
-
-
-def check_start(codebook: Codebook, scenario: Scenario) -> None:
-    """Raise CodebookError if a search for a scenario cannot start from a codebook.
-
-    Amplitudes may be continuous, because even a search over levels begins with such amplitudes.
-    """
-    codebook.check(scenario, discrete=False)
 
 
 def used_elements(scenario: Scenario, start: Codebook | None) -> np.ndarray:

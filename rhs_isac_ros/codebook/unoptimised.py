@@ -31,16 +31,15 @@ def random_codebook(scenario: Scenario, rng: np.random.Generator) -> Codebook:
 
 
 def directional_codebook(
-        scenario: Scenario, rng: np.random.Generator | None = None,
-        scan: str = 'width', surface: SurfaceEstimate | None = None) -> Codebook:
+        scenario: Scenario, scan: str = 'width', surface: SurfaceEstimate | None = None
+) -> Codebook:
     """Focus each of the N_B F frames on a point of a scan: the paper's `Directional`.
 
     The configuration is that of `Board.focused`: on the board of the paper, by the holographic
     principle. The weights of each sub-band are the matched filter of the resulting feed signals,
-    with equal power in all sub-bands. Both include the response of a calibrated surface. The
-    codebook is deterministic, so `rng` is unused. `scan` is one of `SCANS`. Raises ValueError if
-    it is unknown, no element has a gain at a focal point, or the elements of the board are
-    coupled.
+    with equal power in all sub-bands. Both include the response of a calibrated surface. `scan`
+    is one of `SCANS`. Raises ValueError if it is unknown, no element has a gain at a focal point,
+    or the elements of the board are coupled.
     """
     if scan not in SCANS:
         raise ValueError(f'scan: {scan!r}, expected one of {sorted(SCANS)}')

@@ -14,13 +14,9 @@ from scipy.special import chdtri
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import global_bound
-from rhs_isac_ros.codebook import (
-    Codebook,
-    CodebookError,
-    directional_codebook,
-    random_codebook,
-)
+from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.optimisations import optimised
+from rhs_isac_ros.codebook.unoptimised import STARTS
 from rhs_isac_ros.experiments.sweep_settings import (
     FIELDS,
     MEASURES,
@@ -38,8 +34,8 @@ from rhs_isac_ros.support.jobs import Job, Strand, Workers
 from rhs_isac_ros.system import System
 
 # Kinds of codebooks that are made for a scenario.
-OPTIMIZE, DIRECTIONAL, RANDOM = 'optimize', 'directional', 'random'
-KINDS = (OPTIMIZE, DIRECTIONAL, RANDOM)
+OPTIMIZE, RANDOM = 'optimize', 'random'
+KINDS = (OPTIMIZE, 'directional', RANDOM)
 # Number of positions in a job. Another size would change the positions of the global bound.
 BLOCK = 250
 # Number of sample positions in an optimisation.
@@ -84,12 +80,9 @@ def design(scenario: Mapping[str, Any], kind: str, seed: int, objective: str = '
     `scenario` contains the fields that differ from Table I. `objective` and `steps` apply only to
     an optimisation.
     """
-    world = Scenario(**scenario)
-    if kind == DIRECTIONAL:
-        return directional_codebook(world).to_parameters()
-    if kind == RANDOM:
+    if kind in STARTS:
         generator = streams.generator(seed, streams.START)
-        return random_codebook(world, generator).to_parameters()
+        return STARTS[kind](Scenario(**scenario), generator, None).to_parameters()
     found = optimised(scenario, objective=objective, n_positions=_SAMPLES, seed=seed,
                       max_steps=steps)
     return dict(found['codebook'])

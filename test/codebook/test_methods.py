@@ -425,7 +425,7 @@ def test_the_limit_of_steps_holds_in_every_phase(max_steps):
 def test_starts_use_the_levels():
     scenario = with_levels(2)
     for codebook in (random_codebook(scenario, np.random.default_rng(0)),
-                     directional_codebook(scenario, np.random.default_rng(0))):
+                     directional_codebook(scenario)):
         codebook.check(scenario)
         assert set(np.unique(codebook.analog)) == {0.0, 1.0}
 

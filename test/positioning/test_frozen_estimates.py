@@ -36,7 +36,8 @@ CASES = {
     'near field': ('scenarios/near_field', random_codebook, {
         'elements_per_side': 12, 'roi_center_m': (0.6, 0.0, 0.0),
         'roi_size_m': (0.6, 0.6, 0.4)}, 8),
-    'weak signals': ('scenarios/weak_signal', directional_codebook, {}, 8),
+    'weak signals': (
+        'scenarios/weak_signal', lambda scenario, _: directional_codebook(scenario), {}, 8),
 }
 
 
