@@ -30,8 +30,7 @@ from launch_ros.parameter_descriptions import ParameterFile
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from rhs_isac_ros.positioning import Site
 from rhs_isac_ros.ros.parameters import NODES, hint
-from rhs_isac_ros.ros.processes import MAX_USER_NODES
-from rhs_isac_ros.ros.roster import MEMBERS, networks
+from rhs_isac_ros.ros.roster import MAX_USER_NODES, networks, nodes_of
 
 PACKAGE, FOLDER = 'rhs_isac_ros', Path(__file__).resolve().parent
 # A launch that receives SIGTERM does not end its processes, so the kernel does.
@@ -103,7 +102,7 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     others = [name for name in ('config', 'system', 'codebook') if given[name]]
     if given['site'] and others:
         raise ValueError(f'site: {given["site"]!r}, expected none with {others[0]}')
-    parts = networks(Site.from_yaml(given['site']).surfaces if given['site'] else ())
+    surfaces = Site.from_yaml(given['site']).surfaces if given['site'] else ()
     file = given['params_file']
     if file and not Path(file).is_file():
         raise ValueError(f'params_file: {file!r}, expected an existing file')
@@ -113,11 +112,14 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         # Without a name, the parameters apply to every node of the process.
         nodes = [_node(given, 'network', None, users=users, **values)]
     else:
-        nodes = [node for name, roles in parts for role in roles
-                 for node in _nodes(_below(given, name), role, users, values)]
+        together = users > MAX_USER_NODES
+        nodes = [LogInfo(msg=f'the {users} users share the node users')] if together else []
+        nodes += [_node(_below(given, one.namespace), one.role, one.name or one.role,
+                        **_known(one.role, values), **one.users)
+                  for one in nodes_of(users, surfaces, together)]
     if _boolean('visualizer', given) or _boolean('rviz', given):
         nodes += [_node(_below(given, name), 'visualizer', 'visualizer')
-                  for name, roles in parts if 'positioner' in roles]
+                  for name, roles in networks(surfaces) if 'positioner' in roles]
     # The recorder comes first, because it misses earlier messages that are not latched.
     return [*_recorder(given), *nodes, *_rviz(given)]
 
@@ -151,19 +153,10 @@ def _below(given: dict[str, str], name: str) -> dict[str, str]:
     return {**given, 'namespace': f'{given["namespace"].rstrip("/")}/{name}'.rstrip('/')}
 
 
-def _nodes(
-        given: dict[str, str], role: str, users: int, values: dict[str, int | str]
-) -> list[LaunchDescriptionEntity]:
-    """Return the nodes of a role, with the `values` that are parameters of this role."""
+def _known(role: str, values: dict[str, int | str]) -> dict[str, int | str]:
+    """Return those of the `values` that are parameters of a role."""
     known = {parameter.name for parameter in NODES[role]}
-    values = {name: value for name, value in values.items() if name in known}
-    if MEMBERS[role].is_unique:
-        return [_node(given, role, role, **values)]
-    if users > MAX_USER_NODES:
-        return [LogInfo(msg=f'the {users} users share the node users'),
-                _node(given, role, 'users', user_id=1, user_count=users, **values)]
-    return [_node(given, role, f'user_{number}', user_id=number, **values)
-            for number in range(1, users + 1)]
+    return {name: value for name, value in values.items() if name in known}
 
 
 def _integer(name: str, given: dict[str, str], low: int) -> int:

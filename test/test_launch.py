@@ -114,7 +114,7 @@ SITE = str(ROOT / 'config' / 'site.yaml')
     ({'use_composition': 'False', 'users': '1'}, [*ONE_EACH, 'user', 'bs']),
     ({'use_composition': 'True', 'composed': 'false', 'users': '1'}, [*ONE_EACH, 'user', 'bs']),
     ({'composed': 'false', 'users': '16'}, [*ONE_EACH, *['user'] * 16, 'bs']),
-    ({'composed': ' FALSE ', 'users': '1000'}, [*ONE_EACH, 'LogInfo', 'user', 'bs']),
+    ({'composed': ' FALSE ', 'users': '1000'}, ['LogInfo', *ONE_EACH, 'user', 'bs']),
     ({}, ['network']), ({'users': '1000'}, ['network']), ({'site': SITE}, ['network']),
     ({'visualizer': 'True'}, ['network', 'visualizer']),
     ({'site': SITE, 'visualizer': '1'}, ['network', 'visualizer', 'visualizer'])])

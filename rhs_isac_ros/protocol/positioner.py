@@ -4,7 +4,7 @@ import collections
 import dataclasses
 import enum
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -378,7 +378,9 @@ class Positioner(Role):
                 m.PositionEstimate, received, stamp_ns=received.stamp_ns,
                 position=of_site.mean, covariance_m2=of_site.covariance,
                 crlb_m2=float(system.crlb(estimate.mean[None])[0]), estimator=estimator.name,
-                latency_s=latency_s, **probabilities, **self._proposal(received.user, estimate)))
+                latency_s=latency_s, **probabilities, **proposal(
+                    self._library, self._tracks.predict(received.user)
+                    if self._library.by_id and estimate.n_phases else None)))
             self._publish_track(received, of_site)
         else:
             self._no_fix(received, f'position: {problem}' if problem else str(estimate.reason))
@@ -400,12 +402,6 @@ class Positioner(Role):
         if self._is_observed() and isinstance(estimator, SearchEstimator):
             return estimator.posterior(received.stacked)
         return estimator.estimate(received.stacked)
-
-    def _proposal(self, user: int, estimate: Estimate) -> dict[str, Any]:
-        """Return the fields of an estimate that propose a codebook for the user's next cycle."""
-        if not (self._library.by_id and estimate.n_phases):
-            return {}
-        return proposal(self._library, self._tracks.predict(user))
 
     def _publish_track(self, received: m.ReceivedSignals, estimate: Estimate) -> None:
         user, loss = received.user, _Loss.BLOCKED if estimate.is_predicted else None

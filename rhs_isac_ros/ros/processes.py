@@ -10,9 +10,6 @@ from typing import Any
 
 from ament_index_python.packages import get_package_prefix
 
-# Maximum number of users for which `network`, `demo` and the launch file start one node each. More
-# users run in one node, because every node takes memory, and CPU time even between cycles.
-MAX_USER_NODES = 16
 # Signals sent in this order until all processes end, and the time to wait for the exit [s].
 _STOP_SIGNALS = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0))
 _STOP_POLL_S = 0.01

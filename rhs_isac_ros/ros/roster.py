@@ -5,8 +5,8 @@ the declarations in `MEMBERS`.
 """
 
 import dataclasses
-from collections.abc import Collection, Mapping
-from typing import Any
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, NamedTuple
 
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.channel import Channel
@@ -94,8 +94,22 @@ MEMBERS: Mapping[str, Member] = {**ROSTER, **_OF_SITES}
 # The roles of a surface that follows the base station of another one.
 FOLLOWING = ('rhs_controller', 'positioner', 'transmission', topics.OPTIMIZER_NODE, 'channel',
              'receiver')
+
+
 # Roles in which only one node of a network serves.
 UNIQUE = tuple(name for name, member in ROSTER.items() if member.is_unique)
+# Maximum number of users for which `network`, `demo` and the launch file start one node each. More
+# users run in one node, because every node takes memory, and CPU time even between cycles.
+MAX_USER_NODES = 16
+
+
+class Placed(NamedTuple):
+    """A node of a network or a site."""
+
+    namespace: str  # relative to that of the site; empty without a site
+    role: str
+    name: str  # empty: that of the role
+    users: dict[str, Any]  # parameters with the users of the node, if it has any
 
 
 def networks(surfaces: Collection[str] = ()) -> list[tuple[str, tuple[str, ...]]]:
@@ -109,3 +123,20 @@ def networks(surfaces: Collection[str] = ()) -> list[tuple[str, tuple[str, ...]]
     leader, *others = surfaces
     return [(leader, tuple(ROSTER)), *((name, FOLLOWING) for name in others),
             ('', tuple(name for name, member in MEMBERS.items() if member.of_site))]
+
+
+def nodes_of(users: int, surfaces: Collection[str] = (), together: bool = False
+             ) -> Iterator[Placed]:
+    """Yield the nodes of a network, or of a site with `surfaces`; users are numbered from 1.
+
+    If `together`, the users are in one node.
+    """
+    of_users = {'users': (1, users)} if together else {
+        f'user_{user}': (user, 1) for user in range(1, users + 1)}
+    for namespace, roles in networks(surfaces):
+        for role in roles:
+            if MEMBERS[role].is_unique:
+                yield Placed(namespace, role, '', {})
+                continue
+            for name, (first, count) in of_users.items():
+                yield Placed(namespace, role, name, {'user_id': first, 'user_count': count})

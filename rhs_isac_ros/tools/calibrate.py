@@ -359,8 +359,7 @@ def _conflict(options: argparse.Namespace) -> str:
     if options.states and options.codebook:
         return 'argument --codebook: not allowed with --states'
     if options.namespace != '/' and not options.file:
-        return ('argument --namespace: expected together with a recording; for a running '
-                'network, --ros-args -r __ns:=/lab selects the namespace')
+        return command.NO_NAMESPACE
     if (options.file or options.states) and (options.cycles, options.timeout) != (
             _CYCLES, _TIMEOUT_S):
         return 'arguments --cycles and --timeout: expected for a running network'

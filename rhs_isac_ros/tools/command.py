@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
 import rhs_isac_msgs.msg as ros
@@ -21,6 +20,7 @@ from rhs_isac_ros.positioning import ModelError, Site, SiteError
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, diagnostics, endpoints, topics
 from rhs_isac_ros.ros.endpoints import subscribe
+from rhs_isac_ros.ros.environment import check_environment
 from rhs_isac_ros.ros.recording import RecordingError, read, read_networks
 from rhs_isac_ros.ros.run import StartError, parse, spin, starting
 from rhs_isac_ros.ros.session import Session
@@ -34,6 +34,9 @@ from rhs_isac_ros.system import SystemFileError, SystemFiles
 # Errors in arguments and files.
 INVALID = (StartError, RecordingError, ScenarioError, SiteError, SystemFileError, CodebookError,
            CalibrationError, ModelError, plugins.PluginError)
+# Error for an option that only recordings need.
+NO_NAMESPACE = ('argument --namespace: expected together with a recording; for a running network, '
+                '--ros-args -r __ns:=/lab selects the namespace')
 # Advice after an error about messages that do not match the scenario.
 OTHER_SCENARIO = '; if the network uses another scenario, pass it with --config FILE'
 _NodeT = TypeVar('_NodeT', bound=Node)
@@ -51,9 +54,9 @@ class ToolError(RuntimeError):
 def entry(
         work: Callable[[argparse.Namespace, list[str]], int],
         make_parser: Callable[[], argparse.ArgumentParser],
-        conflict: Callable[[argparse.Namespace], str] = lambda options: ''
-) -> Callable[..., int]:
-    """Return the main function of a command whose command line may contain ROS arguments.
+        conflict: Callable[[argparse.Namespace], str] = lambda options: '', *,
+        takes_ros_arguments: bool = True) -> Callable[..., int]:
+    """Return the main function of a command.
 
     The function takes arguments, by default from the command line. It returns the exit code of
     `work`; 0 after a signal or if the reader closes the output; 1 after a `ToolError`, if a
@@ -65,18 +68,24 @@ def entry(
         Runs the command. Takes the options, and the command line with the name of the program.
     conflict
         Returns an error if options contradict each other, otherwise ''.
+    takes_ros_arguments
+        Whether the command line may contain ROS arguments.
     """
     def main(arguments: Sequence[str] | None = None) -> int:
         parser, arguments = make_parser(), sys.argv[1:] if arguments is None else list(arguments)
-        parser.epilog = 'ROS arguments select the namespace: --ros-args -r __ns:=/lab'
-        options = parse(parser, arguments)
+        if takes_ros_arguments:
+            parser.epilog = 'ROS arguments select the namespace: --ros-args -r __ns:=/lab'
+            options = parse(parser, arguments)
+        else:
+            options = parser.parse_args(arguments)
+            check_environment(parser)
         try:
             if problem := conflict(options):
                 parser.error(problem)
             fill_in(options)
             check_distinct(parser, options)
             return work(options, [parser.prog, *arguments])
-        except (KeyboardInterrupt, ExternalShutdownException):
+        except KeyboardInterrupt:
             return 0
         except BrokenPipeError:
             discard_stdout()

@@ -33,23 +33,22 @@ from rhs_isac_ros.frontend import (
 )
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.frontend.sigmf_recording import SAMPLES_FAILED
-from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog, CycleRecord
-from rhs_isac_ros.positioning.site import Site, SiteError
+from rhs_isac_ros.positioning.site import Site
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.settings import PRIORS, REGION, TRACK
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import endpoints, parameters
-from rhs_isac_ros.ros.environment import check_environment, private_domain
+from rhs_isac_ros.ros.environment import private_domain
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
-from rhs_isac_ros.ros.processes import MAX_USER_NODES, Processes
-from rhs_isac_ros.ros.recording import CycleObserver, Recorder, RecordingError
-from rhs_isac_ros.ros.roster import MEMBERS, networks
+from rhs_isac_ros.ros.processes import Processes
+from rhs_isac_ros.ros.recording import CycleObserver, Recorder
+from rhs_isac_ros.ros.roster import MAX_USER_NODES, nodes_of
 from rhs_isac_ros.ros.run import StartError, init, starting
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
-    check_distinct,
     input_file,
     integer,
     output_file,
@@ -60,11 +59,9 @@ from rhs_isac_ros.support.arguments import (
 )
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.exits import on_end_signals, print_error
-from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.pictures import write_picture
 from rhs_isac_ros.support.texts import counted, text_table
-from rhs_isac_ros.system import SystemFileError
-from rhs_isac_ros.tools.command import add_files, choose_scenario, fill_in
+from rhs_isac_ros.tools.command import add_files, choose_scenario, entry
 from rhs_isac_ros.tools.pictures import compose_cycles, prepare_drawing
 
 # Maximum time between two complete cycles [s].
@@ -118,22 +115,15 @@ def start_network(
     default. A scenario other than Table I must also be given as ``scenario_file``, and a site as
     ``site_file``. With ``first_cycle=1``, the seed determines multipath and noise.
     """
-    given = {name: value for name, value in given.items() if value is not None}
     walking: dict[str, Any] = {'mobility': 'random_walk', 'speed_mps': scenario.max_user_speed_mps}
+    given = walking | {name: value for name, value in given.items() if value is not None}
     if composed:
-        processes.start('network', users=users, **walking | given)
+        processes.start('network', users=users, **given)
         return
-    for namespace, role in [(space, role) for space, roles in networks(surfaces)
-                            for role in roles]:
-        known = {parameter.name for parameter in parameters.NODES[role]}
-        values = {name: value for name, value in given.items() if name in known}
-        if MEMBERS[role].is_unique:
-            processes.start(role, namespace=namespace, **values)
-            continue
-        for name, first, count in [('users', 1, users)] if together else [
-                (f'user_{user}', user, 1) for user in range(1, users + 1)]:
-            processes.start(role, name, namespace=namespace, user_id=first, user_count=count,
-                            **walking | values)
+    for one in nodes_of(users, surfaces, together):
+        known = {parameter.name for parameter in parameters.NODES[one.role]}
+        processes.start(one.role, one.name, namespace=one.namespace, **one.users, **{
+            name: value for name, value in given.items() if name in known})
 
 
 def watch(
@@ -284,33 +274,26 @@ def _carriage(observer: SiteObserver, cycles: Sequence[CompleteCycle]) -> str:
             f'{counted(n_handovers, "handover")}')
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the demonstration, and return its exit code.
-
-    The code is 0 if every cycle was served or had no fix, even after a signal; 2 if an argument or
-    a file is invalid; otherwise 1.
-    """
-    parser = _parser()
-    options = parser.parse_args(arguments)
-    check_environment(parser)
-    check_distinct(parser, options)
+def _demonstrate(options: argparse.Namespace, _: list[str]) -> int:
+    """Return 0 if every cycle was served or had no fix, even after a signal; otherwise 1."""
     try:
-        fill_in(options)
-        if options.site:
-            demonstration: _Demonstration = _SiteDemonstration(parser, options)
-        else:
-            demonstration = _Demonstration(options)
-        os.environ.update(private_domain())
-        return _run(demonstration, options)
+        demonstration = (_SiteDemonstration if options.site else _Demonstration)(options)
     except CodebookError as error:
-        print_error(f'{error}; to create a codebook for a scenario: python3 -m '
-                    'rhs_isac_ros.codebook --scenario FILE --output FILE', parser.prog)
-    except (ScenarioError, SiteError, SystemFileError, RecordingError, StartError) as error:
-        print_error(error, parser.prog)
-    except MissingLibraryError as error:
-        print_error(error, parser.prog)
-        return 1
-    return 2
+        raise CodebookError(f'{error}; to create a codebook for a scenario: python3 -m '
+                            'rhs_isac_ros.codebook --scenario FILE --output FILE') from None
+    os.environ.update(private_domain())
+    return _run(demonstration, options)
+
+
+def _conflict(options: argparse.Namespace) -> str:
+    defaults = _parser()
+    others = [name for name in (
+        'system', 'config', 'codebook', 'follow', 'calibration', 'surface', 'port', 'radio',
+        'radio_options', 'samples', 'picture')
+        # Defaults of files are texts.
+        if str(getattr(options, name)) != str(defaults.get_default(name))]
+    return (f'argument --{others[0].replace("_", "-")}: not allowed with --site'
+            if options.site and others else '')
 
 
 def follow(options: argparse.Namespace) -> None:
@@ -397,14 +380,7 @@ class _Demonstration:
 class _SiteDemonstration(_Demonstration):
     """A site, in which one base station leads, and the other surfaces follow."""
 
-    def __init__(self, parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-        if other := [name for name in (
-                'system', 'config', 'codebook', 'follow', 'calibration', 'surface', 'port',
-                'radio', 'radio_options', 'samples', 'picture')
-                # Defaults of files are texts.
-                if str(getattr(options, name)) != str(parser.get_default(name))]:
-            option = other[0].replace('_', '-')
-            parser.error(f'argument --{option}: not allowed with --site')
+    def __init__(self, options: argparse.Namespace) -> None:
         self.site = site = Site.from_yaml(options.site)
         self.scenario = site.surfaces[site.leader].scenario
         self.files, self.options, self.board = {'site_file': options.site.resolve()}, options, None
@@ -527,3 +503,6 @@ def _parser() -> argparse.ArgumentParser:
     add('--picture', type=picture_file, default='demo.png', metavar='FILE',
         help='file to draw: PNG, PDF or SVG')
     return parser
+
+
+main = entry(_demonstrate, _parser, _conflict, takes_ros_arguments=False)

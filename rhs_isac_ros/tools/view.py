@@ -153,8 +153,7 @@ def _by_cycle(found: Iterable[tuple[Any, float]]) -> list[tuple[Any, float]]:
 
 def _conflict(options: argparse.Namespace) -> str:
     if options.file is None and options.namespace:
-        return ('argument --namespace: expected together with a recording; for a running '
-                'network, --ros-args -r __ns:=/lab selects the namespace')
+        return command.NO_NAMESPACE
     # Rerun recognises its files by this suffix.
     if options.save and options.save.suffix != '.rrd':
         return f"argument --save: '{options.save}', expected a name that ends with .rrd"
