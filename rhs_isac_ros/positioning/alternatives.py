@@ -25,6 +25,7 @@ from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
 from rhs_isac_ros.model.geometry import element_positions, to_positions
 from rhs_isac_ros.positioning.dispersed import ONE_STATE, SurfaceState
+from rhs_isac_ros.positioning.grid import separate
 from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.projection import (
@@ -45,6 +46,8 @@ _LEVEL_REACH = 3.0
 # Standard deviation that represents an unknown gain in the level of a blocked user [dB].
 _UNKNOWN_GAIN_DB = 40.0
 _MIN_PROBABILITY = 1e-12
+# Range at which the direct path is negligible [m].
+_FAR_M = 1e7
 # Smallest probability of an alternative that is reported.
 _MIN_DOUBT = 0.01
 
@@ -80,6 +83,8 @@ class OutsideGrid(NamedTuple):
     # Numbers of templates, and of shots, to compute at a time.
     block: int = 512
     shots: int = 16
+    # Number of places to which sets of failed elements are fitted.
+    places: int = 24
 
 
 GRID = OutsideGrid()
@@ -123,6 +128,12 @@ class Blocked:
              ) -> np.ndarray:
         """Return the whitened signals, of which only the energy matters."""
         return whitened
+
+    def places(self, whitened: np.ndarray, prior: NuisancePrior
+               ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return a place without a direct path, and the level of the signals; see `Outside`."""
+        level = float(np.mean(np.abs(whitened)**2))
+        return np.array([[_FAR_M, 0.0, 0.0]]), np.zeros((1, len(prior))), level**0.5
 
     def given(self, wrong: float) -> 'Blocked':
         """Return the alternative; whether a user is in sight does not depend on a prior."""
@@ -229,6 +240,16 @@ class Outside:
             one.log_evidence_of(whitened, prior) for one in self._templates])
         return found + prior.log_evidence_of_aligned(aligned)
 
+    def places(self, whitened: np.ndarray, prior: NuisancePrior
+               ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return the most likely places of a user elsewhere for whitened signals of one shot.
+
+        Returns points (r [m], u, v), [P, 3], parameters that fit there, [P, Q], and the factor of
+        the signals that is not a parameter.
+        """
+        best = max(self._templates, key=lambda one: one.log_evidence_of(whitened[None], prior)[0])
+        return *best.places(whitened, prior), 1.0
+
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some position explains the signals up to this residual energy."""
         return any(one.explain(whitened, max_residual) for one in self._templates)
@@ -242,6 +263,7 @@ class _Templates:
         self._state = state
         self._filters, self._index = arrays['outer_filters'], arrays['outer_index']
         ranges = _ranges(scenario)[:, None]
+        self._directions, self._carriers = _directions(scenario), carrier_wavenumbers(scenario)
         self._scale = (2 / ranges).astype(np.float32)
         energy = arrays['outer_energy']
         if state.operator is not None:
@@ -304,12 +326,42 @@ class _Templates:
         tolerated = max_residual + GRID.error * self._energy
         return bool(((residual <= tolerated) & np.isfinite(self._offset)).any())
 
+    def places(self, whitened: np.ndarray, prior: NuisancePrior) -> tuple[np.ndarray, np.ndarray]:
+        """Return the best points and their parameters for one shot; see `Outside.places`."""
+        outputs = self._outputs(whitened[None])[0][:, self._index]
+        energy, radii = self._state.energy(whitened), Resolution.of(
+            prior.scenario).separation(prior.is_coarse)
+        likely, _ = _best_gain(
+            prior, np.sum(np.abs(outputs), axis=0) * self._scale / 2, energy, whitened.size)
+        likely = likely + self._offset
+        half, parts = GRID.range_ratio**0.5, []
+        for index in np.argsort(-likely, axis=None)[:GRID.places]:
+            place = np.unravel_index(index, likely.shape)
+            centre_m = 2 / float(self._scale[place[0], 0])
+            range_m = np.arange(centre_m / half, centre_m * half, radii[0] / 3)
+            turned = outputs[:, place[0], place[1], None] * np.exp(
+                1j * self._carriers[:, None] * range_m) / range_m
+            value, gain = _best_gain(prior, prior.amplitude(turned), energy, whitened.size)
+            order = np.argsort(-value)[:GRID.places]
+            points = np.column_stack([range_m[order], np.broadcast_to(
+                self._directions[place[1]], (len(order), 2))])
+            parts.append((value[order] - self._energy[place], points, prior.start(
+                turned[:, order], np.broadcast_to(gain, value.shape)[order])))
+        value, points, values = map(np.concatenate, zip(*parts, strict=True))
+        order = np.argsort(-value, kind='stable')
+        order = order[separate(np.zeros(len(order), int), points[order], radii)][:GRID.places]
+        return points[order], values[order]
+
     def _filter(self, whitened: np.ndarray) -> np.ndarray:
         """Return filter output magnitudes by template and direction, [N, N_B, T, V] [m]."""
+        return np.abs(self._outputs(whitened))
+
+    def _outputs(self, whitened: np.ndarray) -> np.ndarray:
+        """Return filter outputs by template and direction, complex64 [N, N_B, T, V] [m]."""
         # The energy outside of a basis is not part of a template.
         seen = self._state.apply(whitened)
         signals = seen[..., :self._filters.shape[2], None].astype(np.complex64)
-        filtered = np.abs(np.matmul(self._filters, signals)[..., 0])
+        filtered = np.matmul(self._filters, signals)[..., 0]
         return filtered.reshape(*filtered.shape[:2], -1, self._energy.shape[1])
 
 

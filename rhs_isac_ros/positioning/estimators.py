@@ -74,6 +74,8 @@ class _Limits(NamedTuple):
     # Total probability of the alternatives above which residuals are not compared with the
     # scenario.
     doubt: float = 0.05
+    # Log odds of an alternative below which averages over surfaces leave no doubt.
+    clear: float = -3.0
     # Growth of errors on the grid, see `NuisancePrior.growth`, above which it is searched again.
     noisier: float = 8.0
 
@@ -347,14 +349,11 @@ class SearchEstimator(abc.ABC):
             seen = whitened
             for alternative in scope.alternatives:
                 seen = alternative.seen(self._likelihood.model, signals.received, seen)
-            residuals = np.array([one.fit.residual for one in fits])
-            evidence = self._log_evidence(
-                scope.alternatives, signals, seen, aligned, residuals)
+            ratios = self._log_ratios(
+                scope.alternatives, signals, seen, aligned, [one.fit for one in fits])
             for n, (row, searched, one, values) in enumerate(zip(
                     usable, fits, seen, aligned, strict=True)):
-                log_ratios = {alternative.name: float(log[n]) - searched.fit.averaged_evidence
-                              for alternative, log in zip(
-                                  scope.alternatives, evidence, strict=True)}
+                log_ratios = {name: float(ratio[n]) for name, ratio in ratios.items()}
                 estimate = self._judge(
                     scope.alternatives, log_ratios, searched, select(signals, [n]), one, values)
                 found[row] = _Found(self, estimate, log_ratios, *searched)
@@ -433,17 +432,28 @@ class SearchEstimator(abc.ABC):
         positions, log_weights = map(np.concatenate, zip(*drawn, strict=True))
         return Samples.of(positions, log_weights, modes.shots)
 
-    def _log_evidence(self, alternatives: Sequence[Alternative], signals: Signals,
-                      seen: np.ndarray, aligned: np.ndarray, residuals: np.ndarray
-                      ) -> list[np.ndarray]:
-        """Return logarithms of the evidence of each alternative, [N] each."""
-        prior, found = self._likelihood.nuisance, []
+    def _log_ratios(self, alternatives: Sequence[Alternative], signals: Signals, seen: np.ndarray,
+                    aligned: np.ndarray, fits: Sequence[Fit]) -> dict[str, np.ndarray]:
+        """Return logarithms of the likelihoods of alternatives relative to the fits, [N] each.
+
+        Averages over all surfaces decide where they leave no doubt. Otherwise, each hypothesis has
+        the sets of failed elements that are found for it.
+        """
+        prior, found = self._likelihood.nuisance, {}
+        residuals, averaged, gains = np.array([
+            (fit.residual, fit.averaged_evidence, fit.log_evidence - fit.averaged_evidence)
+            for fit in fits]).T
         shadow = self._shadow.values_of_each(signals.received, aligned)
         for one in alternatives:
             values = shadow + one.strength * (aligned - shadow)
             if prior.moves_multipath.any():
                 seen = self._likelihood.whitened(values, signals)
-            found.append(one.log_evidence_of(seen, values, residuals, prior))
+            ratios = one.log_evidence_of(seen, values, residuals, prior) - averaged
+            for n in np.flatnonzero((gains > 0) & (one.log_odds + ratios > _LIMITS.clear)):
+                points, parameters, level = one.places(seen[n], prior)
+                ratios[n] += self._refinement.gain(points, parameters + values[n], Signals(*(
+                    each / level for each in select(signals, [n])))) - gains[n]
+            found[one.name] = ratios
         return found
 
     def _judge(self, alternatives: Sequence[Alternative], log_ratios: Mapping[str, float],
@@ -458,7 +468,7 @@ class SearchEstimator(abc.ABC):
                               fit.residual, probabilities)
         if self._movement and not reason:
             reason = self._movement.reason(
-                fit, searched.modes, signals, aligned, self._scale(fit))
+                *searched, signals, aligned, self._scale(fit))
         # Without a fix, only a residual that nothing explains is evidence against the scenario.
         # The residual is the reason if the texts are equal.
         is_evidence = (reason == self._test.residual_test(fit.residual) if reason

@@ -13,6 +13,7 @@ errors, and the likelihood of a set uses their covariance at each point.
 """
 
 import collections
+import copy
 import dataclasses
 import functools
 import itertools
@@ -30,7 +31,7 @@ from rhs_isac_ros.model.geometry import jacobian, to_positions
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import radiation_matrix
-from rhs_isac_ros.positioning.dispersed import LocatedStates
+from rhs_isac_ros.positioning.dispersed import DispersedLikelihood, LocatedStates
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.likelihood import (
     Columns,
@@ -48,6 +49,8 @@ from rhs_isac_ros.positioning.segments import concatenate, select
 _MAX_EXPECTED = 2.0
 # Number of sets whose covariance is kept, and memory of their extensions [bytes].
 _MAX_SURFACES, _EXTENSION_BYTES = 256, 1 << 26
+# Bounds of places elsewhere, among them those without a direct path.
+_ANYWHERE_M = np.array([[0.0, -2e7, -2e7], [2e7, 2e7, 2e7]])
 # Number of places at which all elements are compared at a time.
 _PLACES = 8
 
@@ -113,43 +116,67 @@ class FailedElements:
 
     def __init__(self, likelihood: Likelihood) -> None:
         self._likelihood, self._model = likelihood, FailureModel(likelihood)
+        self._average = DispersedLikelihood(likelihood)
+        # The likelihood of users anywhere in front of the surface.
+        self._elsewhere = copy.copy(likelihood)
+        self._elsewhere.resolution = likelihood.resolution._replace(bounds_m=_ANYWHERE_M)
 
     def refine(self, modes: Modes, signals: Signals, table: TemplateTable
                ) -> tuple[Modes, dict[int, Sequence[Conditional]]]:
         """Return modes for all probable sets, and the sets' likelihoods, by shot."""
         parts, conditionals = [], {}
         for shot in np.unique(modes.shots).tolist():
-            part, conditionals[shot] = self._refine(
-                modes.of_shot(shot), select(signals, [shot]), table)
+            one = select(signals, [shot])
+            part, conditionals[shot] = self._modes(
+                self._search(modes.of_shot(shot), one, table), self._likelihood, one)
             # Each part counts its shots from 0.
             parts.append(part._replace(shots=np.full(len(part.shots), shot)))
         return concatenate(*parts), conditionals
+
+    def same(self, other: Conditional) -> Conditional:
+        """Return the likelihood for the failed elements of another one; see `Refinement.same`."""
+        assert isinstance(other, FailedSet)
+        return self._model.failed_set(other.failed)
+
+    def gain(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> float:
+        """Return how much sets at points elsewhere explain one shot; see `Refinement.gain`."""
+        search = FailureSearch(self._model, signals)
+        self._grow(search, search.add(points, values))
+        modes, _ = self._modes(search, self._elsewhere, signals)
+        averaged = ascend(
+            self._average, self._elsewhere, Starts(np.zeros(len(points), int), points, values),
+            signals, LIMITS.steps, LIMITS.step_margin)
+        return max(modes.log_mass - averaged.log_mass, 0.0)
 
     def _search(self, modes: Modes, signals: Signals, table: TemplateTable) -> 'FailureSearch':
         """Search for probable sets of failed elements at the modes and, if needed, elsewhere."""
         order = modes.order
         search = FailureSearch(self._model, signals)
         keys = search.add(modes.points[order], modes.values[order])
-        if search.explains(keys):
-            search.grow(keys[:LIMITS.usual_modes])
-        else:
+        if not search.explains(keys):
             # The search on the grid needs the parameters that move the multipath.
             aligned = modes.values[order[0]] * self._likelihood.nuisance.moves_multipath
             found = table.starts(
                 self._likelihood.whitened(aligned, signals), self._likelihood.nuisance,
                 LIMITS.point_margin)
             search.add(found.points[:LIMITS.points], found.values[:LIMITS.points] + aligned)
+        self._grow(search, keys)
+        return search
+
+    def _grow(self, search: 'FailureSearch', keys: list[Key]) -> None:
+        """Grow sets at the best of the first places or, if none explains the signals, at all."""
+        if search.explains(keys):
+            search.grow(keys[:LIMITS.usual_modes])
+        else:
             chosen = first_places(
                 np.stack([place.point for place in search.places]),
                 self._likelihood.resolution.separation(self._likelihood.nuisance.is_coarse))
             search.grow([((), index) for index in chosen], LIMITS.remainder)
         search.try_neighbours(search.best)
-        return search
 
-    def _refine(self, modes: Modes, signals: Signals, table: TemplateTable
-                ) -> tuple[Modes, Sequence[Conditional]]:
-        """Return modes and likelihoods for one shot, N = 1; see `refine`."""
-        search = self._search(modes, signals, table)
+    def _modes(self, search: 'FailureSearch', likelihood: Likelihood, signals: Signals
+               ) -> tuple[Modes, Sequence[Conditional]]:
+        """Return the modes of the probable sets of one shot, and the sets' likelihoods."""
         values, best = search.log_probabilities, max(search.log_probabilities.values())
         keys = sorted((key for key in values if values[key] >= best - LIMITS.margin),
                       key=lambda key: -values[key])[:LIMITS.hypotheses]
@@ -162,7 +189,7 @@ class FailedElements:
                 search.places[index] for one, index in keys if one == failed]
             starts = Starts(np.zeros(len(places), int), np.stack([one.point for one in places]),
                             np.stack([one.values for one in places]))
-            parts.append(ascend(conditionals[number], self._likelihood, starts, signals,
+            parts.append(ascend(conditionals[number], likelihood, starts, signals,
                                 LIMITS.steps, LIMITS.step_margin, number))
         modes = concatenate(*parts)
         return select(modes, modes.order[:LIMITS.hypotheses]), conditionals
@@ -345,7 +372,7 @@ class FailedSet(Conditional):
     """
 
     def __init__(self, surfaces: FailedSurfaces, failed: Failed) -> None:
-        self._surfaces, self._failed = surfaces, failed
+        self._surfaces, self.failed = surfaces, failed
         likelihood, scenario = surfaces.likelihood, surfaces.likelihood.scenario
         stuck = np.full(scenario.n_elements, np.nan)
         stuck[[*failed]] = 0.5
@@ -358,16 +385,16 @@ class FailedSet(Conditional):
     def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True) -> LocatedStates:
         """Return the likelihood at points; see `Conditional.at`."""
         surfaces, scenario = self._surfaces, self._surfaces.likelihood.scenario
-        positions, failed = to_positions(points), [*self._failed]
+        positions, failed = to_positions(points), [*self.failed]
         mean, slopes = self._mean_model.mean_and_jacobian(
             *surfaces.likelihood.nuisance.states(points, values, moves))
         gains = np.stack([
             np.repeat(los_gain(scenario, positions, band)[:, :, failed],
                       scenario.n_frames, axis=1) for band in range(scenario.n_bands)])
         amplitudes = np.moveaxis(gains, (0, 1, 2, 3), (2, 0, 3, 1)) * self._amplitudes
-        whitening = surfaces.whitening(self._failed)
+        whitening = surfaces.whitening(self.failed)
         factors = (whitening.factors if surfaces.intact.elements.is_exact
-                   else surfaces.factors_at(self._failed, positions))
+                   else surfaces.factors_at(self.failed, positions))
         return LocatedStates(surfaces.likelihood.nuisance, mean, slopes, amplitudes, [
             (factors, self._offset - factors.log_det, whitening.information)])
 

@@ -14,6 +14,8 @@ during a cycle, whatever the user does, and no test is needed.
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -21,12 +23,13 @@ from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.arrays import log_sum
 from rhs_isac_ros.model.constants import POWER_NEPERS_PER_DB
 from rhs_isac_ros.model.geometry import stands_still, velocity_std_mps
-from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.estimate import Fit
+from rhs_isac_ros.positioning.failures import refinement_of
 from rhs_isac_ros.positioning.grid import Starts
 from rhs_isac_ros.positioning.lattice import Resolution, subband_wavenumbers, unit_points
-from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
+from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
 from rhs_isac_ros.positioning.search import Modes, ascend, one_step
+from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.system import System
 
 # Speeds of users whose scenario declares none [m/s]: one at which frames are long, and the
@@ -55,7 +58,7 @@ class MovementTest:
             self._walking = Likelihood(System(
                 dataclasses.replace(scenario, user_speed_std_mps=_WALKING_STD_MPS),
                 system.codebook, system.surface))
-            self._conditional = DispersedLikelihood.of(self._walking) or self._walking
+            self._refinement = refinement_of(self._walking)
 
     @classmethod
     def of(cls, system: System, likelihood: Likelihood) -> 'MovementTest | None':
@@ -63,16 +66,17 @@ class MovementTest:
         is_short = stands_still(system.scenario, _WALKING_MPS)
         return None if is_short else cls(system, likelihood)
 
-    def reason(self, fit: Fit, modes: Modes | None, signals: Signals, aligned: np.ndarray,
-               level: float) -> str:
+    def reason(self, fit: Fit, modes: Modes | None, conditionals: Sequence[Conditional],
+               signals: Signals, aligned: np.ndarray, level: float) -> str:
         """Return why there is no fix, or ''.
 
-        Takes one shot, the parameters `aligned` that follow from the signals alone, float64 [Q],
-        and the level of the multipath that the residual shows, relative to the model.
+        Takes one shot with the likelihoods for each state of the surface, the parameters `aligned`
+        that follow from the signals alone, float64 [Q], and the level of the multipath that the
+        residual shows, relative to the model.
         """
         log_ratio = self._unsteady(fit, signals, aligned, level)
         if self._walking and modes is not None:
-            log_ratio = max(log_ratio, self._walks(self._walking, modes, signals))
+            log_ratio = max(log_ratio, self._walks(self._walking, modes, conditionals, signals))
         odds = _PRIOR / (1 - _PRIOR) * np.exp(min(log_ratio, 100.0))
         if odds > _LIMIT / (1 - _LIMIT):
             return (f'velocity: probability {odds / (1 + odds):.3g} that the user moves otherwise '
@@ -101,8 +105,12 @@ class MovementTest:
         return (log_sum(values) - np.log(values.size) + constant + float(rest)
                 + prior.log_evidence_of_aligned(aligned) - fit.averaged_evidence)
 
-    def _walks(self, walking: Likelihood, modes: Modes, signals: Signals) -> float:
-        """Return the log evidence of a user who walks, relative to that of the modes."""
+    def _walks(self, walking: Likelihood, modes: Modes, conditionals: Sequence[Conditional],
+               signals: Signals) -> float:
+        """Return the log evidence of a user who walks, relative to that of the modes.
+
+        Each mode keeps its state of the surface.
+        """
         prior, wide = self._likelihood.nuisance, walking.nuisance
         n_moving, n_wide = prior.velocity.shape[1], wide.velocity.shape[1]
         others = modes.values[:, n_moving:][:, ~prior.phases[:, n_moving:].any(axis=0)]
@@ -111,10 +119,17 @@ class MovementTest:
             self._system.scenario.user_speed_std_mps / _WALKING_STD_MPS)
         values[:, n_wide:n_wide + others.shape[1]] = others
         starts = Starts(np.zeros(len(others), int), modes.points, values)
-        args = self._conditional, walking, starts, walking.signals(signals.received)
-        mass = _log_mass(modes)
-        predicted = _log_mass(one_step(*args)[0]) - mass
-        return predicted if predicted < _IMPROBABLE else _log_mass(ascend(*args, 1)) - mass
+        signals, mass = walking.signals(signals.received), modes.log_mass
+        states = [(self._refinement.same(conditionals[state]), modes.state == state)
+                  for state in np.unique(modes.state)]
+
+        def relative(climb: Callable[..., Modes]) -> float:
+            return log_sum(np.array([
+                climb(conditional, walking, select(starts, rows), signals).log_mass
+                for conditional, rows in states])) - mass
+        predicted = relative(lambda *args: one_step(*args)[0])
+        return predicted if predicted < _IMPROBABLE else relative(
+            functools.partial(ascend, n_steps=1))
 
     def _too_fast(self, fit: Fit) -> str:
         """Return the reason if residual and velocity are improbable together, or ''."""
@@ -163,8 +178,3 @@ def _frames(system: System) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     bases, values, _ = np.linalg.svd(np.moveaxis(columns, 0, -1), full_matrices=False)
     shares = values**2 / np.sum(values**2, axis=(1, 2), keepdims=True)
     return bases, shares, np.geomspace(energies.min(), energies.max(), _POWERS)
-
-
-def _log_mass(modes: Modes) -> float:
-    """Return the logarithm of the integral of the likelihood over the modes."""
-    return log_sum(modes.log_likelihood - np.linalg.slogdet(modes.curvature)[1] / 2)

@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel
+from rhs_isac_ros.model.arrays import log_sum
 from rhs_isac_ros.model.gaussian import Marginal, likelihood_loss, marginalise, step_to_maximum
 from rhs_isac_ros.model.geometry import polar_derivative, to_polar, to_positions
 from rhs_isac_ros.positioning.dispersed import (
@@ -81,6 +82,11 @@ class Modes(NamedTuple):
         """Indices of the modes of each shot, the most likely first, int [M]."""
         return np.lexsort((-self.log_likelihood - self.points @ _PREFERENCE, self.shots))
 
+    @property
+    def log_mass(self) -> float:
+        """Logarithm of the integral of the likelihood over all modes."""
+        return log_sum(self.log_likelihood - np.linalg.slogdet(self.curvature)[1] / 2)
+
     def sheets(self, share: float = 1.0) -> Sheets:
         """Return the likelihood without the limits of the region; `share` is an exponent."""
         return Sheets.expanded(
@@ -116,6 +122,17 @@ class Refinement(Protocol):
         """
         ...
 
+    def same(self, other: Conditional) -> Conditional:
+        """Return the likelihood for the state of the surface of another `Likelihood`'s."""
+        ...
+
+    def gain(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> float:
+        """Return the log evidence of one shot that averages over surfaces ignore, at least 0.
+
+        Takes points elsewhere, [P, 3], with parameters [P, Q], where a user may be instead.
+        """
+        ...
+
 
 class OneState:
     """Refinement for elements that are known, or whose errors are averaged: a `Refinement`."""
@@ -139,6 +156,14 @@ class OneState:
             modes = ascend(
                 self._conditional, self._likelihood, modes.starts(), signals, 1, np.inf)
         return modes, dict.fromkeys(np.unique(modes.shots).tolist(), [self._conditional])
+
+    def same(self, other: Conditional) -> Conditional:
+        """Return the only likelihood; see `Refinement.same`."""
+        return self._conditional
+
+    def gain(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> float:
+        """Return 0, because the evidence is that of averages; see `Refinement.gain`."""
+        return 0.0
 
 
 def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,

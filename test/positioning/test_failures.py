@@ -9,10 +9,12 @@ import pytest
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
 from rhs_isac_ros.model.geometry import jacobian, to_polar, to_positions
-from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning import alternatives, make_estimator
+from rhs_isac_ros.positioning.alternatives import Blocked, Outside, tabulate_outside
 from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.failures import (
     LIMITS,
+    FailedElements,
     FailureModel,
     FailureSearch,
     Whitening,
@@ -20,7 +22,9 @@ from rhs_isac_ros.positioning.failures import (
     can_enumerate,
     first_places,
 )
+from rhs_isac_ros.positioning.grid import Starts
 from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.positioning.search import OneState, ascend
 from rhs_isac_ros.system import System
 
 SCENARIO = Scenario(
@@ -231,6 +235,31 @@ def test_sets_grow_to_the_true_one_or_to_one_that_is_more_probable(ambiguous):
         search.grow(sites, 0.3)
         (true,), _ = ambiguous.weigh(failed, search.places[:1])
         assert search.log_probabilities[search.best] >= true - 1e-6
+
+
+@pytest.mark.parametrize('range_m, level_db', [(14.0, 0.0), (1e7, 20.0)], ids=['far', 'blocked'])
+def test_users_elsewhere_have_the_evidence_of_the_true_set(
+        codebook, range_m, level_db, monkeypatch):
+    """Relative to an average over surfaces, and up to the sets that explain signals as well."""
+    failed, point = (3, 17), np.array([[range_m, 0.2, -0.1]])
+    likelihood = Likelihood(System(SCENARIO, codebook))
+    elements, average = FailedElements(likelihood), DispersedLikelihood(likelihood)
+    surface = MeasurementModel(SCENARIO, codebook, with_failures(failed, [0.1, 0.8]))
+    received = 10**(level_db / 20) * surface.sample(
+        to_positions(point), np.random.default_rng(3))
+    monkeypatch.setattr(alternatives, 'GRID', alternatives.GRID._replace(templates=1000))
+    elsewhere = (Blocked(SCENARIO, received.size) if level_db
+                 else Outside(SCENARIO, tabulate_outside(likelihood.model)))
+    points, values, level = elsewhere.places(
+        likelihood.signals(received).whitened[0], likelihood.nuisance)
+    signals = likelihood.signals(received / level)
+    starts = Starts(np.zeros(len(points), int), points, values)
+    known, averaged = (
+        ascend(conditional, elements._elsewhere, starts, signals, 8).log_mass
+        for conditional in (elements._model.failed_set(failed), average))
+    assert known > averaged + 3
+    assert known - averaged - 0.5 < elements.gain(points, values, signals) < known - averaged + 6
+    assert OneState(likelihood).gain(points, values, signals) == 0
 
 
 def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):
