@@ -20,6 +20,7 @@ import sys
 import threading
 import time
 import traceback
+import types
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
@@ -75,10 +76,12 @@ class JobResult(NamedTuple):
 def sources_of(function: Function | None = None) -> str:
     """Return the version of this package with a digest of the sources of a function's results.
 
-    They are the modules of this package, that of the function, and those that it imports from. A
-    function without a module in a file, as in a notebook, is itself such a source. Sources in an
-    archive have no digest.
+    They are the modules of this package, that of the function, those that it imports from, and
+    what `_definition` returns. Sources in an archive have no digest.
     """
+    # Any other callable may keep a record of its calls.
+    is_plain = isinstance(function, functools.partial) or inspect.isfunction(function)
+    text = json.dumps(_definition(function if is_plain else type(function).__qualname__, set()))
     while isinstance(function, functools.partial):
         function = function.func
     module = sys.modules[function.__module__] if function else None
@@ -86,11 +89,47 @@ def sources_of(function: Function | None = None) -> str:
     modules = [module, *(
         value if inspect.ismodule(value) else
         sys.modules.get(str(getattr(value, '__module__', ''))) for value in named)]
-    files, text = {str(getattr(one, '__file__', '')) for one in modules if one}, ''
-    if inspect.isfunction(function) and not hasattr(module, '__file__'):
-        with contextlib.suppress(OSError):  # There is no text of a command line.
-            text = inspect.getsource(function)
+    files = {str(getattr(one, '__file__', '')) for one in modules if one}
     return f'{__version__} {_digest(*sorted(files), text=text)}'
+
+
+def _definition(value: Any, seen: set[int]) -> Any:
+    """Describe a function, or a value that it uses, apart from what files contain, for JSON.
+
+    A function has bound arguments and, without a file, as in a notebook, its code and all that it
+    uses. `seen` contains the identities of functions and objects that are already described.
+    """
+    if isinstance(value, functools.partial):
+        value = (value.func, value.args, value.keywords)
+    if isinstance(value, np.ndarray):
+        value = (value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).hexdigest())
+    if isinstance(value, Mapping):
+        return [[str(name), _definition(one, seen)] for name, one in value.items()]
+    if isinstance(value, list | tuple | set | frozenset):
+        ordered = value if isinstance(value, list | tuple) else sorted(value, key=repr)
+        return [_definition(one, seen) for one in ordered]
+    if inspect.iscode(value):
+        return _definition((value.co_code, value.co_names, value.co_consts), seen)
+    is_function: bool = inspect.isfunction(value)
+    kind: Any = type(value)
+    if hasattr(value, 'id') or not (is_function or kind.__repr__ is object.__repr__):
+        return repr(getattr(value, 'id', value))
+    if id(value) in seen:
+        return ''
+    seen.add(id(value))
+    if not is_function:
+        return _definition((kind.__qualname__, getattr(value, '__dict__', {})), seen)
+    parts = (value.__qualname__, inspect.getclosurevars(value).nonlocals)
+    if Path(value.__code__.co_filename).is_file():
+        return _definition((*parts, value.__code__.co_firstlineno), seen)
+    return _definition((*parts, value.__code__, value.__defaults__, value.__kwdefaults__, {
+        name: value.__globals__[name] for name in _names(value.__code__)
+        if name in value.__globals__}), seen)
+
+
+def _names(code: types.CodeType) -> list[str]:
+    """Return the names in code, and in that of functions and comprehensions in it."""
+    return sorted({*code.co_names}.union(*map(_names, filter(inspect.iscode, code.co_consts))))
 
 
 @functools.cache
@@ -114,8 +153,10 @@ def attempt(function: Function, job: Job,
     """
     plugins.GIVEN.update(given)
     try:
-        return JobResult(
-            job, json.dumps(as_json(function(**job.arguments))), sources=sources_of())
+        result = function(**job.arguments)
+        if not isinstance(result, Mapping):
+            raise TypeError(f'{result!r}, expected a mapping as the result')
+        return JobResult(job, json.dumps(as_json(result)), sources=sources_of())
     except MissingLibraryError as error:
         return JobResult(job, error=str(error))
     except Exception:
@@ -148,7 +189,9 @@ def as_json(value: Any) -> Any:
 
 
 def _checked(job: Job) -> Job:
-    """Return a job without values of NumPy; raise ValueError if JSON cannot represent one."""
+    """Return a job without values of NumPy; raise ValueError if it cannot be stored."""
+    if not job.name or Path(job.name).name != job.name:
+        raise ValueError(f'job {job.name!r}: expected the name of a file, without folders')
     arguments = as_json(job.arguments)
     for name, value in arguments.items():
         try:
@@ -186,6 +229,11 @@ class Workers:
     folder: Path | None = None  #: Folder of a file for each result; None to keep no results.
     label: str = ''  #: Text beside the progress.
     quiet: bool = False  #: Whether to show no progress.
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if there are no processes."""
+        if not self.n_jobs:
+            raise ValueError('n_jobs: 0, expected 1 or more, or -1 for one per core')
 
     def run(self, strands: Sequence[Strand[_End]]) -> list[_End]:
         """Run strands until all have returned; return what they return.
@@ -442,8 +490,9 @@ def _interrupts_ignored() -> Iterator[None]:
 
 
 def run_jobs(
-        function: Callable[..., dict[str, Any]], jobs: Sequence[Job], folder: Path | None = None,
-        n_jobs: int = -1, dask: str | None = None) -> list[dict[str, Any]]:
+        function: Callable[..., dict[str, Any]], jobs: Sequence[Job],
+        folder: str | Path | None = None, n_jobs: int = -1, dask: str | None = None
+) -> list[dict[str, Any]]:
     """Run the jobs that have no stored result; return all results in order, decoded from JSON.
 
     `function` takes the arguments of a job and returns a dict that JSON or NumPy can represent.
@@ -455,7 +504,7 @@ def run_jobs(
     Raises JobError if a job fails, its process dies or its worker has other sources of this
     package, ConnectionError if the cluster does not respond, OSError if a result cannot be read or
     stored, MissingLibraryError if a library is not installed, and ValueError if two jobs have the
-    same name, or JSON cannot represent an argument.
+    same name, a name is not that of a file, or JSON cannot represent an argument.
     """
     if len({job.name for job in jobs}) < len(jobs):
         raise ValueError('jobs: two have the same name, expected unique names')
@@ -463,7 +512,7 @@ def run_jobs(
     def strand() -> Strand[list[dict[str, Any]]]:
         return (yield function, jobs)
 
-    (results,) = Workers(n_jobs, dask, folder).run([strand()])
+    (results,) = Workers(n_jobs, dask, Path(folder) if folder else None).run([strand()])
     return results
 
 

@@ -174,6 +174,48 @@ def test_a_function_without_a_module_in_a_file_is_a_source():
     assert digests[0] == digests[2] != digests[1]
 
 
+@pytest.mark.parametrize('cells', [
+    ('k = 1', 'k = 2'), ('k = [1, {"a": 2}]', 'k = [1, {"a": 3}]'),
+    ('import numpy as np\nk = np.zeros(3000)', 'k[1500] = 1'),
+    ('def k(): return 1', 'def k(): return 2'),
+    ('k = lambda: helper()\nhelper = 1', 'helper = 2')])
+def test_what_a_function_without_a_file_uses_is_a_source(cells):
+    module = types.ModuleType('__main__')
+    digests = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, '__main__', module)
+        work = 'def work():\n    return {"all": [k for _ in range(2)]}'
+        for cell in (work, *cells, 'other = 1'):
+            exec(compile(cell, '<string>', 'exec'), vars(module))
+            digests.append(jobs_module.sources_of(module.work))
+    assert len({*digests}) == 3
+    assert digests[2] == digests[3]
+
+
+def test_values_bound_to_a_function_are_sources():
+    def of(value):
+        def work():
+            return {'value': value}
+        return work
+    for wrap in (of, lambda value: functools.partial(print, end=value)):
+        one, other, same = (jobs_module.sources_of(wrap(value)) for value in (
+            np.arange(2000), np.arange(1, 2001), np.arange(2000)))
+        assert one == same != other
+
+
+@pytest.mark.parametrize('name', ['', 'a/b', '../a', '/a'])
+def test_a_name_that_is_no_file_name_is_refused(tmp_path, name):
+    with pytest.raises(ValueError, match=f'job {name!r}: expected the name of a file'):
+        run_jobs(Worker(), [Job(name, {'number': 1, 'of': 1})], tmp_path / 'kept', n_jobs=1)
+
+
+def test_a_result_is_a_mapping_and_a_process_is_needed(tmp_path):
+    with pytest.raises(JobError, match='TypeError: 1, expected a mapping'):
+        run_jobs(lambda number, of: 1, JOBS[:1], str(tmp_path), n_jobs=1)
+    with pytest.raises(ValueError, match='n_jobs: 0, expected 1 or more'):
+        run_jobs(Worker(), JOBS, n_jobs=0)
+
+
 def test_what_cannot_be_sent_to_a_cluster_is_named(cluster):
     lock = threading.Lock()
 
@@ -196,9 +238,11 @@ def test_what_a_process_cannot_read_is_named():
 
 def test_a_result_may_be_infinite_or_missing(tmp_path):
     calls = []
+    # A list that a function refers to is a source of its results; a method is not.
+    record = calls.append
 
     def work(number, of):
-        calls.append(number)
+        record(number)
         return {'mean': float('inf'), 'low': float('nan')}
 
     for _ in range(2):
@@ -210,9 +254,10 @@ def test_a_result_may_be_infinite_or_missing(tmp_path):
 def test_values_of_numpy_are_numbers_and_lists(tmp_path):
     given = {'number': np.int64(3), 'of': (np.float32(0.5), np.arange(2), {'a': np.bool_(True)})}
     seen = []
+    record = seen.append
 
     def work(number, of):
-        seen.append((number, of))
+        record((number, of))
         return {'square': np.float32(number**2), 'each': np.eye(2)}
 
     for _ in range(2):
