@@ -30,6 +30,7 @@ from rhs_isac_ros.link import capacity_report, choose_beam
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import Estimator, make_estimator
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.fields import whole
 from rhs_isac_ros.support.jobs import Job, Strand, Workers
 from rhs_isac_ros.system import System
 
@@ -40,8 +41,6 @@ KINDS = (OPTIMIZE, 'directional', RANDOM)
 BLOCK = 250
 # Number of sample positions in an optimisation.
 _SAMPLES = 64
-# Squared Mahalanobis radius of the 95 % region.
-_RADIUS = float(chdtri(3, 0.05))
 # Above this coarseness of its lattice, a global bound is too loose.
 _MAX_COARSENESS = 3.0
 # Largest relative error of the power that is not corrected; `Codebook.check` allows a larger one.
@@ -116,8 +115,10 @@ def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, An
         fix[:, None, None], located.covariance, np.diag(np.square(world.roi_size_m) / 12))
     error = mean - positions
     distance = np.einsum('na,nab,nb->n', error, np.linalg.pinv(covariance, hermitian=True), error)
+    # The 95 % region has as many dimensions as that of interest.
+    radius = chdtri(np.count_nonzero(world.roi_size_m), 0.05)
     result = {'squared_error_m2': np.sum(error**2, axis=1), 'fix': fix.astype(float),
-              'inside': (fix & (distance <= _RADIUS)).astype(float)}
+              'inside': (fix & (distance <= radius)).astype(float)}
     if family in (CAPACITY, LOSS):
         beams = [choose_beam(world, *known).beam for known in zip(mean, covariance, strict=True)]
         pairs = list(zip(beams, positions, strict=True))
@@ -189,8 +190,10 @@ class Sweep:
             if name not in MEASURES:
                 raise ValueError(f'measures: {name!r}, expected some of {", ".join(MEASURES)}')
         for name, low in (('n_positions', 1), ('repeats', 1), ('steps', 1), ('seed', 0)):
-            if getattr(self, name) < low:
-                raise ValueError(f'{name}: {getattr(self, name)}, expected at least {low}')
+            whole(name, getattr(self, name), low)
+        for name in self.optimize_for or ():
+            if name not in FIELDS:
+                raise ValueError(f'optimize_for: {name!r}, expected names of fields of a scenario')
         files = self._files
         for setting in self.settings:
             if setting.codebook in KINDS:
@@ -243,7 +246,7 @@ class Sweep:
                        else self._files[setting.codebook], setting)
 
 
-def run_sweep(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = None
+def run_sweep(sweep: Sweep, folder: str | Path, n_jobs: int = -1, dask: str | None = None
               ) -> list[Point]:
     """Run a sweep with `run_blocks`; return the measures of each setting, with their intervals."""
     return [Point(results.setting, name,
@@ -252,13 +255,13 @@ def run_sweep(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = N
             for results in run_blocks(sweep, folder, n_jobs, dask) for name in sweep.measures]
 
 
-def run_blocks(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = None
+def run_blocks(sweep: Sweep, folder: str | Path, n_jobs: int = -1, dask: str | None = None
                ) -> list[Results]:
     """Run the jobs of a sweep that have no stored result; return the results of each setting.
 
     Several sweeps may share a folder. `run_jobs` describes the other arguments and the errors.
     """
-    found = iter(Workers(n_jobs, dask, folder, 'sweep').run(
+    found = iter(Workers(n_jobs, dask, Path(folder), 'sweep').run(
         [_evaluated(sweep, setting, job) for setting in sweep.settings
          for job in sweep.designs(setting) or (None,)]))
     results = []

@@ -171,9 +171,7 @@ class Setting(NamedTuple):
 def parse_axis(text: str) -> Axis:
     """Parse ``FIELD=VALUE,...``, with values as in a scenario file, or raise ValueError."""
     name, equals, listed = text.partition('=')
-    if name not in NAMES:
-        close = difflib.get_close_matches(name, NAMES) or NAMES
-        raise ValueError(f'{name}: unknown field, expected one of {", ".join(close)}')
+    _known(name)
     try:
         values = parse_yaml(f'[{listed}]')
     except ValueError:
@@ -184,14 +182,22 @@ def parse_axis(text: str) -> Axis:
     return Axis((name,), tuple((value,) for value in values))
 
 
+def _known(name: str) -> str:
+    """Return the name of a field, or raise ValueError."""
+    if name not in NAMES:
+        close = difflib.get_close_matches(name, NAMES) or NAMES
+        raise ValueError(f'{name}: unknown field, expected one of {", ".join(close)}')
+    return name
+
+
 def settings_of(
         base: Scenario, axes: Sequence[Axis], codebook: str, estimator: Any) -> list[Setting]:
     """List all combinations; the last axis varies fastest.
 
     `codebook` and `estimator`, a name or a class, apply unless an axis varies them. Raises
-    ValueError if a field is varied twice, or values contradict each other.
+    ValueError if a field is unknown or varied twice, or values contradict each other.
     """
-    names = [name for axis in axes for name in axis.fields]
+    names = [_known(name) for axis in axes for name in axis.fields]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f'{name}: varied more than once, expected different fields')

@@ -14,6 +14,7 @@ from rhs_isac_ros.experiments import sweep as sweep_module
 from rhs_isac_ros.experiments.sweep import Sweep, run_sweep, table
 from rhs_isac_ros.experiments.sweep_settings import FIELDS, parse_axis, settings_of
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.system import System
 
 pytest.importorskip('joblib')
@@ -112,6 +113,8 @@ def test_the_table_names_the_origin_of_the_codebooks(tmp_path, file, monkeypatch
 @pytest.mark.parametrize(('options', 'expected'), [
     ({'measures': ['fame']}, "measures: 'fame', expected some of crlb"),
     ({'n_positions': 0}, 'n_positions: 0, expected at least 1'),
+    ({'n_positions': 1e3}, 'n_positions: 1000.0, expected an integer'),
+    ({'optimize_for': ['n_frame']}, "optimize_for: 'n_frame', expected names of fields"),
     ({'repeats': 0}, 'repeats: 0, expected at least 1')])
 def test_an_error_names_what_is_wrong(options, expected):
     with pytest.raises(ValueError, match=expected):
@@ -120,8 +123,28 @@ def test_an_error_names_what_is_wrong(options, expected):
 
 def test_more_positions_repeat_only_the_new_blocks(tmp_path, monkeypatch):
     made = []
-    monkeypatch.setattr(sweep_module, 'evaluate', lambda first, n, **_: made.append(
+    # What a function refers to is a source of its results, unlike what a method changes.
+    record = made.append
+    monkeypatch.setattr(sweep_module, 'evaluate', lambda first, n, **_: record(
         (first, n)) or {'crlb_m2': [1.0] * n})
     run_sweep(sweep_over('n_frames=1', n_positions=500), tmp_path, 1)
     run_sweep(sweep_over('n_frames=1', n_positions=600), tmp_path, 1)
     assert made == [(0, 250), (250, 250), (500, 100)]
+
+
+def test_the_coverage_of_a_plane_is_that_of_its_two_dimensions(tmp_path, monkeypatch):
+    """Errors of two standard normal coordinates; in three dimensions, 98 % would be inside."""
+    class Normal:
+        def estimate(self, received):
+            n = len(received)
+            errors = np.random.default_rng(0).standard_normal((n, 3)) * [1.0, 1.0, 0.0]
+            places = places_of[0] + errors
+            return Estimate(places, np.tile(np.diag([1.0, 1.0, 1e-10]), (n, 1, 1)), ('',) * n)
+
+    flat = dataclasses.replace(BASE, roi_size_m=(10.0, 10.0, 0.0))
+    book = random_codebook(flat, np.random.default_rng(0))
+    places_of = [System(flat, book).pairs(2000, 1)[0]]
+    monkeypatch.setattr(sweep_module, '_estimator', lambda *_: Normal())
+    inside = sweep_module.evaluate(
+        'error', flat.changes(), book.to_parameters(), 1, 0, 2000)['inside']
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.012)

@@ -73,3 +73,8 @@ def test_combinations_are_checked():
         settings('feed_positions_m=[[0,0,0]]', 'n_feeds=1,2')
     with pytest.raises(ValueError, match='n_frames: varied more than once'):
         settings('n_frames=1,2', 'n_frames=3,4')
+
+
+def test_an_unknown_field_of_an_axis_is_an_error():
+    with pytest.raises(ValueError, match='n_frame: unknown field, expected one of n_frames'):
+        settings_of(Scenario(), [Axis(('n_frame',), ((1,), (2,)))], 'random', 'bayes')
