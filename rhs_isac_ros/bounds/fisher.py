@@ -135,19 +135,21 @@ def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.n
 def site_information(surfaces: Iterable[MeasurementModel], positions: np.ndarray) -> np.ndarray:
     """Add up the Fisher information of the surfaces, float64 [N, 3, 3] [1/m^2].
 
-    Each surface has the pose of its scenario. Takes positions of the user, float64 [N, 3] [m], in
-    the frame of the site, in front of every surface. Noise, multipath, nuisance parameters and
+    Each surface has the pose of its scenario. Takes positions of the user, float64 [N, 3] [m], or
+    with columns for the velocity, [N, 6] [m, m/s], in the frame of the site, in front of every
+    surface. Noise, multipath, nuisance parameters and
     errors of the poses are independent for each surface and cycle. Raises ValueError if a position
     is not in front of a surface.
     """
-    total = np.zeros((len(positions), 3, 3))
+    states = np.asarray(positions)
+    total = np.zeros((len(states), 3, 3))
     for model in surfaces:
         pose = model.scenario.pose
-        joint = joint_information_of(model, pose.to_surface(positions))
+        joint = joint_information_of(model, pose.states_to_surface(states))
         information = pose.covariances_to_site(
             without_nuisance(joint, model.scenario).information)
         # The errors of the pose add their covariance to the inverse of the information.
-        widened = np.eye(3) + np.matmul(information, pose.spread(positions))
+        widened = np.eye(3) + np.matmul(information, pose.spread(states[:, :3]))
         total += np.linalg.solve(widened, information)
     return (total + np.swapaxes(total, 1, 2)) / 2
 

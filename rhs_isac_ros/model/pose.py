@@ -94,6 +94,18 @@ class Pose:
         """Convert positions, [..., 3] [m], from the frame of the site to that of the surface."""
         return self.vectors_to_surface(positions - self.origin)
 
+    def states_to_surface(self, states: np.ndarray) -> np.ndarray:
+        """Convert positions, [N, 3], or positions and velocities, [N, 6], as `to_surface`.
+
+        Raises ValueError if the shape is another one, or a number is not finite.
+        """
+        states = numbers('positions', states)
+        if states.ndim != 2 or states.shape[1] not in (3, 6):
+            raise ValueError(f'positions: shape {states.shape}, expected [N, 3] or [N, 6]')
+        places = self.to_surface(states[:, :3])
+        return np.hstack([places, *(
+            [self.vectors_to_surface(states[:, 3:])] if states.shape[1] > 3 else [])])
+
     def vectors_to_site(self, vectors: np.ndarray) -> np.ndarray:
         """Rotate vectors, such as velocities, [..., 3], into the frame of the site."""
         return vectors @ self.rotation.T

@@ -100,9 +100,15 @@ class Site:
     def sample(self, positions: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """Draw signals for users at positions [N, 3] [m], complex128 [N, N_B, N_SB F] by name.
 
-        Multipath, noise and impairments of different surfaces are independent.
+        With columns for the velocity, [N, 6], users move; velocities that the leader's scenario
+        declares are drawn. Multipath, noise and impairments of different surfaces are independent.
         """
-        return {name: one.sample(one.pose.to_surface(positions), rng)
+        states, (_, speed_mps) = np.asarray(positions), self.users
+        if speed_mps and states.shape[1:] == (3,):
+            # All surfaces see the same velocity.
+            states = np.hstack([states, speed_mps * (np.ptp(self.bounds_m, axis=0) > 0)
+                                * rng.standard_normal(states.shape)])
+        return {name: one.sample(one.pose.states_to_surface(states), rng)
                 for name, one in self.surfaces.items()}
 
 
@@ -112,7 +118,7 @@ class SiteEstimator:
     All surfaces together decide whether the user is outside of the region.
     """
 
-    def __init__(self, site: Site, table_folder: Path | None = None) -> None:
+    def __init__(self, site: Site, table_folder: str | Path | None = None) -> None:
         self._site = site
         self._estimators = {name: BayesEstimator(one, table_folder, reject_outside=True)
                             for name, one in site.surfaces.items()}
@@ -122,12 +128,16 @@ class SiteEstimator:
 
         `received` contains signals, complex128 [N_B, N_SB F], of some or all surfaces.
         """
-        ((_, found),) = self._each({name: signals[None] for name, signals in received.items()})
+        ((_, found),) = self._each({
+            name: np.asarray(signals)[None] for name, signals in received.items()})
         return found
 
     def _each(self, received: Mapping[str, np.ndarray]
               ) -> Iterator[tuple[dict[str, Estimate], dict[str, Sighting]]]:
         """Yield the posteriors of the surfaces for each shot, and their sightings, by name."""
+        if not received or not received.keys() <= self._estimators.keys():
+            raise SignalError(f'received: surfaces {sorted(received)}, expected some of '
+                              f'{sorted(self._estimators)}')
         found = {name: self._estimators[name].posterior(signals)
                  for name, signals in received.items()}
         lengths = {name: len(one.mean) for name, one in found.items()}
@@ -160,7 +170,8 @@ class SiteEstimator:
         """Return the position with its mixture, in the frame of the site; see `sightings`.
 
         For several shots, complex128 [N, N_B, N_SB F] by name, there are N positions. Raises
-        `SignalError` if signals are unusable, or if the numbers of shots differ.
+        `SignalError` if signals are unusable, there are none, a name is not that of a surface, or
+        the numbers of shots differ.
         """
         single = {name for name, signals in received.items() if np.ndim(signals) == 2}
         found = [self._fused(*one) for one in self._each({

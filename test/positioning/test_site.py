@@ -188,3 +188,31 @@ def test_drawn_agreements_are_references_for_their_places(estimator):
     assert len(agreements) == len(places) <= 5
     assert ((places >= BOUNDS[0]) & (places <= BOUNDS[1])).all()
     PoseTest(agreements, places).add(agreements[0], places[0])
+
+
+def test_signals_of_no_or_an_unknown_surface_are_refused(estimator, cycles):
+    for received in ({}, {'left': cycles[1][0]['side']}):
+        with pytest.raises(SignalError, match=r"surfaces \[.*\], expected some of \['front'"):
+            estimator.estimate(received)
+
+
+def test_all_surfaces_see_the_same_velocity(monkeypatch):
+    seen = {}
+    monkeypatch.setattr(System, 'sample', lambda self, states, rng: seen.setdefault(
+        self.pose, states))
+    walking = [dataclasses.replace(one.scenario, user_speed_std_mps=1.0) for one in (FRONT, SIDE)]
+    site = Site({name: System(scenario, CODEBOOK) for name, scenario in zip(
+        ('front', 'side'), walking, strict=True)}, BOUNDS)
+    places = np.random.default_rng(1).uniform(*BOUNDS, size=(200, 3))
+    for states in (places, np.hstack([places, [[1.0, 2.0, 0.0]] * 200])):
+        seen.clear()
+        site.sample(states, np.random.default_rng(2))
+        front, side = ([pose.to_site(one[:, :3]), pose.vectors_to_site(one[:, 3:])]
+                       for pose, one in seen.items())
+        np.testing.assert_allclose(front, side, atol=1e-12)
+        np.testing.assert_allclose(front[0], places)
+        if states is places:
+            np.testing.assert_allclose(front[1].std(axis=0), 1.0, atol=0.2)
+    np.testing.assert_allclose(front[1], states[:, 3:])
+    with pytest.raises(ValueError, match=r'positions: shape \(3,\), expected \[N, 3\] or'):
+        site.sample(places[0], np.random.default_rng(2))
