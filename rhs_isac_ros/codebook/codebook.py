@@ -76,6 +76,10 @@ class Codebook:
                 f'analog: [N_B, F] = {self.analog.shape[:2]}, expected {(n_bands, n_frames)} '
                 'as in digital')
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and unpickle through the constructor: NumPy's own copies could be changed."""
+        return type(self), tuple(getattr(self, field.name) for field in dataclasses.fields(self))
+
     @property
     def shape(self) -> tuple[int, int, int, int, int]:
         """Sizes (N_B, N_SB, F, K, N_E)."""

@@ -112,8 +112,8 @@ class Estimate:
     density: Callable[[], Mixture] | Mixture | None = None
     #: Posterior without regard to the limits of the region, from which a track continues.
     unbounded: Mixture | None = None
-    #: Function that returns the `sighting`.
-    see: Callable[[], Sighting] | None = None
+    #: The `sighting`, or a function that returns it.
+    see: Callable[[], Sighting] | Sighting | None = None
     frame: str = SURFACE  #: ``surface`` or ``site``: the frame of the mean and the velocity.
 
     @property
@@ -121,21 +121,32 @@ class Estimate:
         """Posterior with the mean and the covariance, normalised, in the frame of the site.
 
         None without a position, and unless `posterior`, a track, `fuse` or a site returned the
-        estimate. D = 6 with velocities. It is computed when it is first read.
+        estimate. D = 6 with velocities. It is computed when it is first read. N estimates have a
+        tuple of N.
         """
-        if isinstance(self.reason, tuple):
-            found: Any = tuple(self[n].mixture for n in range(len(self.reason)))
-            return found
-        return self.density() if callable(self.density) else self.density
+        found: Mixture | None = self._computed('density')
+        return found
 
     @property
     def sighting(self) -> Sighting | None:
         """What the signals of one shot alone say; None unless `posterior` returned the estimate.
 
         Without a position, it is None, too, unless the reason is a user outside of the region,
-        which is evidence.
+        which is evidence. N estimates have a tuple of N.
         """
-        return self.see() if callable(self.see) else None
+        found: Sighting | None = self._computed('see')
+        return found
+
+    def _computed(self, name: str) -> Any:
+        """Return the value of a field that may be a function, or N values."""
+        if isinstance(self.reason, tuple):
+            return tuple(self[n]._computed(name) for n in range(len(self.reason)))
+        value = getattr(self, name)
+        return value() if callable(value) else value
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields for a copy or a pickle, with values in place of functions."""
+        return {**vars(self), 'density': self.mixture, 'see': self.sighting}
 
     @classmethod
     def without_fix(cls, reason: str, **statistics: Any) -> 'Estimate':

@@ -60,6 +60,9 @@ class Mixture(_Arrays):
     #: phases, such as those of poses, float64 [3, 3] [m^2]; see `shared`.
     constant_covariance: np.ndarray = read_only(np.zeros((3, 3)))
 
+    # Tuples would compare the arrays, which have no truth value.
+    __eq__, __ne__, __hash__ = object.__eq__, object.__ne__, object.__hash__
+
     def __new__(cls: type[_MixtureT], log_weights: np.ndarray, means: np.ndarray,
                 covariances: np.ndarray) -> _MixtureT:
         """Check the arrays. `_make`, which all methods use, does not."""

@@ -1,6 +1,8 @@
 """The codebook: checks, id, parameters and files; and the shipped codebooks."""
 
+import copy
 import dataclasses
+import pickle
 import re
 from pathlib import Path
 
@@ -14,6 +16,17 @@ from rhs_isac_ros.codebook.objective import draw_confusable
 from rhs_isac_ros.model import Scenario
 
 CONFIG = Path(__file__).parents[2] / 'config'
+
+
+@pytest.mark.parametrize('copied', [
+    copy.copy, copy.deepcopy, lambda codebook: pickle.loads(pickle.dumps(codebook))])
+def test_a_copy_is_equal_and_read_only(copied):
+    codebook = Codebook(np.zeros((2, 1, 3)), np.ones((2, 1, 1, 1)), 1.0, 'origin')
+    known_id, found = codebook.id, copied(codebook)
+    assert (found.id, found.average_crlb_m2, found.provenance) == (known_id, 1.0, 'origin')
+    for array in (found.analog, found.digital):
+        with pytest.raises(ValueError, match='read-only'):
+            array[:] = 1
 
 
 def test_arrays_are_copied_converted_and_read_only():

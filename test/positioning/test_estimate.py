@@ -1,13 +1,16 @@
 """Estimates in the frame of the site, and checks of received signals."""
 
+import copy
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
 
 from rhs_isac_ros.model import Pose
-from rhs_isac_ros.positioning import Mixture, SignalError
+from rhs_isac_ros.positioning import BayesEstimator, Mixture, SignalError, Tracker
 from rhs_isac_ros.positioning.estimate import Estimate, checked_received, estimate_each
+from rhs_isac_ros.system import System
 
 
 def test_signals_of_one_phase_become_a_batch_of_one(small):
@@ -47,3 +50,26 @@ def test_a_position_behind_the_surface_is_no_fix(small):
     assert found.fix.tolist() == [True, False]
     assert found.reason[0] == ''
     assert found.reason[1].startswith('position: x = -8 m, expected x > 0')
+
+
+@pytest.mark.parametrize('copied', [copy.copy, copy.deepcopy, lambda one: pickle.loads(
+    pickle.dumps(one))])
+def test_a_copy_of_a_posterior_has_its_mixture_and_its_sighting(small, copied):
+    system = System(small.scenario, small.codebook)
+    estimator = BayesEstimator(system)
+    received = system.sample(np.array([[8.0, 1.0, 0.2]]), np.random.default_rng(1))
+    found = estimator.posterior(np.concatenate([received, 0 * received]))
+    mixtures, sightings = found.mixture, found.sighting
+    assert mixtures[1] is sightings[1] is None
+    for one, mixture, sighting in (
+            (copied(found)[0], mixtures[0], sightings[0]),
+            (copied(found[0]), found[0].mixture, found[0].sighting),
+            (copied(found).to_site(Pose()), None, None)):
+        np.testing.assert_array_equal(one.mean, found[0].mean if mixture else found.mean)
+        if mixture:
+            np.testing.assert_array_equal(one.mixture.means, mixture.means)
+            np.testing.assert_array_equal(one.sighting.sheets.means, sighting.sheets.means)
+    tracker = Tracker(estimator)
+    tracker.update(0.0, received[0])
+    np.testing.assert_array_equal(copied(tracker).update(0.1, received[0]).mean,
+                                  tracker.update(0.1, received[0]).mean)

@@ -20,6 +20,13 @@ def one(mean, covariance, log_weight=0.0):
     return Mixture(np.array([log_weight]), np.array([mean], float), np.array([covariance], float))
 
 
+def test_mixtures_are_equal_if_they_are_the_same():
+    first, second = mixture(1), mixture(1)
+    assert first == first != second
+    assert [second, first].index(first) == 1
+    assert len({first, second}) == 2
+
+
 def test_the_moments_are_those_of_the_density():
     both = Mixture(np.log([0.2, 0.6]), np.array([[0.0, 0, 0], [4.0, 0, 0]]),
                    np.array([np.eye(3), 2 * np.eye(3)]))
