@@ -21,6 +21,7 @@ from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.measurement import KnownSurface
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.fields import whole
 from rhs_isac_ros.support.files import mapping_of, read_yaml
 from rhs_isac_ros.support.threads import map_blocks
 
@@ -93,11 +94,10 @@ class System(MeasurementModel):
         A seed defines an infinite sequence of pairs, of which this method returns n, beginning
         with `first`. The pairs do not depend on how calls divide the sequence. Returns positions,
         float64 [n, 3] [m], uniform in the region, and received signals,
-        complex128 [n, N_B, N_SB F], sub-band-major. Raises ValueError if an argument is negative.
+        complex128 [n, N_B, N_SB F], sub-band-major. Raises ValueError unless all arguments
+        are integers from 0.
         """
-        for name, value in (('n', n), ('seed', seed), ('first', first)):
-            if value < 0:
-                raise ValueError(f'{name}: {value}, expected 0 or more')
+        n, seed, first = whole('n', n), whole('seed', seed), whole('first', first)
         positions = np.empty((n, 3))
         received = np.empty((n, *self.shape), complex)
 

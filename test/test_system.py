@@ -126,7 +126,7 @@ def test_signals_are_those_of_the_positions(setting):
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
-    ((-1, 0), 'n: -1, expected 0 or more'), ((1, -2), 'seed: -2'), ((1, 0, -3), 'first: -3')])
+    ((-1, 0), 'n: -1, expected at least 0'), ((1, -2), 'seed: -2'), ((1, 0, -3), 'first: -3')])
 def test_negative_numbers_are_errors(setting, arguments, message):
     with pytest.raises(ValueError, match=message):
         System(*setting).pairs(*arguments)

@@ -26,6 +26,7 @@ from rhs_isac_ros.model.arrays import checked_positions
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.surface import on_levels, ports_of
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.fields import whole
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Number of Sobol points: for Table I, about as good as 1200 independent positions.
@@ -178,8 +179,8 @@ class _Design:
         for name, number, low in (('n_positions', n_positions, 1), ('seed', seed, 0),
                                   ('max_evaluations', max_evaluations, 1),
                                   ('max_steps', max_steps, 1)):
-            if number is not None and number < low:
-                raise ValueError(f'{name}: {number}, expected at least {low}')
+            if number is not None or not name.startswith('max_'):
+                whole(name, number, low)
         if positions is None:
             positions = prior.positions(scenario, SAMPLINGS[sampling](
                 scenario, n_positions, streams.generator(seed, streams.SAMPLES)))

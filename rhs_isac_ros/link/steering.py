@@ -17,7 +17,9 @@ from rhs_isac_ros.link.candidates import candidate_configurations, tables
 from rhs_isac_ros.link.capacity import Beamformer, actual_capacity, expected_capacities
 from rhs_isac_ros.link.tuned import tuned_beam
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arrays import checked_position
 from rhs_isac_ros.model.elements import SurfaceEstimate
+from rhs_isac_ros.support.fields import whole
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Maximum number of rounds; usually two or three suffice.
@@ -176,9 +178,7 @@ def steer_bands(
     """Find the beams of `steer` for several bands, in little more time than for one band."""
     if not len(bands):
         raise ValueError('bands: none, expected at least one')
-    for band in bands:
-        if not 0 <= band < scenario.n_bands:
-            raise ValueError(f'band: {band}, expected 0 to {scenario.n_bands - 1}')
+    bands = [whole('band', band, high=scenario.n_bands - 1) for band in bands]
     if not scenario.board.is_affine:
         return [tuned_beam(scenario, position, band, surface) for band in bands]
     link = BandLink.to(scenario, position, bands, surface)
@@ -218,6 +218,7 @@ def choose_beam(
     chosen. Raises ValueError if `mean` or `covariance` has a wrong shape or is not finite, there
     is no band, or a band is out of range.
     """
+    mean = checked_position(mean, 'mean')
     covariance = np.zeros((3, 3)) if covariance is None else covariance
     bands = range(scenario.n_bands) if bands is None else bands
     beams = steer_bands(scenario, mean, bands, surface)

@@ -154,7 +154,7 @@ def checked_states(states: ArrayLike) -> np.ndarray:
     return array
 
 
-def checked_position(position: ArrayLike, name: str = 'positions') -> np.ndarray:
+def checked_position(position: ArrayLike, name: str = 'position') -> np.ndarray:
     """Return a position in front of the surface as float64 [3] [m], or raise ValueError."""
     return _checked(name, position, 1, '[3]')
 

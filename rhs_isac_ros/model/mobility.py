@@ -139,7 +139,7 @@ class RandomWalk(StraightMobility):
             start: ArrayLike | None = None) -> None:
         self._scenario, self._rng = scenario, rng
         self._speed_mps = finite('speed_mps', speed_mps, 0.0)
-        self._target = self._draw() if start is None else checked_position(start)
+        self._target = self._draw() if start is None else checked_position(start, 'start')
         self._leg: Leg | None = None
 
     def leg(self, now_s: float) -> Leg:

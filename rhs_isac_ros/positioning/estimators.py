@@ -128,7 +128,7 @@ class SearchEstimator(abc.ABC):
 
     @one_blas_thread
     def __init__(
-            self, system: System, table_folder: Path | None = None, *,
+            self, system: System, table_folder: str | Path | None = None, *,
             reject_outside: bool = False, progress: Callable[[float], None] | None = None,
             lazy: bool = False) -> None:
         self.system, self.scenario = system, system.scenario

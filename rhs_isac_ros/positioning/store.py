@@ -37,7 +37,7 @@ def default_folder() -> Path | None:
         return None
 
 
-def load_table(system: System, folder: Path | None = None,
+def load_table(system: System, folder: str | Path | None = None,
                progress: Callable[[float], None] | None = None, *, outside: bool = False,
                model: MeasurementModel | None = None) -> Mapping[str, np.ndarray]:
     """Load the table of a system from a folder, or compute it and store it there.
@@ -52,7 +52,7 @@ def load_table(system: System, folder: Path | None = None,
     if folder is None:
         return tabulate(model or system, progress)
     key = table_key(system)
-    path = folder / f'{_PREFIX}{key}{"-outside" if outside else ""}.npy'
+    path = Path(folder) / f'{_PREFIX}{key}{"-outside" if outside else ""}.npy'
     table = _read(path, key)
     if table is not None:
         return table

@@ -122,6 +122,12 @@ class Field:
         return f'{value!r}, expected {self.expected}{listed}'
 
 
+def whole(name: str, value: Any, low: float = 0, high: float = math.inf) -> int:
+    """Return an integer in a range; raise ValueError with `name` if it is not one."""
+    number: int = Field(int, low=low, high=high).checked(name, value)
+    return number
+
+
 def finite(name: str, value: Any, low: float = -math.inf) -> float:
     """Return a finite number, at least `low`, as a float; raise ValueError with `name` if not."""
     # At once, because roles check the time of every event.
