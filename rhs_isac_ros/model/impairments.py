@@ -81,6 +81,7 @@ class Impairment:
 class Exponents:
     """Standard normal parameters z with exponents P: signals contain the factor exp(z P)."""
 
+    scenario: Scenario
     scaled_patterns: np.ndarray  #: The exponents P, complex128 [Q, N_B, N_SB F].
     #: Whether a parameter changes measurements of the same band relative to each other, and so
     #: moves the multipath out of the nulls of its covariance, bool [Q].
@@ -92,22 +93,31 @@ class Exponents:
 
     def divide(self, signals: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Remove the factors of values z [..., Q] from signals [..., N_B, N_SB F]."""
-        patterns, index = self._distinct
-        factors = np.exp(values @ -patterns)[..., index]
-        return signals * factors.reshape(*values.shape[:-1], *self.scaled_patterns.shape[1:])
+        shape = *signals.shape[:-1], self.scenario.n_subbands, self.scenario.n_frames
+        divided = np.broadcast_to(signals.reshape(shape), np.broadcast_shapes(
+            shape, (*values.shape[:-1], 1, 1, 1)))
+        for rows, patterns in self._by_axes:
+            exponents = values[..., rows] @ patterns.reshape(len(rows), -1)
+            divided = divided * np.exp(-exponents).reshape(
+                *values.shape[:-1], *patterns.shape[1:])
+        return divided.reshape(*divided.shape[:-2], -1)
 
     @functools.cached_property
-    def _distinct(self) -> tuple[np.ndarray, np.ndarray]:
-        """The D different exponents, complex128 [Q, D], and the one of each measurement, int.
+    def _by_axes(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Indices of parameters, [q], and their exponents, complex128 [q, N_B, N_SB, F].
 
-        Offsets of timing and carrier are the same in all frames or sub-bands of a band.
+        Offsets of timing and carrier are the same in all frames or sub-bands of a band, which then
+        appear once.
         """
-        flat = self.scaled_patterns.reshape(len(self), math.prod(self.scaled_patterns.shape[1:]))
-        # The row of zeros is for no parameters.
-        _, first, index = np.unique(
-            np.vstack([np.zeros(flat.shape[1]), flat.real, flat.imag]), axis=1,
-            return_index=True, return_inverse=True)
-        return flat[:, first], index.reshape(-1)
+        found: dict[tuple[int | None, ...], list[int]] = {}
+        scenario, n_bands = self.scenario, self.scaled_patterns.shape[1]
+        patterns = self.scaled_patterns.reshape(
+            len(self), n_bands, scenario.n_subbands, scenario.n_frames)
+        for row in np.flatnonzero(patterns.any(axis=(1, 2, 3))).tolist():
+            kept = [None if np.ptp(patterns[row], axis=axis).any() else 1 for axis in range(3)]
+            found.setdefault(tuple(kept), []).append(row)
+        return [(np.array(rows), patterns[rows][:, :bands, :subbands, :frames])
+                for (bands, subbands, frames), rows in found.items()]
 
     def derivatives(self, divided: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Return the derivatives of signals with respect to z, [N, Q, N_B, N_SB F].
@@ -137,7 +147,7 @@ class Nuisance(Exponents):
     """
 
     def __init__(self, scenario: Scenario, parts: Sequence[Linear]) -> None:
-        none = np.zeros((0, *_shape(scenario)), complex)
+        self.scenario, none = scenario, np.zeros((0, *_shape(scenario)), complex)
         self.patterns = read_only(np.concatenate([none, *(part.patterns for part in parts)]))
         scaled = np.concatenate([none, *(
             np.tensordot(part.root.T, part.patterns, axes=1) for part in parts)])

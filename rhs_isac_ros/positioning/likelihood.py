@@ -12,6 +12,7 @@ A `Conditional` evaluates the log-likelihood and its derivatives. The search, th
 tracker use this interface for all impairments and errors of elements.
 """
 
+import dataclasses
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -160,14 +161,20 @@ class Likelihood(Conditional):
 
     def whitened(self, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Divide signals by the factors of parameters [M, Q]; whiten them, [M, N_B, N_SB F]."""
+        return self.turned(values, self.still(values, signals))
+
+    def still(self, values: np.ndarray, signals: Signals) -> np.ndarray:
+        """Whiten signals without the factors of the parameters that move the multipath."""
+        moves = self.nuisance.moves_multipath
+        return self.model.whiten(self.nuisance.divide(
+            signals.received, values * moves)) if moves.any() else signals.whitened
+
+    def turned(self, values: np.ndarray, still: np.ndarray) -> np.ndarray:
+        """Remove the factors of all other parameters, which multiply whole bands."""
         if not len(self.nuisance):
-            return signals.whitened
-        moves, whitened = self.nuisance.moves_multipath, signals.whitened
-        if moves.any():
-            whitened = self.model.whiten(self.nuisance.divide(signals.received, values * moves))
-        # All other parameters multiply whole bands.
-        exponents = (values * ~moves) @ self.nuisance.scaled_patterns[:, :, 0]
-        return whitened * np.exp(-exponents)[..., None]
+            return still
+        others = values * ~self.nuisance.moves_multipath
+        return still * np.exp(-(others @ self.nuisance.scaled_patterns[:, :, 0]))[..., None]
 
     def weights_at(self, gains: np.ndarray) -> np.ndarray:
         """Return the factors of whitened measurements, [M, N_B, N_SB F]; without a gain, 1.
@@ -186,17 +193,28 @@ class Likelihood(Conditional):
             *self.nuisance.states(points, values, moves), whitened=True))
 
 
-class WhiteMeans(NamedTuple):
+@dataclasses.dataclass(eq=False)
+class WhiteMeans:
     """The likelihood at M points with one covariance."""
 
     likelihood: Likelihood
     mean: np.ndarray  # Whitened, complex128 [M, N_B, N_SB F].
     # Derivatives of `mean` with respect to point and velocity, [M, P + D, N_B, N_SB F].
     slopes: np.ndarray
+    # Latest parameters that move the multipath, and signals with and without their factors.
+    _latest: tuple[np.ndarray, Signals, np.ndarray] | None = None
+
+    def _whitened(self, values: np.ndarray, signals: Signals) -> np.ndarray:
+        """Return `Likelihood.whitened`; steps of the bands' phases alone change little of it."""
+        moving = values[:, self.likelihood.nuisance.moves_multipath]
+        if self._latest is None or self._latest[1] is not signals or not np.array_equal(
+                self._latest[0], moving):
+            self._latest = moving, signals, self.likelihood.still(values, signals)
+        return self.likelihood.turned(values, self._latest[2])
 
     def local(self, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate the likelihood; see `Located.local`."""
-        prior, whitened = self.likelihood.nuisance, self.likelihood.whitened(values, signals)
+        prior, whitened = self.likelihood.nuisance, self._whitened(values, signals)
         slopes = self.slopes.reshape(*self.slopes.shape[:2], self.mean[0].size)
         n_moving = prior.velocity.shape[1]
         by_point, by_velocity = np.split(slopes, [slopes.shape[1] - n_moving], axis=1)
@@ -220,7 +238,7 @@ class WhiteMeans(NamedTuple):
         """Compute the outputs of the bands' matched filters, complex128 [M, N_B]."""
         gains = values @ self.likelihood.nuisance.gains.T
         return np.sum(
-            self.mean.conj() * self.likelihood.whitened(values, signals)
+            self.mean.conj() * self._whitened(values, signals)
             * self.likelihood.weights_at(gains)**2, axis=2)
 
 

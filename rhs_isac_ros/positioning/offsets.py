@@ -4,10 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import blocks
-from rhs_isac_ros.model.gaussian import (
-    step_to_maximum,
-)
+from rhs_isac_ros.model.arrays import blocks, multiply_rows
+from rhs_isac_ros.model.gaussian import quadratic_form, step_to_maximum
 from rhs_isac_ros.positioning.likelihood import Likelihood
 
 
@@ -63,23 +61,18 @@ class Alignment:
             return np.zeros((len(received), len(self._prior)))
         if starts is None:
             starts = np.stack([self._best_on_grid(one) for one in received])
-        return np.stack([self._refined(*each) for each in zip(received, starts, strict=True)])
-
-    def _refined(self, received: np.ndarray, values: np.ndarray) -> np.ndarray:
-        prior, moves = self._prior, self._prior.moves_multipath
-        values = values.copy()
+        prior, moves, values = self._prior, self._prior.moves_multipath, starts.copy()
         for _ in range(_SEARCH.refinements):
-            divided = prior.divide(received, values)
-            residual = self._whitened(divided[None]).reshape(-1)
-            slopes = self._whitened(prior.scaled_patterns[moves] * divided)
-            slopes = slopes.reshape(len(slopes), -1)
+            divided = prior.divide(received, values)[:, None]
+            white = multiply_rows(self._whitener, np.concatenate(
+                [divided, prior.scaled_patterns[moves] * divided], axis=1))
+            products = quadratic_form(white.reshape(*white.shape[:2], -1))
             # With an unknown gain, the energy is normalised.
-            scale = residual.size / np.sum(np.abs(residual)**2) if prior.gain_std else 1.0
-            curvature = 2 * scale * (slopes.conj() @ slopes.T).real
-            curvature += np.diag(prior.precision[moves])
-            gradient = 2 * scale * (slopes.conj() @ residual).real
-            gradient -= prior.precision[moves] * values[moves]
-            values[moves] += step_to_maximum(curvature, gradient)
+            if prior.gain_std:
+                products *= 2 * white[0, 0].size / products[:, :1, :1]
+            values[:, moves] += step_to_maximum(
+                products[:, 1:, 1:] + np.diag(prior.precision[moves]),
+                products[:, 1:, 0] - prior.precision[moves] * values[:, moves])
         return values
 
     def _best_on_grid(self, received: np.ndarray) -> np.ndarray:
