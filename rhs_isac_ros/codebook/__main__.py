@@ -23,12 +23,12 @@ from rhs_isac_ros.codebook.band_plan import (
 )
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.codebook.objective import OBJECTIVES, SAMPLINGS
-from rhs_isac_ros.codebook.optimisations import restarted
 from rhs_isac_ros.codebook.optimize import (
     DEFAULT_POSITIONS,
     METHODS,
     OptimizeResult,
     optimize,
+    restarted,
 )
 from rhs_isac_ros.codebook.plot import plot_optimization
 from rhs_isac_ros.codebook.problem import Progress

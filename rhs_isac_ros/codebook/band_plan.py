@@ -17,8 +17,7 @@ import numpy as np
 from rhs_isac_ros.bounds import crlb_of, global_bound
 from rhs_isac_ros.bounds.range_ambiguity import range_confusion_error, range_confusion_error_of
 from rhs_isac_ros.codebook.codebook import Codebook
-from rhs_isac_ros.codebook.optimisations import optimisation, optimised, result_of
-from rhs_isac_ros.codebook.optimize import OptimizeResult
+from rhs_isac_ros.codebook.optimize import OptimizeResult, optimisation, optimised, result_of
 from rhs_isac_ros.codebook.unoptimised import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.impairments import nuisance_of

@@ -22,7 +22,7 @@ import numpy as np
 from rhs_isac_ros.codebook.cell import Cell
 from rhs_isac_ros.codebook.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.objective import OBJECTIVES, sobol
-from rhs_isac_ros.codebook.optimisations import optimisation, optimised, result_of
+from rhs_isac_ros.codebook.optimize import optimisation, optimised, result_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import numbers
 from rhs_isac_ros.support import streams

@@ -15,7 +15,7 @@ from scipy.special import chdtri
 from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import global_bound
 from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.codebook.optimisations import optimised
+from rhs_isac_ros.codebook.optimize import optimised
 from rhs_isac_ros.codebook.unoptimised import STARTS
 from rhs_isac_ros.experiments.sweep_settings import (
     FIELDS,
