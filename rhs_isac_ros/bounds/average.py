@@ -29,18 +29,10 @@ from rhs_isac_ros.model.elements import (
     error_terms,
 )
 from rhs_isac_ros.model.gaussian import quadratic_form
-from rhs_isac_ros.model.geometry import (
-    measurement_times_s,
-    region_information,
-    velocity_std_mps,
-)
+from rhs_isac_ros.model.geometry import measurement_times_s, region_information, velocity_std_mps
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import los_and_derivative
-from rhs_isac_ros.model.multipath import (
-    coupling,
-    declared_covariance,
-    measurement_correlation,
-)
+from rhs_isac_ros.model.multipath import coupling, declared_covariance, measurement_correlation
 from rhs_isac_ros.model.surface import NOMINAL, Beamforming, Response, ports_of
 from rhs_isac_ros.support.threads import one_blas_thread
 

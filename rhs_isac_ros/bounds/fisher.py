@@ -10,11 +10,7 @@ import numpy as np
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import blocks, checked_states
 from rhs_isac_ros.model.gaussian import Marginal, marginalise, quadratic_form
-from rhs_isac_ros.model.geometry import (
-    measurement_times_s,
-    region_information,
-    velocity_std_mps,
-)
+from rhs_isac_ros.model.geometry import measurement_times_s, region_information, velocity_std_mps
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread

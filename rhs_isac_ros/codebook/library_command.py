@@ -13,12 +13,7 @@ import numpy as np
 from rhs_isac_ros.codebook import library
 from rhs_isac_ros.codebook.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.support.arguments import (
-    ArgumentParser,
-    input_file,
-    output_file,
-    positive_float,
-)
+from rhs_isac_ros.support.arguments import ArgumentParser, input_file, output_file, positive_float
 from rhs_isac_ros.support.exits import finished
 from rhs_isac_ros.support.files import save_or_rescue
 from rhs_isac_ros.support.job_commands import add_run_options, unfinished

@@ -12,11 +12,7 @@ import numpy as np
 from rhs_isac_ros.model.arrays import checked_positions
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.geometry import (
-    element_normals,
-    element_positions,
-    subband_frequencies_hz,
-)
+from rhs_isac_ros.model.geometry import element_normals, element_positions, subband_frequencies_hz
 from rhs_isac_ros.model.scenario import Scenario
 
 # Minimum distance of the user from a boresight. On the boresight itself, the direction

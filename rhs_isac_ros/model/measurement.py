@@ -46,13 +46,7 @@ from rhs_isac_ros.model.geometry import (
     velocity_std_mps,
 )
 from rhs_isac_ros.model.impairments import draw_impairments, nuisance_of
-from rhs_isac_ros.model.los import (
-    Waves,
-    boresight_axes,
-    direct_gain,
-    draw_blocked,
-    los_waves,
-)
+from rhs_isac_ros.model.los import Waves, boresight_axes, direct_gain, draw_blocked, los_waves
 from rhs_isac_ros.model.multipath import (
     complex_normal,
     draw_multipath,

@@ -16,13 +16,7 @@ from parts.emulated_cycle import EmulatedLink
 
 from rhs_isac_ros.calibration.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.frontend import (
-    Air,
-    EmulatedRadio,
-    Radio,
-    Waveform,
-    WaveformRadio,
-)
+from rhs_isac_ros.frontend import Air, EmulatedRadio, Radio, Waveform, WaveformRadio
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.support.arguments import nonnegative_float
