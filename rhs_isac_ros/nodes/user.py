@@ -21,7 +21,7 @@ from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.ros.cdr import check_floats
-from rhs_isac_ros.ros.frames import vector
+from rhs_isac_ros.ros.convert import vector
 from rhs_isac_ros.ros.parameters import ODOMETRY, ROBOTS
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry

@@ -30,10 +30,15 @@ from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState, SceneUser
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, endpoints, parameters, topics
-from rhs_isac_ros.ros.frames import Frame, to_ros
+from rhs_isac_ros.ros.convert import to_ros
 from rhs_isac_ros.ros.node_surface import NodeSurface
 from rhs_isac_ros.ros.run import entry
-from rhs_isac_ros.ros.topics import RHS_FRAME, TF, TF_STATIC
+from rhs_isac_ros.ros.topics import RHS_FRAME, Frame
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # It has no wheel.
+    TFMessage = None
 
 # Opacity of translucent bodies.
 _ELLIPSOID, _OUTLINE, _MESH = 0.35, 0.15, 0.25
@@ -155,32 +160,6 @@ def transform(
                             rotation=to_ros(Quaternion, orientation)))
 
 
-class TransformPublisher:
-    """Publishes transforms; `available` is False if ``tf2_msgs``, which has no wheel, is missing.
-
-    The constructor publishes the static transform of the surface.
-    """
-
-    def __init__(self, node: Node, frame: Frame, pose: model.Pose) -> None:
-        try:
-            from tf2_msgs.msg import TFMessage
-        except ImportError:
-            self.available = False
-            return
-        self.available = True
-        self._message = TFMessage
-        self._dynamic = endpoints.create_publisher(node, TFMessage, TF, endpoints.EXCHANGE)
-        self._static = endpoints.create_publisher(node, TFMessage, TF_STATIC, endpoints.LATCHED)
-        self._static.publish(TFMessage(transforms=[
-            transform(frame, frame.surface, pose.origin, node.get_clock().now().to_msg(),
-                      pose.unit_quaternion)]))
-
-    def publish(self, transform: TransformStamped) -> None:
-        """Publish a transform that is not static, if transforms are `available`."""
-        if self.available:
-            self._dynamic.publish(self._message(transforms=[transform]))
-
-
 class VisualizerNode(Node):
     """Publishes the scene of a network as markers, paths and transforms."""
 
@@ -199,22 +178,30 @@ class VisualizerNode(Node):
             self, MarkerArray, topics.MARKERS, endpoints.EXCHANGE, overridable=True)
         self._paths = endpoints.UserTopics(
             self, {topics.PATH: Path, topics.TRUE_PATH: Path}, values.user_topics)
-        self._transforms = TransformPublisher(self, self._frame, self._scenario.pose)
+        if TFMessage:
+            self._transforms = endpoints.create_publisher(
+                self, TFMessage, topics.TF, endpoints.EXCHANGE)
+            pose = self._scenario.pose
+            endpoints.create_publisher(
+                self, TFMessage, topics.TF_STATIC, endpoints.LATCHED).publish(TFMessage(
+                    transforms=[transform(self._frame, self._frame.surface, pose.origin,
+                                          self.get_clock().now().to_msg(), pose.unit_quaternion)]))
         endpoints.subscribe_messages(self, SCENE_RECEIVES, self._scenario, self._on_message,
                                      on_foreign=lambda message: None)
         endpoints.steady_timer(self, values.period_s, self._show)
         self.get_logger().info(  # type: ignore[no-untyped-call]
             'serving: markers, paths' + (
-                ' and transforms' if self._transforms.available
+                ' and transforms' if TFMessage
                 else '; no transforms, because tf2_msgs is not installed'))
 
     def _on_message(self, message: m.Message, arrived_s: float) -> None:
         self._scene.add(message, arrived_s)
         # The number of frames is limited like the number of topics, because tf2 keeps every frame.
-        if isinstance(message, m.PositionEstimate) and self._paths.publishers(message.user):
-            self._transforms.publish(transform(
+        if TFMessage and isinstance(message, m.PositionEstimate) and self._paths.publishers(
+                message.user):
+            self._transforms.publish(TFMessage(transforms=[transform(
                 self._frame, self._frame.user(message.user), message.position,
-                convert.stamp_of(message, self)))
+                convert.stamp_of(message, self))]))
 
     def _show(self) -> float:
         """Publish all markers and paths, so that late joiners receive them.

@@ -18,9 +18,8 @@ from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol.events import PublishTrack
 from rhs_isac_ros.protocol.messages import Message, MessageError, PositionEstimate
 from rhs_isac_ros.protocol.presences import Presence
-from rhs_isac_ros.ros import cdr, frames
-from rhs_isac_ros.ros.frames import Frame
-from rhs_isac_ros.ros.topics import NAMES, RHS_FRAME
+from rhs_isac_ros.ros import cdr
+from rhs_isac_ros.ros.topics import NAMES, RHS_FRAME, Frame
 
 # Variance of an unknown angular velocity [rad^2/s^2], a value that ROS drivers often use.
 _UNKNOWN_ROTATION_VARIANCE = 1e6
@@ -94,6 +93,16 @@ def deserialize(content: bytes, kind: type) -> Any:
         raise MessageError(f'{kind.__name__}: {str(error).partition(",")[0]}') from error
 
 
+def vector(message: Any) -> np.ndarray:
+    """Return a point or a vector of ROS as an array [3]."""
+    return np.array([message.x, message.y, message.z])
+
+
+def to_ros(kind: Any, numbers: np.ndarray) -> Any:
+    """Return a point, vector or quaternion of ROS with the given x, y, z and (if any) w."""
+    return kind(**dict(zip('xyzw', numbers.tolist(), strict=False)))
+
+
 def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
     """Return the stamp of a message, or the current time of a node if the stamp is unknown."""
     if not message.stamp_ns:
@@ -107,7 +116,7 @@ def pose(estimate: PositionEstimate, stamp: Time, frame: Frame) -> PoseWithCovar
     Each rotation angle has the variance of a uniform distribution from -pi to pi.
     """
     result = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=frame.name))
-    result.pose.pose.position = frames.to_ros(Point, estimate.position)
+    result.pose.pose.position = to_ros(Point, estimate.position)
     result.pose.covariance = _with_rotation(estimate.covariance_m2, math.pi**2 / 3)
     return result
 
@@ -131,8 +140,8 @@ def true_odometry(
     """Return a true position [3] [m] and velocity [3] [m/s] as odometry without covariances."""
     result = Odometry(header=Header(stamp=stamp, frame_id=frame.name),
                       child_frame_id=frame.user(user))
-    result.pose.pose.position = frames.to_ros(Point, position)
-    result.twist.twist.linear = frames.to_ros(Vector3, velocity)
+    result.pose.pose.position = to_ros(Point, position)
+    result.twist.twist.linear = to_ros(Vector3, velocity)
     return result
 
 

@@ -22,11 +22,11 @@ from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.ros.diagnostics import make_reporter
-from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.node_surface import NodeSurface
 from rhs_isac_ros.ros.parameters import CODEBOOK, ParameterizedNode
 from rhs_isac_ros.ros.peers import Peers
 from rhs_isac_ros.ros.roster import MEMBERS
+from rhs_isac_ros.ros.topics import Frame
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import ParameterError
 

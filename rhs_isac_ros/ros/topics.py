@@ -1,6 +1,12 @@
-"""Names of topics, services and frames. Most topic names are relative to the namespace."""
+"""Names of topics, services and frames. Most topic names are relative to the namespace.
 
+Positions in messages are in the frame of the site, which the parameter ``frame_id`` names.
+"""
+
+import dataclasses
+import types
 from collections.abc import Mapping
+from typing import Any
 
 from rhs_isac_ros.protocol import messages as m
 
@@ -55,10 +61,37 @@ STEP = '~/step'
 
 # Node whose parameters hold the codebook.
 OPTIMIZER_NODE = 'optimizer'
-# Default of the parameter frame_id, the frame of the site, in which all positions are.
+# Default of the parameter frame_id.
 MAP_FRAME = 'map'
 # Frame of the surface, and of messages without positions: the origin is the centre of the surface,
 # x points outward and z points up. The namespace precedes this name and the next one.
 RHS_FRAME = 'rhs_link'
 # Frame at the estimated position of a user, with the axes of the frame frame_id.
 USER_FRAME = 'user_{user}'
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """The names of the frames of a site, of a surface and of its users."""
+
+    name: str = MAP_FRAME
+    # Prefix of the frames of the surface and the users: the namespace with a final slash, or ''.
+    prefix: str = ''
+
+    @classmethod
+    def of(cls, node: Any, values: types.SimpleNamespace) -> 'Frame':
+        """Return the frames given by ``frame_id`` and the namespace.
+
+        Nodes that publish no positions do not have the parameter.
+        """
+        return cls(getattr(values, 'frame_id', MAP_FRAME),
+                   f'{node.get_namespace().strip("/")}/'.lstrip('/'))
+
+    @property
+    def surface(self) -> str:
+        """Name of the frame of the surface."""
+        return f'{self.prefix}{RHS_FRAME}'
+
+    def user(self, number: int) -> str:
+        """Return the name of the frame of a user."""
+        return f'{self.prefix}{USER_FRAME.format(user=number)}'

@@ -62,7 +62,7 @@ from rhs_isac_ros.support.exits import on_end_signals, print_error
 from rhs_isac_ros.support.pictures import write_picture
 from rhs_isac_ros.support.texts import counted, text_table
 from rhs_isac_ros.tools.command import add_files, choose_scenario, entry
-from rhs_isac_ros.tools.pictures import compose_cycles, prepare_drawing
+from rhs_isac_ros.tools.pictures import compose_cycles
 
 # Maximum time between two complete cycles [s].
 _CYCLE_TIMEOUT_S = 60.0
@@ -438,8 +438,6 @@ def _observe(
     init(['demo'])
     with starting():
         observer = demonstration.observer(log)
-    # Use the time that the network takes to start.
-    prepare_drawing()
     try:
         problem = watch(observer, processes, cycles, _show_progress, stopped)
         # The executor may have processed further messages at once.

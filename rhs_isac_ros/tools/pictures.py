@@ -40,15 +40,6 @@ _PATTERN_STEP_DEG = 1.0
 _REGION: dict[str, Any] = {'facecolor': '0.95', 'edgecolor': '0.4', 'linestyle': '--'}
 
 
-def prepare_drawing() -> None:
-    """Import the libraries for the pictures, so that drawing does not have to wait for them."""
-    # Imported here, because the program has more urgent imports at its start.
-    from matplotlib import figure, patches, style
-    from matplotlib.backends import backend_agg
-
-    del figure, patches, style, backend_agg
-
-
 @paper_style()
 def compose_cycles(cycles: Sequence[CompleteCycle], scenario: Scenario) -> Any:
     """Return a `matplotlib.figure.Figure` of one or more cycles."""

@@ -20,8 +20,8 @@ from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.monitoring.shapes import Entry
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import endpoints, topics
+from rhs_isac_ros.ros.convert import vector
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
-from rhs_isac_ros.ros.frames import vector
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import RecordingError
 from rhs_isac_ros.support.arguments import (

@@ -17,8 +17,7 @@ from rhs_isac_ros.nodes.bs import LocateServer
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, endpoints
 from rhs_isac_ros.ros.endpoints import LATCHED
-from rhs_isac_ros.ros.frames import Frame
-from rhs_isac_ros.ros.topics import LOCATE
+from rhs_isac_ros.ros.topics import LOCATE, Frame
 
 PHASES = (m.Phase.POSITIONING, m.Phase.ESTIMATING)
 FRAME = Frame('odom')

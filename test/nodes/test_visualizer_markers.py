@@ -19,7 +19,7 @@ from rhs_isac_ros.nodes.visualizer import VisualizerNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED
-from rhs_isac_ros.ros.frames import Frame
+from rhs_isac_ros.ros.topics import Frame
 
 STAMP = Time(sec=3)
 

@@ -22,7 +22,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import MessageError
 from rhs_isac_ros.ros import cdr, convert, topics
 from rhs_isac_ros.ros.convert import CodebookMessage
-from rhs_isac_ros.ros.frames import Frame
+from rhs_isac_ros.ros.topics import Frame
 
 SIZES = Scenario().sizes
 STAMP = Time(sec=12, nanosec=345)
