@@ -8,7 +8,7 @@ The modules, in reading order:
 
 * `surface`: the interface, its faults, and the surface without hardware
 * `opensourceris`: the board Open Source RIS on a serial port
-* `opensourceris_emulator`: this board on a pseudo-terminal, with faults
+* `opensourceris_emulator`: this board on a pseudo-terminal
 * `waveform`: pilots as samples, synchronisation, and the sub-bands of a capture
 * `radio`: the interface, and the emulated radios
 * `sigmf_recording`: recordings of samples, and their playback

@@ -1,6 +1,5 @@
-"""An emulator of the board Open Source RIS on a pseudo-terminal, with faults for tests."""
+"""An emulator of the board Open Source RIS on a pseudo-terminal."""
 
-import fcntl
 import os
 import re
 import select
@@ -8,11 +7,9 @@ import tempfile
 import threading
 import time
 import tty
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
-
-from rhs_isac_ros.frontend.opensourceris import BAUD, to_configuration
+from rhs_isac_ros.frontend.opensourceris import BAUD
 
 BANNER = (b'\nOpen Source RIS\nFirmware version: 1.1\nSerial no.:   0\nRow count: 16\n'
           b'Column count: 16\n\n#READY!\n')
@@ -25,8 +22,6 @@ _VALID = {b'': re.compile(rb'[!?]'), b'!': re.compile(rb'[0-9A-Z=-]'), b'?': re.
 _BUFFER = 128
 # A character has a start bit, eight bits and a stop bit.
 _CHARACTER_S = 10 / BAUD
-
-BoardFault = Literal['silence', 'flipped bit', 'restart', 'late', 'closed', 'occupied']
 
 
 class Firmware:
@@ -68,32 +63,15 @@ class Firmware:
 class EmulatedBoard:
     """The board on a pseudo-terminal, whose path `port` stays the same; use it as a context.
 
-    Parameters
-    ----------
-    is_paced : bool
-        Whether characters and a restart take as long as with the real board.
-
-    Attributes
-    ----------
-    faults : dict[int, BoardFault]
-        Faults by the number of the pattern, from 0, at which they occur. ``silence``: the board
-        loses the command. ``flipped bit``: it receives another bit. ``restart``: it restarts.
-        ``late``: it answers together with the next command. ``closed``: the port disappears,
-        until `plug`. ``occupied``: likewise, and another process opens the port first.
-    n_patterns : int
-        Number of commands for a pattern so far.
+    Characters and a restart take as long as with the real board.
     """
 
-    def __init__(self, is_paced: bool = True) -> None:
-        self.faults: dict[int, BoardFault] = {}
-        self.n_patterns = 0
-        self._is_paced = is_paced
+    def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix='rhs_isac_ros.')
         self.port = os.path.join(self._folder.name, 'opensourceris')
         self._firmware = Firmware()
-        self._late = b''
         self._thread: threading.Thread | None = None
-        # The thread closes files at a fault, another thread when the board is unplugged.
+        # The thread may close the files at a fault, another thread when the board is unplugged.
         self._lock = threading.Lock()
         self._files: list[int] = []
 
@@ -107,15 +85,10 @@ class EmulatedBoard:
         self.unplug()
         self._folder.cleanup()
 
-    @property
-    def configuration(self) -> np.ndarray:
-        """What the elements show, float64 [256] of 0 and 1."""
-        return to_configuration(self._firmware.pattern)
-
     def plug(self) -> None:
-        """Start the board with a new port; this ends the faults ``closed`` and ``occupied``."""
+        """Start the board with a new port."""
         self.unplug()
-        self._firmware, self._late = Firmware(), b''
+        self._firmware = Firmware()
         self._open()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
@@ -129,21 +102,18 @@ class EmulatedBoard:
             self._thread.join()
         self._close()
 
-    def send(self, text: bytes) -> None:
-        """Send text that no command asked for."""
-        os.write(self._board, text)
-
-    def _open(self, is_occupied: bool = False) -> None:
+    def _open(self) -> None:
         self._board, host = os.openpty()
         self._stopped, self._stop = os.pipe()
         tty.setraw(host)
         # While this process keeps the terminal open, a driver can close and open it.
         self._files = [self._board, host, self._stopped, self._stop]
-        if is_occupied:
-            self._files.append(os.open(os.ttyname(host), os.O_RDWR | os.O_NOCTTY))
-            fcntl.flock(self._files[-1], fcntl.LOCK_EX)
-        # Last, because a driver opens the port as soon as it exists. It may replace another one.
-        os.symlink(os.ttyname(host), f'{self.port}.new')
+        # Last, because a driver opens the port as soon as it exists.
+        self._offer(os.ttyname(host))
+
+    def _offer(self, terminal: str) -> None:
+        """Let the port lead to a terminal, perhaps instead of another one."""
+        os.symlink(terminal, f'{self.port}.new')
         os.replace(f'{self.port}.new', self.port)
 
     def _close(self) -> None:
@@ -177,36 +147,10 @@ class EmulatedBoard:
                 os.write(self._board, answer)
 
     def _stops_before(self, time_s: float) -> bool:
-        """Wait until a time, if the board is paced; return whether it is unplugged before."""
-        remaining_s = max(time_s - time.monotonic(), 0) if self._is_paced else 0
+        """Wait until a time; return whether the board is unplugged before."""
+        remaining_s = max(time_s - time.monotonic(), 0)
         return bool(select.select([self._stopped], [], [], remaining_s)[0])
 
     def _receive(self, character: bytes) -> bytes | None:
-        """Return the answer of the firmware with the faults, or None if the port is closed."""
-        firmware, fault = self._firmware, None
-        if character == b'\n' and _COMMAND.fullmatch(firmware.line):
-            fault = self.faults.get(self.n_patterns)
-            self.n_patterns += 1
-        if fault == 'closed':
-            self._close()
-            return None
-        if fault == 'occupied':
-            with self._lock:
-                before = self._files
-                self._open(is_occupied=True)
-            # The driver notices this, and finds the new port.
-            for file in before:
-                os.close(file)
-            return None
-        if fault == 'silence':
-            firmware.line = b''
-        elif fault == 'flipped bit':
-            firmware.line = firmware.line[:-1] + b'%X' % (int(firmware.line[-1:], 16) ^ 1)
-        elif fault == 'restart':
-            firmware.line = b'!RESET'
-        answer = firmware.receive(character)
-        if fault == 'late':
-            self._late, answer = answer, b''
-        elif answer and self._late:
-            self._late, answer = b'', self._late + answer
-        return answer
+        """Return the answer of the firmware; None if the port has been closed."""
+        return self._firmware.receive(character)

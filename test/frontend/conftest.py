@@ -1,9 +1,9 @@
 """The emulated board without pauses, and its driver."""
 
 import pytest
+from faulty_board import FaultyBoard
 
 from rhs_isac_ros.frontend import OpenSourceRis
-from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 
 # No answer of the emulated board takes as long, even on a busy machine.
 TIMEOUT_S = 0.5
@@ -11,7 +11,7 @@ TIMEOUT_S = 0.5
 
 @pytest.fixture
 def board():
-    with EmulatedBoard(is_paced=False) as board:
+    with FaultyBoard() as board:
         yield board
 
 

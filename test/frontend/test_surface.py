@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from faulty_board import FaultyBoard
 
 from rhs_isac_ros.frontend import SURFACES, Surface, make_surface
-from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import parse_options
 
@@ -26,7 +26,7 @@ def contract(request):
         surface = make_surface('emulated', 12)
         yield surface, lambda: surface.applied
     else:
-        with EmulatedBoard(is_paced=False) as board:
+        with FaultyBoard() as board:
             surface = make_surface(request.param, 256, port=board.port, timeout_s=0.5)
             yield surface, lambda: board.configuration
             surface.close()

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from faulty_board import FaultyBoard
 from rclpy.node import Node
 from ros_messages import to_ros
 
 from rhs_isac_ros.frontend import OpenSourceRis, SurfaceFault
-from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.channel import ChannelNode
 from rhs_isac_ros.protocol import messages as m
@@ -18,7 +18,7 @@ FILE = 'n_subbands: 1\nn_frames: 3\nn_feeds: 1\nelements_per_side: 16\n'
 
 @pytest.fixture
 def board():
-    with EmulatedBoard(is_paced=False) as board:
+    with FaultyBoard() as board:
         yield board
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import yaml
+from faulty_board import FaultyBoard
 from rclpy.node import Node
 
 from rhs_isac_ros.codebook import random_codebook
-from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 
@@ -17,7 +17,7 @@ SCENARIO = Scenario(
 
 @pytest.fixture(scope='module')
 def board():
-    with EmulatedBoard() as board:
+    with FaultyBoard(is_paced=True) as board:
         yield board
 
 
