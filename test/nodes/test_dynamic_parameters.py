@@ -44,7 +44,7 @@ class Running:
 def running(make_watch, module_processes, small_files):
     # Without a pause, cycles are faster than the observer. On a busy machine, steps take long.
     process = module_processes.start(
-        'network', namespace=f'/{NAMESPACE}', users=2, rest_s=0.02, retries=39,
+        'network', namespace=f'/{NAMESPACE}', users=2, rest_s=0.05, retries=39,
         step_timeout_s=10.0,
         scenario_file=small_files / 'scenario.yaml',
         codebook_file=small_files / 'first.yaml')
@@ -53,11 +53,11 @@ def running(make_watch, module_processes, small_files):
     return running
 
 
-@pytest.fixture(scope='module')
-def other(make_watch, module_processes, small_files):
+@pytest.fixture
+def other(make_watch, processes, small_files):
     """Another network, with one user, another seed and the second codebook."""
-    process = module_processes.start(
-        'network', namespace='/other', users=1, seed=2, rest_s=0.02,
+    process = processes.start(
+        'network', namespace='/other', users=1, seed=2, rest_s=0.05,
         scenario_file=small_files / 'scenario.yaml', codebook_file=small_files / 'second.yaml')
     return types.SimpleNamespace(process=process, watch=make_watch('/other'))
 

@@ -43,7 +43,7 @@ def test_two_robots_are_located_in_the_map(mobility, processes, make_watch, tmp_
     space = f'/robots_{mobility}'
     watch = make_watch(space)
     network = processes.start(
-        'network', *files, namespace=space, rest_s=0.0, scenario_file=EXAMPLES / 'wall.yaml',
+        'network', *files, namespace=space, rest_s=0.1, scenario_file=EXAMPLES / 'wall.yaml',
         codebook_file=EXAMPLES.parents[1] / 'config' / 'codebook_bandplan.yaml')
     output = tmp_path / 'output.txt'
     with output.open('w', encoding='utf-8') as stream, subprocess.Popen(

@@ -112,7 +112,7 @@ class Running:
         for role, member in ROSTER.items():
             if member.is_unique:
                 self.start('/front', role, **(
-                    {'rest_s': 0.02, 'retries': 39, **STEPS} if role == 'bs' else {}))
+                    {'rest_s': 0.1, 'retries': 39, **STEPS} if role == 'bs' else {}))
         self.start('/front', 'user', name='users', user_count=N_USERS, mobility='random_walk',
                    speed_mps=1.0, **STEPS)
 
@@ -257,7 +257,7 @@ def recorded(running, built_scripts, tmp_path_factory):
             lambda: all('recorder' in [one.node_name for one in
                         running.fused.node.get_subscriptions_info_by_topic(f'{space}/presence')]
                         for space in ('', '/front', '/side')), 'the recorder')
-        estimates = running.until_fused(BOTH, 4 * N_USERS)
+        estimates = running.until_fused(BOTH, 2 * N_USERS)
         process.send_signal(signal.SIGINT)
         output = process.communicate(timeout=60)[0]
     assert process.returncode == 0, output
@@ -365,12 +365,12 @@ def test_a_surface_that_has_moved_is_named_and_its_pose_is_found(
     # The fusion draws them between cycles.
     assert running.front.set_parameters('bs', {'rest_s': 0.5}).successful
     running.until(lambda: reports and 'agreement.front.side' in reports[-1], 'the references')
-    assert running.front.set_parameters('bs', {'rest_s': 0.02}).successful
+    assert running.front.set_parameters('bs', {'rest_s': 0.1}).successful
     assert 'warning.poses' not in reports[-1]
     assert running.side.set_parameters('channel', {'surface_shift_m': 0.3}).successful
     running.until_fused(BOTH, 2)
     done = subprocess.run(
-        [ROOT / 'scripts' / 'calibrate', '--site', running.site_file, '--cycles', '40',
+        [ROOT / 'scripts' / 'calibrate', '--site', running.site_file, '--cycles', '24',
          '--output', tmp_path / 'found.yaml'], capture_output=True, text=True, timeout=120,
         check=False)
     assert (done.returncode, done.stderr) == (0, '')
