@@ -104,6 +104,11 @@ class NuisancePrior(Exponents):
         self.noise_share = self.scenario.noise_power_w * float(
             np.sum(np.abs(model.whitener)**2, axis=2).max())
 
+    @property
+    def _turns_together(self) -> bool:
+        """Whether the search compares the bands as if all phases were off by the same angle."""
+        return not self.is_coarse and not self.relative_phase_std_rad
+
     @functools.cached_property
     def gain(self) -> np.ndarray:
         """Gain of all signals per unit [nepers], float64 [Q]."""
@@ -234,7 +239,7 @@ class NuisancePrior(Exponents):
 
     def amplitude(self, outputs: np.ndarray) -> np.ndarray:
         """Add up the bands' matched-filter outputs, [N_B, ...], rotated as in `_in_phase`."""
-        if not self.relative_phase_std_rad:
+        if self._turns_together:
             return _in_phase(outputs.sum(axis=0), float(self.phase_std_rad[0]))
         parts = [_in_phase(output, float(std))
                  for output, std in zip(outputs, self.phase_std_rad, strict=True)]
@@ -270,7 +275,7 @@ class NuisancePrior(Exponents):
     def start(self, outputs: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Return initial parameters [M, Q] for filter outputs [N_B, M] and gains [M] [nepers]."""
         angles = np.angle(outputs)
-        if not self.relative_phase_std_rad:
+        if self._turns_together:
             angles = np.broadcast_to(np.angle(outputs.sum(axis=0)), angles.shape)
         # Phases without a prior follow the angles; the others share the rest by their variance.
         variance = np.where(self.precision > 0, 1.0, 1e6)

@@ -62,6 +62,17 @@ def test_positions_and_velocities_are_in_their_regions(walking):
     assert np.sqrt(np.mean(errors[:, 2:]**2)) < 0.3
 
 
+@pytest.mark.parametrize('std_rad', [0.0, 2 * np.pi], ids=['known', 'unknown'])
+def test_the_search_compares_no_phases_of_bands(std_rad):
+    """The range, and with it the phases, changes by wavelengths within a cycle."""
+    prior = Likelihood(system_of(band_phase_std_rad=std_rad)).nuisance
+    rng, shape = np.random.default_rng(1), (len(prior.phases), 5)
+    outputs = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+    np.testing.assert_allclose(prior.amplitude(outputs), np.abs(outputs).sum(axis=0))
+    turns = prior.phases @ prior.start(outputs, np.zeros(5)).T
+    np.testing.assert_allclose(np.exp(1j * turns), outputs / np.abs(outputs))
+
+
 @pytest.mark.slow
 def test_users_who_walk_are_located_with_known_phases_of_bands():
     system, rng = system_of(band_phase_std_rad=0.0), np.random.default_rng(2)
