@@ -20,16 +20,14 @@ from rhs_isac_ros.calibration.estimate import (
 )
 from rhs_isac_ros.calibration.mixture import SurfacePrior
 from rhs_isac_ros.model import MeasurementModel, Scenario, SurfaceEstimate
-from rhs_isac_ros.model.arrays import check_arrays, numbers, read_only
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import energy_limit
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import ArchiveError, read_archive, read_once, write_archive
 
 _FORMAT = 1
-# Arrays in a file with their types, and standard deviations, which are only for human readers.
-_ARRAYS = {'gains': complex, 'offsets': complex, 'band_gains': complex, 'factor': complex,
-           'failed_probability': float}
+# Arrays in a file, and standard deviations, which are only for human readers.
+_ARRAYS = tuple(field.name for field in dataclasses.fields(SurfaceEstimate))
 _DEVIATIONS = ('gains_std', 'offsets_std', 'band_gains_std')
 # Number of working elements that a report lists.
 _N_WORST = 5
@@ -45,10 +43,7 @@ class CalibrationError(ValueError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Calibration:
-    """An estimate of a surface, the scenario to which it applies, and a record of its origin.
-
-    Raises CalibrationError if sizes disagree, or a number is not finite or not a probability.
-    """
+    """An estimate of a surface, the scenario to which it applies, and a record of its origin."""
 
     surface: SurfaceEstimate  #: The estimate, as used by estimators, bounds and beams.
     scenario_id: str  #: `Scenario.id` without pose, files of the hall and movement of users.
@@ -57,22 +52,6 @@ class Calibration:
     #: estimation, and whether it ``converged``; ``warnings``; ``version``. The record of known
     #: ``states`` has no estimation.
     about: dict[str, Any]
-
-    def __post_init__(self) -> None:
-        """Check sizes and numbers, and make the arrays read-only."""
-        n_elements, n_bands = np.size(self.surface.gains), np.size(self.surface.band_gains)
-        rank = (*np.shape(self.surface.factor), 0, 0)[1]
-        check_arrays(self.surface, {
-            'gains': (n_elements,), 'offsets': (n_elements,), 'band_gains': (n_bands,),
-            'factor': (2 * n_elements + n_bands, rank), 'failed_probability': (n_elements,),
-        }, CalibrationError)
-        for name in _ARRAYS:
-            read_only(getattr(self.surface, name))
-        probability = self.surface.failed_probability
-        if n_elements and not (0 <= probability.min() and probability.max() <= 1):
-            raise CalibrationError(
-                f'failed_probability: {probability.min():g} to {probability.max():g}, expected '
-                '0 to 1')
 
     @property
     def id(self) -> str:
@@ -110,9 +89,7 @@ class Calibration:
         with translated(ArchiveError, CalibrationError):
             arrays, about = read_archive(path, 'calibration', _FORMAT, {*_ARRAYS, *_DEVIATIONS})
         with translated((TypeError, ValueError), CalibrationError, path):
-            surface = SurfaceEstimate(**{
-                name: numbers(name, arrays[name], kind, finite=False)
-                for name, kind in _ARRAYS.items()})
+            surface = SurfaceEstimate(**{name: arrays[name] for name in _ARRAYS})
             return cls(surface, str(about.pop('scenario_id', '')), about)
 
 

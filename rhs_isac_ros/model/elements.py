@@ -23,7 +23,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import adjoint, blocks, digest, gauss_legendre, numbers, read_only
+from rhs_isac_ros.model.arrays import (
+    adjoint,
+    blocks,
+    check_arrays,
+    digest,
+    gauss_legendre,
+    numbers,
+    read_only,
+)
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import (
     complex_normal,
@@ -153,7 +161,10 @@ class DeclaredElements(SurfaceModel):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SurfaceEstimate(SurfaceModel):
-    """Mean and covariance of the coefficients of a surface, ``gain c + offset``."""
+    """Mean and covariance of the coefficients of a surface, ``gain c + offset``.
+
+    Raises ValueError if sizes disagree, or a number is not finite or not a probability.
+    """
 
     gains: np.ndarray  #: Expected gains of the elements, complex128 [N_E].
     offsets: np.ndarray  #: Expected offsets of the elements, complex128 [N_E].
@@ -164,11 +175,20 @@ class SurfaceEstimate(SurfaceModel):
     failed_probability: np.ndarray  #: Probability that each element has failed, float64 [N_E].
 
     def __post_init__(self) -> None:
-        """Raise ValueError unless the arrays contain finite numbers."""
+        """Copy and check the arrays, and make them read-only."""
         for field in dataclasses.fields(self):
             kind = float if field.name == 'failed_probability' else complex
-            object.__setattr__(
-                self, field.name, numbers(field.name, getattr(self, field.name), kind))
+            array = numbers(field.name, getattr(self, field.name), kind)
+            object.__setattr__(self, field.name, read_only(array.copy('K')))
+        n_elements, n_bands, probability = (
+            self.gains.size, self.band_gains.size, self.failed_probability)
+        check_arrays(self, {
+            'gains': (n_elements,), 'offsets': (n_elements,), 'band_gains': (n_bands,),
+            'factor': (2 * n_elements + n_bands, (*self.factor.shape, 0, 0)[1]),
+            'failed_probability': (n_elements,)})
+        if n_elements and not (0 <= probability.min() and probability.max() <= 1):
+            raise ValueError(f'failed_probability: {probability.min():g} to '
+                             f'{probability.max():g}, expected 0 to 1')
 
     @property
     def is_exact(self) -> bool:
