@@ -20,10 +20,10 @@ from rhs_isac_ros.protocol.events import Event, LogMessage, Outcome, Timeout
 from rhs_isac_ros.protocol.following import Proposals
 from rhs_isac_ros.protocol.handover import Carriers, Steering
 from rhs_isac_ros.protocol.role import ANY, AnyRow, Drops, Row, on
-from rhs_isac_ros.protocol.service_log import ServiceLog, join_users
+from rhs_isac_ros.protocol.service_log import ServiceLog
 from rhs_isac_ros.protocol.settings import BaseStationSettings, PendingSettings
 from rhs_isac_ros.protocol.user_registry import UserRegistry
-from rhs_isac_ros.support.texts import counted
+from rhs_isac_ros.support.texts import counted, listed
 
 
 class BsState(enum.Enum):
@@ -349,7 +349,7 @@ class BaseStation(SignalCollector):
             ((user, instance),) = lost.items()
             self.log(f'user {user} no longer answers', True, f'lost {user} {instance}')
         elif lost:
-            self.log(f'users {join_users(lost)} no longer answer', True, 'lost')
+            self.log(f'users {listed(lost)} no longer answer', True, 'lost')
 
     def _command_bands(self, event: Event) -> None:
         self._command(sorted(self._bands - self._cycle.configured))

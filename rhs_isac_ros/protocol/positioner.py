@@ -31,10 +31,9 @@ from rhs_isac_ros.protocol.events import EstimatorBuilt, Event, Outcome
 from rhs_isac_ros.protocol.following import proposal
 from rhs_isac_ros.protocol.fusion import posterior_of
 from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, Role
-from rhs_isac_ros.protocol.service_log import MAX_NAMED
 from rhs_isac_ros.protocol.settings import TRACK, PendingSettings, PositionerSettings
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
-from rhs_isac_ros.support.texts import counted
+from rhs_isac_ros.support.texts import MAX_LISTED, counted
 from rhs_isac_ros.system import System
 
 
@@ -173,9 +172,9 @@ class ResidualWatch:
     def _describe(self) -> str:
         users = sorted(user for user, monitor in self._users.items() if monitor.drifts)
         parts = [_deviation('', self._all)] if self._all.drifts else []
-        parts += [_deviation(f'user {user}: ', self._users[user]) for user in users[:MAX_NAMED]]
-        if len(users) > MAX_NAMED:
-            parts.append(counted(len(users) - MAX_NAMED, 'more user'))
+        parts += [_deviation(f'user {user}: ', self._users[user]) for user in users[:MAX_LISTED]]
+        if len(users) > MAX_LISTED:
+            parts.append(counted(len(users) - MAX_LISTED, 'more user'))
         return f'the signals do not match the scenario: {"; ".join(parts)}' if parts else ''
 
 

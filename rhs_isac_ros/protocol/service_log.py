@@ -1,24 +1,13 @@
 """What a base station logs about its service: users, what it lacks, and outages."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from rhs_isac_ros.protocol.events import LogMessage, Outcome
 from rhs_isac_ros.protocol.role import NewestDict
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
-from rhs_isac_ros.support.texts import counted
 
 # Reasons for a lost cycle that concern one user. All others concern the whole network.
 _USER_REASONS = (Outcome.USER_GONE, Outcome.NO_FIX)
-# Maximum number of users that a message lists.
-MAX_NAMED = 8
-
-
-def join_users(users: Iterable[int]) -> str:
-    """Return user numbers as text, such as ``1, 2``; after `MAX_NAMED`, only count the others."""
-    names = [str(user) for user in users]
-    n_others = len(names) - MAX_NAMED
-    others = f' and {counted(n_others, "other")}' if n_others > 0 else ''
-    return f'{", ".join(names[:MAX_NAMED])}{others}'
 
 
 class ServiceLog:

@@ -1,7 +1,10 @@
-"""Texts for people: tables for a terminal and in Markdown, and numbers of things."""
+"""Texts for people: tables for a terminal and in Markdown, lists, and numbers of things."""
 
 import itertools
 from collections.abc import Iterable, Sequence
+
+# Maximum number of things that a text lists.
+MAX_LISTED = 8
 
 
 def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> str:
@@ -27,3 +30,11 @@ def _aligned(lines: Sequence[Sequence[str]], align: str) -> list[list[str]]:
 def counted(number: int, thing: str) -> str:
     """Return a number of things, such as ``1 user`` or ``2 users``."""
     return f'{number} {thing}{"s" * (number != 1)}'
+
+
+def listed(things: Iterable[object]) -> str:
+    """Return things as text, such as ``1, 2``; after `MAX_LISTED`, only count the others."""
+    names = list(map(str, things))
+    n_others = len(names) - MAX_LISTED
+    others = f' and {counted(n_others, "other")}' if n_others > 0 else ''
+    return f'{", ".join(names[:MAX_LISTED])}{others}'

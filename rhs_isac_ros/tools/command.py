@@ -1,6 +1,7 @@
 """What all commands use: their entry point, nodes, recordings and tables."""
 
 import argparse
+import functools
 import os
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -114,9 +115,8 @@ def fill_in(options: argparse.Namespace) -> None:
                 setattr(options, option, path)
 
 
-def print_now(*values: object, end: str = '\n') -> None:
-    """Print and flush, so that the reader of a pipe receives the text at once."""
-    print(*values, end=end, flush=True)
+#: Prints and flushes, so that the reader of a pipe receives the text at once.
+print_now = functools.partial(print, flush=True)
 
 
 def none_within(what: str, timeout_s: float) -> ToolError:

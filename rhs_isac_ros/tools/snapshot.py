@@ -11,11 +11,11 @@ from rclpy.node import Node
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.service_log import join_users
 from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float, picture_file
 from rhs_isac_ros.support.pictures import write_picture
+from rhs_isac_ros.support.texts import listed
 from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.command import ToolError
 from rhs_isac_ros.tools.pictures import compose_scene
@@ -102,7 +102,7 @@ def _missing(scene: SceneState) -> list[str]:
         parts.append('a data beam')
     users = scene.without_estimate
     if users:
-        parts.append(f'estimates of {len(users)} of {len(scene.users)} users: {join_users(users)}')
+        parts.append(f'estimates of {len(users)} of {len(scene.users)} users: {listed(users)}')
     return parts
 
 

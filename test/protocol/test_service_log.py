@@ -3,7 +3,7 @@
 import pytest
 
 from rhs_isac_ros.protocol.events import LogMessage, Outcome
-from rhs_isac_ros.protocol.service_log import ServiceLog, join_users
+from rhs_isac_ros.protocol.service_log import ServiceLog
 
 
 class Service(ServiceLog):
@@ -102,11 +102,3 @@ def test_lost_users_are_logged_in_one_message(network):
             net.remove(f'user{user}')
         net.run_cycles(6)
     assert net.logged('bs') == ['user 4 no longer answers', 'users 2, 3 no longer answer']
-
-
-@pytest.mark.parametrize(('users', 'text'), [
-    ([4, 9], '4, 9'), (range(1, 9), '1, 2, 3, 4, 5, 6, 7, 8'),
-    (range(1, 10), '1, 2, 3, 4, 5, 6, 7, 8 and 1 other'),
-    (range(1, 21), '1, 2, 3, 4, 5, 6, 7, 8 and 12 others')])
-def test_a_list_names_few_users_and_counts_the_others(users, text):
-    assert join_users(users) == text

@@ -1,6 +1,8 @@
-"""Tables and numbers of things."""
+"""Tables, lists and numbers of things."""
 
-from rhs_isac_ros.support.texts import counted, markdown_table, text_table
+import pytest
+
+from rhs_isac_ros.support.texts import counted, listed, markdown_table, text_table
 
 
 def test_a_text_table_has_heads_of_several_lines():
@@ -16,3 +18,11 @@ def test_a_table_is_aligned_markdown():
 
 def test_one_thing_is_singular():
     assert [counted(number, 'user') for number in (0, 1, 2)] == ['0 users', '1 user', '2 users']
+
+
+@pytest.mark.parametrize(('users', 'text'), [
+    ([4, 9], '4, 9'), (range(1, 9), '1, 2, 3, 4, 5, 6, 7, 8'),
+    (range(1, 10), '1, 2, 3, 4, 5, 6, 7, 8 and 1 other'),
+    (range(1, 21), '1, 2, 3, 4, 5, 6, 7, 8 and 12 others')])
+def test_a_list_names_few_users_and_counts_the_others(users, text):
+    assert listed(users) == text
