@@ -91,11 +91,11 @@ CALLS = [
     ('tools.snapshot', ['--timeout', '-1'], '-1.0, expected at least 0'),
     ('tools.snapshot', ['--config', QUICK_CODEBOOK], 'unknown field'),
     ('tools.watch', ['--once', 'twice'], 'unrecognized arguments: twice'),
-    ('tools.topic', ['show'], "invalid choice: 'show'"),
-    ('tools.topic', ['echo'], 'required: topic_name'),
-    ('tools.topic', ['list', '--spin-time', 'nan'], 'nan, expected at least 0'),
-    ('tools.param', ['get', 'bs'], 'required: parameter_name'),
-    ('tools.param', ['list', '--timeout', 'x'], 'expected a number, at least 0'),
+    ('parts.topic', ['show'], "invalid choice: 'show'"),
+    ('parts.topic', ['echo'], 'required: topic_name'),
+    ('parts.topic', ['list', '--spin-time', 'nan'], 'nan, expected at least 0'),
+    ('parts.param', ['get', 'bs'], 'required: parameter_name'),
+    ('parts.param', ['list', '--timeout', 'x'], 'expected a number, at least 0'),
     ('codebook.__main__', ['--output', '.'], '.: a directory, expected a file'),
     ('codebook.__main__', ['--plot', 'p.xyz'], 'ends in .png, .pdf, .svg'),
     ('codebook.__main__', ['--output', 'a.pdf', '--plot', 'a.pdf'], 'a file other than --output'),
@@ -160,6 +160,12 @@ def exit_code(main, arguments):
         return exit.code
 
 
+def main_of(module):
+    """The main function of a module of the package, or of the parts of scripts."""
+    return importlib.import_module(
+        module if module.startswith('parts.') else f'rhs_isac_ros.{module}').main
+
+
 def assert_one_line(errors, expected):
     assert 'Traceback' not in errors
     assert len(errors.splitlines()) == 1, errors
@@ -171,7 +177,7 @@ def test_a_bad_call_prints_one_line_and_starts_and_changes_nothing(
         module, arguments, expected, folder, monkeypatch, capfd):
     def refuse(*args, **options):
         raise AssertionError('the command starts')
-    main = importlib.import_module(f'rhs_isac_ros.{module}').main
+    main = main_of(module)
     before = contents(folder)
     with monkeypatch.context() as patch:
         patch.setattr(subprocess, 'Popen', refuse)
@@ -184,11 +190,11 @@ def test_a_bad_call_prints_one_line_and_starts_and_changes_nothing(
     assert contents(folder) == before
 
 
-@pytest.mark.parametrize('module', ['nodes.bs', 'tools.demo', 'tools.topic'])
+@pytest.mark.parametrize('module', ['nodes.bs', 'tools.demo', 'parts.topic'])
 def test_an_invalid_domain_is_an_error(module, monkeypatch, capfd):
     monkeypatch.setenv('ROS_DOMAIN_ID', '233')
-    main = importlib.import_module(f'rhs_isac_ros.{module}').main
-    assert exit_code(main, ['list'] if module == 'tools.topic' else []) == 2
+    main = main_of(module)
+    assert exit_code(main, ['list'] if module == 'parts.topic' else []) == 2
     assert_one_line(capfd.readouterr().err, "ROS_DOMAIN_ID: '233', expected an integer")
 
 

@@ -86,8 +86,8 @@ def test_any_other_name_is_an_attribute_error(name):
 
 @pytest.mark.parametrize(('call', 'module'), [
     ('executables.bs()', 'nodes.bs'),
-    ("sys.argv = ['', 'topic']; runpy.run_module('rhs_isac_ros.tools', run_name='__main__')",
-     'tools.topic')])
+    ("sys.argv = ['', 'watch']; runpy.run_module('rhs_isac_ros.tools', run_name='__main__')",
+     'tools.watch')])
 def test_a_signal_during_the_imports_ends_the_process_without_a_traceback(call, module):
     code = f"""
 import importlib, runpy, signal, sys

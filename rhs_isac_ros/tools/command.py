@@ -23,8 +23,7 @@ from rhs_isac_ros.ros import convert, diagnostics, endpoints, topics
 from rhs_isac_ros.ros.endpoints import subscribe
 from rhs_isac_ros.ros.environment import check_environment
 from rhs_isac_ros.ros.recording import RecordingError, read, read_networks
-from rhs_isac_ros.ros.run import StartError, parse, spin, starting
-from rhs_isac_ros.ros.session import Session
+from rhs_isac_ros.ros.run import StartError, parse, spin
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import check_distinct, input_file
 from rhs_isac_ros.support.errors import translated
@@ -202,17 +201,3 @@ def recorded(
                 message: m.Message = convert.from_bytes(kind, content)
                 m.check(message, scenario)
                 yield message, time_s
-
-
-def run_verb(options: argparse.Namespace, arguments: list[str]) -> int:
-    """Call ``options.verb`` with a session and the options, and return the exit code.
-
-    As in ``ros2``, errors do not start with the name of the program.
-    """
-    try:
-        with Session(arguments) as session, starting():
-            options.verb(session, options)
-    except ToolError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0

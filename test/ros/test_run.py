@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 from ament_index_python.packages import get_package_prefix
+from parts import param, topic
 from rclpy.exceptions import InvalidNodeNameException, InvalidTopicNameException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -18,7 +19,6 @@ from std_msgs.msg import Empty
 from rhs_isac_ros.ros import run
 from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.run import StartError
-from rhs_isac_ros.tools import param, topic
 
 PROGRAMS = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros'
 
@@ -185,7 +185,7 @@ def test_a_tool_that_is_refused_a_topic_or_a_service_ends_with_one_line(
         return condition()
     session = SimpleNamespace(node=node, spin_until=spin_until)
     monkeypatch.setattr(
-        'rhs_isac_ros.tools.command.Session', lambda arguments: contextlib.nullcontext(session))
+        'parts.verbs.Session', lambda arguments: contextlib.nullcontext(session))
     assert main(arguments) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(': error: Failed to create: not allowed at a line')

@@ -141,7 +141,7 @@ def run(shared_session, tmp_path_factory):
 def call(shared_session, capsys, monkeypatch):
     """Function that calls a tool's main function and returns output, errors and exit code."""
     monkeypatch.setattr(
-        'rhs_isac_ros.tools.command.Session',
+        'parts.verbs.Session',
         lambda arguments: contextlib.nullcontext(shared_session))
 
     def result(main, *arguments):

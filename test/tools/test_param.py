@@ -7,14 +7,13 @@ import threading
 import pytest
 import rclpy
 import yaml
+from parts import param
+from parts.param import main
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
-
-from rhs_isac_ros.tools import param
-from rhs_isac_ros.tools.param import main
 
 
 def test_get_prints_the_type(output_of):

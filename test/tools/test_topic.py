@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import yaml
 from geometry_msgs.msg import Point32, Polygon
+from parts.topic import as_yaml, main, rate_text
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.ros import topics
-from rhs_isac_ros.tools.topic import as_yaml, main, rate_text
 
 SCRIPT = Path(__file__).parents[2] / 'scripts' / 'topic'
 ARRAY = ros.RealArray(shape=array.array('I', [2, 2]), data=array.array('d', [1.0, -2.5, 0.0, 4.0]))

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from parts.verbs import run_verb
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
@@ -30,7 +31,7 @@ from rhs_isac_ros.ros.convert import deserialize
 from rhs_isac_ros.ros.endpoints import OBSERVATION, log_dropped, steady_timer
 from rhs_isac_ros.ros.session import Session
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
-from rhs_isac_ros.tools.command import ToolError, entry, print_now, run_verb
+from rhs_isac_ros.tools.command import ToolError, entry, print_now
 
 _MAX_LENGTH = 128
 # Number of latest messages that are not printed twice.

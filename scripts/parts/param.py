@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import yaml
+from parts.verbs import run_verb
 from rcl_interfaces.msg import ParameterType, SetParametersResult
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
@@ -15,7 +16,7 @@ from rclpy.task import Future
 
 from rhs_isac_ros.ros.session import Session
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
-from rhs_isac_ros.tools.command import ToolError, entry, print_now, run_verb
+from rhs_isac_ros.tools.command import ToolError, entry, print_now
 
 # Texts that the parser of rcl, unlike that of Python, reads as something else.
 _AMBIGUOUS = re.compile(
