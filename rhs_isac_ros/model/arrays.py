@@ -103,6 +103,8 @@ def numbers(name: str, value: ArrayLike, kind: type = float,
     NumPy drops masks and some imaginary parts, and converts text and objects, without an error.
     `shape` describes the expected shape in errors. If `finite` is set, all must be finite.
     """
+    if type(value) is np.ndarray and value.dtype == kind and all_finite(value):
+        return value
     expected = f'expected numbers {shape}'.rstrip()
     if _is_masked(value):
         raise error(f'{name}: a masked array, {expected} without a mask')

@@ -18,6 +18,8 @@ _MIN_X_M = 1e-15
 _AT_REST_RAD = 1.0
 # Lower limit of a region's extent [wavelengths]; the information for an extent of 0 is infinite.
 _NO_EXTENT = 1e-5
+# Derivative of (y, z) with respect to the position.
+_ACROSS = np.eye(3)[1:]
 
 
 def element_intervals_m(scenario: Scenario) -> np.ndarray:
@@ -148,11 +150,9 @@ def to_positions(points: np.ndarray) -> np.ndarray:
 
     Points outside the unit circle, u^2 + v^2 > 1, are given an x just above 0.
     """
-    distance, u, v = points[..., 0], points[..., 1], points[..., 2]
-    positions = np.empty_like(points, dtype=float)
-    positions[..., 0] = np.sqrt(np.maximum(1 - u**2 - v**2, 0.0))
-    positions[..., 1:] = points[..., 1:]
-    positions *= distance[..., None]
+    positions, u, v = np.array(points, float), points[..., 1], points[..., 2]
+    positions[..., 0] = np.sqrt(np.maximum(1 - u * u - v * v, 0.0))
+    positions *= points[..., :1]
     np.maximum(positions[..., 0], _MIN_X_M, out=positions[..., 0])
     return positions
 
@@ -160,8 +160,8 @@ def to_positions(points: np.ndarray) -> np.ndarray:
 def to_polar(positions: np.ndarray) -> np.ndarray:
     """Convert positions with x > 0, float64 [..., 3] [m], to (r [m], u, v), float64 [..., 3]."""
     points = np.empty(positions.shape)
-    points[..., 0] = np.sqrt(np.sum(positions**2, axis=-1))
-    points[..., 1:] = positions[..., 1:] / points[..., :1]
+    range_m = np.sqrt(np.sum(positions * positions, axis=-1, keepdims=True))
+    points[..., :1], points[..., 1:] = range_m, positions[..., 1:] / range_m
     return points
 
 
@@ -184,13 +184,10 @@ def polar_derivative(points: np.ndarray) -> np.ndarray:
 
     Returns float64 [N, 3, 3]: rows r, u and v, columns x, y and z, the inverse of `jacobian`.
     """
-    distance, u, v = points.T
-    matrix = np.zeros((len(points), 3, 3))
-    matrix[:, 0, 0], matrix[:, 0, 1:] = np.sqrt(np.maximum(1 - u**2 - v**2, 0.0)), points[:, 1:]
-    matrix[:, 1:] = -points[:, 1:, None] * matrix[:, :1]
-    matrix[:, 1, 1] += 1
-    matrix[:, 2, 2] += 1
-    matrix[:, 1:] /= distance[:, None, None]
+    matrix, cosines = np.empty((len(points), 3, 3)), points[:, 1:]
+    matrix[:, 0, 0] = np.sqrt(np.maximum(1 - np.sum(cosines * cosines, axis=1), 0.0))
+    matrix[:, 0, 1:] = cosines
+    matrix[:, 1:] = (_ACROSS - cosines[:, :, None] * matrix[:, :1]) / points[:, :1, None]
     return matrix
 
 

@@ -4,12 +4,12 @@ For each surface, the likelihood of a position is a sum of sheets, widened by th
 the pose of the surface. The posterior is the product of these sums. Each of its components is the
 product of one sheet of every surface.
 
-The maximum of a product is found by Gauss-Newton steps. Weighted samples around it, in range and
-direction cosines of the surface with the thinnest sheet, yield the moments in the region. Two
-sheets of opposite curvature that touch have a product along a rim, which may be far from the
-maximum. Samples are therefore as wide as if the other sheets were thicker by what they bend over
-the samples. Where few of them carry the weight, or where two sheets meet again elsewhere, the
-region is halved, and each half has a proposal of its own.
+The maximum of a product is found by a Gauss-Newton step from that of the sheets' moments. Weighted
+samples around it, in range and direction cosines of the surface with the thinnest sheet, yield the
+moments in the region. Two sheets of opposite curvature that touch have a product along a rim,
+which may be far from the maximum. Samples are therefore as wide as if the other sheets were
+thicker by what they bend over the samples. Where few of them carry the weight, or where two sheets
+meet again elsewhere, the region is halved, and each half has a proposal of its own.
 
 To each likelihood, a constant is added: the user may be blocked from the surface, the search may
 have missed a mode, or the surface may be elsewhere. A surface that disagrees with the others thus
@@ -44,10 +44,9 @@ class _Limits(NamedTuple):
     """Numbers that trade the speed of a product for its accuracy; weights are logarithms."""
 
     # Products below the best by more than this, and any beyond a number, are discarded: by the
-    # overlap of their sheets' moments, and after the Gauss-Newton steps.
+    # overlap of their sheets' moments, and after a Gauss-Newton step.
     margins: tuple[float, float] = (25.0, 12.0)
     products: tuple[int, int] = (4000, 512)
-    steps: int = 2
     # Numbers of samples of a sheet, of a part of a product, and of all parts together that are
     # computed at a time. Factor by which samples are wider than a Gaussian.
     of_sheet: int = 64
@@ -58,9 +57,8 @@ class _Limits(NamedTuple):
     # smallest extent of the region along an axis, relative to the largest one.
     narrowing: float = 0.25
     extent: float = 1e-3
-    # Passes in which the width of a Gaussian is found, step of its second differences in standard
-    # deviations, and factor by which sheets are thicker, as they bend more in the tails.
-    passes: int = 2
+    # Step of second differences in standard deviations of a Gaussian, and factor by which sheets
+    # are thicker, as they bend more in the tails.
     step: float = 1.5
     tails: float = 3.0
     # Largest distance of another place where two sheets meet, in standard deviations of the first
@@ -305,21 +303,20 @@ class _Products(NamedTuple):
         return constant
 
     def climbed(self, factors: Sequence[_Factor], bounds_m: np.ndarray) -> '_Products':
-        """Move to the maxima in the region by Gauss-Newton steps."""
+        """Move to the maxima in the region by a Gauss-Newton step."""
         found, _ = self._single(factors)
         prior = _LIMITS.narrowing * _prior_information(bounds_m)
         for mine, terms in self._by_reference(factors):
             around = terms[0].pose
             place = np.clip(self.moments.means[mine], *bounds_m)
-            for _ in range(_LIMITS.steps):
-                points, gradient, curvature = _expanded(terms, place, prior)
-                place = around.to_site(to_positions(move_inside(
-                    points + step_to_maximum(curvature, gradient), curvature, bounds_m, around)))
+            points, gradient, curvature = _expanded(terms, place, prior)
+            place = around.to_site(to_positions(move_inside(
+                points + step_to_maximum(curvature, gradient), curvature, bounds_m, around)))
             points, gradient, curvature = _expanded(terms, place, prior)
             derivative = polar_derivative(points) @ around.rotation.T
             covariances = np.linalg.inv(np.swapaxes(derivative, 1, 2) @ curvature @ derivative)
             found.means[mine], found.covariances[mine] = place, covariances
-            # Where the steps have not converged, the next one still raises the value.
+            # Where this has not converged, the next step still raises the value.
             rise = np.sum(gradient * step_to_maximum(curvature, gradient), axis=1) / 2
             found.log_weights[mine] = (
                 _logarithm(terms, place[:, None])[:, 0] + rise + log_volume(covariances))
@@ -501,13 +498,11 @@ def _proposal(terms: Sequence[_Term], positions: np.ndarray, bounds_m: np.ndarra
     """Return Gaussians that are as wide as products around positions [T, 3] [m], and `beyond`.
 
     In (r, u, v) of the first surface, the sheets of the others are curved. Over the Gaussian, they
-    are thicker by the second differences of their coordinates, and the Gaussian in turn is wider
-    if they are thicker. A sheet may meet that of the first surface again, `beyond` a place where
-    both are apart, [T, 3] [m]; NaN where none does.
+    are thicker by the second differences of their coordinates. A sheet may meet that of the first
+    surface again, `beyond` a place where both are apart, [T, 3] [m]; NaN where none does.
     """
     (pose, first), *others = terms
     prior, centre = _prior_information(bounds_m), bounds_m.mean(axis=0)
-    curvature, gradient = first.curvature, np.zeros((len(first.points), 3))
     positions, beyond = np.clip(positions, *bounds_m), np.full_like(positions, np.nan)
     (free,) = np.nonzero((bounds_m[1] > bounds_m[0]).any(axis=0))
     if len(free) == 1:
@@ -521,41 +516,38 @@ def _proposal(terms: Sequence[_Term], positions: np.ndarray, bounds_m: np.ndarra
         beyond[found] = mirrored[found]
     points = to_polar(pose.to_surface(positions))
     by_point = pose.rotation @ jacobian(points)
-    for number in range(_LIMITS.passes):
-        # The centre and the width of the Gaussian in the region.
-        by_site = by_point.swapaxes(1, 2) @ prior
-        total = symmetric(curvature + by_site @ by_point)
-        pull = gradient + (by_site @ (centre - positions)[..., None])[..., 0]
-        positions = np.clip(pose.to_site(to_positions(
-            points + step_to_maximum(total, pull))), *bounds_m)
-        points = to_polar(pose.to_surface(positions))
-        by_point = pose.rotation @ jacobian(points)
-        curvature = first.curvature
-        gradient = (curvature @ (first.points - points)[..., None])[..., 0]
-        axes = _LIMITS.step * np.linalg.cholesky(np.linalg.inv(total)).swapaxes(1, 2)
-        around = pose.to_site(to_positions(
-            points[:, None] + np.concatenate([axes, -axes], axis=1)))
-        for other, rows in others:
-            here = to_polar(other.to_surface(positions))
-            change = to_polar(other.to_surface(around)) - here[:, None]
-            second = (change[:, :3] + change[:, 3:]) / _LIMITS.step**2
-            if not number:
-                slopes = (change[:, :3, 0] - change[:, 3:, 0]) / (2 * _LIMITS.step)
-                turns, chosen = _turns(slopes, second[:, :, 0], rows)
-                places = pose.to_site(to_positions(
-                    points + axes[chosen] * turns[:, None] / _LIMITS.step))
-                nearest = np.clip(places, *bounds_m)
-                found = (np.linalg.norm(nearest - positions, axis=1)
-                         > _LIMITS.within * np.linalg.norm(places - positions, axis=1))
-                beyond[found] = nearest[found]
-            thicker = _LIMITS.tails**2 * (
-                np.sum(second**2, axis=1) / 2 + np.sum(second, axis=1)**2 / 4)
-            information = rows.is_sheet[:, None, None] * np.linalg.inv(
-                rows.covariances + thicker[:, :, None] * np.eye(3))
-            slope = polar_derivative(here) @ other.rotation.T @ by_point
-            by_slope = slope.swapaxes(1, 2) @ information
-            curvature = curvature + by_slope @ slope
-            gradient = gradient + (by_slope @ (rows.points - here)[..., None])[..., 0]
+    # The centre and the width of the sheet in the region.
+    by_site = by_point.swapaxes(1, 2) @ prior
+    total = symmetric(first.curvature + by_site @ by_point)
+    positions = np.clip(pose.to_site(to_positions(points + step_to_maximum(
+        total, (by_site @ (centre - positions)[..., None])[..., 0]))), *bounds_m)
+    points = to_polar(pose.to_surface(positions))
+    by_point = pose.rotation @ jacobian(points)
+    curvature = first.curvature
+    gradient = (curvature @ (first.points - points)[..., None])[..., 0]
+    axes = _LIMITS.step * np.linalg.cholesky(np.linalg.inv(total)).swapaxes(1, 2)
+    around = pose.to_site(to_positions(
+        points[:, None] + np.concatenate([axes, -axes], axis=1)))
+    for other, rows in others:
+        here = to_polar(other.to_surface(positions))
+        change = to_polar(other.to_surface(around)) - here[:, None]
+        second = (change[:, :3] + change[:, 3:]) / _LIMITS.step**2
+        slopes = (change[:, :3, 0] - change[:, 3:, 0]) / (2 * _LIMITS.step)
+        turns, chosen = _turns(slopes, second[:, :, 0], rows)
+        places = pose.to_site(to_positions(
+            points + axes[chosen] * turns[:, None] / _LIMITS.step))
+        nearest = np.clip(places, *bounds_m)
+        found = (np.linalg.norm(nearest - positions, axis=1)
+                 > _LIMITS.within * np.linalg.norm(places - positions, axis=1))
+        beyond[found] = nearest[found]
+        thicker = _LIMITS.tails**2 * (
+            np.sum(second**2, axis=1) / 2 + np.sum(second, axis=1)**2 / 4)
+        information = rows.is_sheet[:, None, None] * np.linalg.inv(
+            rows.covariances + thicker[:, :, None] * np.eye(3))
+        slope = polar_derivative(here) @ other.rotation.T @ by_point
+        by_slope = slope.swapaxes(1, 2) @ information
+        curvature = curvature + by_slope @ slope
+        gradient = gradient + (by_slope @ (rows.points - here)[..., None])[..., 0]
     wide = 1 / _LIMITS.spread**2
     return Inside.of(
         points, wide * gradient, wide * symmetric(curvature), bounds_m, pose), beyond
