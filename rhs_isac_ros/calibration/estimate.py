@@ -138,6 +138,7 @@ def log_evidence(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
     Impairments are integrated out by the method of Laplace.
     """
     nuisance, (values, aligned, mean) = nuisance_of(model.scenario), _aligned(model, pilots)
+    share = nuisance.share_of_multipath(model.root, model.whitener)
     gains = nuisance.scaled_patterns.real.reshape(len(nuisance), mean[0].size)
     for _ in range(_ALIGNMENT_STEPS if gains.any() else 0):
         # The energy of the multipath tells gains as well as the direct path does.
@@ -146,7 +147,7 @@ def log_evidence(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
             nuisance.scaled_patterns * aligned[:, None])), residual).real
         excess = np.maximum(np.mean(np.abs(residual)**2, axis=(1, 2)), 1)
         values = values + step_to_maximum(
-            _curvature(nuisance, model.whiten(nuisance.derivatives(aligned, mean)))
+            _curvature(nuisance, model.whiten(nuisance.derivatives(aligned, mean, share)))
             + 4 * excess[:, None, None] * (gains @ gains.T),
             gradient - 2 * gains.sum(axis=1) - nuisance.precision * values)
         aligned = nuisance.divide(pilots.received, values)
@@ -154,7 +155,7 @@ def log_evidence(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
     log_root = np.sum(np.linalg.slogdet(model.combined_root)[1])
     log_gain = np.sum(np.log(np.abs(nuisance.divide(np.ones_like(mean), values))), axis=(1, 2))
     curvature = 4 * gains @ gains.T + _curvature(
-        nuisance, model.whiten(nuisance.derivatives(aligned, mean)))
+        nuisance, model.whiten(nuisance.derivatives(aligned, mean, share)))
     evidence: np.ndarray = 2 * (log_gain - log_root) - energy - (
         values**2 @ nuisance.precision + np.linalg.slogdet(curvature)[1]) / 2
     return evidence
@@ -164,9 +165,10 @@ def _aligned(model: MeasurementModel, pilots: Pilots
              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the likeliest impairments [N, Q], the pilots without them, and the mean."""
     nuisance, mean = nuisance_of(model.scenario), model.mean(pilots.positions)
+    share = nuisance.share_of_multipath(model.root, model.whitener)
     values = initial_values(nuisance, model.whiten(pilots.received), model.whiten(mean))
     for _ in range(_ALIGNMENT_STEPS if len(nuisance) else 0):
-        values = refined_values(nuisance, values, pilots.received, mean, model.whiten)
+        values = refined_values(nuisance, values, pilots.received, mean, model.whiten, share)
     return values, nuisance.divide(pilots.received, values), mean
 
 
@@ -211,14 +213,22 @@ def initial_values(nuisance: Nuisance, white: np.ndarray, white_mean: np.ndarray
 
 
 def refined_values(nuisance: Nuisance, values: np.ndarray, signals: np.ndarray, mean: np.ndarray,
-                   whiten: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Improve nuisance values [N, Q] by a scoring step, for signals [N, N_B, N_SB F]."""
+                   whiten: Callable[[np.ndarray], np.ndarray], share: np.ndarray) -> np.ndarray:
+    """Improve nuisance values [N, Q] by a scoring step, for signals [N, N_B, N_SB F].
+
+    `share` is that of `Nuisance.share_of_multipath`.
+    """
     aligned = nuisance.divide(signals, values)
-    slopes = whiten(nuisance.derivatives(aligned, mean))
-    residual = whiten(aligned) - whiten(mean)
-    gradient = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), residual).real
-    gradient -= nuisance.precision * values
+    gradient = _gradient(nuisance, aligned, mean, whiten) - nuisance.precision * values
+    slopes = whiten(nuisance.derivatives(aligned, mean, share))
     return values + step_to_maximum(_curvature(nuisance, slopes), gradient)
+
+
+def _gradient(nuisance: Nuisance, aligned: np.ndarray, mean: np.ndarray,
+              whiten: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return the gradient of the likelihood with respect to nuisance values, [N, Q]."""
+    slopes, residual = whiten(nuisance.derivatives(aligned, mean)), whiten(aligned - mean)
+    return 2 * np.einsum('nqir,nir->nq', np.conj(slopes), residual).real
 
 
 def _curvature(nuisance: Nuisance, slopes: np.ndarray) -> np.ndarray:
@@ -289,13 +299,15 @@ class PilotStatistics:
         for number, (group, radiation) in enumerate(
                 zip(self._pilots, self._radiation, strict=True)):
             whiteners = self._whiteners(radiation, gains, mean, covariance)
+            share = self._nuisance.share_of_multipath(np.linalg.inv(whiteners), whiteners)
             for block in blocks(len(group.positions), _BLOCK):
                 part = _Block(self._scenario, radiation, whiteners, group.positions[block], mean,
                               self._weights[number][block])
                 signals = group.received[block] / gains[:, None]
                 if len(self._nuisance):
-                    signals, slopes = self._linearised(part, signals, (number, block.start))
-                    of_values = self._integrated(part, signals, slopes)
+                    signals, *known = self._linearised(
+                        part, signals, share, (number, block.start))
+                    of_values = self._integrated(part, *known)
                     lost, moved = lost + of_values[0], moved + of_values[1]
                 whitened = np.swapaxes(part.whiten(signals), 0, 1)
                 for columns, white in zip(part.columns, whitened, strict=True):
@@ -317,25 +329,31 @@ class PilotStatistics:
         total += excess[:, None, None] * np.eye(total.shape[1])
         return np.linalg.inv(covariance_root(scenario, total))
 
-    def _linearised(self, part: '_Block', signals: np.ndarray, key: tuple[int, int]
-                    ) -> tuple[np.ndarray, np.ndarray]:
-        """Improve a block's nuisance values; return linearised signals and whitened slopes."""
-        values = self._values.get(key)
-        if values is None:
-            values = initial_values(self._nuisance, part.whiten(signals), part.whiten(part.mean))
-        self._values[key] = values = refined_values(
-            self._nuisance, values, signals, part.mean, part.whiten)
-        aligned = self._nuisance.divide(signals, values)
-        slopes = self._nuisance.derivatives(aligned, part.mean)
-        return aligned + np.einsum('nq,nqir->nir', values, slopes), part.whiten(slopes)
+    def _linearised(self, part: '_Block', signals: np.ndarray, share: np.ndarray,
+                    key: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Improve a block's nuisance values, and linearise its signals about them.
 
-    def _integrated(self, part: '_Block', signals: np.ndarray, slopes: np.ndarray
+        Returns linearised signals, whitened slopes, and their inner product with the signals.
+        """
+        nuisance, values = self._nuisance, self._values.get(key)
+        if values is None:
+            values = initial_values(nuisance, part.whiten(signals), part.whiten(part.mean))
+        self._values[key] = values = refined_values(
+            nuisance, values, signals, part.mean, part.whiten, share)
+        aligned = nuisance.divide(signals, values)
+        slopes = nuisance.derivatives(aligned, part.mean, share)
+        change, white = np.einsum('nq,nqir->nir', values, slopes), part.whiten(slopes)
+        # The gradient contains all of the received multipath.
+        of_signals = _gradient(nuisance, aligned, part.mean, part.whiten) + 2 * np.einsum(
+            'nqir,nir->nq', np.conj(white), part.whiten(part.mean + change)).real
+        return aligned + change, white, of_signals
+
+    def _integrated(self, part: '_Block', slopes: np.ndarray, of_signals: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the information [2 P, 2 P] and shift [2 P] lost to unknown nuisance values."""
         coupling = sum(np.einsum('nqr,nrp->nqp', np.conj(slopes[:, :, band]), columns)
                        for band, columns in enumerate(part.columns))
         coupling = 2 * np.concatenate([coupling.real, -coupling.imag], axis=2)
-        of_signals = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), part.whiten(signals)).real
         regression = np.linalg.solve(_curvature(self._nuisance, slopes), coupling)
         flat = regression.reshape(-1, regression.shape[2])
         return coupling.reshape(flat.shape).T @ flat, of_signals.reshape(-1) @ flat

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import read_only
+from rhs_isac_ros.model.arrays import adjoint, read_only
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.elements import ElementErrors, draw_surface, has_errors
 from rhs_isac_ros.model.geometry import frame_lags_s, subband_frequencies_hz
@@ -36,6 +36,8 @@ UNIFORM_STD_RAD = 2.0
 _SEPARATE_STD_RAD, _CIRCLE, NO_INFORMATION = 0.25, 256, 1e-12
 # Standard deviation of the gain below which the gain has no effect [nepers].
 _MIN_GAIN_STD = 1e-9
+# Share of the multipath in derivatives above which it counts as 1, to save a product.
+_WHOLE_SHARE = 0.7
 # Relative deviation of phases from whole multiples of the smallest one.
 _ROUNDING = 1e-9
 
@@ -119,15 +121,39 @@ class Exponents:
         return [(np.array(rows), patterns[rows][:, :bands, :subbands, :frames])
                 for (bands, subbands, frames), rows in found.items()]
 
-    def derivatives(self, divided: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    def derivatives(self, divided: np.ndarray, mean: np.ndarray,
+                    share: np.ndarray | float = 1.0) -> np.ndarray:
         """Return the derivatives of signals with respect to z, [N, Q, N_B, N_SB F].
 
         Takes signals after `divide`, and their mean, [N, N_B, N_SB F]. For a parameter that moves
         the multipath, the derivative contains the signals, including the received multipath, so it
         differs between positioning phases. For any other parameter, it contains only the mean.
+        `share`, [Q] or a number, is the factor of the received multipath.
         """
-        moves = self.moves_multipath[:, None, None]
-        return self.scaled_patterns * np.where(moves, divided[:, None], mean[:, None])
+        share = (share * self.moves_multipath)[:, None, None]
+        return self.scaled_patterns * (share * divided[:, None] + (1 - share) * mean[:, None])
+
+    def operators(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
+        """Compute W P W^-1, which applies P to whitened signals, [Q, N_B, N_SB F, N_SB F]."""
+        return np.matmul(whitener * self.scaled_patterns[:, :, None], root)
+
+    def information_of(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
+        """Compute the Fisher information of a covariance about the parameters, [Q, Q]."""
+        # The multipath reveals gains and offsets of carrier and timing, but no phase.
+        operators = self.operators(root, whitener)
+        both = operators + adjoint(operators)
+        return np.einsum('aimn,binm->ab', both, both, optimize=True).real
+
+    def share_of_multipath(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
+        """Return the factor of the received multipath in `derivatives`, float64 [Q].
+
+        The square of a derivative then has the expected information of the covariance. Multipath
+        that changes from frame to frame turns without any trace.
+        """
+        information = np.diagonal(self.information_of(root, whitener))
+        energy = 2 * np.sum(np.abs(self.operators(root, whitener))**2, axis=(1, 2, 3))
+        share = np.sqrt(information / np.where(energy, energy, 1.0))
+        return self.moves_multipath * np.where(share > _WHOLE_SHARE, 1.0, share)
 
 
 class Nuisance(Exponents):

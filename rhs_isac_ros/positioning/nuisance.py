@@ -5,7 +5,7 @@ import functools
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.model.arrays import adjoint, multiply_rows
+from rhs_isac_ros.model.arrays import multiply_rows
 from rhs_isac_ros.model.geometry import (
     jacobian,
     polar_derivative,
@@ -26,8 +26,6 @@ UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
 # density then has many peaks along the range, too narrow for Gaussians. Its information is added
 # to the samples of the posterior afterwards.
 COARSE_STD_RAD = 0.75
-# Share of the multipath in derivatives above which it counts as 1, to save a product.
-_WHOLE_SHARE = 0.7
 # Largest logarithm of the power of noise relative to signals, which keeps it finite.
 _MAX_EXPONENT = 300.0
 
@@ -58,9 +56,7 @@ class NuisancePrior(Exponents):
     #: Half of the change of a parameter that does not change the signals, float64 [Q].
     half_period: np.ndarray
     information: np.ndarray  #: Contribution of the model's covariance, float64 [Q, Q].
-    #: Factor of the received multipath in derivatives with respect to the parameters, so that the
-    #: expected information about each of them is that of the covariance, float64 [Q].
-    multipath_share: np.ndarray
+    multipath_share: np.ndarray  #: That of `share_of_multipath`, float64 [Q].
     noise_share: float  #: Largest share of thermal noise in a whitened measurement.
 
     def __init__(self, model: MeasurementModel) -> None:
@@ -96,11 +92,9 @@ class NuisancePrior(Exponents):
                 'as well: half a period of the timing turns all phases by half a turn')
         self.precision, self.half_period = np.where(uniform, 0.0, precision), period / 2
         self.gains, self.has_gain = self.scaled_patterns.real.mean(axis=2).T, declared.has_gain
-        self._operators = self._multiplying(model.root, model.whitener)
+        self._operators = self.operators(model.root, model.whitener)
         self.information = self.information_of(model.root, model.whitener)
-        energy = 2 * np.sum(np.abs(self._operators)**2, axis=(1, 2, 3))
-        share = np.sqrt(np.diagonal(self.information) / np.where(energy, energy, 1.0))
-        self.multipath_share = self.moves_multipath * np.where(share > _WHOLE_SHARE, 1.0, share)
+        self.multipath_share = self.share_of_multipath(model.root, model.whitener)
         self.noise_share = self.scenario.noise_power_w * float(
             np.sum(np.abs(model.whitener)**2, axis=2).max())
 
@@ -148,21 +142,10 @@ class NuisancePrior(Exponents):
         """Curvature in (r, u, v) that is added to every log-likelihood, float64 [3]."""
         return Resolution.of(self.scenario).curvature_floor
 
-    def information_of(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
-        """Compute the Fisher information of a covariance about the parameters, [Q, Q]."""
-        # The multipath reveals gains and offsets of carrier and timing, but no phase.
-        operators = self._multiplying(root, whitener)
-        both = operators + adjoint(operators)
-        return np.einsum('aimn,binm->ab', both, both, optimize=True).real
-
     def direct_information(self, spread: np.ndarray) -> np.ndarray:
         """Compute the information of whitened means with second moments `spread`, [Q, Q]."""
         return 2 * np.einsum('aimn,ino,bimo->ab', self._operators, spread, self._operators.conj(),
                              optimize=True).real
-
-    def _multiplying(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
-        """Compute W P W^-1, which applies P to whitened signals, [Q, N_B, N_SB F, N_SB F]."""
-        return np.matmul(whitener * self.scaled_patterns[:, :, None], root)
 
     def states(self, points: np.ndarray, values: np.ndarray, moves: bool = True
                ) -> tuple[np.ndarray, np.ndarray]:

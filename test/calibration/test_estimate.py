@@ -10,11 +10,13 @@ from rhs_isac_ros.calibration import (
     Pilots,
     SurfacePrior,
     calibrate,
+    estimate,
     report,
 )
 from rhs_isac_ros.calibration.estimate import initial_values
 from rhs_isac_ros.model import ElementErrors, MeasurementModel
 from rhs_isac_ros.model.elements import DeclaredElements, SurfaceEstimate
+from rhs_isac_ros.model.gaussian import quadratic_form
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.positioning import make_estimator
 
@@ -124,6 +126,24 @@ def test_an_alignment_starts_at_the_phases_of_the_bands(scenario, beams):
     values = initial_values(nuisance, model.whiten(signals), model.whiten(mean))
     np.testing.assert_allclose(
         nuisance.divide(signals, values), mean, rtol=0, atol=1e-2 * np.abs(mean).max())
+
+
+@pytest.mark.parametrize('speed_mps', [0.0, 1.5], ids=['static', 'changing'])
+def test_multipath_that_changes_anyway_reveals_no_offset(scenario, beams, speed_mps):
+    """The information about an offset is the variance of the score, whatever the multipath."""
+    exact = dataclasses.replace(
+        scenario, element_error_rms=0.0, failed_element_share=0.0, frame_duration_s=0.015,
+        max_user_speed_mps=speed_mps)
+    declared = dataclasses.replace(exact, carrier_offset_std_hz=3.0)
+    model, nuisance = MeasurementModel(exact, beams), nuisance_of(declared)
+    positions = scenario.sample_positions(400, np.random.default_rng(1))
+    mean, received = model.mean(positions), model.sample(positions, np.random.default_rng(2))
+    share = nuisance.share_of_multipath(model.root, model.whitener)
+    score = estimate._gradient(nuisance, received, mean, model.whiten)
+    slopes = model.whiten(nuisance.derivatives(received, mean, share))
+    information = quadratic_form(slopes.reshape(len(mean), 1, -1))
+    assert np.mean(score**2) == pytest.approx(np.mean(information), rel=0.2)
+    assert (share == 1) == (speed_mps == 0)
 
 
 def test_several_codebooks_reveal_more_of_the_elements(scenario, damaged, send, random_beams):
