@@ -38,6 +38,10 @@ class Cell(Prior):
     centre_m: tuple[float, float, float]  #: In the frame of the surface [m].
     std_m: float  #: Standard deviation of each coordinate [m].
 
+    def __post_init__(self) -> None:
+        """Convert the centre, which may be an array or a list, to a tuple."""
+        object.__setattr__(self, 'centre_m', tuple(map(float, self.centre_m)))
+
     def positions(self, scenario: Scenario, uniform: np.ndarray) -> np.ndarray:
         """Map positions that are uniform in the region, float64 [N, 3] [m], to the cell."""
         # A slow import, which loading a codebook does not need.

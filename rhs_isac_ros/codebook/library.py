@@ -61,8 +61,7 @@ class Plan:
         for spread_m, pitch_m in zip(self.spreads_m, self.pitches_m, strict=True):
             lines = [low + (np.arange(n) + 0.5) * (high - low) / n for low, high, n in zip(
                 *scenario.roi_bounds_m, _numbers(scenario, pitch_m), strict=True)]
-            cells += [Cell((float(x), float(y), float(z)), spread_m)
-                      for x, y, z in itertools.product(*lines)]
+            cells += [Cell(centre, spread_m) for centre in itertools.product(*lines)]
         return cells
 
 
@@ -201,14 +200,14 @@ def pitch(scenario: Scenario, start: Codebook, objective: str, spread_m: float, 
     rng = streams.generator(0, streams.SAMPLES)
     places = scenario.sample_positions(_N_TRIALS, rng)
     own = yield from codebooks_of(
-        scenario, [Cell(_tuple(place), spread_m) for place in places], start, objective)
+        scenario, [Cell(place, spread_m) for place in places], start, objective)
     pitch_m = spread_m
     for pitch_m in spread_m * np.array(_PITCHES):
         # A codebook is used at most half a pitch from the centre of its cell.
         offsets = pitch_m * (rng.random(places.shape) - 0.5)
         centres = np.clip(places - offsets, *scenario.roi_bounds_m)
         others = yield from codebooks_of(
-            scenario, [Cell(_tuple(centre), spread_m) for centre in centres], start, objective)
+            scenario, [Cell(centre, spread_m) for centre in centres], start, objective)
         values = yield compared, [Job.of('compared', {
             'scenario': scenario.changes(), 'objective': objective, 'cell': (place, spread_m),
             'codebooks': [one.to_parameters() for one in pair]})
@@ -225,7 +224,7 @@ def pitch(scenario: Scenario, start: Codebook, objective: str, spread_m: float, 
 def compared(scenario: Mapping[str, Any], objective: str, cell: Sequence[Any],
              codebooks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Run a job: evaluate the objective of codebooks for a user in a cell."""
-    world, own = Scenario(**scenario), Cell(_tuple(np.array(cell[0])), cell[1])
+    world, own = Scenario(**scenario), Cell(*cell)
     rng = streams.generator(0, streams.HELD_OUT)
     average = OBJECTIVES[objective](
         world, own.positions(world, sobol(world, 2 * _N_POSITIONS, rng)), rng, prior=own)
@@ -243,8 +242,3 @@ def codebooks_of(scenario: Scenario, cells: Sequence[Cell], start: Codebook, obj
 def _numbers(scenario: Scenario, pitch_m: float) -> list[int]:
     """Return the numbers of cells along each axis."""
     return [max(int(np.ceil(size / pitch_m - 1e-9)), 1) for size in scenario.roi_size_m]
-
-
-def _tuple(position: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = position.tolist()
-    return x, y, z

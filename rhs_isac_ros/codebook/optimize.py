@@ -342,10 +342,9 @@ def optimised(
     surface = Calibration.load(calibration[0]) if calibration else None
     if surface and calibration and surface.id != calibration[1]:
         raise CodebookError(f'{calibration[0]}: {surface.id}, expected {calibration[1]}')
-    centre_m, std_m = cell or ((0.0, 0.0, 0.0), 0.0)
     result = optimize(
         Scenario(**scenario), start=Codebook.from_parameters(dict(start)) if start else None,
-        prior=Cell((centre_m[0], centre_m[1], centre_m[2]), std_m) if cell else REGION,
+        prior=Cell(*cell) if cell else REGION,
         calibration=surface, **options)
     if result.reason == INTERRUPTED:
         raise KeyboardInterrupt
