@@ -17,8 +17,11 @@ from rhs_isac_ros.support.exits import exit_code_of, on_end_signals
 PR_SET_PDEATHSIG = 1
 
 FORKS = multiprocessing.get_context('forkserver')
+# Nodes import parts of SciPy when they first need them, which takes longer than most cycles.
 FORKS.set_forkserver_preload([
-    f'rhs_isac_ros.nodes.{name}' for name, package in EXECUTABLES.items() if package == 'nodes'])
+    'scipy.optimize', 'scipy.spatial', 'scipy.special', 'scipy.stats', *(
+        f'rhs_isac_ros.nodes.{name}' for name, package in EXECUTABLES.items()
+        if package == 'nodes')])
 
 
 def run_executable(command, log, environment):
