@@ -226,6 +226,9 @@ def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np
     """
     try:
         with open(path, 'rb') as stream:
+            if not stream.read(6).startswith((b'PK', b'\x93NUMPY')):
+                raise ValueError('no arrays, expected a file of the format .npz')
+            stream.seek(0)
             file = np.load(stream, allow_pickle=False)
             found = getattr(file, 'files', ())
             members = file.zip.infolist() if found else []

@@ -215,6 +215,11 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     networks = read_networks(options.file, options.site)
     if networks.is_site(options.namespace):
         return _replay_site(options, networks)
+    leader = next(iter(networks.surfaces), '')
+    if leader and not options.publish and posixpath.basename(
+            options.namespace.rstrip('/')) != leader:
+        raise RecordingError(f'{options.file}: namespace {options.namespace} has no base station, '
+                             f'expected that of {leader} or of the site')
     if options.publish:
         return republish.republish(options, arguments)
     recording = load(options.file, options.namespace, options.config, options.site)

@@ -69,7 +69,14 @@ def show_list(session: Session, options: argparse.Namespace) -> None:
         session.discover(options.timeout)
         nodes = sorted(_nodes(session))
     for node in nodes:
-        names = _names(session, node)
+        try:
+            names = _names(session, node)
+        except ToolError as error:
+            # A recorder, for example, has no services.
+            if options.node_name:
+                raise
+            print(error, file=sys.stderr)
+            continue
         if names and not options.node_name:
             print_now(f'{node}:')
         for name in names:

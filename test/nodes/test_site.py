@@ -305,7 +305,7 @@ def test_a_replay_locates_the_users_of_each_surface_and_of_the_fusion_again(reco
     (['--publish'], 1, '--publish: not available for a whole site; select a surface with '
      '--namespace: /front, /side\n'),
     (['--estimator', 'ml'], 1, 'select a surface with --namespace: /front\n'),
-    (['--namespace', '/side'], 2, 'with a true position in the namespace /side'),
+    (['--namespace', '/side'], 2, 'namespace /side has no base station, expected that of front'),
     (['--namespace', '/lab'], 2, 'with a true position in the namespace /lab')])
 def test_a_replay_of_a_site_names_what_is_not_available(
         recorded, capsys, arguments, code, expected):

@@ -136,6 +136,14 @@ def test_a_flipped_bit_is_an_error_or_changes_no_content(file):
     assert n_errors > len(content) / 2
 
 
+@pytest.mark.parametrize('content', [b'', b'n_frames: 4\n', b'\x89PNG\r\n'])
+def test_a_file_of_another_format_is_named(tmp_path, content):
+    """NumPy would take it for pickled objects, and propose to execute them."""
+    (tmp_path / 'a.npz').write_bytes(content)
+    with pytest.raises(ArchiveError, match='cannot be read: no arrays, expected .* .npz'):
+        read_arrays(tmp_path / 'a.npz')
+
+
 @pytest.mark.parametrize('compression', [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA])
 def test_damaged_compressed_arrays_are_an_error(tmp_path, compression):
     array, path = io.BytesIO(), tmp_path / 'file.npz'

@@ -87,6 +87,20 @@ def foreign():
     rclpy.shutdown(context=context)
 
 
+def test_a_node_without_parameter_services_does_not_end_the_list(
+        foreign, output_of, call, monkeypatch):
+    """The recorder is such a node."""
+    monkeypatch.setattr(param, '_SERVICE_TIMEOUT_S', 1.0)
+    context = foreign.context
+    silent = Node('a_silent_node', context=context, start_parameter_services=False)
+    out, err, code = call(main, 'list')
+    assert code == 0
+    assert '/bs:' in out.splitlines() and '/foreign:' in out.splitlines()
+    assert 'parameter services for node /a_silent_node' in err
+    assert call(main, 'list', 'a_silent_node')[2] == 1
+    silent.destroy_node()
+
+
 def test_a_dump_has_the_same_values_and_types_for_load_and_for_a_start(
         foreign, output_of, call, tmp_path):
     values = {**{f'text.{n}': text for n, text in enumerate(TEXTS)}, 'texts': TEXTS,
