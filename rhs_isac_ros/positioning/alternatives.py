@@ -299,10 +299,12 @@ class _Templates:
         arguments *= self._scale[:, 0]
         # A Bessel function I_0(x) is at most exp(x), and its logarithm is convex. So few places
         # need its value.
-        highest, gain = _best_gain(prior, arguments.sum(axis=0) / 2, energy, n)
-        highest += self._offset.T[direction]
-        arguments *= np.exp(-gain).astype(np.float32)
         total = arguments.sum(axis=0)
+        highest, gain = _best_gain(prior, total / 2, energy, n)
+        highest += self._offset.T[direction]
+        if prior.gain_std:
+            factor = np.exp(-gain).astype(np.float32)
+            arguments, total = arguments * factor, total * factor
         mean = of_shot.max(total.max(axis=1)) / len(arguments)
         least = of_shot.max(highest.max(axis=1)) - GRID.margin - len(arguments) * (
             mean - _log_bessel(mean))

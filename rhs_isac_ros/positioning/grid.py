@@ -343,7 +343,10 @@ def _near(shots: np.ndarray, scaled: np.ndarray, reach: float
         moved = scaled.copy()
         moved[:, 0] += shots * (2 * reach + np.ptp(scaled[:, 0]))
         first, last = cKDTree(moved).query_pairs(reach, output_type='ndarray').T
-    squares = np.sum((scaled[last] - scaled[first])**2, axis=1)
+    squares = np.zeros(len(first))
+    for values in scaled.T:
+        offsets = values[last] - values[first]
+        squares += offsets * offsets
     near = np.flatnonzero((squares <= reach**2) & (shots[first] == shots[last]))
     return first[near], last[near], squares[near]
 
