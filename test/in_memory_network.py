@@ -20,7 +20,7 @@ from rhs_isac_ros.link import Beamformer, CapacityReport
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.model.geometry import frame_times_s
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.measurement import receive_feeds, received_signal
+from rhs_isac_ros.model.measurement import received_signal
 from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
 from rhs_isac_ros.model.surface import radiation_matrix
 from rhs_isac_ros.positioning import Estimate, ModelError
@@ -489,7 +489,7 @@ class Network:
                 first = 1_000_000 * self._n_starts + 1
                 self._n_starts += 1
                 return BaseStation(
-                    scenario, self.settings, rng, self._receive, first, library, self.world_s)
+                    scenario, self.settings, rng, self.seed, first, library, self.world_s)
             case 'rhs_controller':
                 return RhsController(library)
             case 'user':
@@ -508,10 +508,6 @@ class Network:
             case 'transmission':
                 return Transmission(scenario, **self._beams, library=library)
         return ROLES[kind]()
-
-    def _receive(self, codebook, feeds, user: int, cycle_id: int, noise: bool) -> np.ndarray:
-        rng = streams.generator(self.seed, streams.RECEIVER, user, cycle_id)
-        return receive_feeds(self.scenario, codebook, feeds, rng if noise else None)
 
     def _report_missing(self) -> None:
         """Report changes of the missing roles to the roles that need them."""

@@ -10,7 +10,6 @@ import svg
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.frontend import Air, EmulatedRadio, EmulatedSurface, FrontEnd
 from rhs_isac_ros.model import Scenario, mobility
-from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user
@@ -51,9 +50,7 @@ def cycle():
         'rhs_controller': RhsController(), 'transmission': Transmission(scenario),
         'positioner': Positioner(scenario, lambda: 0.0),
         'bs': BaseStation(
-            scenario, BaseStationSettings(policy='first'), np.random.default_rng(0),
-            lambda codebook, feeds, user, cycle_id, noise: receive_feeds(
-                scenario, codebook, feeds, None)),
+            scenario, BaseStationSettings(policy='first'), np.random.default_rng(0), 0),
     }
     air = Air(scenario, np.random.default_rng(0))
     front_end = FrontEnd(

@@ -19,7 +19,6 @@ from rhs_isac_msgs.action import Locate
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BaseStation
-from rhs_isac_ros.protocol.cycle import combiner
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.cdr import TINY
 from rhs_isac_ros.ros.endpoints import SERVICES, create_or_refuse, steady_timer
@@ -220,7 +219,7 @@ class BsNode(RoleNode[BaseStation]):
         values = self.values
         rng = streams.generator(values.seed, streams.BASE_STATION)
         self.start(BaseStation(
-            self.scenario, self.make_settings(values), rng, combiner(self.scenario, values.seed),
+            self.scenario, self.make_settings(values), rng, values.seed,
             values.first_cycle or _cycle_from_clock(), self.library, self.clocks.world_s))
         self._locate: LocateServer | None = None
         self._begin_locate()

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from rhs_isac_ros.protocol.cycle import combiner
 from rhs_isac_ros.protocol.receiver import Receiver
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
@@ -13,8 +12,9 @@ class ReceiverNode(RoleNode[Receiver]):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('receiver', **node_options)
-        self.start(Receiver(self.scenario, combiner(self.scenario, self.values.seed),
-                            self.make_settings(self.values)), needs_codebook=True)
+        values = self.values
+        self.start(Receiver(self.scenario, values.seed, self.make_settings(values)),
+                   needs_codebook=True)
 
 
 main = entry('receiver', lambda: [ReceiverNode()])

@@ -15,7 +15,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.admission import Admission
-from rhs_isac_ros.protocol.cycle import Combine, Reception, SignalCollector
+from rhs_isac_ros.protocol.cycle import Reception, SignalCollector
 from rhs_isac_ros.protocol.events import Event, LogMessage, Outcome, Timeout
 from rhs_isac_ros.protocol.following import Proposals
 from rhs_isac_ros.protocol.handover import Carriers, Steering
@@ -90,8 +90,8 @@ class BaseStation(SignalCollector):
 
     Parameters
     ----------
-    receiver
-        Combines the signals at the feeds.
+    seed
+        Seed of the noise.
     first_cycle_id
         Id of the first cycle. After a restart, it must exceed all earlier ids, so that messages
         still in transit are recognised as stale.
@@ -114,10 +114,9 @@ class BaseStation(SignalCollector):
 
     def __init__(
             self, scenario: Scenario, settings: BaseStationSettings, rng: np.random.Generator,
-            receiver: Combine, first_cycle_id: int = 1, library: Library = EMPTY,
+            seed: int, first_cycle_id: int = 1, library: Library = EMPTY,
             world_s: Callable[[], float] | None = None) -> None:
-        super().__init__(BsState.WAITING, scenario, receiver, Cycle(first_cycle_id - 1))
-        self._scenario = scenario
+        super().__init__(BsState.WAITING, scenario, seed, Cycle(first_cycle_id - 1))
         self._users = UserRegistry(settings.policy, rng)
         self._settings = PendingSettings(settings)
         self._admission = _admission(settings)
@@ -372,7 +371,7 @@ class BaseStation(SignalCollector):
         self._cycle.piloted.add(event.band)
 
     def _send_signals(self, event: m.FeedSignals) -> None:
-        received = self._cycle.combined(self._combine, self._settings.in_use.receiver_noise)
+        received = self._combined(self._settings.in_use.receiver_noise)
         self._cycle.received = received
         self.send(received)
         self._announce(m.Phase.ESTIMATING)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import enum
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,19 +14,6 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome
 from rhs_isac_ros.protocol.role import Drops, StateMachine
 from rhs_isac_ros.support import streams
-
-# Combines the signals at the feeds: (codebook, feeds [N_B, F, N_SB, K], user, cycle_id, whether to
-# add noise) to complex128 [N_B, N_SB, F].
-Combine = Callable[[Codebook, np.ndarray, int, int, bool], np.ndarray]
-
-
-def combiner(scenario: Scenario, seed: int) -> Combine:
-    """Return the combination of a receiver whose noise depends on the seed, user and cycle."""
-    def combine(codebook: Codebook, feeds: np.ndarray, user: int, cycle_id: int, noise: bool
-                ) -> np.ndarray:
-        rng = streams.generator(seed, streams.RECEIVER, user, cycle_id) if noise else None
-        return receive_feeds(scenario, codebook, feeds, rng)
-    return combine
 
 
 @dataclasses.dataclass
@@ -60,22 +46,17 @@ class Reception:
         self.stamp_ns = self.stamp_ns or event.stamp_ns and event.stamp_ns + reference_ns
         self.signals[event.band] = event.signals
 
-    def combined(self, combine: Combine, noise: bool) -> m.ReceivedSignals:
-        """Combine the signals of all bands, which must be complete; `noise` adds noise."""
-        assert self.codebook
-        feeds = np.stack([signals for _, signals in sorted(self.signals.items())])
-        return m.derive(
-            m.ReceivedSignals, self, stamp_ns=self.stamp_ns, signals=combine(
-                self.codebook, feeds, self.user, self.cycle_id, noise))
-
 
 class SignalCollector(StateMachine):
-    """A role that collects the feed signals of one cycle at a time; `cycle` is the first one."""
+    """A role that collects the feed signals of one cycle at a time; `cycle` is the first one.
 
-    def __init__(self, initial: enum.Enum, scenario: Scenario, combine: Combine,
-                 cycle: Reception) -> None:
+    The noise of the receiver depends on the seed, the user and the cycle.
+    """
+
+    def __init__(self, initial: enum.Enum, scenario: Scenario, seed: int, cycle: Reception
+                 ) -> None:
         super().__init__(initial)
-        self._combine, self._cycle = combine, cycle
+        self._scenario, self._seed, self._cycle = scenario, seed, cycle
         self._bands = frozenset(range(scenario.n_bands))
         self._reference_ns = round(-1e9 * frame_times_s(scenario)[0, 0])
 
@@ -101,6 +82,16 @@ class SignalCollector(StateMachine):
 
     def _store_signals(self, event: m.FeedSignals) -> None:
         self._cycle.store(event, self._reference_ns)
+
+    def _combined(self, noise: bool) -> m.ReceivedSignals:
+        """Combine the signals of all bands, which must be complete; `noise` adds noise."""
+        cycle = self._cycle
+        assert cycle.codebook
+        feeds = np.stack([signals for _, signals in sorted(cycle.signals.items())])
+        rng = streams.generator(
+            self._seed, streams.RECEIVER, cycle.user, cycle.cycle_id) if noise else None
+        return m.derive(m.ReceivedSignals, cycle, stamp_ns=cycle.stamp_ns, signals=receive_feeds(
+            self._scenario, cycle.codebook, feeds, rng))
 
     # Conditions under which a message of a cycle is dropped.
     _OF_CYCLE: Drops = {_wrong_cycle: Outcome.WRONG_CYCLE}

@@ -5,7 +5,7 @@ import enum
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.cycle import Combine, Reception, SignalCollector
+from rhs_isac_ros.protocol.cycle import Reception, SignalCollector
 from rhs_isac_ros.protocol.events import CodebookOffered, Outcome, SettingsOffered
 from rhs_isac_ros.protocol.role import ANY, Row, on
 from rhs_isac_ros.protocol.settings import PendingSettings, ReceiverSettings
@@ -30,9 +30,9 @@ class Receiver(SignalCollector):
 
     STATES = ReceiverState
 
-    def __init__(self, scenario: Scenario, combine: Combine,
-                 settings: ReceiverSettings | None = None) -> None:
-        super().__init__(ReceiverState.LISTENING, scenario, combine, Reception(0))
+    def __init__(self, scenario: Scenario, seed: int, settings: ReceiverSettings | None = None
+                 ) -> None:
+        super().__init__(ReceiverState.LISTENING, scenario, seed, Reception(0))
         self._settings = PendingSettings(settings or ReceiverSettings())
         self._codebook: Codebook | None = None
 
@@ -71,7 +71,7 @@ class Receiver(SignalCollector):
 
     def _send_signals(self, event: m.FeedSignals) -> None:
         cycle = self._cycle
-        self.send(cycle.combined(self._combine, self._settings.in_use.receiver_noise))
+        self.send(self._combined(self._settings.in_use.receiver_noise))
         self.log_state(f'signals of user {cycle.user}', f'cycle {cycle.cycle_id}: signals of '
                        f'user {cycle.user} in all bands', False)
 

@@ -13,7 +13,6 @@ from rhs_isac_ros.positioning import Mixture, Sighting, Site
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BsState
 from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.cycle import combiner
 from rhs_isac_ros.protocol.events import Outcome
 from rhs_isac_ros.protocol.fusion import Fusion, posterior_of
 from rhs_isac_ros.protocol.handover import Carriers, Steering
@@ -110,7 +109,7 @@ class SiteNetwork(Network):
                 return Transmission(scenario, choose=by_distance,
                                     evaluate=lambda *_: CapacityReport(1e6, 1.1e6))
             case 'receiver':
-                return Receiver(scenario, combiner(scenario, 0))
+                return Receiver(scenario, 0)
             case 'channel':
                 return Channel(scenario, 0, Impairments(multipath_memory=False))
             case 'fusion':

@@ -6,7 +6,6 @@ from in_memory_network import feed
 
 from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.cycle import combiner
 from rhs_isac_ros.protocol.events import CodebookOffered, LogMessage, SettingsOffered
 from rhs_isac_ros.protocol.receiver import Receiver, ReceiverState
 from rhs_isac_ros.protocol.settings import ReceiverSettings
@@ -14,7 +13,7 @@ from rhs_isac_ros.protocol.settings import ReceiverSettings
 
 @pytest.fixture
 def receiver(scenario, codebooks):
-    role = Receiver(scenario, combiner(scenario, 3))
+    role = Receiver(scenario, 3)
     feed(role, [CodebookOffered(codebooks[0])])
     return role
 
@@ -55,11 +54,12 @@ def test_the_signals_of_all_bands_are_combined_with_the_own_codebook(
 
 
 def test_surfaces_with_different_seeds_have_independent_noise(scenario, codebooks, signals):
-    feeds = np.stack([signals(band).signals for band in range(scenario.n_bands)])
-    one, again, other = (combiner(scenario, seed)(codebooks[0], feeds, 2, 5, True)
-                         for seed in (0, 0, 2**31))
-    assert np.array_equal(one, again)
-    assert not np.isclose(one, other, rtol=1e-9, atol=0).any()
+    def received(seed):
+        *_, (message,) = feed(Receiver(scenario, seed), [
+            CodebookOffered(codebooks[0]), grant(), signals(1), signals(0)])
+        return message.signals
+    assert np.array_equal(received(0), received(0))
+    assert not np.isclose(received(0), received(2**31), rtol=1e-9, atol=0).any()
 
 
 def test_the_codebook_of_the_grant_is_used_to_the_end_of_the_cycle(receiver, codebooks, signals):
@@ -99,6 +99,6 @@ def test_incomplete_signals_are_discarded_and_logged_by_user(receiver, signals):
 
 
 def test_no_command_is_sent_without_a_codebook(scenario):
-    receiver = Receiver(scenario, combiner(scenario, 0))
+    receiver = Receiver(scenario, 0)
     assert feed(receiver, [grant()]) == [[]]
     assert receiver.counters == {'wrong_codebook': 1}

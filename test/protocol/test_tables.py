@@ -10,7 +10,7 @@ import pytest
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.protocol import base_station as bs
-from rhs_isac_ros.protocol import cycle, events, receiver, rhs_controller, user
+from rhs_isac_ros.protocol import events, receiver, rhs_controller, user
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BsState
 from rhs_isac_ros.protocol.role import ANY, SAME, StateMachine, always, rows_for
@@ -35,13 +35,11 @@ def settings(**values):
 @pytest.fixture
 def machine(scenario, name):
     """The machine of a role, with timeouts of 1 s."""
-    def receive(codebook, feeds, user, cycle_id, noise):
-        return np.zeros((2, 3, 2), complex)
     return MACHINES[name](**{
         'bs': {'scenario': scenario, 'settings': settings(), 'rng': np.random.default_rng(0),
-               'receiver': receive},
+               'seed': 0},
         'user': {'mobilities': {1: mobility.Static((10, 0, 0))}, 'step_s': 1.0, 'beacon_s': 1.0},
-        'receiver': {'scenario': scenario, 'combine': cycle.combiner(scenario, 0)}
+        'receiver': {'scenario': scenario, 'seed': 0}
     }.get(name, {}))
 
 
