@@ -36,16 +36,6 @@ class Reception:
         """Id of the codebook; empty if there is none."""
         return self.codebook.id if self.codebook else ''
 
-    def store(self, event: m.FeedSignals, reference_ns: int) -> None:
-        """Store the signals of a band, and the instances of user and channel if still unknown.
-
-        `reference_ns` is the time from the first frame to the reference time of the cycle [ns].
-        """
-        self.user_instance = self.user_instance or event.user_instance
-        self.channel = self.channel or event.sender
-        self.stamp_ns = self.stamp_ns or event.stamp_ns and event.stamp_ns + reference_ns
-        self.signals[event.band] = event.signals
-
 
 class SignalCollector(StateMachine):
     """A role that collects the feed signals of one cycle at a time; `cycle` is the first one.
@@ -58,6 +48,7 @@ class SignalCollector(StateMachine):
         super().__init__(initial)
         self._scenario, self._seed, self._cycle = scenario, seed, cycle
         self._bands = frozenset(range(scenario.n_bands))
+        # Time from the first frame to the reference time of the cycle [ns].
         self._reference_ns = round(-1e9 * frame_times_s(scenario)[0, 0])
 
     def _silent_bands(self) -> list[int]:
@@ -81,7 +72,12 @@ class SignalCollector(StateMachine):
         return self._silent_bands() == [event.band]
 
     def _store_signals(self, event: m.FeedSignals) -> None:
-        self._cycle.store(event, self._reference_ns)
+        """Store the signals of a band, and the instances of user and channel if still unknown."""
+        cycle = self._cycle
+        cycle.user_instance = cycle.user_instance or event.user_instance
+        cycle.channel = cycle.channel or event.sender
+        cycle.stamp_ns = cycle.stamp_ns or event.stamp_ns and event.stamp_ns + self._reference_ns
+        cycle.signals[event.band] = event.signals
 
     def _combined(self, noise: bool) -> m.ReceivedSignals:
         """Combine the signals of all bands, which must be complete; `noise` adds noise."""

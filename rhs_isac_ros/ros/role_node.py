@@ -308,9 +308,15 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         """Handle the deadlines that have passed, and set the timer for the next one."""
         while (deadline_s := self.role.next_deadline()) is not None and deadline_s <= now_s:
             self._handle(events.Timeout(), now_s)
-        if deadline_s is not None and (
-                self._timer_due_s is None or deadline_s < self._timer_due_s):
-            self._set_timer(deadline_s - now_s, deadline_s)
+        if deadline_s is None or (
+                self._timer_due_s is not None and self._timer_due_s <= deadline_s):
+            return
+        delay_s, self._timer_due_s = deadline_s - now_s, deadline_s
+        # The timer follows the steady clock, but the speed of a simulation is unknown, so poll.
+        if self.clocks.is_simulated and self._in_world():
+            delay_s = min(delay_s, _WORLD_POLL_S)
+        self._timer.timer_period_ns = max(int(delay_s * 1e9), 1)
+        self._timer.reset()
 
     def publish(self, message: m.Message) -> bool:
         """Publish a message; return False if it is invalid (logged), or if the node stands by."""
@@ -383,14 +389,6 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 self.revert_parameters(settings)
             case _:
                 self.execute(action)
-
-    def _set_timer(self, delay_s: float, due_s: float) -> None:
-        # The timer follows the steady clock, but the speed of a simulation is unknown, so poll.
-        if self.clocks.is_simulated and self._in_world():
-            delay_s = min(delay_s, _WORLD_POLL_S)
-        self._timer.timer_period_ns = max(int(delay_s * 1e9), 1)
-        self._timer.reset()
-        self._timer_due_s = due_s
 
     def _on_timer(self) -> None:
         self._timer.cancel()
