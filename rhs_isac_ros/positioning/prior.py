@@ -16,7 +16,6 @@ their covariance is added to its result. Between modes, the evidence of phases w
 grows more slowly than their number. `fusion` treats errors of poses in the same way.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -77,14 +76,13 @@ _FLOOR = -(EXACT_MARGIN + PRIOR_MARGIN)
 
 def cells_of(bent: Sheets, grid: Grid, resolution: Resolution) -> np.ndarray:
     """Mark the cells in which a prior in (r [m], u, v) requires a search, bool [C]."""
-    widths_m, (u, v) = grid.widths_m[grid.range_bin], 2 * PHASE_ERROR * resolution.direction
     merged = bent.position().reduce(_LIMITS.boxes, _LIMITS.same_box)
-    coordinates, chosen = np.ascontiguousarray(grid.points.T), np.zeros(len(grid.node), bool)
-    for mean, covariance in zip(merged.means, merged.covariances, strict=True):
-        reach = _LIMITS.reach * np.sqrt(np.diagonal(covariance))
-        chosen |= functools.reduce(np.logical_and, (
-            np.abs(values - centre) <= far + width / 2 for values, centre, far, width in zip(
-                coordinates, mean, reach, (widths_m, u, v), strict=True)))
+    reach = _LIMITS.reach * np.sqrt(np.diagonal(merged.covariances, axis1=1, axis2=2))[:, None]
+    offsets_m = np.abs(grid.ranges_m - merged.means[:, :1])
+    in_range = offsets_m <= reach[..., 0] + grid.widths_m / 2
+    offsets = np.abs(grid.nodes[:, 1:] - merged.means[:, None, 1:])
+    beside = (offsets <= reach[..., 1:] + PHASE_ERROR * resolution.direction).all(axis=2)
+    chosen: np.ndarray = (in_range[:, grid.range_bin] & beside[:, grid.node]).any(axis=0)
     return chosen
 
 
