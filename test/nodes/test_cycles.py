@@ -20,7 +20,7 @@ COMPLETE = {m.Grant: 1, m.ReceivedSignals: 1, m.PositionEstimate: 1, m.Beam: 1, 
          m.PilotRequest: 1, m.Pilot: SIZES['N_B'],
          m.FeedSignals: SIZES['N_B'], m.Data: 4, m.ProtocolState: 4}
 # Parameters of the nodes, in another order than in test_start_and_stop.
-BASE = {'channel': {}, 'transmission': {}, 'bs': {'rest_s': 0.02, 'ack_timeout_s': 0.3},
+BASE = {'channel': {}, 'transmission': {}, 'bs': {'rest_s': 0.1, 'ack_timeout_s': 0.3},
         'positioner': {}, 'optimizer': {}, 'rhs_controller': {}}
 
 

@@ -18,7 +18,7 @@ def test_a_network_uses_its_library_until_a_node_lacks_it(processes, make_watch)
     library, watch, space = Library.load(LIBRARY), make_watch('/following'), '/following'
     # A slow user, whose position is known well enough even if cycles are seconds apart.
     network = processes.start(
-        'network', namespace=space, users=1, position_m=[9.0, 1.5, 0.3], rest_s=0.02,
+        'network', namespace=space, users=1, position_m=[9.0, 1.5, 0.3], rest_s=0.1,
         prior='track', track_speed_mps=0.02, scenario_file=SCENARIO, library_file=LIBRARY,
         codebook_file=CONFIG / 'codebook_bandplan.yaml')
     summaries = {}

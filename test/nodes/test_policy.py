@@ -151,7 +151,7 @@ def test_policy_and_graph_agree(processes, make_watch, small_files):
     """A running network uses all allowed rights and no others."""
     space, watch = '/closed', make_watch('/closed')
     network = processes.start(
-        'network', namespace=space, users=2, rest_s=0.02, prior='track',
+        'network', namespace=space, users=2, rest_s=0.1, prior='track',
         scenario_file=small_files / 'scenario.yaml', codebook_file=small_files / 'first.yaml')
     visualizer = processes.start(
         'visualizer', namespace=space, scenario_file=small_files / 'scenario.yaml')

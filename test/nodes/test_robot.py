@@ -96,7 +96,7 @@ def driven(module_processes, make_watch, tmp_path_factory):
     common = {'namespace': space, 'use_sim_time': True, 'frame_id': 'odom', 'scenario_file': file}
     running = [
         module_processes.start(
-            'network', users=1, rest_s=0.02, mobility='waypoints', speed_mps=1.0,
+            'network', users=1, rest_s=0.1, mobility='waypoints', speed_mps=1.0,
             ground_truth_period_s=0.01, waypoints_m=way.ravel().tolist(), **common),
         module_processes.start(
             'user', name='user_2', user_id=2, mobility='odometry',
