@@ -150,11 +150,11 @@ class DeclaredElements(SurfaceModel):
         n_bands, n_rows, n_terms, n_elements = radiation.shape
         amplitude = np.sqrt(spatial_covariance(scenario).power)
         flat = (radiation * amplitude[:, None, None]).reshape(n_bands, n_rows, -1)
+        by_subband = radiation.reshape(n_bands, scenario.n_subbands, -1, n_elements)
 
         def direct(band: int, positions: np.ndarray) -> np.ndarray:
-            gains = np.repeat(los_gain(scenario, positions, band), scenario.n_frames, axis=1)
-            errors = radiation[band] * gains[:, :, None]
-            return errors.reshape(len(gains), n_rows, n_terms * n_elements)
+            errors = by_subband[band] * los_gain(scenario, positions, band)[:, :, None]
+            return errors.reshape(len(positions), n_rows, n_terms * n_elements)
 
         return measurement_correlation(scenario) * np.matmul(flat, adjoint(flat)), direct
 
@@ -236,11 +236,11 @@ def with_direct_errors(
 
     Returns complex128 [N, N_B, N_SB F, N_SB F].
     """
-    total = np.repeat(covariance[None], len(positions), axis=0)
+    total = np.empty((len(positions), *covariance.shape), complex)
     for band in range(len(covariance)):
         for block in blocks(len(positions), _BLOCK):
             errors = direct(band, positions[block])
-            total[block, band] += np.matmul(errors, adjoint(errors))
+            total[block, band] = covariance[band] + np.matmul(errors, adjoint(errors))
     return total
 
 

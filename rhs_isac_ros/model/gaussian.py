@@ -16,8 +16,6 @@ FALSE_ALARM = 1e-9
 # Smallest square of a pivot relative to the largest variance, in units of the rounding error of n
 # variances. Below it, bounds have errors of more than about a per cent.
 _MIN_PIVOT = 4
-# Smallest size of the blocks of `inverse_lower`.
-_MIN_DIVIDED = 8
 
 
 class Marginal(NamedTuple):
@@ -68,14 +66,14 @@ def covariance_root(scenario: Scenario, covariance: np.ndarray, *, orthogonal: b
 
 def inverse_lower(roots: np.ndarray) -> np.ndarray:
     """Invert lower triangular matrices [..., n, n]."""
-    n = roots.shape[-1] // 2
-    if n < _MIN_DIVIDED:
-        return np.linalg.inv(roots)
-    # The inverse of a block triangular matrix takes a quarter of the operations.
-    inverse = np.zeros_like(roots)
-    first, last = inverse[..., :n, :n], inverse[..., n:, n:]
-    first[:], last[:] = inverse_lower(roots[..., :n, :n]), inverse_lower(roots[..., n:, n:])
-    inverse[..., n:, :n] = -np.matmul(np.matmul(last, roots[..., n:, :n]), first)
+    # Every node imports this package, and SciPy takes longer to load than ROS.
+    from scipy.linalg.lapack import get_lapack_funcs
+
+    (inverted,) = get_lapack_funcs(('trtri',), (roots,))
+    inverse = np.empty(roots.shape, roots.dtype)
+    # LAPACK stores columns, in which lower matrices are upper ones.
+    for index in np.ndindex(roots.shape[:-2]):
+        inverse[index] = inverted(roots[index].T)[0].T
     return inverse
 
 
