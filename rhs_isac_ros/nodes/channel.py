@@ -5,14 +5,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from rhs_isac_ros.frontend import (
-    Air,
-    FrontEnd,
-    Radio,
-    SampleRecorder,
-    make_radio,
-    make_surface,
-)
+from rhs_isac_ros.frontend import Air, FrontEnd, Radio, SampleRecorder, make_radio, make_surface
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol.channel import Channel, apply_patterns

@@ -21,11 +21,7 @@ from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, parameters, topics
 from rhs_isac_ros.ros.endpoints import LATCHED, create_publisher
-from rhs_isac_ros.ros.parameters import (
-    CODEBOOK,
-    CODEBOOK_PREFIX,
-    same_value,
-)
+from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX, same_value
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import StartError, parse, run
 from rhs_isac_ros.ros.session import Session

@@ -7,14 +7,7 @@ import itertools
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
 
-from rhs_isac_ros.protocol.events import (
-    Action,
-    Event,
-    Immediately,
-    LogMessage,
-    Outcome,
-    Send,
-)
+from rhs_isac_ros.protocol.events import Action, Event, Immediately, LogMessage, Outcome, Send
 from rhs_isac_ros.protocol.messages import Message
 from rhs_isac_ros.support.fields import finite
 

@@ -23,14 +23,7 @@ from rclpy.utilities import try_shutdown
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.codebook.library import Library
-from rhs_isac_ros.frontend import (
-    RADIOS,
-    SURFACES,
-    Air,
-    Waveform,
-    make_radio,
-    make_surface,
-)
+from rhs_isac_ros.frontend import RADIOS, SURFACES, Air, Waveform, make_radio, make_surface
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.frontend.sigmf_recording import SAMPLES_FAILED
 from rhs_isac_ros.model import Scenario

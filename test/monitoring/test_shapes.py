@@ -11,14 +11,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.model.hall import PathChannel
 from rhs_isac_ros.model.pose import rotation_matrix
-from rhs_isac_ros.monitoring.shapes import (
-    axes_95,
-    board,
-    estimate,
-    lobe,
-    traced,
-    user_colour,
-)
+from rhs_isac_ros.monitoring.shapes import axes_95, board, estimate, lobe, traced, user_colour
 from rhs_isac_ros.protocol import messages as m
 
 # From tables of the chi-square distribution with two and three degrees of freedom.

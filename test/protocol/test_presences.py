@@ -4,13 +4,7 @@ import dataclasses
 
 import pytest
 
-from rhs_isac_ros.protocol.presences import (
-    PERIOD_S,
-    SILENCE_S,
-    SLOW_PERIOD_S,
-    Presence,
-    Presences,
-)
+from rhs_isac_ros.protocol.presences import PERIOD_S, SILENCE_S, SLOW_PERIOD_S, Presence, Presences
 
 NOW_NS = 1_700_000_000 * 10**9
 OWN = Presence(NOW_NS - 5 * 10**9, 'sc1', 'bs', '/bs', '{"n_frames": 4, "n_feeds": 3}')

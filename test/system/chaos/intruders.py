@@ -17,13 +17,7 @@ from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import LATCHED, subscribe
 from rhs_isac_ros.ros.roster import UNIQUE
 from system.chaos.crashes import PUBLISHES
-from system.chaos.trial import (
-    TIMEOUT_S,
-    Trial,
-    measure_recovery,
-    wait_for_service,
-    warnings_since,
-)
+from system.chaos.trial import TIMEOUT_S, Trial, measure_recovery, wait_for_service, warnings_since
 from system.observer import NetworkObserver
 from system.trial_processes import TrialProcesses
 
