@@ -197,8 +197,8 @@ class VisualizerNode(Node):
     def _on_message(self, message: m.Message, arrived_s: float) -> None:
         self._scene.add(message, arrived_s)
         # The number of frames is limited like the number of topics, because tf2 keeps every frame.
-        if TFMessage and isinstance(message, m.PositionEstimate) and self._paths.publishers(
-                message.user):
+        if isinstance(message, m.PositionEstimate) and self._paths.publishers(
+                message.user) and TFMessage:
             self._transforms.publish(TFMessage(transforms=[transform(
                 self._frame, self._frame.user(message.user), message.position,
                 convert.stamp_of(message, self))]))
