@@ -133,21 +133,44 @@ def site_information(surfaces: Iterable[MeasurementModel], positions: np.ndarray
 
     Each surface has the pose of its scenario. Takes positions of the user, float64 [N, 3] [m], or
     with columns for the velocity, [N, 6] [m, m/s], in the frame of the site, in front of every
-    surface. Noise, multipath, nuisance parameters and
-    errors of the poses are independent for each surface and cycle. Raises ValueError if a position
-    is not in front of a surface.
+    surface. A declared velocity is unknown, and the same for all surfaces; its prior is that of
+    the first one. Noise, multipath, other nuisance parameters and errors of the poses are
+    independent for each surface and cycle. Raises ValueError if a position is not in front of a
+    surface.
     """
-    states = np.asarray(positions)
-    total = np.zeros((len(states), 3, 3))
-    for model in surfaces:
-        pose = model.scenario.pose
-        joint = joint_information_of(model, pose.states_to_surface(states))
-        information = pose.covariances_to_site(
-            without_nuisance(joint, model.scenario).information)
-        # The errors of the pose add their covariance to the inverse of the information.
-        widened = np.eye(3) + np.matmul(information, pose.spread(states[:, :3]))
-        total += np.linalg.solve(widened, information)
-    return (total + np.swapaxes(total, 1, 2)) / 2
+    states, total = np.asarray(positions), np.zeros((len(positions), 6, 6))
+    # How position and velocity depend on the position and a velocity of unit variance.
+    by_prior = np.eye(6)[:, :3]
+    for number, model in enumerate(surfaces):
+        total += _information_in_site(model, states)
+        if not number:
+            std = velocity_std_mps(model.scenario)
+            by_velocity = np.vstack([np.zeros((3, 3)), model.scenario.pose.rotation * std])
+            by_prior = np.hstack([by_prior, by_velocity[:, std > 0]])
+    scaled = by_prior.T @ total @ by_prior + np.diag(np.arange(by_prior.shape[1]) > 2)
+    found = marginalise(scaled, np.zeros(scaled.shape[:2])).information
+    return (found + np.swapaxes(found, 1, 2)) / 2
+
+
+def _information_in_site(model: MeasurementModel, states: np.ndarray) -> np.ndarray:
+    """Return the information of one surface about position and velocity, float64 [N, 6, 6]."""
+    pose, std = model.scenario.pose, velocity_std_mps(model.scenario)
+    joint = joint_information_of(model, pose.states_to_surface(states))
+    precision, moving = nuisance_of(model.scenario).precision, std > 0
+    others = np.arange(3, 3 + len(precision))
+    joint[:, others, others] += precision
+    kept = np.setdiff1d(np.arange(joint.shape[1]), others)
+    order = np.append(kept, others)
+    known = marginalise(
+        joint[:, order[:, None], order], np.zeros(joint.shape[:2]), len(kept)).information
+    by_site = np.zeros((len(kept), 6))
+    by_site[:3, :3] = pose.rotation.T
+    by_site[3:, 3:] = pose.rotation.T[moving] / std[moving, None]
+    information = by_site.T @ known @ by_site
+    # The errors of the pose add their covariance to the inverse of the information.
+    widened = np.tile(np.eye(6), (len(states), 1, 1))
+    widened[:, :, :3] += np.matmul(information[:, :, :3], pose.spread(states[:, :3]))
+    return np.linalg.solve(widened, information)
 
 
 def site_crlb(surfaces: Iterable[MeasurementModel], positions: np.ndarray) -> np.ndarray:

@@ -283,3 +283,20 @@ def test_a_surface_in_an_unknown_place_adds_nothing(model):
 def test_a_user_behind_a_surface_is_refused(model):
     with pytest.raises(ValueError, match='in front of the surface'):
         site_crlb([at(model, SIDE)], np.array([[10.0, -11.0, 0.0]]))
+
+
+def test_the_velocity_of_a_user_is_the_same_for_all_surfaces(model):
+    """Two equal surfaces at one place are one with twice the signals."""
+    scenario = dataclasses.replace(
+        model.scenario, user_speed_std_mps=1.0, frame_duration_s=0.05, user_gain_std_db=1.0)
+    walking = at(MeasurementModel(scenario, model.beams), FRONT)
+    joint = 2 * fisher.joint_information_of(walking, PLACES)
+    assert joint.shape[1:] == (7, 7)
+    # The gain is another one for each of the surfaces.
+    joint[:, 3, 3] += 2 * nuisance_of(scenario).precision[0]
+    joint[:, range(4, 7), range(4, 7)] += 1.0
+    expected = np.linalg.inv(joint)[:, :3, :3].trace(axis1=1, axis2=2)
+    np.testing.assert_allclose(site_crlb([walking, walking], PLACES), expected)
+    np.testing.assert_allclose(site_crlb([at(walking, SIDE)] * 2, PLACES), site_crlb(
+        [walking, walking], SIDE.to_surface(PLACES)))
+    np.testing.assert_allclose(site_crlb([walking], PLACES), crlb_of(walking, PLACES))
