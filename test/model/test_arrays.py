@@ -73,14 +73,14 @@ def doors(small):
 def test_positions_behind_the_surface_are_errors(doors, small, kind):
     bad = BEHIND.get(kind, element_positions(small.scenario)[:1])
     for call in doors.values():
-        with pytest.raises(ValueError, match=r'^(positions|mean): x = .* expected x > 0'):
+        with pytest.raises(ValueError, match=r'^(positions?|mean|start): x = .* expected x > 0'):
             call(bad)
 
 
 @pytest.mark.parametrize('kind', MALFORMED)
 def test_malformed_positions_are_errors(doors, kind):
     for call in doors.values():
-        with pytest.raises(ValueError, match=r'(?s)^(positions|mean): .*expected '):
+        with pytest.raises(ValueError, match=r'(?s)^(positions?|mean|start): .*expected '):
             call(MALFORMED[kind])
 
 
