@@ -3,7 +3,8 @@
 Each alternative has prior odds and an evidence, the likelihood averaged over its own unknowns. A
 comparison with the evidence for a user in the region gives the probability of the alternative.
 Both average over errors and failures of the elements in the same way, without regard to what the
-signals reveal about single elements. All parameters, such as an offset of the timing, are those
+signals reveal about single elements. Where this leaves a doubt, all have the sets of failed
+elements that are found for them. All parameters, such as an offset of the timing, are those
 that fit the alternative.
 
 There is a fix only if a user in the region and in sight is at least as probable as all

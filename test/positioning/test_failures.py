@@ -262,6 +262,19 @@ def test_users_elsewhere_have_the_evidence_of_the_true_set(
     assert OneState(likelihood).gain(points, values, signals) == 0
 
 
+def test_users_who_walk_have_the_failed_elements_of_users_at_rest(codebook, model):
+    """Sets are compared with sets, also in another scenario."""
+    walking = Likelihood(System(dataclasses.replace(
+        SCENARIO, frame_duration_s=0.015, user_speed_std_mps=1.0), codebook))
+    at_rest, found = model.failed_set((3, 17)), FailedElements(walking)
+    known = FailureModel(walking).failed_set((3, 17))
+    signals = walking.signals(MeasurementModel(SCENARIO, codebook).sample(
+        POSITION[None], np.random.default_rng(2)))
+    values = np.zeros((1, len(walking.nuisance)))
+    assert (found.same(at_rest).local(POINT[None], values, signals).value
+            == known.local(POINT[None], values, signals).value)
+
+
 def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):
     scenario = dataclasses.replace(
         AMBIGUOUS, elements_per_side=2, failed_element_share=0.1)
