@@ -156,6 +156,15 @@ def checked_states(states: ArrayLike) -> np.ndarray:
     return array
 
 
+def checked_bounds(bounds_m: ArrayLike) -> np.ndarray:
+    """Return the lower and the upper corner of a box, float64 [2, 3] [m], or raise ValueError."""
+    array = numbers('bounds_m', bounds_m)
+    if array.shape != (2, 3) or (array[0] > array[1]).any():
+        raise ValueError(f'bounds_m: {array.tolist()}, expected the lower and the upper corner of '
+                         'a box, [2, 3]')
+    return array
+
+
 def checked_position(position: ArrayLike, name: str = 'position') -> np.ndarray:
     """Return a position in front of the surface as float64 [3] [m], or raise ValueError."""
     return _checked(name, position, 1, '[3]')

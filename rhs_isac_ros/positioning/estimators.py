@@ -56,6 +56,7 @@ from rhs_isac_ros.positioning.segments import Segments, concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.positioning.templates import N_NORMAL, standard_normal, tabulate
+from rhs_isac_ros.support.fields import finite
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 from rhs_isac_ros.system import System
 
@@ -220,7 +221,8 @@ class SearchEstimator(abc.ABC):
         Without a prior, the position is that of `estimate`. The probabilities of users outside or
         blocked, and the reason why there is no position, are those without the prior, except that
         a user is outside only if the prior is wrong. Users outside are considered only if the
-        whole region is searched. Raises `SignalError` if the signals are unusable.
+        whole region is searched. Raises `SignalError` if the signals are unusable, and ValueError
+        if another argument is out of range.
 
         Parameters
         ----------
@@ -241,6 +243,11 @@ class SearchEstimator(abc.ABC):
             found = [one.posterior() for block in blocks(len(signals.received), _LIMITS.block)
                      for one in self._locate_block(self._region, select(signals, block))]
         else:
+            if not 0 < finite('wrong', wrong) < 1:
+                raise ValueError(f'wrong: {wrong}, expected a probability between 0 and 1')
+            if not 0 < finite('share', share) <= 1:
+                raise ValueError(f'share: {share}, expected an exponent above 0, up to 1')
+            finite('n_before', n_before, 0.0)
             before = self.in_front(prior, wrong)
             found = [self._update(select(signals, [n]), before, wrong, share, n_before)
                      for n in range(len(signals.received))]

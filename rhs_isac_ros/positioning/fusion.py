@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import log_sum, mixture_weights
+from rhs_isac_ros.model.arrays import checked_bounds, log_sum, mixture_weights
 from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximum, symmetric
 from rhs_isac_ros.model.geometry import jacobian, polar_derivative, to_polar, to_positions
 from rhs_isac_ros.model.pose import Pose
@@ -110,6 +110,7 @@ class Fuser:
     def __init__(self, bounds_m: np.ndarray, outside_probability: float = 0.0,
                  user_speed_std_mps: float = 0.0) -> None:
         """Take the bounds of the region and what is known of users; see the function `fuse`."""
+        bounds_m = checked_bounds(bounds_m)
         self._bounds_m, self._outside_probability = bounds_m, outside_probability
         self._velocity_variance = velocity_variance(user_speed_std_mps, bounds_m)
         self._factor = functools.cache(lambda one: _Factor.of(one, bounds_m))

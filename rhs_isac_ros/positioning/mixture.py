@@ -68,9 +68,9 @@ class Mixture(_Arrays):
         """Check the arrays. `_make`, which all methods use, does not."""
         weights = numbers('log_weights', log_weights, finite=False)
         centres, spreads = numbers('means', means), numbers('covariances', covariances)
-        if weights.ndim != 1 or not weights.size or not (weights < np.inf).all():
+        if weights.ndim != 1 or not -np.inf < weights.max(initial=-np.inf) < np.inf:
             raise ValueError(f'log_weights: shape {weights.shape} with a maximum of '
-                             f'{weights.max(initial=-np.inf):g}, expected [C] below infinity')
+                             f'{weights.max(initial=-np.inf):g}, expected [C] with a finite one')
         n = len(weights)
         if centres.ndim != 2 or len(centres) != n or centres.shape[1] not in (3, 6):
             raise ValueError(f'means: shape {centres.shape}, expected [{n}, 3] or [{n}, 6]')

@@ -76,6 +76,8 @@ _FLOOR = -(EXACT_MARGIN + PRIOR_MARGIN)
 
 def cells_of(bent: Sheets, grid: Grid, resolution: Resolution) -> np.ndarray:
     """Mark the cells in which a prior in (r [m], u, v) requires a search, bool [C]."""
+    if not len(bent.means):  # All of the prior is behind the surface.
+        return np.zeros(len(grid.node), bool)
     merged = bent.position().reduce(_LIMITS.boxes, _LIMITS.same_box)
     reach = _LIMITS.reach * np.sqrt(np.diagonal(merged.covariances, axis1=1, axis2=2))[:, None]
     offsets_m = np.abs(grid.ranges_m - merged.means[:, :1])

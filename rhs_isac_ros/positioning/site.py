@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 
 from rhs_isac_ros.model import Pose, Scenario
+from rhs_isac_ros.model.arrays import checked_bounds
 from rhs_isac_ros.positioning.agreement import Pair, pair_agreements
 from rhs_isac_ros.positioning.estimate import SITE, Estimate, Sighting, SignalError
 from rhs_isac_ros.positioning.estimators import BayesEstimator
@@ -44,6 +45,8 @@ class Site:
         """Check the surfaces."""
         if not self.surfaces:
             raise SiteError('surfaces: none, expected at least one')
+        with translated(ValueError, SiteError):
+            object.__setattr__(self, 'bounds_m', checked_bounds(self.bounds_m))
         names: dict[str, str] = {}
         for name, one in self.surfaces.items():
             if not re.fullmatch('[a-z][a-z0-9_]*', name):

@@ -184,3 +184,8 @@ def test_the_product_of_two_square_roots_is_the_mixture():
     np.testing.assert_allclose(root.log_density(points), mixture.log_density(points) / 2)
     np.testing.assert_allclose(
         root.product(root).log_density(points), mixture.log_density(points))
+
+
+def test_a_mixture_without_mass_is_refused():
+    with pytest.raises(ValueError, match='log_weights: .* maximum of -inf, expected'):
+        Mixture([-np.inf], [[8.0, 0.0, 0.0]], [np.eye(3)])

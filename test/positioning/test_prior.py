@@ -208,6 +208,24 @@ def test_the_region_is_searched_if_the_signals_disagree_with_the_prior(
     assert offset @ np.linalg.solve(found.covariance, offset) < REGION_RADIUS
 
 
+def test_a_prior_behind_the_surface_is_wrong(lazy, table1_estimator, model):
+    signals = model.sample(PLACE[None], np.random.default_rng(2))[0]
+    free = table1_estimator.estimate(signals)
+    for estimator in (lazy, table1_estimator):
+        found = estimator.posterior(signals, around(-PLACE))
+        np.testing.assert_allclose(found.mean, free.mean, atol=0.1)
+
+
+@pytest.mark.parametrize(('options', 'message'), [
+    ({'wrong': 0.0}, 'wrong: 0.0, expected a probability between 0 and 1'),
+    ({'wrong': 1.0}, 'wrong: 1.0, expected'), ({'wrong': np.nan}, 'wrong: nan, expected'),
+    ({'share': 0.0}, 'share: 0.0, expected an exponent above 0'),
+    ({'share': 2.0}, 'share: 2.0, expected'), ({'n_before': -1}, 'n_before: -1.0, expected')])
+def test_an_argument_out_of_range_is_named(table1_estimator, options, message):
+    with pytest.raises(ValueError, match=message):
+        table1_estimator.posterior(np.zeros((2, 32)), around(PLACE), **options)
+
+
 def test_positions_are_in_the_frame_of_the_surface_and_mixtures_in_that_of_the_site(
         shipped, table1_estimator, model):
     placed = BayesEstimator(System(dataclasses.replace(Scenario(), pose=POSE), shipped))

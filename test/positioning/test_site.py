@@ -12,6 +12,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.positioning import SignalError, Site, SiteError, SiteEstimator
 from rhs_isac_ros.positioning.agreement import PoseTest
+from rhs_isac_ros.positioning.fusion import Fuser
 from rhs_isac_ros.positioning.site import site_text
 from rhs_isac_ros.system import System
 
@@ -216,3 +217,12 @@ def test_all_surfaces_see_the_same_velocity(monkeypatch):
     np.testing.assert_allclose(front[1], states[:, 3:])
     with pytest.raises(ValueError, match=r'positions: shape \(3,\), expected \[N, 3\] or'):
         site.sample(places[0], np.random.default_rng(2))
+
+
+@pytest.mark.parametrize('bounds_m', [BOUNDS[::-1], BOUNDS[:1], np.nan * BOUNDS])
+def test_bounds_are_two_corners(bounds_m):
+    with pytest.raises(SiteError, match='bounds_m: .*expected'):
+        Site({'front': FRONT}, bounds_m)
+    with pytest.raises(ValueError, match='bounds_m: .*expected'):
+        Fuser(bounds_m)
+    assert Site({'front': FRONT}, BOUNDS.astype(int).tolist()).bounds_m.dtype == float
