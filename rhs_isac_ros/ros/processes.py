@@ -34,6 +34,7 @@ class Processes:
         # The variable gives the enclave of this process, but each node has its own enclave.
         self._environment.pop('ROS_SECURITY_ENCLAVE_OVERRIDE', None)
         self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._commands: dict[str, list[str]] = {}
 
     def start(
             self, executable: str, name: str = '', process: str = '', namespace: str = '',
@@ -55,7 +56,12 @@ class Processes:
         for key, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ['-p', f'{key}:={text}']
-        with open(self._logs / f'{name}.log', 'ab') as stream:
+        self._commands[name] = command
+        self._spawn(name)
+
+    def _spawn(self, name: str) -> None:
+        command, log = self._commands[name], self._logs / f'{name}.log'
+        with open(log, 'ab') as stream:
             self._running[name] = subprocess.Popen(
                 with_parent(command), stdin=subprocess.DEVNULL, stdout=stream, stderr=stream,
                 env=self._environment, start_new_session=True)
@@ -63,7 +69,7 @@ class Processes:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all processes that were started."""
-        return tuple(self._running)
+        return tuple(self._commands)
 
     def ended(self) -> dict[str, int]:
         """Return the exit codes, by name, of processes that have ended."""

@@ -2,7 +2,6 @@
 
 import dataclasses
 import signal
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -75,8 +74,7 @@ def test_samples_that_cannot_be_written_have_an_exit_code(tmp_path, monkeypatch,
     error = 'samples: samples cannot be written: No space left on device; the recording has ended'
 
     def start(processes, *_, **__):
-        processes._running['channel'] = subprocess.Popen(['true'])
-        processes._running['channel'].wait()
+        processes._commands['channel'] = []
         (processes._logs / 'channel.log').write_text(
             f'[INFO] [1.0] [channel]: serving\n[ERROR] [2.0] [channel]: {error}\n')
         signal.raise_signal(signal.SIGINT)
