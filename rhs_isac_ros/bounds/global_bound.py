@@ -26,6 +26,7 @@ from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.geometry import jacobian, polar_bounds, to_polar
+from rhs_isac_ros.support.fields import whole
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Lattice steps of (r, u, v), in standard deviations of one coordinate with the others known, and
@@ -66,8 +67,7 @@ def global_bound(
     The bound holds for a synchronised user: nuisance parameters of the scenario are not included.
     Raises ValueError if `n_phases` is less than 2.
     """
-    if n_phases < 2:
-        raise ValueError(f'n_phases: {n_phases}, expected at least 2')
+    n_phases = whole('n_phases', n_phases, 2)
     steps, coarseness = _steps(model.prepare(), rng)
     parts = []
     for first in range(0, n_phases, _PER_OFFSET):

@@ -102,7 +102,7 @@ class Exponents:
             exponents = values[..., rows] @ patterns.reshape(len(rows), -1)
             divided = divided * np.exp(-exponents).reshape(
                 *values.shape[:-1], *patterns.shape[1:])
-        return divided.reshape(*divided.shape[:-2], -1)
+        return divided.reshape(*divided.shape[:-2], signals.shape[-1])
 
     @functools.cached_property
     def _by_axes(self) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -23,7 +23,7 @@ from rhs_isac_ros.model.numerology import nr_grid
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.errors import translated
-from rhs_isac_ros.support.fields import UNKNOWN, Field, to_number
+from rhs_isac_ros.support.fields import UNKNOWN, Field, to_number, whole
 from rhs_isac_ros.support.files import read_yaml
 from rhs_isac_ros.support.plugins import PluginError
 
@@ -466,9 +466,9 @@ class Scenario(Extensions, Table1):
         They are uniform in the region of interest or, with a channel file, drawn from its users.
         """
         if self.channel:
-            return self.channel.users[rng.integers(len(self.channel.users), size=n)]
+            return self.channel.users[rng.integers(len(self.channel.users), size=whole('n', n))]
         low, high = self.roi_bounds_m
-        return rng.uniform(low, high, size=(n, 3))
+        return rng.uniform(low, high, size=(whole('n', n), 3))
 
 
 def _with_paths(values: dict[str, Any], convert: Callable[[str], str]) -> dict[str, Any]:

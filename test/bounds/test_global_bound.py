@@ -94,8 +94,9 @@ def test_log_likelihoods_are_interpolated_over_the_range_also_for_wide_bands():
 
 
 def test_too_few_phases_are_an_error():
-    with pytest.raises(ValueError, match='n_phases: 1, expected at least 2'):
-        bound_and_codebook(1)
+    for n_phases, expected in ((1, 'at least 2'), (1e3, 'an integer, at least 2')):
+        with pytest.raises(ValueError, match=f'n_phases: {n_phases}, expected {expected}'):
+            bound_and_codebook(n_phases)
 
 
 def test_a_flat_region_is_the_limit_of_thin_ones():

@@ -105,6 +105,9 @@ def test_without_pilots_the_estimate_is_the_prior(scenario, beams):
     covariance = found.error_covariance(scenario, beams)
     declared = elements.error_covariance(scenario, beams)
     assert np.abs(covariance - declared).max() < 0.05 * np.abs(declared).max()
+    none = Pilots(beams, np.zeros((0, 3)), np.zeros((0, *MeasurementModel(scenario, beams).shape)))
+    np.testing.assert_array_equal(
+        calibrate(scenario, [none]).surface.gains, calibrate(scenario, []).surface.gains)
 
 
 def test_gains_and_phases_of_bands_are_estimated(scenario, beams, damaged, send):

@@ -365,6 +365,9 @@ def test_positions_are_uniform_in_the_region():
     np.testing.assert_allclose(unit.mean(axis=0), 0.5, atol=0.01)
     np.testing.assert_allclose(np.cov(unit.T), np.eye(3) / 12, atol=0.003)
     np.testing.assert_array_equal(positions, s.sample_positions(20_000, np.random.default_rng(0)))
+    for n, expected in ((-1, 'at least 0'), (1e3, 'an integer, at least 0')):
+        with pytest.raises(ValueError, match=f'n: {n}, expected {expected}'):
+            s.sample_positions(n, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(('field', 'value'), [
