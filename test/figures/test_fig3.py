@@ -79,9 +79,10 @@ def test_the_command_writes_all_files_and_repeats_no_finished_trial(
     monkeypatch.setattr(fig3, 'METHODS', ('alternating', 'direct', 'genetic'))
     monkeypatch.setattr(fig3, 'BANDS', (1, 2))
     made = []
+    record = made.append
 
     def trial(method, n_bands, seed, samples, held_out, max_steps):
-        made.append((method, n_bands, seed))
+        record((method, n_bands, seed))
         return {'crlb_m2': 1.0 / n_bands, 'held_out_m2': 1.0, 'seconds': 1.0}
     monkeypatch.setattr(fig3, 'trial', trial)
     call = ['--jobs', '1', '--output', str(tmp_path)]

@@ -18,10 +18,11 @@ from figures import synchronisation as figure  # noqa: E402
 def located(monkeypatch):
     """The blocks that were located, with the jobs replaced by formulas."""
     def evaluate(family, scenario, codebook, seed, first, n, estimator):
-        made.append((Scenario(**scenario).id, first))
+        record((Scenario(**scenario).id, first))
         return {'squared_error_m2': [0.1 + Scenario(**scenario).band_phase_std_rad] * n}
 
     made = []
+    record = made.append
     monkeypatch.setattr(sweep, 'design', lambda scenario, **_: random_codebook(
         Scenario(**scenario), np.random.default_rng(0)).to_parameters())
     monkeypatch.setattr(sweep, 'evaluate', evaluate)
