@@ -9,8 +9,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.calibration import Calibration
 from rhs_isac_ros.codebook import library_command
@@ -48,7 +46,7 @@ from rhs_isac_ros.support.arguments import (
     seed,
 )
 from rhs_isac_ros.support.exits import exit_code_of, finished
-from rhs_isac_ros.support.files import save_or_rescue, write_whole
+from rhs_isac_ros.support.files import save_or_rescue
 from rhs_isac_ros.support.job_commands import add_run_options, unfinished
 from rhs_isac_ros.support.jobs import JobError, Workers
 from rhs_isac_ros.support.optional import MissingLibraryError
@@ -90,7 +88,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('--output', type=output_file, default='codebook.yaml',
         help='file to write; an existing file is replaced at the end')
-    add('--scenario', type=input_file,
+    add('--scenario', '--config', type=input_file,
         help="YAML file of the scenario; the paper's Table I if omitted")
     add('--calibration', type=input_file,
         help="calibration file of the surface; the scenario's surface if omitted")
@@ -222,17 +220,11 @@ def _choose_bands(
         scenario, options.spectrum, options.bands, raster_hz=options.raster,
         min_gap_hz=options.min_gap, seed=options.seed, report=report, workers=workers)
     best = best_of(scenario, candidates, given, options.seed, report, workers=workers)
-    _save_plan(options.plan, best.scenario)
+    best.scenario.to_yaml(options.plan, 'Chosen by python3 -m rhs_isac_ros.codebook --spectrum. '
+                          'Omitted fields have the values of Table I.')
     print(f'{options.plan}: {_in_ghz(best.scenario.center_frequencies_hz)}, '
           f'{best.scenario.n_frames} frames each')
     return best
-
-
-def _save_plan(path: Path, scenario: Scenario) -> None:
-    changes = yaml.safe_dump(
-        scenario.changes(path.parent), sort_keys=False, default_flow_style=None)
-    write_whole(path, f'# Chosen by python3 -m rhs_isac_ros.codebook --spectrum. Omitted '
-                      f'fields have the values of Table I.\n{changes}')
 
 
 def _in_ghz(frequencies_hz: Sequence[float]) -> str:

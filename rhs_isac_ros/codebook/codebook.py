@@ -37,7 +37,7 @@ class CodebookError(ValueError):
     """A codebook is missing or malformed, or does not fit a scenario."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Codebook:
     """Analog and digital beamforming of a positioning phase.
 
@@ -48,8 +48,8 @@ class Codebook:
     --------
     >>> codebook = Codebook.default()
     >>> codebook.check(Scenario())  # An error if it did not fit.
-    >>> codebook.shape, codebook.id
-    ((2, 8, 4, 3, 100), 'cbc9e0547b8d8915e7')
+    >>> codebook
+    Codebook(id='cbc9e0547b8d8915e7', shape=(2, 8, 4, 3, 100), average_crlb_m2=0.0465)
     """
 
     analog: np.ndarray  #: Configurations C, float64 [N_B, F, N_E], each entry in [0, 1].
@@ -79,6 +79,11 @@ class Codebook:
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and unpickle through the constructor: NumPy's own copies could be changed."""
         return type(self), tuple(getattr(self, field.name) for field in dataclasses.fields(self))
+
+    def __repr__(self) -> str:
+        """Return the identifier, the sizes and the bound, but no arrays."""
+        return (f'Codebook(id={self.id!r}, shape={self.shape}, '
+                f'average_crlb_m2={self.average_crlb_m2:.3g})')
 
     @property
     def shape(self) -> tuple[int, int, int, int, int]:

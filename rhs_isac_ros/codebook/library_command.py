@@ -37,7 +37,7 @@ def _parser() -> ArgumentParser:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     add = parser.add_argument
     add('--output', type=output_file, default='library.npz', help='file to write')
-    add('--scenario', type=input_file,
+    add('--scenario', '--config', type=input_file,
         help="YAML file of the scenario; the paper's Table I if omitted")
     add('--start', type=input_file,
         help='codebook of the whole region, from which each optimisation starts; '

@@ -67,7 +67,8 @@ class OptimizeResult:
     """Result of an optimisation."""
 
     codebook: Codebook  #: The best one found; `average_crlb_m2` is for the sampled positions.
-    history: tuple[Progress, ...]  #: Progress at the start and after each step.
+    #: Progress at the start and after each step.
+    history: tuple[Progress, ...] = dataclasses.field(repr=False)
     reason: str  #: The reason for stopping.
 
 

@@ -96,7 +96,7 @@ def _add_options(parser: ArgumentParser) -> None:
     add('--measure', type=_type(parse_measures), default='crlb,mse', metavar='NAME,...',
         help='measures, each in its own panel; NAME+NAME draws several in one panel '
              '(default: %(default)s)')
-    add('--scenario', type=input_file, metavar='FILE',
+    add('--scenario', '--config', type=input_file, metavar='FILE',
         help="YAML file of all other fields (default: the paper's Table I)")
     add('--estimator', default='bayes', metavar='NAME',
         help='bayes, ml, an installed plug-in or MODULE:NAME (default: %(default)s)')

@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     style = argparse.ArgumentDefaultsHelpFormatter
     guides = kinds.add_parser('waveguides', formatter_class=style,
                               help='compute waveguides with coupled dipoles')
-    guides.add_argument('--scenario', type=input_file, required=True,
+    guides.add_argument('--scenario', '--config', type=input_file, required=True,
                         help='YAML file of the scenario; its field board is ignored')
     guides.add_argument('--loss', type=positive_float, default=3.0,
                         help='loss of the guides [dB/m]')

@@ -159,7 +159,7 @@ class DeclaredElements(SurfaceModel):
         return measurement_correlation(scenario) * np.matmul(flat, adjoint(flat)), direct
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class SurfaceEstimate(SurfaceModel):
     """Mean and covariance of the coefficients of a surface, ``gain c + offset``.
 
@@ -189,6 +189,11 @@ class SurfaceEstimate(SurfaceModel):
         if n_elements and not (0 <= probability.min() and probability.max() <= 1):
             raise ValueError(f'failed_probability: {probability.min():g} to '
                              f'{probability.max():g}, expected 0 to 1')
+
+    def __repr__(self) -> str:
+        """Return the identifier and the sizes, but no arrays."""
+        return (f'SurfaceEstimate(id={self.id!r}, n_bands={len(self.band_gains)}, '
+                f'n_elements={len(self.gains)})')
 
     @property
     def is_exact(self) -> bool:

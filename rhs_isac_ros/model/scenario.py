@@ -24,7 +24,7 @@ from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import UNKNOWN, Field, to_number, whole
-from rhs_isac_ros.support.files import read_yaml
+from rhs_isac_ros.support.files import read_yaml, write_yaml
 from rhs_isac_ros.support.plugins import PluginError
 
 # Largest number of elements at given positions, whose covariances are computed one by one.
@@ -342,9 +342,8 @@ class Scenario(Extensions, Table1):
         """Read a scenario from a YAML file that maps field names to values.
 
         ``grid`` may map the parameters of `nr_grid` to values, in place of the fields that this
-        function returns.
-        Fields that the file omits keep their defaults. Paths in the file are relative to its
-        folder. Raises ScenarioError if the file is unreadable or invalid.
+        function returns. Fields that the file omits keep their defaults. Paths in the file are
+        relative to its folder. Raises ScenarioError if the file is unreadable or invalid.
         """
         with translated(ValueError, ScenarioError):
             content = read_yaml(path)
@@ -375,6 +374,10 @@ class Scenario(Extensions, Table1):
             changes = _with_paths(changes, lambda file: os.path.relpath(
                 os.path.realpath(file), os.path.realpath(folder)))
         return changes
+
+    def to_yaml(self, path: str | Path, about: str = '') -> None:
+        """Write the `changes` to a file for `from_yaml`, with a comment; OSError if this fails."""
+        write_yaml(path, self.changes(Path(path).parent), about)
 
     def fields(self) -> dict[str, Any]:
         """Return all fields by name, as plain values; see `changes`."""
@@ -461,10 +464,7 @@ class Scenario(Extensions, Table1):
         return read_only(np.stack([center - size / 2, center + size / 2]))
 
     def sample_positions(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw positions of users, float64 [n, 3] [m].
-
-        They are uniform in the region of interest or, with a channel file, drawn from its users.
-        """
+        """Draw positions, float64 [n, 3] [m], in the region or of the users of a channel file."""
         if self.channel:
             return self.channel.users[rng.integers(len(self.channel.users), size=whole('n', n))]
         low, high = self.roi_bounds_m

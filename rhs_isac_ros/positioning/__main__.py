@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     add = parser.add_argument
     add('--codebook', type=input_file, required=True, help='codebook file')
-    add('--scenario', type=input_file,
+    add('--scenario', '--config', type=input_file,
         help="YAML file of the scenario; the paper's Table I if omitted")
     add('--pairs', type=integer(20, 10**7), default=DEFAULT_PAIRS,
         help='simulated pairs for training, validation and test, 7 : 1.5 : 1.5')

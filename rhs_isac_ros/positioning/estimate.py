@@ -68,7 +68,7 @@ class Sighting:
         return dataclasses.replace(self, pose=pose, mixture=self.mixture.moved(self.pose, pose))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Estimate:
     """A position with its uncertainty, or the reason why there is none; or N of these.
 
@@ -115,6 +115,14 @@ class Estimate:
     #: The `sighting`, or a function that returns it.
     see: Callable[[], Sighting] | Sighting | None = None
     frame: str = SURFACE  #: ``surface`` or ``site``: the frame of the mean and the velocity.
+
+    def __repr__(self) -> str:
+        """Return position, standard deviations and reason, or how many of N have a position."""
+        if self.mean.ndim > 1:
+            n_fixes = int(np.isfinite(self.mean[:, 0]).sum())
+            return f'<{len(self.mean)} estimates, {n_fixes} with a position>'
+        std = np.sqrt(np.diagonal(self.covariance))
+        return f'Estimate(mean={self.mean}, std={std}, reason={self.reason!r})'
 
     @property
     def mixture(self) -> Mixture | None:

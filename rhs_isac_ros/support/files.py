@@ -181,6 +181,12 @@ def read_yaml(path: str | Path, max_bytes: int = _MAX_YAML_BYTES) -> Any:
         raise ValueError(f'{path}: cannot be read: {_reason(error)}') from error
 
 
+def write_yaml(path: str | Path, content: Mapping[str, Any], about: str = '') -> None:
+    """Write plain values as YAML behind a comment, if any; raise OSError if this fails."""
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+    write_whole(path, f'# {about}\n{text}' if about else text)
+
+
 def _reason(error: Exception) -> str:
     """Return the text of an error in one line, without the name of a file."""
     return ' '.join(str(getattr(error, 'strerror', None) or error).split())

@@ -8,7 +8,6 @@ import time
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any
 
-import yaml
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
@@ -30,7 +29,6 @@ from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import RecordingError, read, recorded_topics
 from rhs_isac_ros.ros.run import spin
 from rhs_isac_ros.support.arguments import positive_float
-from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.command import ToolError
 
@@ -298,7 +296,7 @@ def _first_codebook(options: argparse.Namespace) -> Codebook:
 
 def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
-        write_whole(file := f'{folder}/scenario.yaml', yaml.safe_dump(scenario.changes(folder)))
+        scenario.to_yaml(file := f'{folder}/scenario.yaml')
         return OptimizerNode(parameter_overrides=ros_parameters(
             {'scenario_file': file, **codebook.to_parameters()}))
 

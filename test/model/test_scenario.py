@@ -5,7 +5,6 @@ import re
 
 import numpy as np
 import pytest
-import yaml
 
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Pose, Scenario, ScenarioError
 from rhs_isac_ros.model.hall import PathChannel
@@ -226,12 +225,11 @@ CHANGES = [
 
 @pytest.mark.parametrize('changes', CHANGES, ids=str)
 def test_changes_are_the_differences_from_table_1(tmp_path, changes):
-    found = Scenario(**changes).changes()
-    assert found == changes
-    # Safe YAML has lists, but no tuples.
-    path = tmp_path / 'scenario.yaml'
-    path.write_text(yaml.safe_dump(found), encoding='utf-8')
-    assert Scenario.from_yaml(path) == Scenario(**changes)
+    scenario = Scenario(**changes)
+    assert scenario.changes() == changes
+    scenario.to_yaml(path := tmp_path / 'scenario.yaml', 'A comment.')
+    assert path.read_text(encoding='utf-8').startswith('# A comment.\n')
+    assert Scenario.from_yaml(path) == scenario
 
 
 def test_paths_are_relative_to_the_folder_of_the_file(tmp_path, monkeypatch):
@@ -244,7 +242,7 @@ def test_paths_are_relative_to_the_folder_of_the_file(tmp_path, monkeypatch):
     (tmp_path / 'link').symlink_to(tmp_path / 'all' / 'plans')
     for folder in ('all/plans', 'link'):
         path = tmp_path / folder / 'plan.yaml'
-        path.write_text(yaml.safe_dump(scenario.changes(path.parent)), encoding='utf-8')
+        scenario.to_yaml(path)
         assert Scenario.from_yaml(path).id == scenario.id
 
 
@@ -309,7 +307,7 @@ class TestPose:
         scenario = Scenario.from_yaml(path)
         assert scenario.pose == Pose((0, 10, 1), (0, 0, -0.5, 0.5), (0.01, 0.1))
         assert scenario.changes() == {'pose': self.PLACED}
-        path.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
+        scenario.to_yaml(path)
         assert Scenario.from_yaml(path) == Scenario(**scenario.fields()) == scenario
         path.write_text('pose: {position_m: [0, 10, 1], uncertainty: [0.01, 0.1], '
                         'quaternion: {w: 0.5, x: 0, y: 0, z: -0.5}}', encoding='utf-8')

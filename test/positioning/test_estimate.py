@@ -30,6 +30,13 @@ def test_the_error_for_another_shape_names_field_shape_and_expectation(small, sh
     assert message.startswith(f'received: shape {shape}, expected [N_B, N_SB F] = (1, 6)')
 
 
+def test_a_notebook_shows_position_errors_and_reason():
+    one = Estimate(np.array([9.0, 1.0, 0.0]), np.diag([4.0, 1.0, 0.25]))
+    assert repr(one) == "Estimate(mean=[9. 1. 0.], std=[2.  1.  0.5], reason='')"
+    two = Estimate(np.array([[9.0, 1, 0], [np.nan] * 3]), np.full((2, 3, 3), np.nan), ('', 'far'))
+    assert repr(two) == '<2 estimates, 1 with a position>'
+
+
 def test_a_position_in_the_site_contains_the_errors_of_the_pose():
     mixture = Mixture(np.zeros(2), [[9.0, 1.0, 0.0], [11.0, 1.0, 0.0]], [np.eye(3)] * 2)
     found = Estimate(*mixture.moments(), density=mixture)
