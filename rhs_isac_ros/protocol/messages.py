@@ -12,6 +12,7 @@ import numpy as np
 
 from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.model.arrays import all_finite, position_problem
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.support.fields import Field
 
 
@@ -338,7 +339,7 @@ class PositionEstimate(Message):
     codebook_id: str
     position: np.ndarray = array('3', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M,
                                  in_front=True)
-    covariance_m2: np.ndarray = array('3 3')
+    covariance_m2: np.ndarray = array('3 3', low=-MAX_COORDINATE_M**2, high=MAX_COORDINATE_M**2)
     crlb_m2: float = optional_float()
     estimator: str
     latency_s: float = number(0, 3600)
@@ -376,8 +377,10 @@ class Posterior(Message):
     #: The likelihood around the surface, in range [m] and direction cosines; of no length if the
     #: Gaussians in the frame of the site touch it at their means.
     sheet_log_weights: np.ndarray = array('SHEETS', empty=True)
-    sheet_means: np.ndarray = array('SHEETS 3', empty=True)
-    sheet_covariances: np.ndarray = array('SHEETS 3 3', empty=True)
+    sheet_means: np.ndarray = array(
+        'SHEETS 3', empty=True, low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M)
+    sheet_covariances: np.ndarray = array(
+        'SHEETS 3 3', empty=True, low=-MAX_COORDINATE_M**2, high=MAX_COORDINATE_M**2)
     #: Log-likelihoods relative to a user in the region and in sight; NaN if unknown.
     outside_log_ratio: float = optional_float(math.nan)
     blocked_log_ratio: float = optional_float(math.nan)
@@ -479,7 +482,7 @@ class GroundTruth(Message):
     user: int = number(1, LAST_USER)
     position: np.ndarray = array('3', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M,
                                  in_front=True)
-    velocity: np.ndarray = array('3')
+    velocity: np.ndarray = array('3', low=-SPEED_OF_LIGHT_MPS, high=SPEED_OF_LIGHT_MPS)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -489,7 +492,7 @@ class GroundTruths(Message):
     users: np.ndarray = array('USERS', int, low=1, high=LAST_USER)
     position: np.ndarray = array('USERS 3', low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M,
                                  in_front=True)
-    velocity: np.ndarray = array('USERS 3')
+    velocity: np.ndarray = array('USERS 3', low=-SPEED_OF_LIGHT_MPS, high=SPEED_OF_LIGHT_MPS)
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
         """Return the number of users, USERS."""

@@ -165,6 +165,12 @@ MALFORMED = [
     (m.Posterior, {'surface_uncertainty': -np.eye(6)}, 'without negative eigenvalues'),
     (m.Posterior, {'log_weights': np.zeros(257), 'means': np.zeros((257, 3)),
                    'covariances_m2': np.tile(np.eye(3), (257, 1, 1))}, 'expected at most 256'),
+    # The position of a later frame would be beyond all that the model computes.
+    *((kind, {'velocity': sets(-3e8)}, 'velocity: -3e+08') for kind in (
+        m.GroundTruth, m.GroundTruths)),
+    (m.PositionEstimate, {'covariance_m2': np.eye(3) * 1e13}, 'covariance_m2: 0 to 1e+13'),
+    (m.Posterior, {'sheet_means': np.full((1, 3), 1e7), 'sheet_log_weights': np.zeros(1),
+                   'sheet_covariances': np.eye(3)[None]}, 'sheet_means: 1e+07 to 1e+07'),
     (m.GroundTruth, {'position': np.array([5.0, 1j, 0.0])}, 'expected real numbers'),
     (m.GroundTruth, {'position': np.ma.array([5.0, 1.0, 0.0], mask=[0, 1, 0])},
      'expected real numbers'),
