@@ -90,13 +90,14 @@ def foreign():
 def test_a_node_without_parameter_services_does_not_end_the_list(
         foreign, output_of, call, monkeypatch):
     """The recorder is such a node."""
-    monkeypatch.setattr(param, '_SERVICE_TIMEOUT_S', 1.0)
     context = foreign.context
     silent = Node('a_silent_node', context=context, start_parameter_services=False)
+    # Nodes that have the services get the time that they have in use.
     out, err, code = call(main, 'list')
     assert code == 0
     assert '/bs:' in out.splitlines() and '/foreign:' in out.splitlines()
     assert 'parameter services for node /a_silent_node' in err
+    monkeypatch.setattr(param, '_SERVICE_TIMEOUT_S', 0.1)
     assert call(main, 'list', 'a_silent_node')[2] == 1
     silent.destroy_node()
 
@@ -160,7 +161,7 @@ def test_load_sets_the_parameters_of_a_dump(output_of, call, tmp_path):
 def test_a_request_is_repeated_until_a_response_arrives(output_of, monkeypatch):
     """DDS may lose a response to a client that it has just discovered."""
     send, lost = AsyncParameterClient.list_parameters, [Future(), Future()]
-    monkeypatch.setattr(param, '_SERVICE_TIMEOUT_S', 2.5)
+    monkeypatch.setattr(param, '_SERVICE_TIMEOUT_S', 6.0)
     monkeypatch.setattr(AsyncParameterClient, 'list_parameters',
                         lambda client: lost.pop() if lost else send(client))
     assert '  policy' in output_of(main, 'list', 'bs').splitlines()
