@@ -109,7 +109,7 @@ def built_scripts():
     Under ``scripts/test``, they have one.
     """
     done = subprocess.run(['bash', '-c', '. scripts/env.sh'], cwd=HERE.parent,
-                          capture_output=True, text=True, timeout=60, check=False)
+                          capture_output=True, text=True, timeout=240, check=False)
     if done.returncode:
         pytest.skip(f'a test of the scripts: {done.stderr.strip()}')
 

@@ -1,5 +1,6 @@
 """An emulated board that is as fast as it can be, and has faults at chosen patterns."""
 
+import contextlib
 import fcntl
 import os
 
@@ -7,6 +8,21 @@ import numpy as np
 
 from rhs_isac_ros.frontend.opensourceris import to_configuration
 from rhs_isac_ros.frontend.opensourceris_emulator import _COMMAND, EmulatedBoard
+
+# Time for an answer [s]: a busy machine delays those of the emulated board. A driver waits only
+# briefly while it is to receive none.
+ANSWER_S, NO_ANSWER_S = 60.0, 0.05
+
+
+@contextlib.contextmanager
+def impatient(driver):
+    """Let a driver, whose connection is synchronised, wait only briefly for an answer."""
+    driver.supply_voltage_v()
+    driver._timeout_s, before = NO_ANSWER_S, driver._timeout_s
+    try:
+        yield
+    finally:
+        driver._timeout_s = before
 
 
 class FaultyBoard(EmulatedBoard):

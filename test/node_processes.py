@@ -25,6 +25,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import OBSERVATION
 from rhs_isac_ros.ros.environment import claim_domain
+from rhs_isac_ros.ros.parameters import NODES
 from rhs_isac_ros.ros.processes import with_parent
 
 # Set before rclpy reads them; the child processes inherit them.
@@ -35,6 +36,8 @@ REQUEST_S = 10.0
 # Texts that show an uncaught exception.
 CRASH_TEXTS = ('Traceback', 'Exception in', 'Error occurred at', '[FATAL]', 'Segmentation')
 EXECUTABLES = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros'
+# A step of a cycle is repeated every 0.25 s, as by default, but for longer on a busy machine.
+STEPS = {'step_timeout_s': 10.0, 'retries': 39}
 
 
 class Process:
@@ -102,7 +105,9 @@ class Processes:
 
         By default, it is a copy of a process that has imported it; a program takes longer.
         """
-        for key, value in parameters.items():
+        known = {parameter.name for parameter in NODES[executable]}
+        steps = {key: value for key, value in STEPS.items() if key in known}
+        for key, value in (steps | parameters).items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             arguments += ('-p', f'{key}:={text}')
         if name:

@@ -213,7 +213,7 @@ def processes(built_scripts, tmp_path_factory):
 @pytest.mark.parametrize('index', range(len(PROCESSES)), ids=lambda i: ' '.join(PROCESSES[i][0]))
 def test_a_script_prints_one_line_and_exits_with_code_2(index, processes):
     folder, process = processes[index]
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=240)
     assert (process.returncode, output) == (2, '')
     assert_one_line(errors, PROCESSES[index][1])
     assert not os.listdir(folder)

@@ -22,7 +22,7 @@ def installed():
         [sys.executable, '-c', 'import runpy, setuptools\n'
          'setuptools.setup = lambda **options: print(*options["entry_points"].popitem()[1])\n'
          'runpy.run_path("setup.py")'],
-        cwd=ROOT, capture_output=True, text=True, check=True, timeout=60).stdout
+        cwd=ROOT, capture_output=True, text=True, check=True, timeout=240).stdout
     return re.findall(r'(\w+) = ', printed)
 
 
@@ -103,5 +103,5 @@ importlib.import_module = slow
         env={**os.environ, 'PYTHONPATH': os.pathsep.join(map(str, [ROOT, *sys.path]))})
     assert process.stdout.readline() == f'importing rhs_isac_ros.{module}\n'
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=240)
     assert (process.returncode, errors) == (0, '')

@@ -20,7 +20,7 @@ from rhs_isac_ros.ros.roster import FOLLOWING, UNIQUE
 
 ROOT = Path(__file__).parents[1]
 FILES = ('network.launch.py', 'network.launch.xml', 'site.launch.py')
-TIMEOUT_S = 60.0
+TIMEOUT_S = 120.0
 # mcap has no rosdep key.
 RECORDS = importlib.util.find_spec('mcap') is not None
 # A short form of `ros2 launch --noninteractive`, which passes SIGINT on to the processes.

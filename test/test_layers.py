@@ -34,7 +34,7 @@ for name in {names!r}:
 def imported_in_a_fresh_interpreter(names):
     path = os.pathsep.join([str(ROOT.parent), os.environ.get('PYTHONPATH', '')])
     return subprocess.run(
-        [sys.executable, '-c', CODE.format(refused=REFUSED, names=names)], text=True, timeout=60,
+        [sys.executable, '-c', CODE.format(refused=REFUSED, names=names)], text=True, timeout=240,
         capture_output=True, env=os.environ | {'PYTHONPATH': path}, check=False)
 
 

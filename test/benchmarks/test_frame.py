@@ -114,7 +114,7 @@ def test_jobs_of_a_program_use_its_caches_and_ufuncs_in_other_processes(tmp_path
     path = os.pathsep.join([str(tmp_path), str(frame.CONFIG.parent / 'scripts'), *sys.path])
     done = subprocess.run(
         [sys.executable, str(program), '--jobs', '2'], cwd=tmp_path, capture_output=True,
-        text=True, timeout=60, check=False, env={**os.environ, 'PYTHONPATH': path})
+        text=True, timeout=240, check=False, env={**os.environ, 'PYTHONPATH': path})
     assert done.returncode == 0, done.stderr
     assert re.fullmatch(
         r"{'one': {'squared': 3.8414\d*}, 'three': {'squared': 7.8147\d*}}\n", done.stdout)

@@ -212,7 +212,7 @@ def server():
 @pytest.fixture
 def openris(server):
     surface = make_surface(
-        'openris', 512, address='127.0.0.1', port=server.port, tile=3, timeout_s=0.2)
+        'openris', 512, address='127.0.0.1', port=server.port, tile=3, timeout_s=60.0)
     yield surface
     surface.close()
 
@@ -229,9 +229,12 @@ def test_the_board_over_tcp_shows_rows_from_the_top(openris, server):
 
 @pytest.mark.parametrize(('answer', 'kind'), [
     (b'', 'silence'), (b'b', 'garbled'), (b'x', 'garbled'), (b'aa', 'garbled')])
-def test_the_board_over_tcp_recovers_with_a_new_connection(openris, server, answer, kind):
+def test_the_board_over_tcp_recovers_with_a_new_connection(
+        openris, server, monkeypatch, answer, kind):
     server.answers = iter([answer])
-    with pytest.raises(SurfaceFault) as caught:
+    with monkeypatch.context() as patch, pytest.raises(SurfaceFault) as caught:
+        if kind == 'silence':
+            patch.setattr(openris, '_timeout_s', 0.1)
         openris.apply(np.ones(512))
     assert caught.value.kind == kind
     openris.apply(np.ones(512))

@@ -9,7 +9,7 @@ from parts import frame
 
 def test_without_arguments_it_lists_the_experiments(pytestconfig):
     scripts = pytestconfig.rootpath / 'scripts'
-    listed = subprocess.run([scripts / 'reproduce'], check=True, timeout=20, capture_output=True,
+    listed = subprocess.run([scripts / 'reproduce'], check=True, timeout=240, capture_output=True,
                             text=True).stdout.splitlines()[4:]
     assert [line.split()[0] for line in listed] == sorted(
         path.stem for path in (scripts / 'figures').glob('*.py'))

@@ -1,12 +1,9 @@
 """The emulated board without pauses, and its driver."""
 
 import pytest
-from faulty_board import FaultyBoard
+from faulty_board import ANSWER_S, FaultyBoard
 
 from rhs_isac_ros.frontend import OpenSourceRis
-
-# No answer of the emulated board takes as long, even on a busy machine.
-TIMEOUT_S = 0.5
 
 
 @pytest.fixture
@@ -17,6 +14,6 @@ def board():
 
 @pytest.fixture
 def driver(board):
-    driver = OpenSourceRis(port=board.port, timeout_s=TIMEOUT_S)
+    driver = OpenSourceRis(port=board.port, timeout_s=ANSWER_S)
     yield driver
     driver.close()

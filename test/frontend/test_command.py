@@ -19,7 +19,7 @@ def pattern(board, driver):
 
 
 def test_check_reads_every_element_back_and_restores_the_pattern(board, pattern, capsys):
-    assert main(['check', board.port, '--timeout', '2']) == 0
+    assert main(['check', board.port, '--timeout', '60']) == 0
     state, set_ms, read_ms, count = capsys.readouterr().out.splitlines()
     assert state == 'serial number 0, supply 5.80 V'
     assert re.fullmatch(r'set: median \d+\.\d\d ms, longest \d+\.\d\d ms', set_ms)
@@ -30,13 +30,13 @@ def test_check_reads_every_element_back_and_restores_the_pattern(board, pattern,
 
 def test_check_names_the_elements_that_differ(board, capsys):
     board.faults = {3: 'flipped bit', 200: 'flipped bit'}
-    assert main(['check', board.port, '--timeout', '2']) == 1
+    assert main(['check', board.port, '--timeout', '60']) == 1
     assert capsys.readouterr().out.splitlines()[-1] == (
         '254 of 256 patterns of one element are right; wrong: [3, 200]')
 
 
 def test_show_draws_the_pattern(board, pattern, capsys):
-    assert main(['show', board.port, '--timeout', '2']) == 0
+    assert main(['show', board.port, '--timeout', '60']) == 0
     assert capsys.readouterr().out == picture(pattern) + '\n'
 
 
@@ -52,7 +52,7 @@ def test_sweep_shows_one_element_after_the_other(board, pattern, capsys, monkeyp
         apply(driver, configuration)
         shown.append(board.configuration)
     monkeypatch.setattr(OpenSourceRis, 'apply', record)
-    assert main(['sweep', board.port, '--interval', '0', '--timeout', '2']) == 0
+    assert main(['sweep', board.port, '--interval', '0', '--timeout', '60']) == 0
     assert (shown == np.vstack([np.eye(256), pattern])).all()
     lines = capsys.readouterr().out.splitlines()
     assert (len(lines), lines[-1]) == (256, 'element 255: row 15, column 15')
@@ -62,7 +62,7 @@ def test_ctrl_c_ends_a_sweep_and_restores_the_pattern(board, pattern, monkeypatc
     def interrupt(_):
         raise KeyboardInterrupt
     monkeypatch.setattr('time.sleep', interrupt)
-    assert main(['sweep', board.port, '--timeout', '2']) == 130
+    assert main(['sweep', board.port, '--timeout', '60']) == 130
     assert (board.configuration == pattern).all()
 
 
@@ -76,5 +76,5 @@ def test_a_fault_is_one_line(board, capsys, monkeypatch):
 
 
 def test_the_emulated_board_needs_no_hardware(capsys):
-    assert main(['show', 'emulated', '--timeout', '2']) == 0
+    assert main(['show', 'emulated', '--timeout', '60']) == 0
     assert capsys.readouterr().out == picture(np.zeros(256)) + '\n'

@@ -53,7 +53,7 @@ def test_of_eight_commands_at_once_four_are_answered(board):
 
 def test_a_paced_board_is_as_slow_as_its_port():
     with EmulatedBoard() as board:
-        driver = OpenSourceRis(port=board.port, timeout_s=2.0, read_back=False)
+        driver = OpenSourceRis(port=board.port, timeout_s=60.0, read_back=False)
         driver.supply_voltage_v()
         start_s = time.monotonic()
         driver.apply([0] * 256)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from faulty_board import FaultyBoard
+from faulty_board import ANSWER_S, FaultyBoard
 
 from rhs_isac_ros.frontend import SURFACES, Surface, make_surface
 from rhs_isac_ros.support import plugins
@@ -27,7 +27,7 @@ def contract(request):
         yield surface, lambda: surface.applied
     else:
         with FaultyBoard() as board:
-            surface = make_surface(request.param, 256, port=board.port, timeout_s=0.5)
+            surface = make_surface(request.param, 256, port=board.port, timeout_s=ANSWER_S)
             yield surface, lambda: board.configuration
             surface.close()
 

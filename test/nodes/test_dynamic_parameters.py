@@ -42,10 +42,9 @@ class Running:
 
 @pytest.fixture(scope='module')
 def running(make_watch, module_processes, small_files):
-    # Without a pause, cycles are faster than the observer. On a busy machine, steps take long.
+    # Without a pause, cycles are faster than the observer.
     process = module_processes.start(
-        'network', namespace=f'/{NAMESPACE}', users=2, rest_s=0.05, retries=39,
-        step_timeout_s=10.0,
+        'network', namespace=f'/{NAMESPACE}', users=2, rest_s=0.05,
         scenario_file=small_files / 'scenario.yaml',
         codebook_file=small_files / 'first.yaml')
     running = Running(process, make_watch(f'/{NAMESPACE}'))

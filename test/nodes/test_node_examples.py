@@ -73,7 +73,9 @@ def test_a_network_with_the_radio_serves_the_user_without_repetitions(
     for role, values in {
             'optimizer': {'codebook_file': codebook_file}, 'rhs_controller': {},
             'positioner': {'table_folder': ''}, 'transmission': {},
-            'bs': {'receiver_noise': False, 'rest_s': 0.0}}.items():
+            # A step is repeated only if a message is lost, also on a busy machine.
+            'bs': {'receiver_noise': False, 'rest_s': 0.0, 'step_timeout_s': 10.0,
+                   'retries': 1}}.items():
         bench.add_role(role, values={'scenario_file': file, **values})
     bench.add(example.RadioNode, hardware.measure, hardware.carry, values={'scenario_file': file})
     receiver, posteriors = bench.add(Node, 'receiver'), []
@@ -96,7 +98,7 @@ def test_a_network_with_the_radio_serves_the_user_without_repetitions(
         finally:
             user.terminate()
             try:
-                user.wait(30)
+                user.wait(60)
             except subprocess.TimeoutExpired:
                 user.kill()
     # Rarely, Fast DDS 2.14 never destroys a publisher; see `run.run`.
@@ -123,7 +125,7 @@ def test_the_reader_of_posteriors_imports_nothing_of_this_package():
     done = subprocess.run(
         [sys.executable, '-c', "import runpy, sys; runpy.run_path(sys.argv[1]); "
          "assert not [name for name in sys.modules if name.startswith('rhs_isac_ros')]",
-         EXAMPLES / 'read_posterior.py'], timeout=60, check=False)
+         EXAMPLES / 'read_posterior.py'], timeout=240, check=False)
     assert done.returncode == 0
 
 

@@ -91,6 +91,6 @@ class Stuck(Node):
 run._DESTRUCTION_S = 1
 run.spin(lambda: [Stuck('stuck')], ['stuck'], lambda nodes: True)
 '''
-    done = subprocess.run([sys.executable, '-c', code], timeout=60, check=False,
+    done = subprocess.run([sys.executable, '-c', code], timeout=240, check=False,
                           capture_output=True, text=True)
     assert done.returncode == -signal.SIGALRM, done.stderr

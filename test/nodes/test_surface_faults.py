@@ -13,6 +13,8 @@ from rhs_isac_ros.protocol import messages as m
 SCENARIO = Scenario(
     n_subbands=2, n_frames=3, n_feeds=1, elements_per_side=16, amplitude_levels=2,
     roi_center_m=(3, 0, 0), roi_size_m=(1, 1, 1))
+# Times for an answer of the board, and for a step of a cycle [s], which suffice on a busy machine.
+ANSWER_S, STEP_S = 1.0, 4.0
 
 
 @pytest.fixture(scope='module')
@@ -30,8 +32,10 @@ def observed(module_bench, board, tmp_path_factory):
     for role, values in {
             'optimizer': {'codebook_file': folder / 'codebook.yaml'}, 'rhs_controller': {},
             'positioner': {'table_folder': folder}, 'transmission': {},
-            'channel': {'surface': 'opensourceris', 'surface_options': f'port={board.port}'},
-            'user': {'position_m': [3.0, 0.1, 0.2]}, 'bs': {'rest_s': 0.02}}.items():
+            'channel': {'surface': 'opensourceris',
+                        'surface_options': f'port={board.port} timeout_s={ANSWER_S}'},
+            'user': {'position_m': [3.0, 0.1, 0.2], 'step_timeout_s': STEP_S},
+            'bs': {'rest_s': 0.02, 'step_timeout_s': STEP_S}}.items():
         bench.add_role(role, values={'scenario_file': folder / 'scenario.yaml', **values})
     receiver = bench.add(Node, 'receiver')
     return bench.collect(receiver, m.ProtocolState), bench.collect(receiver, m.PositionEstimate)

@@ -92,11 +92,13 @@ def refused(monkeypatch):
 
 
 @pytest.mark.parametrize('role', sorted(ROSTER))
-def test_a_role_runs_without_what_was_refused(bench, refused, capfd, role):
+def test_a_role_runs_without_what_was_refused(bench, bench_files, refused, capfd, role):
     member = ROSTER[role]
-    node = bench.add_role(role, **({'name': 'user_1'} if role == 'user' else {}))
+    values = {'scenario_file': bench_files / 'scenario.yaml'} if member.has_codebook else {}
+    node = bench.add_role(
+        role, values=values, **({'name': 'user_1'} if role == 'user' else {}))
     if member.has_codebook:
-        node._on_codebook(Codebook.default())
+        node._on_codebook(Codebook.load(bench_files / 'first.yaml'))
     if role == 'positioner':
         bench.until(lambda: topics.NAMES[m.ReceivedSignals] in refused, 'the estimator')
         assert node.publish(position_estimate())
@@ -246,7 +248,7 @@ def test_closing_waits_for_the_running_job_and_discards_the_others(
         done.append(1)
     background.run(first, results.append)
     background.run(lambda: done.append(2), results.append)
-    assert begun.wait(10)
+    assert begun.wait(60)
     # Until the others are cancelled, the first one runs.
     monkeypatch.setattr(background._pool, 'shutdown', release)
     background.close()

@@ -8,7 +8,7 @@ import sys
 
 from system.trial_processes import TrialProcesses
 
-TIMEOUT_S = 60.0
+TIMEOUT_S = 120.0
 # A parent that starts two nodes and prints their process ids.
 PARENT = """
 import signal, sys

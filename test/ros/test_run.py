@@ -27,7 +27,7 @@ def program(name, *arguments, **environment):
     """Run an executable, and return its exit code and the lines of stderr that ROS did not log."""
     done = subprocess.run(
         [PROGRAMS / name, *arguments], env={**os.environ, **environment}, capture_output=True,
-        text=True, errors='backslashreplace', timeout=60, check=False)
+        text=True, errors='backslashreplace', timeout=240, check=False)
     return done.returncode, [line for line in done.stderr.splitlines() if line[:1] != '[']
 
 

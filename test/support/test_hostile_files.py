@@ -42,7 +42,7 @@ def test_yaml(tmp_path):
     for file, content in zip(files, FILES, strict=True):
         file.write_text(content, encoding='utf-8')
     done = subprocess.run([sys.executable, '-c', READ, *files], capture_output=True, text=True,
-                          timeout=60, check=True)
+                          timeout=240, check=True)
     for index, line in enumerate(done.stdout.splitlines()):
         assert line.startswith(f'{files[index // 2]}: cannot be read: ')
         assert [*FILES.values()][index // 2] in line

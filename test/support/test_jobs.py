@@ -338,7 +338,7 @@ def abandon(arguments, folder):
             time.sleep(0.02)
         client.kill()
         # The pipe ends with the last process that has inherited it.
-        client.communicate(timeout=60)
+        client.communicate(timeout=240)
     return [int((folder / name).read_text()) for name in 'ab']
 
 
@@ -359,7 +359,7 @@ def test_ctrl_c_ends_all_processes_and_the_run_resumes(tmp_path):
     # The call returns only after every process that inherited the pipes has ended.
     done = subprocess.run(
         [sys.executable, '-c', INTERRUPTED, str(tmp_path)], capture_output=True, text=True,
-        timeout=60, start_new_session=True, check=False)
+        timeout=240, start_new_session=True, check=False)
     assert done.returncode == 130, done.stderr
     assert done.stderr == 'interrupted: finished jobs are kept; repeat the command to resume\n'
     jobs = [Job(str(number), {'number': number}) for number in range(4)]
@@ -401,7 +401,7 @@ def two_workers(tmp_path):
             env=os.environ | {'OPENBLAS_NUM_THREADS': '1'}) for _ in range(2)]
         try:
             with distributed.Client(empty, set_as_default=False) as client:
-                client.wait_for_workers(2, timeout=30)
+                client.wait_for_workers(2, timeout=240)
             yield empty.scheduler_address
         finally:
             for worker in workers:

@@ -68,7 +68,7 @@ def test_processes_write_equal_files_whatever_their_hash_seed(tmp_path, monkeypa
     files = [f'a.{kind}' for kind in PICTURE_FORMATS]
     monkeypatch.setattr(sys, 'argv', ['', *(str(tmp_path / 'here' / name) for name in files)])
     exec(DRAW, {})
-    subprocess.run([sys.executable, '-c', DRAW, *files], check=True, timeout=60,
+    subprocess.run([sys.executable, '-c', DRAW, *files], check=True, timeout=240,
                    cwd=tmp_path / 'there', env=os.environ | {'PYTHONHASHSEED': '1'})
     for name in files:
         assert (tmp_path / 'here' / name).read_bytes() == (tmp_path / 'there' / name).read_bytes()

@@ -19,7 +19,7 @@ from rhs_isac_ros.ros.recording import CycleObserver, Recorder, schema, type_nam
 from rhs_isac_ros.ros.session import Session
 
 CONFIG = Path(__file__).parents[2] / 'config'
-TIMEOUT_S = 60.0
+TIMEOUT_S = 120.0
 CYCLES = 4
 
 
@@ -143,6 +143,12 @@ def call(shared_session, capsys, monkeypatch):
     monkeypatch.setattr(
         'parts.verbs.Session',
         lambda arguments: contextlib.nullcontext(shared_session))
+    # A busy machine may take longer than the tools allow.
+    for name in ('param._DISCOVERY_TIMEOUT_S', 'param._SERVICE_TIMEOUT_S',
+                 'topic._DISCOVERY_TIMEOUT_S'):
+        monkeypatch.setattr(f'parts.{name}', TIMEOUT_S)
+    # Requests are repeated as often.
+    monkeypatch.setattr('rhs_isac_ros.ros.session._N_REQUESTS', int(TIMEOUT_S))
 
     def result(main, *arguments):
         code = main(arguments)

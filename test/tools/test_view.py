@@ -176,10 +176,10 @@ def served(recording, built_scripts):
 
 def test_the_viewer_listens_on_the_loopback_address_alone(served):
     for port in map(int, re.findall(r':(\d+)', served)):
-        socket.create_connection(('127.0.0.1', port), timeout=5.0).close()
+        socket.create_connection(('127.0.0.1', port), timeout=240.0).close()
         # A server for all addresses would accept this one, too.
         with pytest.raises(ConnectionRefusedError):
-            socket.create_connection(('127.0.0.2', port), timeout=5.0)
+            socket.create_connection(('127.0.0.2', port), timeout=240.0)
 
 
 def test_a_port_that_is_used_is_an_error_of_one_line(recording, capsys):

@@ -57,7 +57,7 @@ def test_watch_refreshes_the_terminal_until_it_is_interrupted(built_scripts, net
 def test_a_command_without_a_network_is_an_error(built_scripts, tmp_path, arguments, missing):
     done = subprocess.run(
         [SCRIPT.with_name(arguments[0]), *arguments[1:], '--timeout', '0.3', '--ros-args', '-r',
-         '__ns:=/nobody'], capture_output=True, text=True, cwd=tmp_path, timeout=60, check=False)
+         '__ns:=/nobody'], capture_output=True, text=True, cwd=tmp_path, timeout=240, check=False)
     assert (done.returncode, done.stdout) == (1, '')
     assert done.stderr.startswith(
         f'{arguments[0]}: error: {missing} within 0.3 s, in the domain ')

@@ -27,12 +27,11 @@ from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES, UNNAMED, profile_for
 from rhs_isac_ros.ros.processes import Processes
 from system.chaos.mutations import mutate
-from system.chaos.trial import ChaosError, both_served, wait_for_service
+from system.chaos.trial import TIMEOUT_S, ChaosError, both_served, wait_for_service
 from system.observer import NetworkObserver
 
 # Mutations on one topic between checks; the queues of the nodes hold more messages.
 _BATCH = 8
-_TIMEOUT_S = 30.0
 _N_ORIGINALS = 8
 # Messages of the protocol by topic.
 _PROTOCOL = {name: kind for kind, name in topics.NAMES.items()}
@@ -141,8 +140,8 @@ def fuzz(
     wait_for_service(observer)
     # The name of a node may arrive after its endpoints.
     if not observer.spin_until(lambda: not any(
-            _subscribers(observer, name) & {*UNNAMED} for name in _PROTOCOL), _TIMEOUT_S):
-        raise ChaosError(f'a subscriber without a name after {_TIMEOUT_S:g} s')
+            _subscribers(observer, name) & {*UNNAMED} for name in _PROTOCOL), TIMEOUT_S):
+        raise ChaosError(f'a subscriber without a name after {TIMEOUT_S:g} s')
     counters = _Counters(observer)
     sent: collections.Counter[str] = collections.Counter()
     malformed: collections.Counter[str] = collections.Counter()
@@ -160,10 +159,10 @@ def fuzz(
                 malformed.update(counters.subscribers[name])
         # Queues overflow unless every node has received all mutations before the next ones.
         observer.spin_until(lambda: bool(processes.ended()) or (
-            counters.all_received(sent) and not counters.wrong(malformed)), _TIMEOUT_S)
+            counters.all_received(sent) and not counters.wrong(malformed)), TIMEOUT_S)
         failed = counters.wrong(malformed) | {*processes.ended()}
         if not failed and not counters.all_received(sent):
-            raise ChaosError(f'not all mutations were received within {_TIMEOUT_S:g} s')
+            raise ChaosError(f'not all mutations were received within {TIMEOUT_S:g} s')
         on_progress(sent.total())
     result = _result(observer, processes, counters, sent, malformed)
     return dataclasses.replace(result, suspects=tuple(
@@ -195,7 +194,7 @@ def _result(
         sent: Mapping[str, int], malformed: Mapping[str, int]) -> FuzzResult:
     """Wait until the network serves its users again, and collect the counters."""
     first, begin_s = len(observer.log.ended), time.monotonic()
-    recovered = observer.spin_until(lambda: both_served(observer, first), _TIMEOUT_S)
+    recovered = observer.spin_until(lambda: both_served(observer, first), TIMEOUT_S)
     recovery_s = time.monotonic() - begin_s if recovered else None
     # Diagnostics are published once a second.
     observer.spin_for(1.5)

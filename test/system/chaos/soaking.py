@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rhs_isac_ros.protocol.settings import Impairments
-from system.chaos.trial import ChaosError
+from system.chaos.trial import TIMEOUT_S, ChaosError
 from system.observer import NetworkObserver
 from system.trial_processes import TrialProcesses
 
@@ -17,7 +17,6 @@ IMPAIRMENTS = Impairments(
 MIN_ESTIMATE_SHARE, MAX_MEMORY_GROWTH = 0.99, 0.05
 # Start of the measurement of growth [s], or a third of the run if that is earlier.
 _WARM_UP_S = 60.0
-_TIMEOUT_S = 30.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,8 +68,8 @@ def soak(
     that ended. Raises ChaosError if no cycle ends at the start.
     """
     log = observer.log
-    if not observer.spin_until(lambda: bool(log.ended), _TIMEOUT_S):
-        raise ChaosError(f'no cycle within {_TIMEOUT_S:g} s')
+    if not observer.spin_until(lambda: bool(log.ended), TIMEOUT_S):
+        raise ChaosError(f'no cycle within {TIMEOUT_S:g} s')
     begin_s, first = time.monotonic(), len(log.ended)
     duration_s = 60.0 * minutes
     warm_up_s = min(_WARM_UP_S, duration_s / 3)

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from rhs_isac_ros.ros.processes import Processes
 from system.observer import RECOVERY_LIMIT_S, NetworkObserver
 
-TIMEOUT_S = 30.0
+# Maximum time to reach a state, also while a busy machine starts the nodes [s].
+TIMEOUT_S = 120.0
 # Number of latest cycles among which a served cycle is sought.
 _N_LATEST = 20
 

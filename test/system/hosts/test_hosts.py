@@ -42,19 +42,20 @@ def start(small_files):
 def test_the_namespaces_of_killed_and_interrupted_runs_are_removed(start):
     killed = start()
     killed.kill()
-    killed.communicate(timeout=60)
+    killed.communicate(timeout=240)
     assert namespaces_of(killed.pid)
     interrupted = start()
     assert not namespaces_of(killed.pid)
     interrupted.send_signal(signal.SIGTERM)
-    interrupted.communicate(timeout=60)
+    interrupted.communicate(timeout=240)
     assert interrupted.returncode == 130
     assert not namespaces_of(interrupted.pid)
 
 
 def test_cycles_are_served_after_an_outage(start):
     process = start('--pull', 'channel', '--seconds', '1')
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=400)
+    assert out, err
     figures = json.loads(out)
     (outage,) = figures['outages']
     assert process.returncode == (0 if figures['passed'] else 1), out + err
