@@ -6,7 +6,7 @@ The parameters of a board maximise the evidence.
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -61,8 +61,8 @@ def board_evidence(scenario: Scenario, pilots: Sequence[Pilots], board: Board) -
 def fit_board(scenario: Scenario, pilots: Sequence[Pilots], names: Sequence[str]) -> BoardFit:
     """Fit fields of a scenario's board, which are positive numbers or lists of them, to pilots.
 
-    The search begins at the declared values, or at 1 for a value of 0; None stands for resonances
-    at the centres of the bands, and for gains of 1. It finds the nearest maximum of the evidence.
+    The search begins at the declared values, or at 1 for a value of 0, and finds the nearest
+    maximum of the evidence.
     The covariance is that of a Gaussian with the same curvature. Raises ValueError if the board
     has no such field, or the pilots are not those of the region.
     """
@@ -119,16 +119,20 @@ def _derivatives(function: Callable[[np.ndarray], float], point: np.ndarray
 
 
 def _is_list(scenario: Scenario, name: str) -> bool:
-    return not isinstance(getattr(scenario.board, name), float)
+    return np.ndim(_declared(scenario.board, name, scenario)) == 1
+
+
+def _declared(board: Board, name: str, scenario: Scenario) -> Any:
+    """Return the value of a field, or what None stands for."""
+    value = getattr(board, name) if name in getattr(board, '__dataclass_fields__', ()) else None
+    return board.implied(name, scenario) if value is None else value
 
 
 def _start(scenario: Scenario, name: str) -> np.ndarray:
     """Return the values of a field with which the search begins, float64 [1 or more]."""
-    missing = {'resonances_hz': scenario.center_frequencies_hz,
-               'feed_gains': np.ones(scenario.n_feeds)}
-    value = getattr(scenario.board, name, '')
-    value = missing.get(name) if value is None else value
-    if name == 'masked' or not isinstance(value, float | tuple | list | np.ndarray):
+    value = _declared(scenario.board, name, scenario)
+    if (name == 'masked' or not isinstance(value, float | tuple | list) or np.ndim(value) > 1
+            or min(np.atleast_1d(value)) < 0):
         raise ValueError(f'{name}: expected a field of the board {scenario.board.kind!r} that '
                          'contains positive numbers')
     return np.atleast_1d(np.asarray(value, float))

@@ -12,6 +12,7 @@ from rhs_isac_ros.model.waveguides import board_of_guides
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
+    nonnegative_float,
     output_file,
     positive_float,
     positive_int,
@@ -33,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                               help='compute waveguides with coupled dipoles')
     guides.add_argument('--scenario', '--config', type=input_file, required=True,
                         help='YAML file of the scenario; its field board is ignored')
-    guides.add_argument('--loss', type=positive_float, default=3.0,
+    guides.add_argument('--loss', type=nonnegative_float, default=3.0,
                         help='loss of the guides [dB/m]')
     guides.add_argument('--across', type=positive_float, default=0.07,
                         help='position of the elements between the walls of a guide, from 0 to 1')

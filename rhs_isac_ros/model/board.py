@@ -106,6 +106,10 @@ class Board(abc.ABC):
                     "described by an amplitude, as those of the board 'paper'")
         return ''
 
+    def implied(self, name: str, scenario: Any) -> Any:
+        """Return what a field with the value None stands for, or None if it is no number."""
+        return None
+
     @functools.cached_property
     def plain(self) -> str | dict[str, Any]:
         """The value that `board_of` converts to an equal board."""

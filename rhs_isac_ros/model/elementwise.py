@@ -39,6 +39,10 @@ class Elementwise(Board):
         masked = numbers('masked', self.masked, int, BoardError)
         object.__setattr__(self, 'masked', tuple(sorted({*masked.ravel().tolist()})))
 
+    def implied(self, name: str, scenario: Any) -> Any:
+        """Return the gains of feeds."""
+        return [1.0] * scenario.n_feeds if name == 'feed_gains' else None
+
     def misfit(self, scenario: Any) -> str:
         """Return the reason why the board does not fit a scenario, or ''."""
         if self.feed_gains is not None and len(self.feed_gains) != scenario.n_feeds:
@@ -164,6 +168,11 @@ class Resonant(Elementwise):
     resonances_hz: tuple[float, ...] | None = limited(None, 1e6, 1e13, is_list=True)
     quality_factor: float = limited(40.0, 1.0, 1e6)  #: Quality factor Q of an element.
     tuning_range: float = limited(0.3, 1e-6, 1.9)  #: Range of f_0 relative to f_r.
+
+    def implied(self, name: str, scenario: Any) -> Any:
+        """Return the gains of feeds, and the resonances."""
+        return (list(scenario.center_frequencies_hz) if name == 'resonances_hz' else
+                super().implied(name, scenario))
 
     def misfit(self, scenario: Any) -> str:
         """Return the reason why the board does not fit a scenario, or ''."""

@@ -11,6 +11,7 @@ where s stands for the ports of the elements and t for those of the feeds.
 import dataclasses
 import functools
 import hashlib
+import itertools
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,8 +29,12 @@ from rhs_isac_ros.support.optional import optional_import
 _TOLERANCE = 1e-4
 # Largest step between frequencies of the file, relative to the frequency, to interpolate in it.
 _MAX_STEP = 0.02
-# Relative difference of frequencies that count as equal.
-_ROUNDING = 1e-9
+# Largest relative error of an interpolated transfer.
+_MAX_ERROR = 0.03
+# Multiples of the golden ratio, modulo 1, are spread like tunings of a codebook.
+_GOLDEN = 0.6180339887498949
+# Relative difference of frequencies that count as equal: files may state them with six digits.
+_ROUNDING = 5e-6
 # A comment in a Touchstone file.
 _COMMENT = re.compile(r'!.*')
 _LOADS = 'load_conductance_s', 'load_susceptance_slope_s'
@@ -203,6 +208,13 @@ class CoupledNetwork(Board):
             self.load_susceptance_slope_s)
         return hashlib.sha256(repr(fields).encode()).hexdigest()[:16]
 
+    def implied(self, name: str, scenario: Any) -> Any:
+        """Return the number of the file, unless its elements have different ones."""
+        network = self.network
+        load = dict(zip(_LOADS, (network.conductance_s, network.susceptance_slope_s),
+                        strict=True)).get(name, np.ones(0))
+        return None if load.ndim else load.item()
+
     def misfit(self, scenario: Any) -> str:
         """Return the reason why the board does not fit a scenario, or ''."""
         n_elements, n_feeds = self.network.between.shape[1:]
@@ -214,7 +226,7 @@ class CoupledNetwork(Board):
         with_bands = np.add.outer(scenario.center_frequencies_hz, span)
         try:
             for band in with_bands:
-                _between(self.network.frequencies_hz, band)
+                self._check_steps(band)
         except BoardError as error:
             return f'{self.file}: {error}'
         return super().misfit(scenario)
@@ -242,6 +254,30 @@ class CoupledNetwork(Board):
                     through * transfers[point, frame], axis=1).imag / self.gain
         return gradients * self.network.susceptance_slope_s
 
+    def _check_steps(self, wanted_hz: np.ndarray) -> None:
+        """Raise BoardError unless transfers are accurate that are interpolated in a band."""
+        network = self.network
+        tunings = _GOLDEN * np.arange(network.between.shape[1])[None] % 1
+        points, weights = _between(network.frequencies_hz, wanted_hz)
+        for first, ends in enumerate(itertools.pairwise(points)):
+            # The middle has the largest error.
+            shares = weights[:, first:first + 2]
+            share = shares[shares.prod(axis=1).argmax()]
+            if not share.all():
+                continue
+            transfer = np.tensordot(share, self._solved(ends, tunings)[1], axes=1)
+            elements, between = (np.tensordot(share, array[[*ends]], axes=1) for array in (
+                network.elements, network.between))
+            other = self.gain * _loaded(network, elements, between, tunings)[1]
+            # Interpolated admittances have errors of about the same size and of their own.
+            error = 2 * np.linalg.norm(other - transfer) / np.linalg.norm(transfer)
+            if error > _MAX_ERROR:
+                low, high = network.frequencies_hz[[*ends]]
+                raise BoardError(
+                    f'a transfer between {low:.9g} Hz and {high:.9g} Hz would have an error of '
+                    f'about {100 * error:.2g} %, expected at most {100 * _MAX_ERROR:g} %, as '
+                    'with smaller steps')
+
     def _points(self, ports: Ports) -> list[tuple[tuple[int, ...], np.ndarray]]:
         """Return frequencies of the file for each band, and weights of each sub-band for them."""
         return [_between(self.network.frequencies_hz, band) for band in ports.frequencies_hz]
@@ -255,25 +291,30 @@ class CoupledNetwork(Board):
 @functools.lru_cache(maxsize=8)
 def _solved(board: CoupledNetwork, points: tuple[int, ...], shape: tuple[int, ...], tunings: bytes
             ) -> tuple[Any, np.ndarray]:
-    from scipy.linalg import lu_factor, lu_solve
-
     network, frames = board.network, np.frombuffer(tunings).reshape(shape)
     transfers = np.empty((len(points), len(frames), *network.between.shape[1:]), complex)
     factors: list[list[Any]] = []
     for row, point in enumerate(points):
-        admittances = network.elements[point]
-        own = np.diagonal(admittances)
-        # The load cancels the susceptance of the element.
-        loaded = (own.real + network.conductance_s
-                  + 1j * network.susceptance_slope_s * (frames - 0.5))
-        factors.append([])
-        for frame, diagonal in enumerate(loaded):
-            matrix = admittances.copy()
-            np.fill_diagonal(matrix, diagonal)
-            factors[-1].append(lu_factor(matrix, overwrite_a=True, check_finite=False))
-            transfers[row, frame] = board.gain * lu_solve(
-                factors[-1][-1], network.between[point], check_finite=False)
-    return factors, transfers
+        found, transfers[row] = _loaded(
+            network, network.elements[point], network.between[point], frames)
+        factors.append(found)
+    return factors, board.gain * transfers
+
+
+def _loaded(network: Admittances, elements: np.ndarray, between: np.ndarray, frames: np.ndarray
+            ) -> tuple[list[Any], np.ndarray]:
+    """Return factors of admittances with the loads of frames, and the transfers [Q, N_E, K]."""
+    from scipy.linalg import lu_factor, lu_solve
+
+    # The load cancels the susceptance of the element.
+    loaded = (np.diagonal(elements).real + network.conductance_s
+              + 1j * network.susceptance_slope_s * (frames - 0.5))
+    factors = []
+    for diagonal in loaded:
+        matrix = elements.copy()
+        np.fill_diagonal(matrix, diagonal)
+        factors.append(lu_factor(matrix, overwrite_a=True, check_finite=False))
+    return factors, np.array([lu_solve(one, between, check_finite=False) for one in factors])
 
 
 def _between(known_hz: np.ndarray, wanted_hz: np.ndarray) -> tuple[tuple[int, ...], np.ndarray]:

@@ -15,12 +15,18 @@ import dataclasses
 import numpy as np
 
 from rhs_isac_ros.model.constants import NEPERS_PER_DB, SPEED_OF_LIGHT_MPS
-from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
+from rhs_isac_ros.model.geometry import (
+    element_intervals_m,
+    element_positions,
+    subband_frequencies_hz,
+)
 from rhs_isac_ros.model.scenario import Scenario
-from rhs_isac_ros.support.fields import finite
+from rhs_isac_ros.support.fields import Field, finite
 
 _PERMEABILITY = 1.25663706212e-6
 _IMPEDANCE_OHM = _PERMEABILITY * SPEED_OF_LIGHT_MPS
+# At the walls, the field of the mode is 0.
+_ACROSS = Field(float, low=1e-3, high=0.999)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +97,8 @@ def admittances(frequencies_hz: np.ndarray, guides: Guides, along_m: np.ndarray,
     n_feeds, n = int(feed_of.max()) + 1, len(along_m)
     of_feed = np.equal.outer(feed_of[guide_of], np.arange(n_feeds))
     same = guide_of[:, None] == guide_of
-    offsets, reach = elements_m[:, None] - elements_m, np.sin(np.pi * across)
+    offsets = elements_m[:, None] - elements_m
+    reach = np.sin(np.pi * _ACROSS.checked('across', across))
     found: dict[str, list[np.ndarray]] = {'y_tt': [], 'y_st': [], 'y_ss': []}
     for frequency in frequencies_hz.tolist():
         to_feed = guides.admittance(frequency, np.zeros(n), along_m)
@@ -119,11 +126,13 @@ def board_of_guides(
     if scenario.element_positions_m is not None:
         raise ValueError('element_positions_m: not null, expected a grid of elements')
     elements, shape = element_positions(scenario), (scenario.n_rows, scenario.n_columns)
-    spacing = np.ptp(elements[:, 1:], axis=0) / np.maximum(np.array(shape[::-1]) - 1, 1)
-    width = float(spacing[1])
-    guides = Guides(width, width / 3, (shape[1] + 1) * float(spacing[0]),
-                    scenario.refractive_index, loss_db_per_m)
-    along = elements[:, 1] - elements[:, 1].min() + spacing[0]
+    if scenario.n_feeds > shape[0]:
+        raise ValueError(f'n_feeds: {scenario.n_feeds}, expected at most one for each of '
+                         f'{shape[0]} rows of elements')
+    spacing, width = element_intervals_m(scenario).tolist()
+    guides = Guides(width, width / 3, (shape[1] + 1) * spacing, scenario.refractive_index,
+                    loss_db_per_m)
+    along = elements[:, 1] - elements[:, 1].min() + spacing
     rows = np.arange(shape[0])
     arrays = admittances(
         # The ends of a band suffice, because the transfer is interpolated.

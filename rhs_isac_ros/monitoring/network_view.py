@@ -267,7 +267,7 @@ class NetworkView:
         match message:
             case m.RhsConfiguration():
                 yield f'{SURFACE}/board', shapes.board(
-                    self._scenario, message.analog, enlarged=True)
+                    self._scenario, message.analog, message.band, enlarged=True)
                 if message.mode is m.Mode.TRANSMISSION:
                     yield TRANSMISSION, shapes.configurations(self._scenario, [message.analog])
                 else:

@@ -24,6 +24,7 @@ from rhs_isac_ros.model.geometry import (
     element_positions,
     surface_sides_m,
 )
+from rhs_isac_ros.model.surface import ports_of
 from rhs_isac_ros.protocol import messages as m
 
 Colour: TypeAlias = tuple[float, float, float]
@@ -157,6 +158,8 @@ _NAME_HEIGHT_M = 1.0
 _BOARD_SIZE = 0.2
 # Minimum half size: viewers do not show bodies without extent.
 _MIN_HALF_SIZE_M = 1e-3
+# Side of the plate of an element with the modulus 0, relative to the largest.
+_MIN_SHARE = 0.2
 _MAX_GREY = 255
 # Distance of a unit vector from -x, along x, below which the turn from x to it is about z.
 _MIN_FORWARD = 1e-9
@@ -197,11 +200,23 @@ def region(scenario: Scenario) -> Boxes:
         [scenario.roi_size_m], 2 * _MIN_HALF_SIZE_M) / 2, np.array([_GREY]), solid=False)
 
 
-def board(scenario: Scenario, configuration: np.ndarray | None, enlarged: bool = False) -> Boxes:
+def moduli(scenario: Scenario, configuration: np.ndarray, band: int) -> np.ndarray:
+    """Return the norms of the elements' transfers relative to the largest, mean over the frames.
+
+    Takes a configuration, float64 [F, N_E]; returns float64 [N_E].
+    """
+    transfer = scenario.board.transfer(ports_of(scenario, band), configuration[None])[0]
+    norms = np.sqrt(np.sum(np.abs(transfer)**2, axis=(0, 3))).mean(axis=0)
+    return norms / (norms.max() or 1.0)
+
+
+def board(scenario: Scenario, configuration: np.ndarray | None, band: int = 0,
+          enlarged: bool = False) -> Boxes:
     """Return the surface as one plate for each element, from dark for 0 to bright for 1.
 
     The brightness is the mean over the frames of a configuration, float64 [F, N_E] in [0, 1], or
-    0.5 for None. If `enlarged`, single elements are visible in a view of the whole region.
+    0.5 for None. Unless the board is the default, the sides of a plate grow with its modulus. If
+    `enlarged`, single elements are visible in a view of the whole region.
     """
     positions, intervals_m = element_positions(scenario), element_intervals_m(scenario)
     if enlarged:
@@ -210,10 +225,15 @@ def board(scenario: Scenario, configuration: np.ndarray | None, enlarged: bool =
     half_y_m, half_z_m = 0.45 * intervals_m
     level = (np.full(len(positions), 0.5) if configuration is None
              else np.mean(configuration, axis=0))
-    return Boxes(positions, np.tile([_MIN_HALF_SIZE_M, half_y_m, half_z_m], (len(positions), 1)),
+    half_sizes_m = np.tile([_MIN_HALF_SIZE_M, half_y_m, half_z_m], (len(positions), 1))
+    if scenario.board.declared and configuration is not None:
+        share = _MIN_SHARE + (1 - _MIN_SHARE) * moduli(scenario, configuration, band)
+        half_sizes_m[:, 1:] *= share[:, None]
+    return Boxes(positions, half_sizes_m,
                  np.stack([level, level, 0.3 + 0.2 * level], axis=1), solid=True,
-                 quaternions=None if scenario.element_normals is None else _turns(
-                     element_normals(scenario)))
+                 # A marker of RViz has one size for cuboids without turns.
+                 quaternions=_turns(element_normals(scenario)) if (
+                     scenario.element_normals or scenario.board.declared) else None)
 
 
 def _turns(normals: np.ndarray) -> np.ndarray:

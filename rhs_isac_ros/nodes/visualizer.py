@@ -231,8 +231,9 @@ class VisualizerNode(Node):
         bodies: dict[tuple[str, int], shapes.Points | shapes.Ellipsoids | shapes.Boxes
                      | shapes.Lines] = {
             ('region', 0): shapes.region(self._scenario),
-            ('board', 0): shapes.board(
-                self._scenario, state.configuration.analog if state.configuration else None)}
+            ('board', 0): shapes.board(self._scenario, *(
+                (state.configuration.analog, state.configuration.band)
+                if state.configuration else (None,)))}
         for number, user in state.users.items():
             if user.truth:
                 bodies['truth', number], _ = shapes.truth(user.truth)

@@ -246,9 +246,14 @@ def _draw_surface(axes: Any, message: m.RhsConfiguration | None, scenario: Scena
         axes.set(aspect='equal')
     axes.plot(*(100 * feed_positions(scenario)[:, 1:]).T, 'D', color='white',
               markeredgecolor='black', markersize=4)
-    axes.figure.colorbar(image, ax=axes, location='bottom', label='tuning', shrink=0.8,
+    label, text = 'tuning', 'not known yet'
+    if message is not None and scenario.board.declared:
+        label += ' (circles: modulus)'
+        axes.scatter(*(100 * element_positions(scenario)[:, 1:]).T, facecolors='none',
+                     s=30 * shapes.moduli(scenario, message.analog, message.band)**2,
+                     edgecolors='white', linewidths=0.7)
+    axes.figure.colorbar(image, ax=axes, location='bottom', label=label, shrink=0.8,
                          ticks=(0, 0.5, 1))
-    text = 'not known yet'
     if message is not None:
         mean = f', mean of {len(message.analog)} frames' if len(message.analog) > 1 else ''
         text = f'{message.mode.name.lower()}, band {message.band}{mean}\ncycle {message.cycle_id}'

@@ -12,12 +12,20 @@ from rhs_isac_ros.calibration.estimate import log_evidence
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
 from rhs_isac_ros.model.boards import board_of
+from rhs_isac_ros.model.elementwise import PhaseShift
+from rhs_isac_ros.model.waveguides import board_of_guides
 from rhs_isac_ros.positioning import make_estimator
 
 TRUE = {'kind': 'resonant', 'quality_factor': 30.0, 'loss_db_per_m': 4.0}
 GRID = Scenario(n_subbands=2, n_frames=6, elements_per_side=5, board=TRUE)
 NUMBER = r'[\d.e+]+'
 UNKNOWN = {'user_gain_std_db': 3.0, 'phase_std_rad': 2 * np.pi}
+
+
+class OwnBoard(PhaseShift):
+    """A board of a plug-in with a number that is no field."""
+
+    kind, share = 'own', 0.5
 
 
 def pilots_of(scenario, n=60, seed=0):
@@ -82,6 +90,32 @@ def test_two_groups_of_pilots_are_one_survey():
 def test_a_field_without_positive_numbers_is_refused(name):
     with pytest.raises(ValueError, match=f"^{name}: expected a field of the board 'resonant'"):
         fit_board(GRID, [pilots_of(GRID, 2)], [name])
+
+
+@pytest.mark.parametrize(('board', 'name'), [
+    ({'kind': 'states', 'states': [[1, 0], [0, 1]]}, 'states'), (OwnBoard(), 'share'),
+    ('phase', 'kind')])
+def test_fields_of_other_boards_that_cannot_be_fitted_are_refused_by_name(board, name):
+    scenario = dataclasses.replace(GRID, board=board, amplitude_levels=2)
+    with pytest.raises(ValueError, match=f"^{name}: expected a field of the board '"):
+        fit_board(scenario, [pilots_of(scenario, 2)], [name])
+
+
+def test_loads_of_coupled_elements_are_fitted_from_those_of_the_file(tmp_path):
+    grid = dataclasses.replace(GRID, board='paper')
+    arrays, path = board_of_guides(grid), tmp_path / 'board.npz'
+    np.savez(path, **arrays)
+    scenario = dataclasses.replace(grid, board={'kind': 'network', 'file': str(path)})
+    true = 1.3 * float(arrays['load_susceptance_slope_s'])
+    pilots = pilots_of(dataclasses.replace(scenario, board=dataclasses.replace(
+        scenario.board, load_susceptance_slope_s=true)), 20)
+    fit = fit_board(scenario, [pilots], ['load_susceptance_slope_s'])
+    assert abs(fit.values[0] - true) < 3 * np.sqrt(fit.covariance[0, 0]) < 0.05 * true
+    arrays['load_conductance_s'] = np.full(25, arrays['load_conductance_s'])
+    np.savez(path, **arrays)
+    scenario = dataclasses.replace(grid, board={'kind': 'network', 'file': str(path)})
+    with pytest.raises(ValueError, match="^load_conductance_s: expected a field of the board 'n"):
+        fit_board(scenario, [pilots], ['load_conductance_s'])
 
 
 def test_the_reason_of_a_missing_fix_names_the_declared_board():

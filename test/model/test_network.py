@@ -65,6 +65,24 @@ def test_a_guide_that_is_too_narrow_carries_no_wave():
         Guides(0.01, 0.005, 0.1).admittance(10e9, np.zeros(1), np.zeros(1))
 
 
+@pytest.mark.parametrize(('shape', 'n_feeds'), [((6, 1), 1), ((1, 6), 6), ((5, 3), 2)])
+def test_guides_may_be_single_and_have_single_elements(shape, n_feeds):
+    scenario = Scenario(elements_per_side=shape, n_feeds=n_feeds)
+    network = Admittances.of(board_of_guides(scenario, loss_db_per_m=0.0))
+    assert network.between.shape == (4, np.prod(shape), n_feeds)
+    # Each element is connected to one feed, and each feed to some elements.
+    assert (network.between[0] != 0).sum(axis=1).tolist() == [1] * np.prod(shape)
+    assert (network.between[0] != 0).any(axis=0).all()
+
+
+@pytest.mark.parametrize(('changes', 'options', 'expected'), [
+    ({'n_feeds': 5}, {}, '^n_feeds: 5, expected at most one for each of 4 rows'),
+    ({}, {'across': 1.0}, '^across: 1.0, expected 0.001 to 0.999')])
+def test_guides_that_cannot_be_built_are_refused(changes, options, expected):
+    with pytest.raises(ValueError, match=expected):
+        board_of_guides(dataclasses.replace(SMALL, **changes), **options)
+
+
 def test_the_gradient_of_the_bound_is_a_limit_of_differences(coupled):
     rng = np.random.default_rng(0)
     average = AverageCrlb(coupled, coupled.sample_positions(4, rng))
@@ -96,6 +114,39 @@ def test_the_transfer_is_interpolated_between_near_frequencies(tmp_path):
     for file, wanted_hz in ((path, 9.9e9), (path, 10.2e9), (far, 10.5e9)):
         with pytest.raises(BoardError, match=re.escape(f'at {wanted_hz:.9g} Hz, exp')):
             CoupledNetwork(file=file).transfer(ports_at(wanted_hz), tunings)
+
+
+def test_frequencies_of_a_file_have_six_digits_or_more(tmp_path):
+    path = saved(tmp_path / 'board.npz', frequency_hz=9.99999e9)
+    for wanted_hz in (9.99996e9, 10.00003e9):
+        CoupledNetwork(file=path).transfer(ports_at(wanted_hz), VECTORS['tuning'][None])
+
+
+@pytest.mark.parametrize(('step_hz', 'below', 'is_refused'), [
+    (5e6, 0.5, False), (15e6, 0.5, True), (20e6, 0.98, False), (25e6, 0.3, True),
+    (45e6, 0.5, True)])
+def test_an_interpolated_transfer_is_accurate_or_the_file_is_refused(
+        step_hz, below, is_refused, tmp_path):
+    rng, along = np.random.default_rng(0), 0.036 * np.arange(1, 11)
+    elements = np.array([[0, y, z] for z in (0, 0.036) for y in along])
+
+    def board_at(*frequencies_hz):
+        arrays = admittances(np.array(frequencies_hz), Guides(0.036, 0.012, 0.4, 2.0),
+                             np.tile(along, 2), elements, np.repeat([0, 1], 10), np.arange(2), 0.1)
+        own = np.diagonal(arrays['y_ss'].real, axis1=1, axis2=2).mean()
+        np.savez(tmp_path / f'{len(frequencies_hz)}.npz', **arrays,
+                 load_conductance_s=0.05 * own, load_susceptance_slope_s=8 * own)
+        return CoupledNetwork(file=str(tmp_path / f'{len(frequencies_hz)}.npz'))
+
+    exact, sampled = board_at(2.5e9), board_at(2.5e9 - below * step_hz, 2.5e9 + (
+        1 - below) * step_hz)
+    ports, tunings = ports_at(2.5e9), rng.uniform(size=(1, 5, 20))
+    expected = exact.transfer(ports, tunings)
+    error = np.linalg.norm(sampled.transfer(ports, tunings) - expected) / np.linalg.norm(expected)
+    reason = sampled.misfit(Scenario(
+        elements_per_side=(10, 2), n_feeds=2, n_subbands=1, center_frequencies_hz=[2.5e9]))
+    assert (error > 0.03) == is_refused
+    assert ('Hz would have an error of about' in reason) == is_refused
 
 
 @pytest.mark.parametrize(('changes', 'expected'), [

@@ -11,6 +11,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.model.hall import PathChannel
 from rhs_isac_ros.model.pose import rotation_matrix
+from rhs_isac_ros.model.surface import ports_of
 from rhs_isac_ros.monitoring.shapes import axes_95, board, estimate, lobe, traced, user_colour
 from rhs_isac_ros.protocol import messages as m
 
@@ -57,7 +58,7 @@ def test_the_radius_of_a_lobe_is_the_level_in_decibels():
 def test_the_board_is_to_scale_or_enlarged(small, intervals):
     scenario = dataclasses.replace(small.scenario, element_interval_wavelengths=intervals)
     configuration = np.linspace(0, 1, 2 * scenario.n_elements).reshape(2, -1)
-    true, large = (board(scenario, configuration, enlarged) for enlarged in (False, True))
+    true, large = (board(scenario, configuration, enlarged=enlarged) for enlarged in (False, True))
     assert true.centres == pytest.approx(element_positions(scenario))
     factor = large.half_sizes_m[0, 1] / true.half_sizes_m[0, 1]
     assert factor > 1
@@ -68,6 +69,23 @@ def test_the_board_is_to_scale_or_enlarged(small, intervals):
             gap_m = np.diff(np.unique(shown.centres[:, axis])).min()
             assert 0 < 2 * shown.half_sizes_m[0, axis] < gap_m
     assert len(np.unique(board(scenario, None).colours[:, 0])) == 1
+
+
+@pytest.mark.parametrize('changes', [
+    {'board': 'resonant'}, {'board': {'kind': 'paper', 'masked': [3]}}])
+def test_plates_grow_with_the_modulus_where_it_differs_from_the_tuning(small, changes):
+    scenario = dataclasses.replace(small.scenario, **changes)
+    configuration, band = np.linspace(0, 1, scenario.n_elements)[None], 0
+    transfer = scenario.board.transfer(ports_of(scenario, band), configuration[None])
+    order = np.argsort(np.linalg.norm(transfer[0, :, 0], axis=(0, 2)), kind='stable')
+    shown = board(scenario, configuration, band)
+    assert shown.colours[:, 0] == pytest.approx(configuration[0])
+    sizes, full = shown.half_sizes_m, board(scenario, None).half_sizes_m
+    assert (np.diff(sizes[order, 1]) >= 0).all()
+    assert sizes[order[-1]] == pytest.approx(full[order[-1]])
+    assert 0 < sizes[order[0], 1] < 0.5 * full[0, 1]
+    # Markers of RViz keep the size of each plate only with turns.
+    assert shown.quaternions == pytest.approx(np.tile([0, 0, 0, 1], (len(sizes), 1)))
 
 
 def test_plates_of_a_board_face_along_the_normals(small):
