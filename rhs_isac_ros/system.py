@@ -35,7 +35,8 @@ class System(MeasurementModel):
 
     Without a `surface`, the errors of its elements have the distribution that the scenario
     declares. Otherwise the errors are known (`ElementErrors`), or the coefficients are estimated
-    (the attribute `surface` of a `Calibration`). The pose is that of the scenario.
+    (the attribute `surface` of a `Calibration`). The pose is that of the scenario. These are the
+    attributes `scenario`, `codebook` and `surface`; estimators, sites and roles take the system.
 
     Raises CodebookError if the codebook does not fit the scenario, and ValueError if the surface
     does not.

@@ -85,6 +85,7 @@ CALLS = [
     ('tools.replay', ['garbage', '--publish', '--rate', '0'], '0.0, expected above 0'),
     ('tools.replay', ['garbage', '--estimator', 'ml', '--track'], 'expected together with'),
     ('tools.replay', ['garbage', '--track-speed', '2'], 'expected together with --track'),
+    ('tools.replay', ['garbage', '--estimator-options', 'n=1'], 'an option of bayes'),
     ('tools.replay', ['garbage', '--publish', '--topic', 'codebook'], "choice: 'codebook'"),
     ('tools.replay', ['garbage', '--model', 'good.yaml'], 'together with --estimator neural'),
     ('tools.snapshot', ['--output', 'x.jpg'], 'ends in .png, .pdf, .svg'),

@@ -16,9 +16,9 @@ def array(field):
 
 
 def estimate(posterior):
-    """Return the mean [3] [m] and the covariance [3, 3] [m^2] of the message `PositionEstimate`.
+    """Return mean [3] [m] and covariance [3, 3] [m^2], as in `PositionEstimate` with `bayes`.
 
-    Those of a prior, which a track takes from earlier signals, are not in the posterior.
+    They apply to a user in the region. A track's earlier signals are not in the posterior.
     """
     # Where users move, columns for the velocity follow those for the position.
     weights, means = np.exp(array(posterior.log_weights)), array(posterior.means)[:, :3]
@@ -38,7 +38,8 @@ def show(posterior):
     """Print the estimate, and the mode that contributes most to it."""
     mean, covariance = estimate(posterior)
     likely = np.argmax(array(posterior.log_weights))
-    print(f'cycle {posterior.cycle_id}, user {posterior.user}: {mean.round(3)} m, standard '
+    print(f'cycle {posterior.cycle_id}, user {posterior.user}, outside with probability '
+          f'{posterior.outside_probability:.3f}, otherwise at {mean.round(3)} m, standard '
           f'deviations {np.sqrt(np.diag(covariance)).round(3)} m, most likely near '
           f'{array(posterior.means)[likely, :3].round(3)} m', flush=True)
 

@@ -22,7 +22,6 @@ from rhs_isac_ros.ros.parameters import calibrated_surface
 from rhs_isac_ros.ros.poses import LocatingNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import plugins
-from rhs_isac_ros.support.arguments import parse_options
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import ParameterError
 from rhs_isac_ros.system import System
@@ -60,16 +59,13 @@ class PositionerNode(LocatingNode[Positioner]):
                 f'calibration_file: {settings.calibration_file!r}, expected none for the '
                 f'estimator {kind.name}, which assumes the surface of the scenario')
         with translated(ValueError, ParameterError, 'estimator_options'):
-            for name in parse_options(settings.estimator_options):
-                if not (kind.takes_any or name in kind.options):
-                    raise ValueError(f'{name!r}, expected an option of {kind.name}: '
-                                     f'{", ".join(sorted(kind.options))}')
+            options = {'model_file': settings.model_file, **kind.parse(settings.estimator_options)}
         if 'model_file' not in kind.options:
             # A new `model_file` must not rebuild an estimator that does not use it.
             settings = dataclasses.replace(settings, model_file='')
         for name, read in kind.readers.items():
             with translated(ValueError, ParameterError):
-                read(getattr(settings, name))
+                read(options.get(name, ''))
         return settings
 
     def _make_estimator(
@@ -80,7 +76,7 @@ class PositionerNode(LocatingNode[Positioner]):
             table_folder=self.table_folder, model_file=settings.model_file,
             reject_outside=settings.reject_outside, progress=self._on_progress)
         estimator = kind.create(System(self.scenario, codebook, surface), **{
-            **options, **parse_options(settings.estimator_options)})
+            **options, **kind.parse(settings.estimator_options)})
         # The first estimate takes longer than later ones; no user should have to wait for it.
         center = np.array([self.scenario.roi_center_m])
         estimator.estimate(simulate_received(

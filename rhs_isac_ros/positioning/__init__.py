@@ -56,6 +56,7 @@ from rhs_isac_ros.positioning.neural import ModelError, Network, NeuralEstimator
 from rhs_isac_ros.positioning.site import Site, SiteError, SiteEstimator
 from rhs_isac_ros.positioning.tracking import Motion, Tracker
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.arguments import parse_options
 from rhs_isac_ros.system import System
 
 ESTIMATORS: Mapping[str, Callable[..., Estimator]] = {
@@ -132,6 +133,18 @@ class EstimatorKind:
         """Return those of the offered options that the estimator takes, without empty texts."""
         return {name: value for name, value in offered.items()
                 if name in self.options and value != ''}
+
+    def parse(self, text: str) -> dict[str, Any]:
+        """Return the options in a text such as ``log2_points=12``; see `parse_options`.
+
+        Raises ValueError if the estimator does not take one of them.
+        """
+        options = parse_options(text)
+        for name in options:
+            if not (self.takes_any or name in self.options):
+                raise ValueError(f'{name!r}, expected an option of {self.name}: '
+                                 f'{", ".join(sorted(self.options))}')
+        return options
 
     def create(self, system: System, **options: Any) -> Estimator:
         """Create an estimator for a system; see `make_estimator` for options and errors."""

@@ -1,6 +1,6 @@
 """The posterior of a position: weighted samples of its modes, in the region of interest.
 
-A mode is usually Gaussian, and `region` draws samples of it inside the region. If every band has
+A mode is usually Gaussian, and `sheets` draws samples of it inside the region. If every band has
 an unknown phase of its own, only delays, amplitudes and the curvature of the wavefront determine
 the range. A mode then extends over metres, across which the log-likelihood is not quadratic.
 Samples are then drawn from wider Gaussians, and their weights follow from the likelihood at each

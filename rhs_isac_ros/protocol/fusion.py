@@ -1,4 +1,4 @@
-"""The fusion of a site, which multiplies the posteriors of its surfaces, and tests their poses."""
+"""The fusion of a site, which multiplies the likelihoods of its surfaces and tests their poses."""
 
 import dataclasses
 import math

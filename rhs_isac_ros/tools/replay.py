@@ -164,8 +164,8 @@ class SiteRecording(Recording):
 def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
     """Compare the errors of each surface and of the fusion with the recorded errors."""
     given = [name for name in (
-        'publish', 'system', 'codebook', 'config', 'calibration', 'model', 'track')
-        if getattr(options, name)]
+        'publish', 'system', 'codebook', 'config', 'calibration', 'estimator-options', 'model',
+        'track') if getattr(options, name.replace('-', '_'))]
     if any(kind.name != BayesEstimator.name for kind in options.estimator):
         given.append('estimator')
     if given:
@@ -185,11 +185,16 @@ def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
 
 
 def _conflict(options: argparse.Namespace) -> str:
-    if options.publish and (
-            options.estimator or options.model or options.calibration or options.track):
-        return ('argument --publish: not allowed with --estimator, --model, --calibration or '
-                '--track, because running nodes estimate')
+    if options.publish and (options.estimator or options.estimator_options or options.model
+                            or options.calibration or options.track):
+        return ('argument --publish: not allowed with --estimator, --estimator-options, --model, '
+                '--calibration or --track, because running nodes estimate')
     options.estimator = kinds = options.estimator or [EstimatorKind(BayesEstimator.name)]
+    for kind in kinds:
+        try:
+            kind.parse(options.estimator_options)
+        except ValueError as error:
+            return f'argument --estimator-options: {error}'
     ideal = next((kind.name for kind in kinds if not kind.uses_surface), '')
     if options.calibration and ideal:
         return (f'argument --calibration: not allowed with --estimator {ideal}, which assumes the '
@@ -232,6 +237,7 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     for kind in options.estimator:
         accepted = kind.accepted(table_folder=default_folder(), model_file=options.model or '',
                                  reject_outside=True)
+        accepted |= kind.parse(options.estimator_options)
         estimators = {codebook_id: kind.create(System(scenario, codebook, surface), **accepted)
                       for codebook_id, codebook in codebooks.items()}
         rows.append(_row(kind.name, recording, locate(recording, estimators)))
@@ -288,6 +294,8 @@ def _parser() -> argparse.ArgumentParser:
     add('--estimator', action='append', type=_estimator, metavar='NAME',
         help=f'{", ".join(ESTIMATORS)}, an installed plug-in or MODULE:NAME; may be repeated '
              '(default: bayes)')
+    add('--estimator-options', default='', metavar='TEXT',
+        help='further options of each estimator, such as log2_points=12')
     add('--track', action='store_true', help='also track the users with the estimator bayes')
     add('--track-speed', type=positive_float, metavar='MPS',
         help=f'typical speed of the users (default: {Motion.speed_mps:g} m/s)')

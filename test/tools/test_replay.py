@@ -202,11 +202,28 @@ def test_users_are_tracked_beside_single_cycles(run, replayed):
         f'{np.sqrt(np.mean(velocities**2)):.6f}', 'm/s']
 
 
-def test_an_estimator_of_a_plugin_is_available(replayed, install):
-    install('guesses', 'from rhs_isac_ros.positioning import BayesEstimator as Mine',
-            {plugins.ESTIMATORS: {'mine': 'Mine'}})
+PLUGIN = '''
+import dataclasses
+
+from rhs_isac_ros.positioning import BayesEstimator
+
+class Mine(BayesEstimator):
+    def __init__(self, system, *, scale=1.0, reject_outside=False):
+        super().__init__(system, reject_outside=reject_outside)
+        self._times = scale
+
+    def estimate(self, received):
+        found = super().estimate(received)
+        return dataclasses.replace(found, mean=self._times * found.mean)
+'''
+
+
+def test_an_estimator_of_a_plugin_is_available_with_its_options(replayed, install):
+    install('guesses', PLUGIN, {plugins.ESTIMATORS: {'mine': 'Mine'}})
     found, _ = replayed('--estimator', 'mine')
     assert found['mine'] == found['live bayes']
+    found, _ = replayed('--estimator', 'mine', '--estimator-options', 'scale=2')
+    assert float(found['mine'][0]) > 2.0 > float(found['live bayes'][0])
 
 
 def test_another_codebook_is_assumed_with_a_warning(replayed, random_beams, tmp_path):
