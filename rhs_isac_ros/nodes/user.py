@@ -14,6 +14,7 @@ from rclpy.time import Time
 
 from rhs_isac_ros.model import Pose, mobility
 from rhs_isac_ros.model.arrays import position_problem
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.geometry import frame_times_s
 from rhs_isac_ros.model.pose import rotation_matrix
 from rhs_isac_ros.protocol import messages as m
@@ -61,9 +62,9 @@ class RobotMobility:
 
     def put(self, stamp_ns: int, position: np.ndarray, velocity: np.ndarray) -> None:
         """Store a position [3] [m] and a velocity [3] [m/s]; a stamp of 0 means now."""
-        if not np.isfinite([position, velocity]).all():
+        if not (np.isfinite(position) & (np.abs(velocity) <= SPEED_OF_LIGHT_MPS)).all():
             self.reject(f'position {position.tolist()} m, velocity {velocity.tolist()} m/s, '
-                        'expected finite numbers')
+                        'expected finite numbers, and at most the speed of light')
             return
         try:
             check_floats(position)

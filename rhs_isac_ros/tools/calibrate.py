@@ -284,8 +284,8 @@ def _collected(
                   for name, other in others.items())):
             log.add(found)
     else:
-        _collect(lambda: CalibratorNode(log, scenario), lambda: log.n_pilots, 'pilots',
-                 options, arguments)
+        _collect(lambda: command.expecting_cycles(CalibratorNode(log, scenario)),
+                 lambda: log.n_pilots, 'pilots', options, arguments)
     if options.codebook:
         codebook = Codebook.load(options.codebook, scenario)
         log.codebooks.update(dict.fromkeys(log.missing_codebooks, codebook))

@@ -75,7 +75,8 @@ def _snapshot(options: argparse.Namespace, arguments: list[str]) -> int:
     def done(node: SnapshotNode) -> bool:
         return (node.is_ready(options.wait) or node.has_other_scenario
                 or time.monotonic() > end_s)
-    node = command.observe(lambda: SnapshotNode(scenario), arguments, done)
+    node = command.observe(
+        lambda: command.expecting_cycles(SnapshotNode(scenario)), arguments, done)
     if done(node):
         if node.mismatch and node.scene.configuration is None:
             raise ToolError(f'{node.mismatch}{command.OTHER_SCENARIO}')

@@ -17,7 +17,13 @@ from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.support.optional import optional_import
-from rhs_isac_ros.tools.command import entry, none_within, observe, print_now
+from rhs_isac_ros.tools.command import (
+    entry,
+    expecting_cycles,
+    none_within,
+    observe,
+    print_now,
+)
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -181,7 +187,7 @@ def _print_once(timeout_s: float, arguments: Sequence[str]) -> int:
         return now_s > end_s or bool(
             any(node.overview.users.values())
             and now_s > node.overview.began_s + _DIAGNOSTICS_TIMEOUT_S)
-    node = observe(WatchNode, arguments, done)
+    node = observe(lambda: expecting_cycles(WatchNode()), arguments, done)
     if any(node.overview.users.values()):
         Console().print(render(node.overview, time.monotonic()))
     elif time.monotonic() > end_s:

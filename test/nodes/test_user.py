@@ -52,6 +52,16 @@ def test_a_robot_is_continued_with_its_velocity():
     np.testing.assert_allclose(velocity, [1.0, 0.0, 0.0], atol=1e-12)
 
 
+@pytest.mark.parametrize('velocity', [3e8, -1e300, np.nan, np.inf])
+def test_a_velocity_that_no_message_may_have_is_named(velocity):
+    mobility = robot()
+    mobility.put(0, np.array([2.0, 6.0, 3.5]), np.array([0.0, velocity, 0.0]))
+    assert f'velocity [0.0, {velocity}, 0.0] m/s, expected' in mobility.lack
+    assert np.isnan(mobility.state(0.0)[0]).all()
+    mobility.put(0, np.array([2.0, 6.0, 3.5]), np.array([0.0, 2.9e8, 0.0]))
+    assert 'velocity' not in mobility.lack
+
+
 @pytest.mark.parametrize(('stamp_ns', 'position', 'words'), [
     (10**9, [2.0, 6.0, 3.5], 'use_sim_time'), (0, [2.0, -6.0, 3.5], 'in front of the surface'),
     (0, [2.0, np.nan, 3.5], 'position [2.0, nan, 3.5] m, velocity [0.0, 0.0, 0.0] m/s, expected '

@@ -9,8 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from rclpy.node import Node
 
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.tools.command import expecting_cycles
 from rhs_isac_ros.tools.watch import main
 
 pytest.importorskip('rich', reason='rich is not installed')
@@ -62,6 +64,21 @@ def test_a_command_without_a_network_is_an_error(built_scripts, tmp_path, argume
     assert done.stderr.startswith(
         f'{arguments[0]}: error: {missing} within 0.3 s, in the domain ')
     assert not list(tmp_path.iterdir())
+
+
+def test_a_namespace_without_a_base_station_is_named_if_another_one_has_one(bench, capfd):
+    """A surface of a site that follows, and the site itself, have none."""
+    spaces = ('/site/front', '/site/side', '/site')
+    for name, space in zip(('bs', 'receiver', 'fusion'), spaces, strict=True):
+        bench.add(Node, name, namespace=space)
+    for space in spaces:
+        expecting_cycles(bench.add(Node, 'watch', namespace=space), 0.1)
+    log = []
+    bench.until(lambda: log.append(capfd.readouterr().err) or all(
+        f'no base station in the namespace {space};' in ''.join(log) for space in spaces[1:]),
+        'the warnings')
+    warnings = [line for line in ''.join(log).splitlines() if 'WARN' in line]
+    assert len(warnings) == 2 and all(line.endswith('/site/front') for line in warnings)
 
 
 def test_a_missing_library_is_named(monkeypatch, capsys):
