@@ -1,4 +1,4 @@
-"""Own jobs on two cores of this machine, or on the Dask cluster of an address."""
+"""Own jobs on the cores of this machine, or on the Dask cluster of an address."""
 
 import sys
 from pathlib import Path
@@ -21,5 +21,5 @@ def trial(seed, noise_dbm_hz):
 jobs = [Job(f'{noise:g}-{seed}', {'seed': seed, 'noise_dbm_hz': noise})
         for noise in (-174.0, -154.0) for seed in range(3)]
 address = sys.argv[1] if len(sys.argv) > 1 else None
-for result in run_jobs(trial, jobs, Path('results/own'), n_jobs=2, dask=address):
+for result in run_jobs(trial, jobs, Path('results/own'), dask=address):
     print(f'{result["crlb_m2"]:.4f} m^2')

@@ -36,6 +36,7 @@ from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
+    check_effect,
     input_file,
     integer,
     interval,
@@ -131,8 +132,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Exit with a usage error if options conflict, or a library or a file is missing."""
     check_distinct(parser, options, '' if options.spectrum else 'plan')
-    if bool(options.spectrum) != bool(options.bands):
-        parser.error('argument --bands: expected together with --spectrum')
+    if options.spectrum and not options.bands:
+        parser.error('argument --spectrum: expected together with --bands')
+    check_effect(parser, options, ('bands', 'raster', 'min_gap', 'plan'), options.spectrum,
+                 'together with --spectrum')
     if options.spectrum and (options.start or options.resume):
         parser.error('argument --spectrum: not allowed with --start or --resume; to resume, '
                      'repeat the command')

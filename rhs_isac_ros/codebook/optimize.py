@@ -84,11 +84,12 @@ def optimize(
     """Find a codebook that minimises an objective.
 
     After a KeyboardInterrupt during the search, the best codebook so far is returned. Raises
-    ValueError if a name is unknown, a number is out of range, `positions` is empty or not a finite
-    [N_sam, 3] array, `resume` was made with other arguments, a codebook or the calibration does
-    not fit the scenario, the objective is infinite at the start, or the amplitudes are discrete
-    and the method is ``alternating`` or ``direct``. Raises MissingLibraryError if the method needs
-    a missing library.
+    ValueError if a name is unknown, a number is out of range, `positions` is empty, not a finite
+    [N_sam, 3] array, or given beside `sampling` or `n_positions`, `resume` was made with other
+    arguments or is given beside `start`, a codebook or the calibration does not fit the scenario,
+    the objective is infinite at the start, or the amplitudes are discrete and the method is
+    ``alternating`` or ``direct``. Raises MissingLibraryError if the method needs a missing
+    library.
 
     Parameters
     ----------
@@ -110,8 +111,8 @@ def optimize(
         Codebook to start from; by default random, or directional with the method ``directional``.
         Elements that are off in all frames of all bands stay off.
     resume
-        Codebook of an earlier call with the same arguments, to continue from; the earlier steps
-        and evaluations count towards the limits.
+        Codebook of an earlier call with the same arguments, to continue from in place of `start`;
+        the earlier steps and evaluations count towards the limits.
     calibration
         Calibration of the surface, treated as exact; by default the scenario's surface.
     max_steps
@@ -188,10 +189,14 @@ class _Design:
                                   ('max_steps', max_steps, 1)):
             if number is not None or not name.startswith('max_'):
                 whole(name, number, low)
+        if start and resume:
+            raise ValueError('start: not allowed with resume, which continues from a codebook')
         if positions is None:
             positions = prior.positions(scenario, SAMPLINGS[sampling](
                 scenario, n_positions, streams.generator(seed, streams.SAMPLES)))
         else:
+            if (sampling, n_positions) != ('sobol', DEFAULT_POSITIONS):
+                raise ValueError('sampling and n_positions: not allowed with positions')
             positions, sampling = checked_positions(positions), 'given'
             if not len(positions):
                 raise ValueError('positions: none, expected at least one')

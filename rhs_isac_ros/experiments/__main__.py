@@ -15,7 +15,17 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rhs_isac_ros.codebook import OBJECTIVES, CodebookError
-from rhs_isac_ros.experiments.sweep import KINDS, OPTIMIZE, Point, Sweep, run_sweep, table
+from rhs_isac_ros.experiments.sweep import (
+    BOUND,
+    CRLB,
+    KINDS,
+    OPTIMIZE,
+    Point,
+    Sweep,
+    families,
+    run_sweep,
+    table,
+)
 from rhs_isac_ros.experiments.sweep_picture import draw, shown
 from rhs_isac_ros.experiments.sweep_settings import (
     CODEBOOK,
@@ -34,6 +44,7 @@ from rhs_isac_ros.positioning import ESTIMATORS, EstimatorKind
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
+    check_effect,
     input_file,
     integer,
     picture_file,
@@ -123,7 +134,13 @@ def _add_options(parser: ArgumentParser) -> None:
 
 
 def _check(parser: ArgumentParser, options: argparse.Namespace) -> None:
-    """Exit with a usage error for too many settings, or for ``--picture`` without matplotlib."""
+    """Exit with a usage error if an option has no effect, or there are too many settings."""
+    varied = {name for axis in options.vary for name in axis.fields}
+    for name in (CODEBOOK, ESTIMATOR):
+        check_effect(parser, options, [name], name not in varied, f'no --vary or --with {name}')
+    measures = (MEASURES[name].quantity for name in names_of(options.measure))
+    check_effect(parser, options, [ESTIMATOR], {*families(measures)} - {CRLB, BOUND},
+                 'a --measure of errors or capacities')
     n_settings = math.prod(len(axis.values) for axis in options.vary)
     if n_settings > _MAX_SETTINGS:
         parser.error(f'argument --vary: {n_settings} settings, expected at most {_MAX_SETTINGS}')

@@ -50,6 +50,14 @@ class Found(NamedTuple):
     before_m: np.ndarray  #: Position errors without the estimate; NaN without a fix.
     after_m: np.ndarray  #: Position errors with the estimate from the pilots of other places.
 
+    @property
+    def is_worse(self) -> bool:
+        """Whether significantly more pilots are located worse with the estimate than better."""
+        before, after = (np.where(np.isnan(one), np.inf, one)
+                         for one in (self.before_m, self.after_m))
+        n_worse, n_better = int(np.sum(after > before)), int(np.sum(after < before))
+        return bool(n_worse - n_better > 2 * np.sqrt(n_worse + n_better))
+
 
 class PilotWork:
     """What jobs compute from pilots of one surface; `folder` is that of the workers.

@@ -37,6 +37,9 @@ from rhs_isac_ros.system import System
 # Kinds of codebooks that are made for a scenario.
 OPTIMIZE, RANDOM = 'optimize', 'random'
 KINDS = (OPTIMIZE, 'directional', RANDOM)
+# Kinds that use an option of a sweep.
+_USERS = {**dict.fromkeys(('objective', 'steps', 'optimize_for'), (OPTIMIZE,)),
+          'repeats': (OPTIMIZE, RANDOM)}
 # Number of positions in a job. Another size would change the positions of the global bound.
 BLOCK = 250
 # Number of sample positions in an optimisation.
@@ -167,9 +170,9 @@ class Point(NamedTuple):
 class Sweep:
     """The measures of a sweep, its settings, and the options of its codebooks.
 
-    Raises ValueError if a measure is unknown, a number is out of range, a file has no codebook
-    that fits its settings, or fields of `base` contradict those that an optimisation takes from a
-    setting.
+    Raises ValueError if a measure is unknown, a number is out of range, an option would have no
+    effect, a file has no codebook that fits its settings, or fields of `base` contradict those
+    that an optimisation takes from a setting.
     """
 
     base: Scenario  #: Scenario with the values that are not varied.
@@ -194,7 +197,11 @@ class Sweep:
         for name in self.optimize_for or ():
             if name not in FIELDS:
                 raise ValueError(f'optimize_for: {name!r}, expected names of fields of a scenario')
-        files = self._files
+        files, kinds = self._files, {setting.codebook for setting in self.settings}
+        for name, users in _USERS.items():
+            if getattr(self, name) != getattr(Sweep, name) and not kinds.intersection(users):
+                raise ValueError(
+                    f'{name}: no effect, expected a codebook of the kind {" or ".join(users)}')
         for setting in self.settings:
             if setting.codebook in KINDS:
                 self.scenario_of_codebook(setting)

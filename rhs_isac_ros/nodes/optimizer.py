@@ -25,7 +25,12 @@ from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX, same_value
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import StartError, parse, run
 from rhs_isac_ros.ros.session import Session
-from rhs_isac_ros.support.arguments import ArgumentParser, HelpFormatter, input_file
+from rhs_isac_ros.support.arguments import (
+    ArgumentParser,
+    HelpFormatter,
+    check_effect,
+    input_file,
+)
 from rhs_isac_ros.support.exits import print_error
 
 
@@ -189,8 +194,8 @@ def main(args: Sequence[str] | None = None) -> int:
     parameters.check_arguments(parser, topics.OPTIMIZER_NODE, args[1:])
     if not remove_ros_args(args)[1:]:
         return run(lambda: [OptimizerNode()], args)
-    if options.push_file and options.push:
-        parser.error('argument --push-file: not allowed with --push, which optimises')
+    check_effect(parser, options, [name for name in vars(options) if name != 'push_file'],
+                 not options.push_file, 'no --push-file, which does not optimise')
     check(parser, options)
     try:
         if options.push_file:

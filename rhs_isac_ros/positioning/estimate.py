@@ -126,8 +126,10 @@ class Estimate:
 
     @property
     def mixture(self) -> Mixture | None:
-        """Posterior with the mean and the covariance, normalised, in the frame of the site.
+        """Posterior, normalised, in the frame of the site.
 
+        Its moments are mean and covariance, except for `ml` without a prior, whose mean is the
+        most likely position, and whose covariance is the mean squared error about it.
         None without a position, and unless `posterior`, a track, `fuse` or a site returned the
         estimate. D = 6 with velocities. It is computed when it is first read. N estimates have a
         tuple of N.

@@ -240,6 +240,10 @@ class SearchEstimator(abc.ABC):
         """
         signals = self._likelihood.signals(checked_received(self._likelihood.codebook, received))
         if prior is None:
+            for name, value, default in (
+                    ('wrong', wrong, WRONG), ('share', share, 1.0), ('n_before', n_before, 0.0)):
+                if value != default:
+                    raise ValueError(f'{name}: {value}, expected together with a prior')
             found = [one.posterior() for block in blocks(len(signals.received), _LIMITS.block)
                      for one in self._locate_block(self._region, select(signals, block))]
         else:

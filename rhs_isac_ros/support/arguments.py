@@ -5,7 +5,7 @@ import math
 import os
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -162,3 +162,11 @@ def check_distinct(
             other = names.setdefault(path.resolve(), name)
             if other != name and action.type in outputs:
                 parser.error(f'argument {name}: {path}, expected a file other than {other}')
+
+
+def check_effect(parser: argparse.ArgumentParser, options: argparse.Namespace,
+                 names: Iterable[str], has_effect: object, expected: str) -> None:
+    """Exit with a usage error if options are given that have no effect beside the others."""
+    for name in names:
+        if not has_effect and str(getattr(options, name)) != str(parser.get_default(name)):
+            parser.error(f'argument --{name.replace("_", "-")}: no effect, expected {expected}')

@@ -16,12 +16,12 @@ from rhs_isac_ros.support.optional import MissingLibraryError
 
 def add_run_options(parser: argparse.ArgumentParser, output: str = '') -> None:
     """Add the options of `run_jobs`; `output` is the default folder of the results, if any."""
-    parser.add_argument('--jobs', type=integer(1, 1024), default=-1, metavar='N',
-                        help='number of parallel jobs (default: one per core)')
-    parser.add_argument('--dask', type=_address, metavar='ADDRESS',
-                        help='scheduler of a Dask cluster to use instead of this machine; '
-                             'its workers need this package, and one thread each for '
-                             'accurate timing')
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument('--jobs', type=integer(1, 1024), default=-1, metavar='N',
+                       help='number of parallel jobs (default: one per core)')
+    where.add_argument('--dask', type=_address, metavar='ADDRESS',
+                       help='scheduler of a Dask cluster to use instead of this machine; its '
+                            'workers need this package, and one thread each for accurate timing')
     if output:
         parser.add_argument('--output', type=output_folder, default=output, metavar='DIR',
                             help='folder of the results (default: %(default)s); jobs that have '
@@ -33,10 +33,17 @@ def unfinished(output: Path, options: argparse.Namespace, quiet: bool = False
                ) -> Iterator[Workers]:
     """Yield workers whose results are kept in OUTPUT.jobs until the block succeeds.
 
-    The options are those of `add_run_options`.
+    A new folder is also removed if there is nothing to continue: an input is refused, or no job is
+    done. The options are those of `add_run_options`.
     """
     folder = output.with_name(output.name + '.jobs')
-    yield Workers(options.jobs, options.dask, folder, quiet=quiet)
+    is_new = not folder.exists()
+    try:
+        yield Workers(options.jobs, options.dask, folder, quiet=quiet)
+    except BaseException as error:
+        if is_new and (isinstance(error, ValueError) or not any(folder.glob('*.json'))):
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
     shutil.rmtree(folder, ignore_errors=True)
 
 

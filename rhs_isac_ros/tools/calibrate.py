@@ -327,6 +327,9 @@ def _print_errors(found: Found) -> None:
         rms = f'{np.sqrt(np.mean(fixes**2)):.3f} m rms' if len(fixes) else 'none'
         print(f'position error of left-out pilots {text}: {rms}, {len(every) - len(fixes)} of '
               f'{len(every)} without a fix', flush=True)
+    if found.is_worse:
+        print('warning: significantly more left-out pilots are located worse after it than better',
+              flush=True)
 
 
 def _board(text: str) -> Board:
@@ -345,6 +348,8 @@ def _states(text: str) -> tuple[complex, ...]:
 
 
 def _conflict(options: argparse.Namespace) -> str:
+    if (options.site or options.states) and (options.jobs != -1 or options.dask):
+        return 'arguments --jobs and --dask: not allowed with --site or --states'
     options.output = options.output or (_SITE_OUTPUT if options.site else _OUTPUT)
     others = [name for name in (
         'file', 'multipath', 'states', 'board', 'system', 'config', 'codebook', 'calibration',

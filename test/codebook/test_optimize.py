@@ -266,7 +266,7 @@ def test_elements_that_are_off_in_all_frames_of_a_given_start_stay_off(
     analog = result.codebook.analog
     assert not analog[..., masked].any()
     assert analog[..., 7].any()
-    again = optimize(scenario, positions, method, start=start, resume=result.codebook,
+    again = optimize(scenario, positions, method, resume=result.codebook,
                      max_steps=2 * FEW_STEPS[method] + 10 * levels)
     assert not again.codebook.analog[..., masked].any()
 
@@ -353,6 +353,7 @@ def test_a_result_of_other_arguments_cannot_be_resumed(scenario, positions, resu
             ({'objective': 'ambiguity'}, "objective: 'ambiguity', expected 'crlb'"),
             ({'positions': positions[1:]}, 'positions: 59, expected 60'),
             ({'positions': None}, "sampling: 'sobol', expected 'given'"),
+            ({'start': result.codebook}, 'start: not allowed with resume'),
             ({'resume': random_codebook(scenario, np.random.default_rng(0))},
              "resume: provenance 'random', expected that of an optimisation")]:
         original = {'positions': positions, 'seed': 3, 'resume': result.codebook,
@@ -368,7 +369,9 @@ def test_a_result_of_other_arguments_cannot_be_resumed(scenario, positions, resu
                           ('sampling', SAMPLINGS))),
     *(({name: low - 1}, f'{name}: {low - 1}, expected at least {low}') for name, low in (
         ('n_positions', 1), ('max_steps', 1), ('max_evaluations', 1), ('seed', 0))),
-    ({'positions': np.zeros((0, 3))}, 'positions: none, expected at least one')])
+    ({'positions': np.zeros((0, 3))}, 'positions: none, expected at least one'),
+    *(({'positions': np.zeros((1, 3)), **given}, 'sampling and n_positions: not allowed with .*')
+      for given in ({'n_positions': 9}, {'sampling': 'monte_carlo'}))])
 def test_an_invalid_argument_is_an_error(scenario, arguments, error):
     with pytest.raises(ValueError, match=f'^{error}$'):
         optimize(scenario, **arguments)

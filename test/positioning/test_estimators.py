@@ -252,12 +252,15 @@ def test_the_covariance_is_the_inverse_information_at_the_estimate(strong):
 def test_a_single_mode_is_not_enough_for_table_1(table1_estimator, shipped):
     """The errors exceed those of the posterior mean, as the covariances state."""
     positions, received = System(Scenario(), shipped).pairs(60, 2)
-    ml = make_estimator('ml', Scenario(), shipped).estimate(received)
-    mean = table1_estimator.estimate(received)
+    estimator = make_estimator('ml', Scenario(), shipped)
+    ml, mean = estimator.estimate(received), table1_estimator.estimate(received)
     errors = [np.sum((e.mean - positions)**2, axis=1) for e in (ml, mean)]
     assert errors[0].mean() > 1.2 * errors[1].mean()
     assert errors[0].mean() == pytest.approx(
         np.trace(ml.covariance, axis1=1, axis2=2).mean(), rel=0.4)
+    # Both are points of one posterior.
+    mixture = estimator.posterior(received[0]).mixture
+    np.testing.assert_allclose(mixture.moments()[0], mean.mean[0], atol=1e-6)
 
 
 @pytest.fixture(scope='module')

@@ -226,6 +226,13 @@ def test_an_argument_out_of_range_is_named(table1_estimator, options, message):
         table1_estimator.posterior(np.zeros((2, 32)), around(PLACE), **options)
 
 
+@pytest.mark.parametrize('options', [{'wrong': 0.2}, {'share': 0.5}, {'n_before': 1}])
+def test_an_argument_without_effect_is_named(table1_estimator, options):
+    (name,) = options
+    with pytest.raises(ValueError, match=f'{name}: .*, expected together with a prior'):
+        table1_estimator.posterior(np.zeros((2, 32)), **options)
+
+
 def test_positions_are_in_the_frame_of_the_surface_and_mixtures_in_that_of_the_site(
         shipped, table1_estimator, model):
     placed = BayesEstimator(System(dataclasses.replace(Scenario(), pose=POSE), shipped))

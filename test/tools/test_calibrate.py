@@ -82,7 +82,9 @@ def surface():
 def call(*arguments):
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = calibrate.main(['--jobs', '1', *map(str, arguments)])
+        # Only known states take no jobs.
+        jobs = [] if any('--states' in str(one) for one in arguments) else ['--jobs', '1']
+        code = calibrate.main([*jobs, *map(str, arguments)])
     # On a slow machine, the progress of the jobs appears.
     err = re.sub(r'job \d+ of \d+: .*\n', '', err.getvalue())
     return types.SimpleNamespace(code=code, out=out.getvalue(), err=err)
@@ -138,10 +140,25 @@ def test_arrays_are_a_survey_of_the_multipath(two_folds, tmp_path):
         done = call(tmp_path / 'arrays.npz', *options)
         assert done.code == 2 and error in done.err
         assert len(done.err.splitlines()) == 1
+        assert not (tmp_path / 'hall.npz.jobs').exists()
     np.savez(tmp_path / 'arrays.npz', positions=positions)
     done = call(tmp_path / 'arrays.npz', *options)
     assert done.code == 2
     assert 'received: missing' in done.err
+
+
+def test_a_calibration_that_makes_errors_larger_is_called_so(two_folds, tmp_path):
+    rng = np.random.default_rng(0)
+    positions = SCENARIO.sample_positions(20, rng)
+    received = simulate_received(SCENARIO, CODEBOOK, positions, rng)
+    # Positions that are known to 10 cm do not suffice.
+    np.savez(tmp_path / 'arrays.npz', received=received,
+             positions=positions + 0.1 * rng.standard_normal(positions.shape))
+    done = call(tmp_path / 'arrays.npz', '--config', CONFIG / 'quick.yaml', '--codebook',
+                CONFIG / 'codebook_quick.yaml', '--output', tmp_path / 'surface.npz')
+    assert done.code == 0
+    assert done.out.splitlines()[-2] == (
+        'warning: significantly more left-out pilots are located worse after it than better')
 
 
 def test_boards_are_compared_and_the_best_one_is_fitted(tmp_path, capsys):
