@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import crlb
-from rhs_isac_ros.calibration import Pilots, calibrate, known_states
+from rhs_isac_ros.calibration import Pilots, calibrate, fit_board, known_states
 from rhs_isac_ros.codebook import optimize
 from rhs_isac_ros.codebook.cell import Cell
 from rhs_isac_ros.codebook.unoptimised import directional_codebook, random_codebook
@@ -15,7 +15,7 @@ from rhs_isac_ros.link import applied_beam, capacity, capacity_report, choose_be
 from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.waveguides import board_of_guides
-from rhs_isac_ros.positioning import BayesEstimator
+from rhs_isac_ros.positioning import BayesEstimator, Tracker
 from rhs_isac_ros.positioning.site import Site, SiteEstimator
 from rhs_isac_ros.system import System
 
@@ -129,8 +129,38 @@ def impaired(system):
     located(other)
 
 
+def tracked(system):
+    """The second cycle takes the first one as its prior."""
+    tracker, rng = Tracker(BayesEstimator(system)), np.random.default_rng(5)
+    first, second = (tracker.update(time_s, system.sample(USER, rng)[0]) for time_s in (0.0, 0.1))
+    assert np.trace(second.covariance[:3, :3]) < np.trace(first.covariance[:3, :3])
+
+
+def moving(system):
+    """The user walks during the cycle."""
+    walking = dataclasses.replace(system.scenario, user_speed_std_mps=1.0, retune_s=0.01)
+    other = System(walking, system.codebook)
+    estimate = BayesEstimator(other).estimate(other.sample(USER, np.random.default_rng(6)))
+    assert np.isfinite(estimate.mean).all()
+
+
+def fitted(system):
+    """Pilots tell the gains of feeds, or of a network."""
+    board, rng = system.scenario.board, np.random.default_rng(7)
+    name, true = ('gain', 1.2) if board.kind == 'network' else ('feed_gains', [1.2, 0.8])
+    other = dataclasses.replace(
+        system.scenario, board=dataclasses.replace(board, **{name: true}))
+    positions = system.scenario.sample_positions(40, rng)
+    pilots = Pilots(system.codebook, positions,
+                    System(other, system.codebook).sample(positions, rng))
+    fit = fit_board(system.scenario, [pilots], [name])
+    errors = (fit.values - true) / np.sqrt(np.diagonal(fit.covariance))
+    assert (np.abs(errors) < 4).all()
+
+
 CELLS = [optimised, of_a_library, located, bounded, steered, steered_with_offsets,
-         calibrated, focused, with_states, with_failures, at_a_site, impaired]
+         calibrated, focused, with_states, with_failures, at_a_site, impaired, tracked, moving,
+         fitted]
 COUPLED = "'network' couples its elements"
 REFUSED = {
     **{(cell, 'network'): COUPLED for cell in (calibrated, focused, steered_with_offsets)},

@@ -7,6 +7,7 @@ import numpy as np
 
 from rhs_isac_ros.experiments.sweep import Point
 from rhs_isac_ros.experiments.sweep_settings import FIELDS, MEASURES, Axis, plain
+from rhs_isac_ros.model.board import Board
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.support.pictures import (
     COLUMN_IN,
@@ -136,6 +137,8 @@ def shown(name: str, value: Any) -> str:
         return ', '.join(f'{entry / 1e9:.4g}' for entry in value) + ' GHz'
     if isinstance(value, float | int):
         return f'{value:g}'
+    if isinstance(value, Board):
+        return plain(value)
     return plain(value).rpartition('/')[2].removesuffix('.yaml')
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from rhs_isac_ros.experiments.resampling import replicate, share_percent
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.board import Board
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.scenario import checked
 from rhs_isac_ros.support import plugins
@@ -213,6 +214,8 @@ def settings_of(
 
 def plain(value: Any) -> str:
     """Return the value of a field as text in the syntax of scenario files."""
+    if isinstance(value, Board):
+        value = value.plain
     if isinstance(value, GainPattern | str):
         return str(value)
     return json.dumps(value, default=dataclasses.asdict)

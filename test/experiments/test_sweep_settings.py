@@ -2,7 +2,8 @@
 
 import pytest
 
-from rhs_isac_ros.experiments.sweep_settings import Axis, parse_axis, settings_of
+from rhs_isac_ros.experiments.sweep_picture import shown
+from rhs_isac_ros.experiments.sweep_settings import Axis, parse_axis, plain, settings_of
 from rhs_isac_ros.model import Scenario, ScenarioError
 
 
@@ -17,6 +18,22 @@ def test_values_have_the_syntax_and_the_types_of_scenario_files():
         ((2.5e9, 3e9),), ((1e9,),))
     assert parse_axis('feed_positions_m=null').values == ((None,),)
     assert parse_axis('estimator=bayes,ml').values == (('bayes',), ('ml',))
+
+
+def test_boards_have_a_short_text_also_those_of_plug_ins(install):
+    install('own_boards', '''
+from rhs_isac_ros.model.board import Board
+
+class Mirror(Board):
+    kind, id = 'mirror', 'mirror'
+    def transfer(self, ports, tunings): ...
+    def pullback(self, ports, tunings, by_transfer): ...
+''', {})
+    axis = parse_axis('board=own_boards:Mirror,resonant,{kind: phase, phase_range_rad: 3}')
+    assert [plain(board) for board, in axis.values] == [
+        'own_boards:Mirror', 'resonant', '{"kind": "phase", "phase_range_rad": 3.0}']
+    assert [shown('board', board) for board, in axis.values] == [
+        plain(board) for board, in axis.values]
 
 
 @pytest.mark.parametrize(('text', 'expected'), [
