@@ -194,7 +194,7 @@ def _show_live(
         stream: RerunStream, scenario: Scenario, options: argparse.Namespace,
         arguments: Sequence[str]) -> None:
     node = command.observe(
-        lambda: command.expecting_cycles(ViewNode(scenario, stream.write)), arguments,
+        lambda: ViewNode(scenario, stream.write), arguments,
         lambda node: bool(options.cycles) and node.view.n_ended >= options.cycles)
     if options.save and not node.view.n_cycles:
         raise ToolError(f'{options.save} is not written: {node.silence}')
