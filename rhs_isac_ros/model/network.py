@@ -270,13 +270,13 @@ class CoupledNetwork(Board):
                 network.elements, network.between))
             other = self.gain * _loaded(network, elements, between, tunings)[1]
             # Interpolated admittances have errors of about the same size and of their own.
-            error = 2 * np.linalg.norm(other - transfer) / np.linalg.norm(transfer)
-            if error > _MAX_ERROR:
+            error, size = 2 * np.linalg.norm(other - transfer), np.linalg.norm(transfer)
+            if error > _MAX_ERROR * size:
                 low, high = network.frequencies_hz[[*ends]]
                 raise BoardError(
                     f'a transfer between {low:.9g} Hz and {high:.9g} Hz would have an error of '
-                    f'about {100 * error:.2g} %, expected at most {100 * _MAX_ERROR:g} %, as '
-                    'with smaller steps')
+                    f'about {100 * error / size:.2g} %, expected at most {100 * _MAX_ERROR:g} %, '
+                    'as with smaller steps')
 
     def _points(self, ports: Ports) -> list[tuple[tuple[int, ...], np.ndarray]]:
         """Return frequencies of the file for each band, and weights of each sub-band for them."""

@@ -65,6 +65,12 @@ def test_a_guide_that_is_too_narrow_carries_no_wave():
         Guides(0.01, 0.005, 0.1).admittance(10e9, np.zeros(1), np.zeros(1))
 
 
+def test_feeds_that_reach_no_element_are_no_error_of_interpolation(tmp_path):
+    arrays, path = board_of_guides(SMALL), tmp_path / 'board.npz'
+    np.savez(path, **{**arrays, 'y_st': 0 * arrays['y_st']})
+    assert CoupledNetwork(file=str(path)).misfit(SMALL) == ''
+
+
 @pytest.mark.parametrize(('shape', 'n_feeds'), [((6, 1), 1), ((1, 6), 6), ((5, 3), 2)])
 def test_guides_may_be_single_and_have_single_elements(shape, n_feeds):
     scenario = Scenario(elements_per_side=shape, n_feeds=n_feeds)
