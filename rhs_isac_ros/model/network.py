@@ -278,6 +278,7 @@ class CoupledNetwork(Board):
                     f'about {100 * error / size:.2g} %, expected at most {100 * _MAX_ERROR:g} %, '
                     'as with smaller steps')
 
+    @functools.lru_cache(maxsize=64)  # noqa: B019 - boards are few, and equal ones share entries
     def _points(self, ports: Ports) -> list[tuple[tuple[int, ...], np.ndarray]]:
         """Return frequencies of the file for each band, and weights of each sub-band for them."""
         return [_between(self.network.frequencies_hz, band) for band in ports.frequencies_hz]
