@@ -228,6 +228,13 @@ class WhiteMeans:
         return assemble(
             prior, values, columns, prior.information, self.likelihood.factors.noise)
 
+    @property
+    def growth(self) -> np.ndarray:
+        """Relative change of the amplitude of the direct path, float64 [M, P + D]."""
+        changes = np.einsum('mpbn,mbn->mp', self.slopes, self.mean.conj()).real
+        found: np.ndarray = changes / np.sum(np.abs(self.mean)**2, axis=(1, 2))[:, None]
+        return found
+
     def settled(self, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Replace uniform band phases in parameters [M, Q] by the most likely phases."""
         outputs, change = self.outputs(values, signals), np.zeros_like(values)

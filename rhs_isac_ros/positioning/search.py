@@ -254,9 +254,8 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
     Newton steps start from the approximate parameters `values`, [M, Q], of which the first
     `n_held` do not change. Also returns the information about the others, [M, Q, Q].
     """
-    return _maximised(
-        *_settled(conditional, likelihood, points, values, signals, moves=False),
-        likelihood, signals, n_held)[:3]
+    located, _, values = _settled(conditional, likelihood, points, values, signals, moves=False)
+    return _maximised(located, values, likelihood, signals, n_held)[:3]
 
 
 def _maximised(located: Located, values: np.ndarray, likelihood: Likelihood, signals: Signals,
@@ -279,25 +278,44 @@ def expanded_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
 
     The arguments are those of `marginal_at`.
     """
-    located, values = _settled(conditional, likelihood, points, values, signals)
+    located, white, values = _settled(conditional, likelihood, points, values, signals)
     value, values, _, local = _maximised(located, values, likelihood, signals)
     if values.shape[1]:
-        local = located.local(values, signals)
+        local = _with_volume(located.local(values, signals), white, likelihood)
     marginal = marginalise(local.information, local.gradient)
     return value, marginal.gradient, marginal.information
 
 
+def _with_volume(local: Local, white: Located, likelihood: Likelihood) -> Local:
+    """Add the derivative of the parameters' volume with respect to the point to the gradient.
+
+    The curvature in the parameters that the direct path determines is proportional to its
+    amplitude. Within narrow modes, it hardly changes.
+    """
+    prior = likelihood.nuisance
+    if prior.is_coarse:
+        assert isinstance(white, WhiteMeans)
+        determined = len(prior) - np.trace(np.linalg.solve(
+            local.information[:, 3:, 3:], np.diag(prior.precision) + prior.information),
+            axis1=1, axis2=2)
+        local.gradient[:, :3] -= determined[:, None] / 2 * white.growth[:, :3]
+    return local
+
+
 def _settled(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
              values: np.ndarray, signals: Signals, moves: bool = True
-             ) -> tuple[Located, np.ndarray]:
-    """Return the likelihood at points, and parameters [M, Q] with the most likely phases."""
-    located = conditional.at(points, values, moves=moves)
+             ) -> tuple[Located, Located, np.ndarray]:
+    """Return the likelihood at points, and parameters [M, Q] with the most likely phases.
+
+    The second result has only one covariance if phases are uniform.
+    """
+    located = white = conditional.at(points, values, moves=moves)
     # A step in range rotates uniform phases of bands by many turns.
     if likelihood.nuisance.is_coarse:
-        white = located if isinstance(located, WhiteMeans) else likelihood.at(
-            points, values, moves=False)
+        if not isinstance(white, WhiteMeans):
+            white = likelihood.at(points, values, moves=moves)
         values = white.settled(values, signals)
-    return located, values
+    return located, white, values
 
 
 def one_step(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
@@ -307,8 +325,8 @@ def one_step(conditional: Conditional, likelihood: Likelihood, starts: Starts, s
     Takes the signals of one shot or of each start. The modes are as predicted at the starts.
     """
     points = starts.points
-    located, values = _settled(conditional, likelihood, points, starts.values, signals)
-    local = located.local(values, signals)
+    located, white, values = _settled(conditional, likelihood, points, starts.values, signals)
+    local = _with_volume(located.local(values, signals), white, likelihood)
     marginal = marginalise(local.information, local.gradient)
     step = step_to_maximum(marginal.information, marginal.gradient)
     whole = np.zeros_like(local.gradient)

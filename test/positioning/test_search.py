@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.special import i0e
 
 from rhs_isac_ros.bounds.fisher import fisher_information
 from rhs_isac_ros.codebook import Codebook, random_codebook
@@ -13,7 +14,7 @@ from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.offsets import Alignment
-from rhs_isac_ros.positioning.search import ascend, find_modes, marginal_at
+from rhs_isac_ros.positioning.search import ascend, expanded_at, find_modes, marginal_at
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.templates import tabulate
 from rhs_isac_ros.system import System
@@ -68,6 +69,20 @@ def test_the_true_position_is_not_more_likely_than_the_best_mode(setting):
     assert (best > truths - 0.3).all()
     # Half of a chi-square variable with three degrees of freedom.
     assert 0.5 < np.mean(best - truths) < 4
+
+
+def test_the_gradient_contains_the_change_of_the_volume_of_phases(codebook):
+    """Averaged over uniform phases of the bands, the likelihood contains Bessel functions."""
+    scenario = dataclasses.replace(SCENARIO, band_phase_std_rad=2 * np.pi)
+    likelihood, point = Likelihood(System(scenario, codebook)), np.array([[4.0, 0.1, -0.05]])
+    signals = likelihood.signals(likelihood.model.mean(to_positions(point)))
+    nearby = point + np.outer([-1e-3, 1e-3], [1.0, 0.0, 0.0])
+    means = likelihood.model.whiten(likelihood.model.mean(to_positions(nearby)))
+    amplitudes = 2 * np.abs(np.sum(means.conj() * signals.whitened, axis=2))
+    exact = np.sum(np.log(i0e(amplitudes)) + amplitudes - np.sum(np.abs(means)**2, axis=2), axis=1)
+    _, gradient, _ = expanded_at(
+        likelihood, likelihood, point, np.zeros((1, len(likelihood.nuisance))), signals)
+    assert gradient[0, 0] == pytest.approx(np.diff(exact)[0] / 2e-3, rel=0.05)
 
 
 def test_no_ascent_ends_below_its_start(random_beams):
