@@ -117,7 +117,11 @@ def test_cycles_that_had_no_fix_live_count_for_every_estimator(run, capsys):
 
     The recorder has missed the answer to a first one that was served without an estimate.
     """
-    first, *lost = ended = load(run.path).truths
+    outcomes = {(state.cycle_id, state.user) for state in (
+        convert.from_bytes(m.ProtocolState, data) for _, data, _ in read(
+            run.path, ['/protocol_state'])) if state.outcome}
+    # A busy recorder also misses the ends of the first cycles, which have estimates.
+    first, *lost = ended = [key for key in load(run.path).truths if key in outcomes]
     kinds = {f'/{topics.NAMES[kind]}': kind
              for kind in (m.ReceivedSignals, m.PositionEstimate, m.ProtocolState)}
 
