@@ -3,6 +3,7 @@
 import re
 import signal
 import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.positioning import Site, fuse
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.fusion import sighting_of
-from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
 from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.processes import Processes
@@ -252,6 +253,7 @@ def test_data_of_walking_users_move_to_another_surface(running):
 def recorded(running, built_scripts, tmp_path_factory):
     """A recording of some cycles, and the positions from both surfaces meanwhile."""
     pytest.importorskip('mcap', reason='mcap is not installed')
+    from rhs_isac_ros.ros.recording import read
     path = tmp_path_factory.mktemp('recording') / 'site.mcap'
     with subprocess.Popen(
             [ROOT / 'scripts' / 'record', path, '--site', running.site_file],
@@ -264,7 +266,15 @@ def recorded(running, built_scripts, tmp_path_factory):
             line = process.stderr.readline()
             assert line, f'no messages of {missing}'
             missing.discard(line.rpartition('first message of ')[2].strip())
+        # Those that have waited in queues until now are not in the recording.
+        begin_ns, positions = time.time_ns(), running.fused.received[m.PositionEstimate]
+        running.until(lambda: len(positions) and positions[-1].stamp_ns > begin_ns, 'a new cycle')
         estimates = running.until_fused(BOTH, 2 * N_USERS)
+        # Messages may wait in the queues of the recorder.
+        partial = path.with_name(f'{path.name}.part')
+        running.until(lambda: any(
+            convert.from_bytes(m.PositionEstimate, data).cycle_id == estimates[-1].cycle_id
+            for _, data, _ in read(partial, ['/position_estimate'])), 'the last position on disk')
         process.send_signal(signal.SIGINT)
         output = process.communicate(timeout=240)[0]
     assert process.returncode == 0, output
