@@ -441,7 +441,11 @@ class SearchEstimator(abc.ABC):
             self._likelihood, of_shot, self._phases, select(signals, [shot]), modes.of_shot(shot),
             self._mode_normal) for shot, of_shot in conditionals.items())
         positions, log_weights = map(np.concatenate, zip(*drawn, strict=True))
-        return Samples.of(positions, log_weights, modes.shots)
+        # Evenly spread points represent a position well: covariances are 1 % too small. With a
+        # velocity, these are 12 % too small, and points are no better than independent ones.
+        n_moving = self._likelihood.nuisance.velocity.shape[1]
+        return Samples.of(
+            positions, log_weights, modes.shots, (2 * n_moving + 2) * (n_moving > 0))
 
     def _log_ratios(self, alternatives: Sequence[Alternative], signals: Signals, seen: np.ndarray,
                     aligned: np.ndarray, fits: Sequence[Fit]) -> dict[str, np.ndarray]:

@@ -18,7 +18,7 @@ from rhs_isac_ros.model.impairments import (
     nuisance_of,
 )
 from rhs_isac_ros.model.scenario import ScenarioError
-from rhs_isac_ros.positioning.lattice import Resolution
+from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers
 
 # Standard deviation of a Gaussian whose density at its centre equals that of a uniform phase.
 UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
@@ -161,6 +161,32 @@ class NuisancePrior(Exponents):
         derivatives = np.zeros((len(points), 6, n_points + n_moving))
         derivatives[:, :3, :n_points], derivatives[:, 3:, n_points:] = by_point, self.velocity
         return np.hstack([positions, values[:, :n_moving] @ self.velocity.T]), derivatives
+
+    def velocities(self, values: np.ndarray, points: np.ndarray, levels: np.ndarray
+                   ) -> np.ndarray:
+        """Return velocities [M, 3] [m/s] at points for parameters [M, Q].
+
+        An offset of the carrier resembles a radial speed. If both may turn the phase by more than
+        a quarter of a turn within a band, the multipath leaves several offsets of similar
+        likelihood, of which a search finds one. Only the turn by both together is then known, and
+        the standard normal `levels` [M] divide it by the prior.
+        """
+        scenario, velocities = self.scenario, values[:, :self.velocity.shape[1]] @ self.velocity.T
+        band_s = scenario.n_frames * scenario.frame_duration_s
+        frames = self.scaled_patterns.reshape(
+            *self.phases.T.shape, scenario.n_subbands, -1)[:, 0, 0].imag
+        # Offsets of the carrier per unit [Hz]; then those that equal speeds [Hz s/m].
+        offsets_hz = self.needs_search * (frames[:, -1] - frames[:, 0]) / (
+            2 * np.pi * max(scenario.n_frames - 1, 1) * scenario.frame_duration_s)
+        away = jacobian(points)[:, :, 0] * carrier_wavenumbers(scenario).mean() / (2 * np.pi)
+        along = away @ self.velocity @ self.velocity.T
+        of_speed, of_offset = np.sum(along * away, axis=1), np.sum(offsets_hz**2)
+        offset_hz = values @ offsets_hz
+        share = of_offset / (of_offset + of_speed)
+        turn_hz = offset_hz - np.sum(away * velocities, axis=1)
+        change_hz = share * turn_hz + np.sqrt(share * of_speed) * levels - offset_hz
+        is_unclear = np.minimum(of_speed, of_offset) * band_s**2 > 1 / 16
+        return velocities + (is_unclear * change_hz / of_speed)[:, None] * along
 
     def carried(self, values: np.ndarray, points: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Return parameters [M, Q] at target points for those at points, with equal polar rates.

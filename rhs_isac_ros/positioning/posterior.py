@@ -59,20 +59,28 @@ class Samples(NamedTuple):
     weights: np.ndarray  # Float64 [M, S]; their sum is 1 for each shot.
     of_shot: Segments  # The modes of each shot.
     log_evidence: np.ndarray  # Logarithms of the likelihood averaged over the region, [N].
+    # Relative increase of covariances because there are few samples, float64 [N].
+    few: np.ndarray
 
     @classmethod
-    def of(cls, positions: np.ndarray, log_weights: np.ndarray, shots: np.ndarray) -> 'Samples':
+    def of(cls, positions: np.ndarray, log_weights: np.ndarray, shots: np.ndarray,
+           n_fitted: int = 0) -> 'Samples':
         """Normalise the weights of each shot; the density is relative to a uniform prior.
 
-        Takes log-weights [M, S], and the shots of the modes, int [M].
+        Takes log-weights [M, S], and the shots of the modes, int [M]. Given n independent samples
+        of a Gaussian with D unknown coordinates, one more sample has a Student distribution, whose
+        covariance is (n + 1) / (n - D - 2) times theirs. `n_fitted` is D + 2, or 0 for points that
+        represent the covariance well; n is the effective number of samples.
         """
         of_shot = Segments.of_keys(shots)
         highest = of_shot.max(log_weights.max(axis=1))
         weights = np.exp(log_weights - of_shot.repeat(highest)[:, None])
         totals = of_shot.sum(weights.sum(axis=1))
         weights /= of_shot.repeat(totals)[:, None]
+        n = np.maximum(1 / of_shot.sum(np.einsum('ms,ms->m', weights, weights)), n_fitted + 1)
         return cls(positions, weights, of_shot,
-                   highest + np.log(totals) - np.log(log_weights.shape[1]))
+                   highest + np.log(totals) - np.log(log_weights.shape[1]),
+                   (1 + n_fitted) / (n - n_fitted))
 
     def average(self, values: np.ndarray) -> np.ndarray:
         """Average values of the modes, float64 [M], over each posterior, [N]."""
@@ -81,7 +89,7 @@ class Samples(NamedTuple):
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Compute the means, float64 [N, D], and covariances, [N, D, D], of the posteriors.
 
-        The covariance includes the uncertainty of a mean of few samples.
+        The covariance includes the uncertainty of moments of few samples.
         """
         of_shot = self.of_shot
         mean = of_shot.sum(np.matmul(self.weights[:, None], self.positions)[:, 0])
@@ -90,12 +98,7 @@ class Samples(NamedTuple):
         squares, shift = np.matmul(weighted, offsets), weighted.sum(axis=2)
         shares = np.maximum(self.weights.sum(axis=1), np.finfo(float).tiny)
         within = squares - shift[:, :, None] * shift[:, None] / shares[:, None, None]
-        return mean, of_shot.sum(squares) + self._few[:, None, None] * of_shot.sum(within)
-
-    @property
-    def _few(self) -> np.ndarray:
-        """Relative increase of covariances because there are few samples, [N]."""
-        return self.of_shot.sum(np.einsum('ms,ms->m', self.weights, self.weights))
+        return mean, of_shot.sum(squares) + self.few[:, None, None] * of_shot.sum(within)
 
     def described(self, n: int, modes: Modes | None, bounds: np.ndarray
                   ) -> tuple[Mixture, Sheets]:
@@ -111,7 +114,7 @@ class Samples(NamedTuple):
         weights = self.weights[rows][chosen] / shares[chosen, None]
         means, covariances = moments(weights, positions)
         mixture = Mixture._make((
-            log_shares, means, regular(covariances * (1 + self._few[n]))))
+            log_shares, means, regular(covariances * (1 + self.few[n]))))
         return mixture, modes.sheets() if modes else Sheets.of_density(
             log_shares, *moments(weights, to_polar(positions[..., :3])), bounds)
 
@@ -136,6 +139,9 @@ def draw_broad_samples(
     float64 [M, S, 3] [m], with columns for a velocity, [M, S, 6] [m, m/s], and the logarithms of
     their weights, [M, S].
     """
+    # SciPy takes long to load, and users at rest do not need it.
+    from scipy.special import ndtri
+
     prior, bounds = likelihood.nuisance, likelihood.resolution.bounds_m
     n_moving, widening = prior.velocity.shape[1], _SAMPLING.spread**2
     positions, log_weights = Inside.of(
@@ -161,8 +167,9 @@ def draw_broad_samples(
             evidence, values, _ = marginal_at(
                 conditionals[state], likelihood, points, values, signals, n_moving)
             evidence += np.sum(white**2, axis=1) / 2 - np.linalg.slogdet(among)[1] / 2
-            velocities[rows] = (values[:, :n_moving] @ prior.velocity.T).reshape(
-                len(rows), -1, 3)
+            levels = ndtri(_evenly(len(normal)))
+            velocities[rows] = prior.velocities(
+                values, points, np.tile(levels, len(rows))).reshape(len(rows), -1, 3)
         evidence += _log_share(points.reshape(len(rows), -1, 3), select(modes, rows)).ravel()
         if phases.is_informative:
             likely = evidence >= evidence.max() - _SAMPLING.margin
@@ -239,8 +246,7 @@ class BandPhases:
 
     def drawn_m(self, shares: np.ndarray) -> np.ndarray:
         """Draw an offset for each of P positions with these shares, [P, R] [m]."""
-        # Multiples of the golden ratio, modulo 1, are evenly spread.
-        levels = (np.arange(len(shares)) + 0.5) * _SAMPLING.ratio % 1
+        levels = _evenly(len(shares))
         cumulative = np.cumsum(shares, axis=1)
         chosen = np.count_nonzero(cumulative < levels[:, None], axis=1)
         return self.offsets_m[np.minimum(chosen, shares.shape[1] - 1)]
@@ -254,6 +260,13 @@ class BandPhases:
         concentration = 2 * np.maximum(magnitude, 1e-9)
         variance = self._std**2 - 2 * np.log(i1e(concentration) / i0e(concentration))
         return np.minimum(np.sqrt(variance), _SAMPLING.phase_std_rad)
+
+
+def _evenly(n: int) -> np.ndarray:
+    """Return numbers between 0 and 1 that any part of the sequence spreads evenly, float64 [n]."""
+    # Multiples of the golden ratio, modulo 1.
+    levels: np.ndarray = (np.arange(n) + 0.5) * _SAMPLING.ratio % 1
+    return levels
 
 
 def _common_phase(std: float) -> tuple[np.ndarray, np.ndarray]:

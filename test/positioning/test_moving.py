@@ -83,6 +83,28 @@ def test_users_who_walk_are_located_with_known_phases_of_bands():
     assert inside(errors[:, :2], estimate.covariance[:, :2, :2], 2) >= 7 / 8
 
 
+@pytest.mark.parametrize('std_hz', [0.5, 30.0])
+def test_broad_offsets_of_the_carrier_and_radial_speeds_share_the_doppler_shift(std_hz):
+    """Whatever the search found, speeds are distributed as those with the same total shift."""
+    prior = Likelihood(system_of(carrier_offset_std_hz=std_hz)).nuisance
+    rng, n = np.random.default_rng(5), 20_000
+    points = np.tile(to_polar(np.array([[2.5, 0.8, 0.0]])), (n, 1))
+    away, to_hz = to_positions(points[0]) / points[0, 0], 5.5e9 / 299792458.0
+    drawn = np.zeros((n, len(prior)))
+    drawn[:, :3] = rng.standard_normal((n, 3))
+    speeds = drawn[:, :2] @ prior.velocity[:2, :2].T @ away[:2]
+    total_hz = std_hz * drawn[:, 2] - to_hz * speeds
+    found = np.zeros_like(drawn)
+    found[:, 2] = total_hz / std_hz
+    velocities = prior.velocities(found, points, rng.standard_normal(n))
+    if std_hz < 1:
+        np.testing.assert_array_equal(velocities, 0)
+    else:
+        np.testing.assert_array_equal(velocities[:, 2], 0)
+        np.testing.assert_allclose(*(np.cov(one, total_hz) for one in (
+            speeds, velocities @ away)), rtol=0.05)
+
+
 def test_without_the_phases_of_bands_range_and_radial_speed_are_ambiguous():
     """A range step that the phases of the bands explain leaves the signals as they are."""
     system, rng = system_of(multipath_to_los_db=-40.0), np.random.default_rng(4)

@@ -11,7 +11,13 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import estimators, make_estimator
 from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.likelihood import Likelihood
-from rhs_isac_ros.positioning.posterior import _SAMPLING, BandPhases, _log_density, _log_share
+from rhs_isac_ros.positioning.posterior import (
+    _SAMPLING,
+    BandPhases,
+    Samples,
+    _log_density,
+    _log_share,
+)
 from rhs_isac_ros.positioning.search import Modes
 from rhs_isac_ros.system import System
 
@@ -137,6 +143,17 @@ def test_only_broad_phases_are_left_to_the_samples(codebook, std_rad, is_informa
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize('size', [3, 6])
+def test_covariances_of_few_samples_cover_another_one(size):
+    n_shots, n = 4000, 20
+    white = np.random.default_rng(3).standard_normal((n_shots, n + 1, size))
+    means, covariances = Samples.of(
+        white[:, 1:], np.zeros((n_shots, n)), np.arange(n_shots), size + 2).moments()
+    errors = white[:, 0] - means
+    squares = np.sum(errors * np.linalg.solve(covariances, errors[..., None])[..., 0], axis=1)
+    assert squares.mean() == pytest.approx(size, rel=0.04)
+
+
 def test_random_phases_of_the_bands_leave_the_moments_of_the_posterior(random_beams):
     """The modes extend over the range and overlap."""
     scenario = Scenario(
