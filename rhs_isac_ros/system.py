@@ -38,8 +38,8 @@ class System(MeasurementModel):
     (the attribute `surface` of a `Calibration`). The pose is that of the scenario. These are the
     attributes `scenario`, `codebook` and `surface`; estimators, sites and roles take the system.
 
-    Raises CodebookError if the codebook does not fit the scenario, and ValueError if the surface
-    does not.
+    Raises CodebookError if the codebook does not fit the scenario, ValueError if the surface does
+    not, and TypeError if one of them has another class.
 
     Examples
     --------
@@ -52,6 +52,12 @@ class System(MeasurementModel):
 
     def __init__(self, scenario: Scenario, codebook: Codebook,
                  surface: KnownSurface | None = None) -> None:
+        for name, value, kind, expected in (
+                ('scenario', scenario, Scenario, 'a Scenario'),
+                ('codebook', codebook, Codebook, 'a Codebook'),
+                ('surface', surface, KnownSurface | None, 'the surface of a Calibration')):
+            if not isinstance(value, kind):
+                raise TypeError(f'{name}: {type(value).__name__}, expected {expected}')
         with translated(CodebookError, CodebookError, f'codebook {codebook.id}'):
             codebook.check(scenario)
         super().__init__(scenario, codebook, surface)

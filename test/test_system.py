@@ -7,11 +7,12 @@ import pytest
 import yaml
 
 from rhs_isac_ros.bounds import crlb, crlb_of
-from rhs_isac_ros.calibration import Calibration
+from rhs_isac_ros.calibration import Calibration, known_states
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.link import choose_beam, steer
 from rhs_isac_ros.model import MeasurementModel, Scenario, draw_surface
 from rhs_isac_ros.model.elements import SurfaceEstimate
+from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.system import System
 
 CONFIG = Path(__file__).parents[1] / 'config'
@@ -72,6 +73,17 @@ def test_beams_are_those_for_the_coefficients_of_an_estimated_surface(small):
 def test_a_codebook_of_other_sizes_is_named(setting, small):
     with pytest.raises(CodebookError, match=f'codebook {small.codebook.id}: analog: shape'):
         System(setting[0], small.codebook)
+
+
+def test_an_argument_of_another_class_is_named(setting):
+    scenario, codebook = setting
+    system = System(scenario, codebook)
+    with pytest.raises(TypeError, match='^scenario: System, expected a Scenario'):
+        make_estimator('bayes', system, codebook)
+    calibration = known_states(scenario, 0, 1)
+    with pytest.raises(TypeError, match='^surface: Calibration, expected the surface of a Cal'):
+        System(scenario, codebook, calibration)
+    assert System(scenario, codebook, calibration.surface).surface is calibration.surface
 
 
 def test_a_file_names_scenario_codebook_and_calibration(written):
