@@ -23,6 +23,8 @@ from rhs_isac_ros.positioning.nuisance import NuisancePrior
 # Numbers of failures to average over: smallest probability of each, and how many at most.
 _MIN_PROBABILITY = 1e-5
 _MAX_COUNTS = 12
+# Memory of the covariances of several points [bytes].
+_MAX_BYTES = 1 << 27
 # Share of the whitened energy up to which errors of an estimated surface need no covariance for
 # each position.
 _MIN_ERROR_SHARE = 0.05
@@ -48,6 +50,7 @@ class DispersedLikelihood(Conditional):
         self._scales, log_weights = _failure_counts(scenario.n_elements, share)
         self._offsets = log_weights + likelihood.log_det
         roots = covariance_root(scenario, self._covariances(MeasurementModel.covariance))
+        self.n_at_once = max(_MAX_BYTES // roots.nbytes, 1)
         self._information = [likelihood.nuisance.information_of(*both)
                              for both in zip(roots, np.linalg.inv(roots), strict=True)]
 

@@ -47,8 +47,10 @@ from rhs_isac_ros.positioning.segments import concatenate, select
 
 # Largest expected number of failures for which sets are searched.
 _MAX_EXPECTED = 2.0
-# Number of sets whose covariance is kept, and memory of their extensions [bytes].
-_MAX_SURFACES, _EXTENSION_BYTES = 256, 1 << 26
+# Number of sets whose covariance is kept, their memory, and that of their extensions [bytes], of
+# which a block is computed at a time.
+_MAX_SURFACES, _SURFACE_BYTES = 256, 1 << 25
+_EXTENSION_BYTES, _BLOCK_BYTES = 1 << 26, 1 << 24
 # Bounds of places elsewhere, among them those without a direct path.
 _ANYWHERE_M = np.array([[0.0, -2e7, -2e7], [2e7, 2e7, 2e7]])
 # Number of places at which all elements are compared at a time.
@@ -288,9 +290,13 @@ class FailedSurfaces:
         # Covariance of the errors that all failures together cause on average.
         failing = dataclasses.replace(scenario, element_error_rms=0.0)
         self._error = DeclaredElements(failing).error_covariance(failing, codebook)
-        self._extensions: dict[tuple[Failed, float], Whitening] = {}
+        self._extensions: dict[tuple[Failed, float], list[Whitening]] = {}
+        self._n_bytes = self.intact.covariance().nbytes
+        #: Blocks of the elements.
+        self.parts = blocks(scenario.n_elements, max(_BLOCK_BYTES // self._n_bytes, 1))
         # The same set is often probable in successive shots.
-        cache = functools.lru_cache(maxsize=_MAX_SURFACES)
+        self.n_kept = min(max(_SURFACE_BYTES // self._n_bytes, 1), _MAX_SURFACES)
+        cache = functools.lru_cache(maxsize=self.n_kept)
         self.surface = cache(self._surface)
         self.whitening = cache(lambda failed: Whitening.of(
             self.surface(failed).covariance[None], likelihood.nuisance))
@@ -301,8 +307,8 @@ class FailedSurfaces:
         return FailedSurface(np.matmul(self.intact.radiation, self.effects.spatial),
                        self.intact.covariance())
 
-    def extensions(self, failed: Failed, remainder: float) -> Whitening:
-        """Return the factors for a set with each element added in turn.
+    def extensions(self, failed: Failed, remainder: float) -> list[Whitening]:
+        """Return the factors for a set with each element of each block added in turn.
 
         `remainder` times the covariance of the errors of all failures is added to the covariance
         of each extended set.
@@ -311,12 +317,12 @@ class FailedSurfaces:
         known = self._extensions
         found = known.get((failed, remainder))
         if found is None:
-            surface = self.surface(failed)
-            covariance = surface.covariance + self.effects.growth(surface)
-            covariance += remainder * self._error
-            found = Whitening.of(covariance, self.likelihood.nuisance, self.whitening(failed))
+            surface, parent = self.surface(failed), self.whitening(failed)
+            covariance = surface.covariance + remainder * self._error
+            found = [Whitening.of(covariance + self.effects.growth(surface, part),
+                                  self.likelihood.nuisance, parent) for part in self.parts]
             # Extensions of the intact surface serve all shots. Others often serve successive ones.
-            n_kept = _EXTENSION_BYTES // found.factors.whitener.nbytes
+            n_kept = _EXTENSION_BYTES // (self._n_bytes * self.likelihood.scenario.n_elements)
             others = [key for key in known if key[0]]
             left_out = others[:max(len(others) + 1 - n_kept, 0)]
             self._extensions = {key: known[key] for key in known if key not in left_out} | {
@@ -348,21 +354,9 @@ class Place:
     columns: np.ndarray
 
     @functools.cached_property
-    def elements(self) -> tuple[np.ndarray, np.ndarray]:
-        """Effects of the failure of each element, computed at first use.
-
-        They are the change of `columns`, complex128 [N_E, 4 + Q, N_B, N_SB F], and the derivative
-        of the mean with respect to the normalised amplitude, complex128 [N_E, N_B, N_SB F].
-        """
-        ((changes,), (amplitudes,)) = self.model.elements_at(self.point[None])
-        return changes, amplitudes
-
-    def columns_of(self, failed: Failed) -> tuple[np.ndarray, np.ndarray]:
-        """Return the columns with failed elements, and the columns for their amplitudes."""
-        if not failed:
-            return self.columns, self.columns[:0]
-        changes, amplitudes = self.elements
-        return self.columns + changes[[*failed]].sum(axis=0), amplitudes[[*failed]]
+    def gains(self) -> np.ndarray:
+        """Gains of the direct path's elements and derivatives, [4, N_B, N_SB, N_E]; when used."""
+        return self.model.gains_at(self.point)
 
 
 class FailedSet(Conditional):
@@ -404,7 +398,7 @@ class FailureModel:
 
     def __init__(self, likelihood: Likelihood) -> None:
         self.likelihood, self.surfaces = likelihood, FailedSurfaces(likelihood)
-        self.failed_set = functools.lru_cache(maxsize=_MAX_SURFACES)(
+        self.failed_set = functools.lru_cache(maxsize=self.surfaces.n_kept)(
             lambda failed: FailedSet(self.surfaces, failed))
 
     def places(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> list[Place]:
@@ -414,23 +408,43 @@ class FailureModel:
         divided = prior.divide(signals.received, values)
         columns = np.concatenate([
             (divided - mean)[:, None], slopes,
-            prior.derivatives(divided, mean)[:, prior.velocity.shape[1]:]], axis=1)
+            prior.derivatives(divided, mean, prior.multipath_share)[
+                :, prior.velocity.shape[1]:]], axis=1)
         return [Place(self, *each) for each in zip(points, values, columns, strict=True)]
 
-    def elements_at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute `Place.elements` at points [P, 3]; the arrays begin with an axis of places."""
-        scenario, prior = self.likelihood.scenario, self.likelihood.nuisance
-        effects, gains = self.surfaces.effects, []
+    def gains_at(self, point: np.ndarray) -> np.ndarray:
+        """Compute `Place.gains` at a point [3]."""
+        scenario, gains = self.likelihood.scenario, []
         for band in range(scenario.n_bands):
-            gain, slope = los_and_derivative(scenario, to_positions(points), band)
-            slope = np.einsum('pxq,pxjm->pqjm', jacobian(points), slope)
-            gains.append(np.concatenate([gain[:, None], slope], axis=1))
-        elements = np.repeat(np.moveaxis(np.stack(gains), (0, 4), (3, 1)), scenario.n_frames, -1)
-        changes = elements * effects.shift[:, None]
-        fixed = prior.scaled_patterns * ~prior.moves_multipath[:, None, None]
-        changes = np.concatenate(
-            [-changes[:, :, :1], changes[:, :, 1:], fixed * changes[:, :, :1]], axis=2)
-        return changes, elements[:, :, 0] * effects.amplitude
+            gain, slope = los_and_derivative(scenario, to_positions(point[None]), band)
+            slope = np.einsum('xq,xjm->qjm', jacobian(point[None])[0], slope[0])
+            gains.append(np.concatenate([gain, slope]))
+        return np.stack(gains, axis=1)
+
+    def effects_of(self, elements: slice | list[int], places: Sequence[Place]
+                   ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the effects of the failure of each of n elements at P places.
+
+        They are the change of `Place.columns`, complex128 [n, P, 4 + Q, N_B, N_SB F], and the
+        derivative of the mean with respect to the normalised amplitude, [n, P, N_B, N_SB F].
+        """
+        prior, effects = self.likelihood.nuisance, self.surfaces.effects
+        gains = np.repeat(np.stack([place.gains[..., elements].transpose(3, 0, 1, 2)
+                                    for place in places], axis=1),
+                          self.likelihood.scenario.n_frames, axis=-1)
+        changes = gains * effects.shift[elements][:, None, None]
+        fixed = prior.scaled_patterns * (1 - prior.multipath_share)[:, None, None]
+        return np.concatenate(
+            [-changes[:, :, :1], changes[:, :, 1:], fixed * changes[:, :, :1]], axis=2
+        ), gains[:, :, 0] * effects.amplitude[elements][:, None]
+
+    def _columns(self, failed: Failed, places: Sequence[Place]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the columns with failed elements, [P, ...], and those for their amplitudes."""
+        columns = np.stack([place.columns for place in places])
+        if not failed:
+            return columns, columns[:, :0]
+        changes, amplitudes = self.effects_of([*failed], places)
+        return columns + changes.sum(axis=0), amplitudes.swapaxes(0, 1)
 
     def weigh(self, failed: Failed, places: Sequence[Place]) -> tuple[np.ndarray, np.ndarray]:
         """Return a set's log-probability and deviance, [P] each, after a step at each of P places.
@@ -440,7 +454,7 @@ class FailureModel:
         because an unknown gain can lower any energy.
         """
         whitening = self.surfaces.whitening(failed)
-        columns = np.stack([np.concatenate(place.columns_of(failed)) for place in places])
+        columns = np.concatenate(self._columns(failed, places), axis=1)
         (value,) = self._predicted(np.stack([place.values for place in places]), columns[None],
                                    whitening, len(failed))
         log_prior = len(failed) * self.surfaces.log_odds
@@ -454,23 +468,19 @@ class FailureModel:
         share; these failures add to the covariance. With a `remainder`, an element that explains
         part of the signals has a higher value than one that imitates the sum of several failures.
         """
-        extended, parts = self.surfaces.extensions(failed, remainder), []
-        # A cached property is in vars() once it is computed.
-        new = [place for place in places if 'elements' not in vars(place)]
-        if new:
-            for place, *effects in zip(
-                    new, *self.elements_at(np.stack([one.point for one in new])), strict=True):
-                place.elements = tuple(effects)
-        for place in places:
-            (changes, amplitudes), (columns, own) = place.elements, place.columns_of(failed)
-            own = np.broadcast_to(own, (len(changes), *own.shape))
+        values, found = np.stack([place.values for place in places]), []
+        columns, own = self._columns(failed, places)
+        for part, extended in zip(
+                self.surfaces.parts, self.surfaces.extensions(failed, remainder), strict=True):
             # In the order of the fields of `Columns`. The mean is linear in the amplitudes of
             # failed elements.
-            parts.append(np.concatenate([columns + changes, own, amplitudes[:, None]], axis=1))
-        values = np.stack([place.values for place in places])
-        value = self._predicted(values, np.stack(parts, axis=1), extended, len(failed) + 1)
-        return ((len(failed) + 1) * self.surfaces.log_odds
-                - extended.factors.log_det[:, None] + value).T
+            changes, amplitudes = self.effects_of(part, places)
+            value = self._predicted(values, np.concatenate(
+                [columns + changes, np.broadcast_to(own, (len(changes), *own.shape)),
+                 amplitudes[:, :, None]], axis=2), extended, len(failed) + 1)
+            found.append((len(failed) + 1) * self.surfaces.log_odds
+                         - extended.factors.log_det[:, None] + value)
+        return np.concatenate(found).T
 
     def _predicted(self, values: np.ndarray, columns: np.ndarray, whitening: Whitening,
                    n_failed: int) -> np.ndarray:

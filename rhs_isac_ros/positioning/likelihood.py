@@ -61,6 +61,9 @@ class Located(Protocol):
 class Conditional(Protocol):
     """The likelihood for one state of the surface, or averaged over several."""
 
+    #: Largest number of points to evaluate together; each may need covariances of its own.
+    n_at_once: int = 1 << 20
+
     def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True) -> Located:
         """Return the likelihood at points [M, 3]; unless `moves`, without derivatives there.
 

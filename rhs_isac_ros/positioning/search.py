@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.model.arrays import log_sum
+from rhs_isac_ros.model.arrays import blocks, log_sum
 from rhs_isac_ros.model.gaussian import Marginal, likelihood_loss, marginalise, step_to_maximum
 from rhs_isac_ros.model.geometry import polar_derivative, to_polar, to_positions
 from rhs_isac_ros.positioning.dispersed import (
@@ -28,7 +28,7 @@ from rhs_isac_ros.positioning.likelihood import (
     Signals,
     WhiteMeans,
 )
-from rhs_isac_ros.positioning.segments import Segments, select
+from rhs_isac_ros.positioning.segments import Segments, concatenate, select
 from rhs_isac_ros.positioning.sheets import Inside, Sheets
 
 # Negative logarithms of the share of the posterior that discarded modes may have: on the grid,
@@ -196,8 +196,11 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     is the negative logarithm of the share of the posterior that discarded modes may have.
     """
     def step(starts: Starts, moves: bool = True) -> tuple[Modes, np.ndarray]:
-        return one_step(conditional, likelihood, starts, select(signals, starts.shots), state,
-                        moves)
+        parts = [one_step(conditional, likelihood, one, select(signals, one.shots), state, moves)
+                 for one in (select(starts, block) for block in blocks(
+                     len(starts.shots), conditional.n_at_once))]
+        found, gains = zip(*parts, strict=True)
+        return concatenate(*found), np.concatenate(gains)
 
     modes, gain = step(starts)
     # Points that the latest steps started from, and the known log-likelihoods there.
@@ -254,8 +257,15 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
     Newton steps start from the approximate parameters `values`, [M, Q], of which the first
     `n_held` do not change. Also returns the information about the others, [M, Q, Q].
     """
-    located, _, values = _settled(conditional, likelihood, points, values, signals, moves=False)
-    return _maximised(located, values, likelihood, signals, n_held)[:3]
+    def of_block(block: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        shots = signals if len(signals.received) == 1 else select(signals, block)
+        located, _, settled = _settled(
+            conditional, likelihood, points[block], values[block], shots, moves=False)
+        return _maximised(located, settled, likelihood, shots, n_held)[:3]
+
+    value, best, information = map(np.concatenate, zip(*(
+        of_block(block) for block in blocks(len(points), conditional.n_at_once)), strict=True))
+    return value, best, information
 
 
 def _maximised(located: Located, values: np.ndarray, likelihood: Likelihood, signals: Signals,

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import blocks
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
 from rhs_isac_ros.model.geometry import jacobian, to_polar, to_positions
 from rhs_isac_ros.positioning import alternatives, make_estimator
@@ -149,6 +150,8 @@ def weighing(request, codebook):
     received = MeasurementModel(scenario, codebook).sample(
         POSITION[None], np.random.default_rng(3))
     model = FailureModel(Likelihood(System(scenario, codebook)))
+    # As for a large surface.
+    model.surfaces.parts = blocks(36, 10)
     (site,) = model.places(
         POINT[None], np.full((1, len(request.param)), 0.1), model.likelihood.signals(received))
     return model, site
