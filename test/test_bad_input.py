@@ -108,8 +108,6 @@ CALLS = [
     ('codebook.__main__', ['--scenario', 'good.yaml', '--output', 'good.yaml'],
      'a file other than'),
     ('codebook.__main__', ['--raster', '1e6'], 'argument --raster: no effect, expected together'),
-    ('codebook.__main__', ['--restarts', '2', '--jobs', '4', '--dask', 'HOST:1'],
-     'argument --dask: not allowed with argument --jobs'),
     ('positioning.__main__', [], 'required: --codebook'),
     ('positioning.__main__', ['--codebook', 'garbage'], 'garbage: cannot be read'),
     ('positioning.__main__', ['--codebook', CODEBOOK, '--pairs', '3'], 'expected 20 to 10000000'),

@@ -195,11 +195,12 @@ class _Design:
             positions = prior.positions(scenario, SAMPLINGS[sampling](
                 scenario, n_positions, streams.generator(seed, streams.SAMPLES)))
         else:
-            if (sampling, n_positions) != ('sobol', DEFAULT_POSITIONS):
-                raise ValueError('sampling and n_positions: not allowed with positions')
-            positions, sampling = checked_positions(positions), 'given'
+            positions = checked_positions(positions)
             if not len(positions):
                 raise ValueError('positions: none, expected at least one')
+            if sampling != 'sobol' or n_positions not in (DEFAULT_POSITIONS, len(positions)):
+                raise ValueError('sampling and n_positions: not allowed with positions')
+            sampling = 'given'
         provenance = Provenance(
             method=method, objective=objective, seed=int(seed), sampling=sampling,
             positions=len(positions), scenario=scenario.changes(),

@@ -334,9 +334,8 @@ class Scenario(Extensions, Table1):
         if self.roi_center_m[0] - self.roi_size_m[0] / 2 <= foremost:
             raise ScenarioError(f'element_positions_m: x up to {foremost:g} m, expected all '
                                 'elements in front of the region of interest')
-        for name in (*_OF_AXES, 'multipath'):
-            if positions and getattr(self, name) != getattr(Scenario, name):
-                raise ScenarioError(f'element_positions_m: with {name}, expected a grid')
+        if positions and self.multipath is not None:
+            raise ScenarioError('element_positions_m: with a file multipath, expected a grid')
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> 'Scenario':
@@ -353,7 +352,7 @@ class Scenario(Extensions, Table1):
             raise ScenarioError(f'{path}: expected a mapping of field names to values')
         if 'grid' in content:
             with translated((TypeError, ValueError), ScenarioError, f'{path}: grid'):
-                content = dict(**nr_grid(**content.pop('grid')), **content)
+                content = nr_grid(**content.pop('grid')) | content
         known = [field.name for field in dataclasses.fields(cls)]
         for key in content:
             if key not in known:

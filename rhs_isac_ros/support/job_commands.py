@@ -16,12 +16,12 @@ from rhs_isac_ros.support.optional import MissingLibraryError
 
 def add_run_options(parser: argparse.ArgumentParser, output: str = '') -> None:
     """Add the options of `run_jobs`; `output` is the default folder of the results, if any."""
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument('--jobs', type=integer(1, 1024), default=-1, metavar='N',
-                       help='number of parallel jobs (default: one per core)')
-    where.add_argument('--dask', type=_address, metavar='ADDRESS',
-                       help='scheduler of a Dask cluster to use instead of this machine; its '
-                            'workers need this package, and one thread each for accurate timing')
+    parser.add_argument('--jobs', type=integer(1, 1024), default=-1, metavar='N',
+                        help='number of parallel jobs (default: one per core)')
+    parser.add_argument('--dask', type=_address, metavar='ADDRESS',
+                        help='scheduler of a Dask cluster to use instead of this machine; '
+                             'its workers need this package, and one thread each for '
+                             'accurate timing')
     if output:
         parser.add_argument('--output', type=output_folder, default=output, metavar='DIR',
                             help='folder of the results (default: %(default)s); jobs that have '

@@ -231,11 +231,9 @@ class Workers:
     quiet: bool = False  #: Whether to show no progress.
 
     def __post_init__(self) -> None:
-        """Raise ValueError if there are no processes, or both processes and a cluster."""
+        """Raise ValueError if there are no processes."""
         if not self.n_jobs:
             raise ValueError('n_jobs: 0, expected 1 or more, or -1 for one per core')
-        if self.dask and self.n_jobs != -1:
-            raise ValueError(f'n_jobs: {self.n_jobs}, not allowed with dask, whose workers count')
 
     def run(self, strands: Sequence[Strand[_End]]) -> list[_End]:
         """Run strands until all have returned; return what they return.
@@ -506,8 +504,7 @@ def run_jobs(
     Raises JobError if a job fails, its process dies or its worker has other sources of this
     package, ConnectionError if the cluster does not respond, OSError if a result cannot be read or
     stored, MissingLibraryError if a library is not installed, and ValueError if two jobs have the
-    same name, a name is not that of a file, JSON cannot represent an argument, or both `n_jobs`
-    and `dask` are given.
+    same name, a name is not that of a file, or JSON cannot represent an argument.
     """
     if len({job.name for job in jobs}) < len(jobs):
         raise ValueError('jobs: two have the same name, expected unique names')

@@ -370,7 +370,7 @@ def test_a_result_of_other_arguments_cannot_be_resumed(scenario, positions, resu
     *(({name: low - 1}, f'{name}: {low - 1}, expected at least {low}') for name, low in (
         ('n_positions', 1), ('max_steps', 1), ('max_evaluations', 1), ('seed', 0))),
     ({'positions': np.zeros((0, 3))}, 'positions: none, expected at least one'),
-    *(({'positions': np.zeros((1, 3)), **given}, 'sampling and n_positions: not allowed with .*')
+    *(({'positions': np.ones((1, 3)), **given}, 'sampling and n_positions: not allowed with .*')
       for given in ({'n_positions': 9}, {'sampling': 'monte_carlo'}))])
 def test_an_invalid_argument_is_an_error(scenario, arguments, error):
     with pytest.raises(ValueError, match=f'^{error}$'):

@@ -44,9 +44,6 @@ def test_a_scenario_file_may_declare_its_grid(tmp_path):
     file.write_text('center_frequencies_hz: [3.5e9]\n'
                     'grid: {numerology: 1, resource_blocks: 4, symbols: 2, comb: 4}\n')
     assert Scenario.from_yaml(file) == COMB
-    file.write_text(file.read_text() + 'n_frames: 3\n')
-    with pytest.raises(ScenarioError, match="nr.yaml: grid: .* multiple values for .* 'n_frames'"):
-        Scenario.from_yaml(file)
 
 
 @pytest.mark.parametrize(('text', 'words'), [

@@ -214,8 +214,6 @@ def test_a_result_is_a_mapping_and_a_process_is_needed(tmp_path):
         run_jobs(lambda number, of: 1, JOBS[:1], str(tmp_path), n_jobs=1)
     with pytest.raises(ValueError, match='n_jobs: 0, expected 1 or more'):
         run_jobs(Worker(), JOBS, n_jobs=0)
-    with pytest.raises(ValueError, match='n_jobs: 2, not allowed with dask'):
-        run_jobs(Worker(), JOBS, n_jobs=2, dask='HOST:1')
 
 
 def test_what_cannot_be_sent_to_a_cluster_is_named(cluster):
