@@ -306,7 +306,7 @@ def _with_volume(local: Local, white: Located, likelihood: Likelihood) -> Local:
     if prior.is_coarse:
         assert isinstance(white, WhiteMeans)
         determined = len(prior) - np.trace(np.linalg.solve(
-            local.information[:, 3:, 3:], np.diag(prior.precision) + prior.information),
+            local.information[:, 3:, 3:], (np.diag(prior.precision) + prior.information)[None]),
             axis1=1, axis2=2)
         local.gradient[:, :3] -= determined[:, None] / 2 * white.growth[:, :3]
     return local
