@@ -102,6 +102,19 @@ def own_cache(tmp_path_factory):
         yield
 
 
+@pytest.fixture(scope='session', autouse=True)
+def right_hand_sides():
+    """Refuse those that NumPy 1.26 and 2 read differently, as vectors of a stack or a matrix."""
+    solve = np.linalg.solve
+
+    def checked(a, b):
+        assert (np.ndim(b) == 1) == (np.ndim(b) == np.ndim(a) - 1), (np.shape(a), np.shape(b))
+        return solve(a, b)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(np.linalg, 'solve', checked)
+        yield
+
+
 @pytest.fixture(scope='session')
 def built_scripts():
     """Skip the test if the scripts have no build, as in a colcon workspace.

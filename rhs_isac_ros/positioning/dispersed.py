@@ -64,7 +64,7 @@ class DispersedLikelihood(Conditional):
     def states(self, of: Callable[[MeasurementModel], np.ndarray]) -> 'list[SurfaceState]':
         """Return the states of the surface with covariances `of` a model, for all positions."""
         covariances, root = self._covariances(of), self._base.model.combined_root
-        operators = np.matmul(adjoint(root), np.linalg.solve(covariances, root))
+        operators = np.matmul(adjoint(root), np.linalg.solve(covariances, root[None]))
         offsets = self._offsets - np.linalg.slogdet(covariances)[1].sum(axis=1)
         unit = np.eye(root.shape[-1])
         return [SurfaceState(offset, None if np.allclose(one, unit) else one)
