@@ -51,7 +51,7 @@ from rhs_isac_ros.positioning.prior import (
     multiply,
     uniform,
 )
-from rhs_isac_ros.positioning.search import GRID_MARGIN, Modes, OneState, modes_from
+from rhs_isac_ros.positioning.search import GRID_MARGIN, Modes, OneState, likely_modes, modes_from
 from rhs_isac_ros.positioning.segments import Segments, concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.positioning.store import load_table
@@ -412,8 +412,9 @@ class SearchEstimator(abc.ABC):
         modes, conditionals = self._refinement.refine(coarse, signals, scope.table)
         samples = averaged = self._samples(modes, conditionals, signals)
         if not isinstance(self._refinement, OneState):
-            averaged = self._samples(
-                *self._averaging.refine(coarse, signals, scope.table), signals)
+            # The margin of the refinement admits modes that count only for some states.
+            averaged = self._samples(*self._averaging.refine(
+                likely_modes(coarse), signals, scope.table), signals)
         means, covariances = self._moments(modes, samples)
         # If the model holds, twice the residual energy, averaged over the posterior, has the mean
         # of a chi-square variable. At the best of several modes, it is smaller than the average.

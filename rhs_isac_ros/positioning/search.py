@@ -188,6 +188,12 @@ def modes_from(starts: Starts, likelihood: Likelihood, signals: Signals, aligned
                   EXACT_MARGIN + extra_margin)
 
 
+def likely_modes(modes: Modes) -> Modes:
+    """Return the modes of each shot, the most likely first, without those of no weight."""
+    return select(modes, heaviest(
+        Segments.of_keys(modes.shots), modes.log_likelihood, EXACT_MARGIN))
+
+
 def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
            n_steps: int, margin: float = EXACT_MARGIN, state: int = 0) -> Modes:
     """Take up to `n_steps` Gauss-Newton steps from the starts to the modes of the posterior.
