@@ -62,9 +62,8 @@ def fit_board(scenario: Scenario, pilots: Sequence[Pilots], names: Sequence[str]
     """Fit fields of a scenario's board, which are positive numbers or lists of them, to pilots.
 
     The search begins at the declared values, or at 1 for a value of 0, and finds the nearest
-    maximum of the evidence.
-    The covariance is that of a Gaussian with the same curvature. Raises ValueError if the board
-    has no such field, or the pilots are not those of the region.
+    maximum of the evidence. The covariance is that of a Gaussian with the same curvature. Raises
+    ValueError if the board has no such field, or the pilots are not those of the region.
     """
     from scipy.optimize import minimize
 

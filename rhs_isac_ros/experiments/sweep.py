@@ -37,8 +37,8 @@ from rhs_isac_ros.system import System
 # Kinds of codebooks that are made for a scenario.
 OPTIMIZE, RANDOM = 'optimize', 'random'
 KINDS = (OPTIMIZE, 'directional', RANDOM)
-# Kinds that use an option of a sweep.
-_USERS = {**dict.fromkeys(('objective', 'steps', 'optimize_for'), (OPTIMIZE,)),
+# Kinds of codebooks that use an option of a sweep.
+_KINDS_USING = {**dict.fromkeys(('objective', 'steps', 'optimize_for'), (OPTIMIZE,)),
           'repeats': (OPTIMIZE, RANDOM)}
 # Number of positions in a job. Another size would change the positions of the global bound.
 BLOCK = 250
@@ -198,10 +198,10 @@ class Sweep:
             if name not in FIELDS:
                 raise ValueError(f'optimize_for: {name!r}, expected names of fields of a scenario')
         files, kinds = self._files, {setting.codebook for setting in self.settings}
-        for name, users in _USERS.items():
-            if getattr(self, name) != getattr(Sweep, name) and not kinds.intersection(users):
+        for name, using in _KINDS_USING.items():
+            if getattr(self, name) != getattr(Sweep, name) and not kinds.intersection(using):
                 raise ValueError(
-                    f'{name}: no effect, expected a codebook of the kind {" or ".join(users)}')
+                    f'{name}: no effect, expected a codebook of the kind {" or ".join(using)}')
         for setting in self.settings:
             if setting.codebook in KINDS:
                 self.scenario_of_codebook(setting)

@@ -45,6 +45,13 @@ def multiply_rows(matrices: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return products
 
 
+def evenly_spread(n: int) -> np.ndarray:
+    """Return numbers between 0 and 1 of which any part is evenly spread, float64 [n]."""
+    # Multiples of the golden ratio, modulo 1.
+    levels: np.ndarray = (np.arange(n) + 0.5) * 0.6180339887498949 % 1
+    return levels
+
+
 def mixture_weights(log_weights: np.ndarray, axis: int | tuple[int, ...] = -1
                     ) -> tuple[np.ndarray, np.ndarray]:
     """Normalise weights, given as logarithms, over `axis`; return them and the log of the sum."""

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import adjoint, digest, numbers
+from rhs_isac_ros.model.arrays import adjoint, digest, evenly_spread, numbers
 from rhs_isac_ros.model.board import Board, BoardError, Ports, limited
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import ArchiveError, read_arrays, read_once
@@ -31,8 +31,6 @@ _TOLERANCE = 1e-4
 _MAX_STEP = 0.02
 # Largest relative error of an interpolated transfer.
 _MAX_ERROR = 0.03
-# Multiples of the golden ratio, modulo 1, are spread like tunings of a codebook.
-_GOLDEN = 0.6180339887498949
 # Relative difference of frequencies that count as equal: files may state them with six digits.
 _ROUNDING = 5e-6
 # A comment in a Touchstone file.
@@ -257,7 +255,8 @@ class CoupledNetwork(Board):
     def _check_steps(self, wanted_hz: np.ndarray) -> None:
         """Raise BoardError unless transfers are accurate that are interpolated in a band."""
         network = self.network
-        tunings = _GOLDEN * np.arange(network.between.shape[1])[None] % 1
+        # They stand for those of a codebook.
+        tunings = evenly_spread(network.between.shape[1])[None]
         points, weights = _between(network.frequencies_hz, wanted_hz)
         for first, ends in enumerate(itertools.pairwise(points)):
             # The middle has the largest error.

@@ -180,7 +180,9 @@ class NuisancePrior(Exponents):
             2 * np.pi * max(scenario.n_frames - 1, 1) * scenario.frame_duration_s)
         away = jacobian(points)[:, :, 0] * carrier_wavenumbers(scenario).mean() / (2 * np.pi)
         along = away @ self.velocity @ self.velocity.T
-        of_speed, of_offset = np.sum(along * away, axis=1), np.sum(offsets_hz**2)
+        # Across the line of sight, speeds do not turn the phase.
+        of_speed = np.maximum(np.sum(along * away, axis=1), np.finfo(float).tiny)
+        of_offset = np.sum(offsets_hz**2)
         offset_hz = values @ offsets_hz
         share = of_offset / (of_offset + of_speed)
         turn_hz = offset_hz - np.sum(away * velocities, axis=1)

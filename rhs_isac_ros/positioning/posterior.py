@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import mixture_weights
+from rhs_isac_ros.model.arrays import evenly_spread, mixture_weights
 from rhs_isac_ros.model.gaussian import marginalise, moments, symmetric
 from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD
@@ -40,8 +40,6 @@ class _Sampling(NamedTuple):
     # because the average over the range nearly removes the effect of this phase.
     spacing: float = 1.5
     common: int = 8
-    # Golden ratio, for the draws of a range.
-    ratio: float = 0.6180339887498949
     # Largest standard deviation of a wrapped phase: it is nearly uniform, and one wrap suffices.
     # Smallest one: with phases that are known better, few samples would carry the weight.
     phase_std_rad: float = 3.0
@@ -139,9 +137,6 @@ def draw_broad_samples(
     float64 [M, S, 3] [m], with columns for a velocity, [M, S, 6] [m, m/s], and the logarithms of
     their weights, [M, S].
     """
-    # SciPy takes long to load, and users at rest do not need it.
-    from scipy.special import ndtri
-
     prior, bounds = likelihood.nuisance, likelihood.resolution.bounds_m
     n_moving, widening = prior.velocity.shape[1], _SAMPLING.spread**2
     positions, log_weights = Inside.of(
@@ -167,7 +162,10 @@ def draw_broad_samples(
             evidence, values, _ = marginal_at(
                 conditionals[state], likelihood, points, values, signals, n_moving)
             evidence += np.sum(white**2, axis=1) / 2 - np.linalg.slogdet(among)[1] / 2
-            levels = ndtri(_evenly(len(normal)))
+            # SciPy takes long to load, and users at rest do not need it.
+            from scipy.special import ndtri
+
+            levels = ndtri(evenly_spread(len(normal)))
             velocities[rows] = prior.velocities(
                 values, points, np.tile(levels, len(rows))).reshape(len(rows), -1, 3)
         evidence += _log_share(points.reshape(len(rows), -1, 3), select(modes, rows)).ravel()
@@ -246,7 +244,7 @@ class BandPhases:
 
     def drawn_m(self, shares: np.ndarray) -> np.ndarray:
         """Draw an offset for each of P positions with these shares, [P, R] [m]."""
-        levels = _evenly(len(shares))
+        levels = evenly_spread(len(shares))
         cumulative = np.cumsum(shares, axis=1)
         chosen = np.count_nonzero(cumulative < levels[:, None], axis=1)
         return self.offsets_m[np.minimum(chosen, shares.shape[1] - 1)]
@@ -260,13 +258,6 @@ class BandPhases:
         concentration = 2 * np.maximum(magnitude, 1e-9)
         variance = self._std**2 - 2 * np.log(i1e(concentration) / i0e(concentration))
         return np.minimum(np.sqrt(variance), _SAMPLING.phase_std_rad)
-
-
-def _evenly(n: int) -> np.ndarray:
-    """Return numbers between 0 and 1 that any part of the sequence spreads evenly, float64 [n]."""
-    # Multiples of the golden ratio, modulo 1.
-    levels: np.ndarray = (np.arange(n) + 0.5) * _SAMPLING.ratio % 1
-    return levels
 
 
 def _common_phase(std: float) -> tuple[np.ndarray, np.ndarray]:

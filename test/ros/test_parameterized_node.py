@@ -98,6 +98,8 @@ def test_an_invalid_value_is_rejected_with_a_reason(make, executable):
      "estimator_options: 'n', expected an option of bayes: lazy, "),
     ('positioner', {'estimator': 'neural', 'model_file': '/no/model.npz'},
      'model_file: /no/model.npz: '),
+    ('positioner', {'estimator': 'neural', 'estimator_options': 'model_file=/no/model.npz'},
+     'model_file: /no/model.npz: '),
     ('positioner', {'calibration_file': '/no/file.npz'}, 'calibration_file: /no/file.npz: '),
     ('transmission', {'calibration_file': '/no/file.npz'}, 'calibration_file: /no/file.npz: '),
 ])
