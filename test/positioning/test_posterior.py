@@ -142,7 +142,6 @@ def test_only_broad_phases_are_left_to_the_samples(codebook, std_rad, is_informa
     assert BandPhases(Likelihood(System(scenario, codebook))).is_informative is is_informative
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('size', [3, 6])
 def test_covariances_of_few_samples_cover_another_one(size):
     n_shots, n = 4000, 20
@@ -154,6 +153,7 @@ def test_covariances_of_few_samples_cover_another_one(size):
     assert squares.mean() == pytest.approx(size, rel=0.04)
 
 
+@pytest.mark.slow
 def test_random_phases_of_the_bands_leave_the_moments_of_the_posterior(random_beams):
     """The modes extend over the range and overlap."""
     scenario = Scenario(
