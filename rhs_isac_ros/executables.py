@@ -1,5 +1,6 @@
 """Entry points of the executables, which handle signals before any slow import."""
 
+import functools
 import importlib.util
 from collections.abc import Callable
 from pathlib import Path
@@ -17,18 +18,23 @@ def __getattr__(name: str) -> Callable[[], int]:
     """Return a main function that imports and runs an executable and returns an exit code."""
     if name not in EXECUTABLES:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    return functools.partial(run, f'rhs_isac_ros.{EXECUTABLES[name]}.{name}', name)
 
-    def main() -> int:
-        try:
-            run = import_main(f'rhs_isac_ros.{EXECUTABLES[name]}.{name}')
-        except ModuleNotFoundError as error:
-            missing = str(error.name).partition('.')[0]
-            if missing == 'rhs_isac_ros':
-                raise
-            print_error(f'needs {_what_provides(missing)}', name)
-            return 1
-        return exit_code_of(run, program=name)
-    return main
+
+def run(module: str, program: str) -> int:
+    """Import a module, call its function ``main`` and return the exit code.
+
+    The code is 1 if a package is missing, which a line after the name of the program states.
+    """
+    try:
+        main = import_main(module)
+    except ModuleNotFoundError as error:
+        missing = str(error.name).partition('.')[0]
+        if missing == 'rhs_isac_ros':
+            raise
+        print_error(f'needs {_what_provides(missing)}', program)
+        return 1
+    return exit_code_of(main, program=program)
 
 
 def _what_provides(missing: str) -> str:

@@ -72,6 +72,22 @@ def test_a_missing_package_is_named_in_one_line(
     assert expected in line
 
 
+@pytest.mark.parametrize('middleware', ['', 'rmw_fastrtps_cpp'])
+def test_a_tool_without_ros_names_what_is_missing(middleware):
+    code = """
+import runpy, sys
+sys.modules.update(dict.fromkeys(['ament_index_python', 'rclpy']))
+sys.argv = ['', 'demo']
+runpy.run_module('rhs_isac_ros.tools', run_name='__main__')
+"""
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=False, cwd=ROOT,
+        env={**os.environ, 'RMW_IMPLEMENTATION': middleware})
+    assert (done.returncode, done.stderr) == (
+        1, 'demo: error: needs ROS 2 Jazzy, which is not sourced or not installed (no module '
+        'rclpy)\n')
+
+
 def test_a_missing_module_of_the_package_itself_is_not_hidden(monkeypatch):
     without('rhs_isac_ros.nodes.bs', monkeypatch)
     with pytest.raises(ModuleNotFoundError):

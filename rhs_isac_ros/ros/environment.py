@@ -9,9 +9,6 @@ import socket
 import sys
 import xml.etree.ElementTree as ElementTree
 
-from ament_index_python import get_resources
-from ament_index_python.packages import get_package_share_directory
-
 from rhs_isac_ros.support.exits import print_error
 
 LOCALHOST = 'LOCALHOST'
@@ -38,6 +35,11 @@ def check_middleware() -> None:
     Called before rclpy is imported, which would end the process with another code.
     """
     if not (name := os.environ.get('RMW_IMPLEMENTATION')):
+        return
+    try:
+        from ament_index_python import get_resources
+    except ModuleNotFoundError:
+        # The command itself says that ROS is missing.
         return
     installed = sorted({*get_resources('rmw_typesupport')} - {'rmw_implementation'})
     if name not in installed:
@@ -71,6 +73,8 @@ def use_discovery_profile() -> None:
     Fast DDS reads the profile when the first node is created. A file that is already set in the
     environment takes precedence; an empty name selects the defaults of Fast DDS.
     """
+    from ament_index_python.packages import get_package_share_directory
+
     folder = get_package_share_directory('rhs_isac_ros')
     if not os.environ.setdefault(_PROFILES, f'{folder}/config/discovery.xml'):
         # Fast DDS reports an error for an empty name.

@@ -48,7 +48,7 @@ def test_a_missing_or_damaged_profile_is_named(content, reason, monkeypatch, cap
 
 @pytest.mark.parametrize('name', ['rmw_cyclonedds_cpp', 'rmw_implementation', 'nonsense'])
 def test_a_middleware_that_is_not_installed_is_named(name, monkeypatch, capsys):
-    monkeypatch.setattr('rhs_isac_ros.ros.environment.get_resources', lambda kind: {
+    monkeypatch.setattr('ament_index_python.get_resources', lambda kind: {
         'rmw_implementation': '/', 'rmw_fastrtps_cpp': '/'})
     monkeypatch.setenv('RMW_IMPLEMENTATION', name)
     with pytest.raises(SystemExit, match='2'):
