@@ -465,8 +465,9 @@ class ElementSums:
         """
         n, (n_bands, n_subbands, n_elements, n_frames) = len(states), self._frames.shape
         n_slopes = by_coordinate.shape[2]
-        n_terms = 2 + self._n_sums if n_slopes else 1
-        rows = np.empty((n_bands, n, 1 + n_slopes, n_subbands, n_frames), complex)
+        varies = bool(by_coordinate.any())
+        n_terms = 2 + self._n_sums if varies else 1
+        rows = np.zeros((n_bands, n, 1 + n_slopes, n_subbands, n_frames), complex)
         moments = self._moments.reshape(n_bands, n_subbands, n_elements, -1, n_frames)
         # Users at rest are at one place in all frames.
         n_same = 1 if states[:, 3:].any() else n_frames
@@ -475,16 +476,18 @@ class ElementSums:
             same = slice(first, first + n_same)
             times_s = frame_times_s(self._scenario)[band, same]
             places = states[:, :3] + times_s[0] * states[:, 3:]
-            waves = los_waves(self._scenario, places, [band], slopes=n_slopes > 0)
+            waves = los_waves(self._scenario, places, [band], slopes=varies)
             self._add_up(waves, self._frames[[band], ..., same], moments[
                 [band], ..., same].reshape(1, n_subbands, n_elements, -1), terms[None])
             rows[band, :, 0, :, same] = terms[:, 0]
-            if n_slopes:
+            if varies:
                 weights = self.weights(places)
                 for frame, time_s in enumerate(times_s):
                     by_place = by_coordinate[:, :3] + time_s * by_coordinate[:, 3:]
-                    rows[band, :, 1:, :, first + frame] = np.matmul(np.matmul(
-                        np.swapaxes(by_place, 1, 2), weights), terms[:, 1:, :, frame])
+                    by_term = np.matmul(np.swapaxes(by_place, 1, 2), weights)
+                    of_frame = np.ascontiguousarray(terms[:, 1:, :, frame]).view(float)
+                    rows[band, :, 1:, :, first + frame] = np.matmul(
+                        by_term, of_frame).view(complex)
         return rows.reshape(n_bands, n, 1 + n_slopes, -1)
 
     def _add_up(self, waves: Waves, frames: np.ndarray, moments: np.ndarray, terms: np.ndarray

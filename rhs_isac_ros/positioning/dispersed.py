@@ -84,10 +84,10 @@ class DispersedLikelihood(Conditional):
                 return None
         return cls(likelihood)
 
-    def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True
-           ) -> 'LocatedStates':
+    def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True,
+           turns: bool = True) -> 'LocatedStates':
         """Return the likelihood at points; see `Conditional.at`."""
-        users, by_unknown = self._base.nuisance.states(points, values, moves)
+        users, by_unknown = self._base.nuisance.states(points, values, moves, turns)
         positions = users[:, :3]
         intact = self._intact.covariance_at(positions)
         excess = (self._average.covariance_at(positions) - intact if any(self._scales)

@@ -376,12 +376,13 @@ class FailedSet(Conditional):
         self._offset = len(failed) * surfaces.log_odds + intact + likelihood.log_det
         self._amplitudes = surfaces.effects.amplitude[[*failed]]
 
-    def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True) -> LocatedStates:
+    def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True,
+           turns: bool = True) -> LocatedStates:
         """Return the likelihood at points; see `Conditional.at`."""
         surfaces, scenario = self._surfaces, self._surfaces.likelihood.scenario
         positions, failed = to_positions(points), [*self.failed]
         mean, slopes = self._mean_model.mean_and_jacobian(
-            *surfaces.likelihood.nuisance.states(points, values, moves))
+            *surfaces.likelihood.nuisance.states(points, values, moves, turns))
         gains = np.stack([
             np.repeat(los_gain(scenario, positions, band)[:, :, failed],
                       scenario.n_frames, axis=1) for band in range(scenario.n_bands)])

@@ -64,10 +64,12 @@ class Conditional(Protocol):
     #: Largest number of points to evaluate together; each may need covariances of its own.
     n_at_once: int = 1 << 20
 
-    def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True) -> Located:
+    def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True,
+           turns: bool = True) -> Located:
         """Return the likelihood at points [M, 3]; unless `moves`, without derivatives there.
 
         Of the parameters `values`, [M, Q], only the velocity counts, and is that of the result.
+        Unless `turns`, derivatives with respect to the velocity are 0, which is faster.
         """
         ...
 
@@ -190,10 +192,11 @@ class Likelihood(Conditional):
         weights, _ = self.nuisance.noise_weights(gains, self.factors.noise)
         return weights.reshape(len(gains), *self.model.shape)
 
-    def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True) -> 'WhiteMeans':
+    def at(self, points: np.ndarray, values: np.ndarray, *, moves: bool = True,
+           turns: bool = True) -> 'WhiteMeans':
         """Return the likelihood at points; see `Conditional.at`."""
         return WhiteMeans(self, *self.model.mean_and_jacobian(
-            *self.nuisance.states(points, values, moves), whitened=True))
+            *self.nuisance.states(points, values, moves, turns), whitened=True))
 
 
 @dataclasses.dataclass(eq=False)

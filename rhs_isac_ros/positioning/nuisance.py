@@ -147,19 +147,20 @@ class NuisancePrior(Exponents):
         return 2 * np.einsum('aimn,ino,bimo->ab', self._operators, spread, self._operators.conj(),
                              optimize=True).real
 
-    def states(self, points: np.ndarray, values: np.ndarray, moves: bool = True
-               ) -> tuple[np.ndarray, np.ndarray]:
+    def states(self, points: np.ndarray, values: np.ndarray, moves: bool = True,
+               turns: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Return the states of users at points [M, 3] with parameters [M, Q], and derivatives.
 
         The derivatives, float64 [M, 3 or 6, P + D], are those with respect to the points, unless
-        not `moves`, and to the D components of the velocity.
+        not `moves`, and to the D components of the velocity, which are 0 unless `turns`.
         """
         positions, by_point = to_positions(points), jacobian(points)[:, :, :3 * moves]
         n_moving, n_points = self.velocity.shape[1], by_point.shape[2]
         if not n_moving:
             return positions, by_point
         derivatives = np.zeros((len(points), 6, n_points + n_moving))
-        derivatives[:, :3, :n_points], derivatives[:, 3:, n_points:] = by_point, self.velocity
+        derivatives[:, :3, :n_points], derivatives[:, 3:, n_points:] = (
+            by_point, self.velocity * turns)
         return np.hstack([positions, values[:, :n_moving] @ self.velocity.T]), derivatives
 
     def velocities(self, values: np.ndarray, points: np.ndarray, levels: np.ndarray

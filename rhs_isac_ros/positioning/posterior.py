@@ -171,8 +171,9 @@ def draw_broad_samples(
         evidence += _log_share(points.reshape(len(rows), -1, 3), select(modes, rows)).ravel()
         if phases.is_informative:
             likely = evidence >= evidence.max() - _SAMPLING.margin
-            outputs = likelihood.at(points[likely], values[likely], moves=False).outputs(
-                values[likely], signals)
+            outputs = likelihood.at(
+                points[likely], values[likely], moves=False, turns=False
+            ).outputs(values[likely], signals)
             turns = np.exp(1j * (likelihood.nuisance.phases @ values[likely].T))
             log_factors, shares = phases.factors(outputs.T * turns)
             evidence[likely] += log_factors

@@ -261,12 +261,14 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
     """Compute the marginal log-likelihood at M points, [M], and the best parameters, [M, Q].
 
     Newton steps start from the approximate parameters `values`, [M, Q], of which the first
-    `n_held` do not change. Also returns the information about the others, [M, Q, Q].
+    `n_held` do not change: none, or the velocity. Also returns the information about the others,
+    [M, Q, Q].
     """
     def of_block(block: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         shots = signals if len(signals.received) == 1 else select(signals, block)
         located, _, settled = _settled(
-            conditional, likelihood, points[block], values[block], shots, moves=False)
+            conditional, likelihood, points[block], values[block], shots, moves=False,
+            turns=not n_held)
         return _maximised(located, settled, likelihood, shots, n_held)[:3]
 
     value, best, information = map(np.concatenate, zip(*(
@@ -319,17 +321,17 @@ def _with_volume(local: Local, white: Located, likelihood: Likelihood) -> Local:
 
 
 def _settled(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
-             values: np.ndarray, signals: Signals, moves: bool = True
+             values: np.ndarray, signals: Signals, moves: bool = True, turns: bool = True
              ) -> tuple[Located, Located, np.ndarray]:
     """Return the likelihood at points, and parameters [M, Q] with the most likely phases.
 
     The second result has only one covariance if phases are uniform.
     """
-    located = white = conditional.at(points, values, moves=moves)
+    located = white = conditional.at(points, values, moves=moves, turns=turns)
     # A step in range rotates uniform phases of bands by many turns.
     if likelihood.nuisance.is_coarse:
         if not isinstance(white, WhiteMeans):
-            white = likelihood.at(points, values, moves=moves)
+            white = likelihood.at(points, values, moves=moves, turns=turns)
         values = white.settled(values, signals)
     return located, white, values
 

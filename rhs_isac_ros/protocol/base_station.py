@@ -12,6 +12,7 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.codebook.library import EMPTY, Library
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.geometry import frame_times_s
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.admission import Admission
@@ -118,6 +119,7 @@ class BaseStation(SignalCollector):
             world_s: Callable[[], float] | None = None) -> None:
         super().__init__(BsState.WAITING, scenario, seed, Cycle(first_cycle_id - 1))
         self._users = UserRegistry(settings.policy, rng)
+        self._frames_s = float(np.ptp(frame_times_s(scenario)))
         self._settings = PendingSettings(settings)
         self._admission = _admission(settings)
         self._pause_requested = False  # whether a pause begins after the current cycle
@@ -158,14 +160,20 @@ class BaseStation(SignalCollector):
         return ()
 
     def timeout_s(self, state: enum.Enum) -> float | None:
-        """Return the timeout of a state [s], or None; attempts at a step have equal parts."""
+        """Return the timeout of a state [s], or None; attempts at a step have equal parts.
+
+        An attempt at the pilots of all bands also has the time that the frames take.
+        """
         settings = self._settings.in_use
         if state is BsState.BEACONING:
             is_alone = not self._users and self._cycle.attempt >= _N_FAST
             return max(settings.ack_timeout_s, _ALONE_S * is_alone)
         if state is BsState.RESTING:
             return 0.0 if self._pause_requested else settings.rest_s
-        return settings.step_timeout_s / (settings.retries + 1) if state in STEPS else None
+        if state not in STEPS:
+            return None
+        frames_s = self._frames_s if state is BsState.SOUNDING else 0.0
+        return settings.step_timeout_s / (settings.retries + 1) + frames_s
 
     def status(self) -> Mapping[str, str]:
         """Return the settings and the codebook in use, pending settings and conflicts."""

@@ -59,8 +59,9 @@ from rhs_isac_ros.tools.pictures import compose_cycles
 
 # Maximum time between two complete cycles [s].
 _CYCLE_TIMEOUT_S = 60.0
-# Time to wait for a step of a cycle if estimators find velocities, which takes most of a second.
-_MOVING_TIMEOUT_S = 4.0
+# Time to wait for a step of a cycle if estimators find velocities, which takes most of a second
+# on an idle processor, and several seconds on a busy one.
+_MOVING_TIMEOUT_S = 20.0
 # Speed of users whom codebooks follow; faster ones move too far between two cycles.
 _WALKING_MPS = 1.0
 # Period of checks [s].

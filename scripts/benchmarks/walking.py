@@ -124,7 +124,7 @@ def exact_mean(estimator: BayesEstimator, received: np.ndarray, state: np.ndarra
     offset = np.matmul(np.linalg.cholesky(np.linalg.inv(among)),
                        np.tile(normal[:, 3:3 + n_moving], (len(modes.shots), 1))[..., None])
     values[:, :n_moving] += offset[..., 0]
-    located = likelihood.at(points, values, moves=False)
+    located = likelihood.at(points, values, moves=False, turns=False)
     values = located.settled(values, signals)
     for _ in range(3):
         local = located.local(values, signals)

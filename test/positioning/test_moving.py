@@ -43,6 +43,13 @@ def test_gradient_and_information_are_those_of_the_likelihood(declared, moves):
         if row < 5 or not declared:
             assert local.gradient[0, row - first] == pytest.approx(
                 slope, rel=1e-3, abs=0.5 if row < 3 else 1e-2)
+    # What depends on a velocity that is held needs no derivatives with respect to it.
+    held = conditional.at(point, values, moves=moves, turns=False).local(values, signals)
+    rest = np.r_[:3 - first, 5 - first:3 + n - first]
+    assert held.value == pytest.approx(local.value, abs=1e-8)
+    np.testing.assert_allclose(held.gradient[:, rest], local.gradient[:, rest], atol=1e-6)
+    np.testing.assert_allclose(
+        held.information[:, rest[:, None], rest], local.information[:, rest[:, None], rest])
 
 
 @pytest.mark.slow

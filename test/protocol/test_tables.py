@@ -105,6 +105,15 @@ def test_timeouts_alone_lead_to_the_final_state(name, machine):
         assert last[FINAL[name]].restart_timeout
 
 
+def test_each_attempt_at_the_pilots_has_the_time_of_all_frames():
+    scenario = Scenario(frame_duration_s=0.1)
+    machine = bs.BaseStation(scenario, settings(), np.random.default_rng(0), seed=0)
+    n_intervals = scenario.n_bands * scenario.n_frames - 1
+    for state in bs.STEPS:
+        assert machine.timeout_s(state) == pytest.approx(
+            1.0 + 0.1 * n_intervals * (state is BsState.SOUNDING))
+
+
 def test_the_base_station_gives_up_exactly_with_the_lost_outcomes():
     lost = [row for row in bs.BaseStation.TABLE
             if row.outcome and row.outcome.kind is events.Kind.LOST]
