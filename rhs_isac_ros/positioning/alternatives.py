@@ -23,11 +23,12 @@ import numpy as np
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import blocks
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
-from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
+from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_bessel, log_evidence_of_level
 from rhs_isac_ros.model.geometry import element_positions, to_positions
 from rhs_isac_ros.positioning.dispersed import ONE_STATE, SurfaceState
 from rhs_isac_ros.positioning.grid import separate
 from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers
+from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.projection import (
     ProjectedModel,
@@ -35,7 +36,7 @@ from rhs_isac_ros.positioning.projection import (
     project,
     white_means,
 )
-from rhs_isac_ros.positioning.segments import Segments
+from rhs_isac_ros.positioning.segments import Segments, select
 from rhs_isac_ros.support.threads import map_blocks
 
 # Above this probability, a position is less probable than its alternatives.
@@ -89,6 +90,21 @@ class OutsideGrid(NamedTuple):
 
 
 GRID = OutsideGrid()
+
+
+class _Offsets(NamedTuple):
+    """How evidences are integrated over the parameters that move the multipath."""
+
+    # Number of steps to the maximum, largest step in standard deviations, and least curvature,
+    # relative to that of the multipath.
+    steps: int = 2
+    reach: float = 2.0
+    curvature: float = 0.5
+    # Absolute log odds of an alternative up to which its evidence may count.
+    near: float = 30.0
+
+
+_OFFSETS = _Offsets()
 
 
 class Blocked:
@@ -308,10 +324,10 @@ class _Templates:
             arguments, total = arguments * factor, total * factor
         mean = of_shot.max(total.max(axis=1)) / len(arguments)
         least = of_shot.max(highest.max(axis=1)) - GRID.margin - len(arguments) * (
-            mean - _log_bessel(mean))
+            mean - log_bessel(mean))
         pair, place = np.nonzero(highest >= of_shot.repeat(least)[:, None])
         arguments, shot = arguments[:, pair, place], shot[pair]
-        logs = highest[pair, place] + np.sum(_log_bessel(arguments) - arguments, axis=0)
+        logs = highest[pair, place] + np.sum(log_bessel(arguments) - arguments, axis=0)
         if prior.gain_std:
             # Laplace's integral over the gain, which hardly changes the Bessel functions.
             power = np.exp(-2 * gain[pair, place]) * energy[pair, 0]
@@ -385,6 +401,47 @@ def describe_doubts(estimate: object) -> str:
         estimate).items() if value >= _MIN_DOUBT)
 
 
+def log_ratios_of(
+        alternative: Alternative, likelihood: Likelihood, signals: Signals, seen: np.ndarray,
+        aligned: np.ndarray, shadow: np.ndarray, residuals: np.ndarray, in_sight: np.ndarray
+        ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return log evidences of an alternative relative to a user inside and in sight, [N].
+
+    They are integrals over the parameters that move the multipath, by Laplace's method: where the
+    alternative may count, differences over a standard deviation lead from approximate parameters,
+    between those that fit a direct path and `shadow`, [N, Q], to the maximum, and yield the
+    curvature. Also returns the parameters there, and the signals without their factors. Without
+    such parameters, these signals are `seen`. `in_sight`, [N], are the log evidences of a user
+    inside. For the other arguments, see `Outside.log_evidence_of`.
+    """
+    prior, values = likelihood.nuisance, shadow + alternative.strength * (aligned - shadow)
+    axes = prior.axes
+    if not len(axes):
+        found = alternative.log_evidence_of(seen, values, residuals, prior)
+        return found - in_sight, values, seen
+
+    def ratios(values: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        return alternative.log_evidence_of(
+            likelihood.whitened(values, select(signals, rows)), values, residuals[rows], prior
+        ) - in_sight[rows]
+
+    found = ratios(values)
+    (near,) = np.nonzero(np.abs(alternative.log_odds + found) < _OFFSETS.near)
+    if len(near):
+        best, at = found[near], values[near]
+        for _ in range(_OFFSETS.steps):
+            low, high = (np.stack([ratios(at + sign * axis, near) for axis in axes], axis=1)
+                         for sign in (-1, 1))
+            curvature = np.maximum(2 * best[:, None] - high - low, _OFFSETS.curvature)
+            step = np.clip((high - low) / (2 * curvature), -_OFFSETS.reach, _OFFSETS.reach)
+            moved = at + step @ axes
+            there = ratios(moved, near)
+            better = there > best
+            best, at = np.where(better, there, best), np.where(better[:, None], moved, at)
+        found[near], values[near] = best - np.log(curvature).sum(axis=1) / 2, at
+    return found, values, likelihood.whitened(values, signals)
+
+
 def rejection(alternative: Alternative | type[Alternative], probability: float, inside: float
               ) -> str:
     """Return why an alternative rules out a fix, or '' if it does not.
@@ -412,13 +469,6 @@ def _best_gain(prior: NuisancePrior, amplitude: np.ndarray, energy: np.ndarray, 
     """Return `maximised_over_gain` of n measurements, less their energy if the gain is known."""
     value, gain = prior.maximised_over_gain(amplitude, energy, n)
     return value if prior.gain_std else value - energy, gain
-
-
-def _log_bessel(argument: np.ndarray) -> np.ndarray:
-    """Approximate log I_0 of non-negative numbers; the error is below 0.04."""
-    # Exact to first order at 0 and to the leading order for large arguments.
-    growth = 1 + (np.pi - 1) * argument / (1.364 + argument)
-    return argument - np.log(1 + 2 * argument * growth) / 2
 
 
 def _ranges(scenario: Scenario) -> np.ndarray:

@@ -14,7 +14,13 @@ from rhs_isac_ros.model import MeasurementModel, Pose
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.gaussian import share_of_level
 from rhs_isac_ros.model.geometry import jacobian
-from rhs_isac_ros.positioning.alternatives import Alternative, Blocked, Outside, rejection
+from rhs_isac_ros.positioning.alternatives import (
+    Alternative,
+    Blocked,
+    Outside,
+    log_ratios_of,
+    rejection,
+)
 from rhs_isac_ros.positioning.diagnosis import FitTest, misfit_log_ratio
 from rhs_isac_ros.positioning.draws import DrawnPosterior
 from rhs_isac_ros.positioning.estimate import (
@@ -452,8 +458,7 @@ class SearchEstimator(abc.ABC):
                     aligned: np.ndarray, fits: Sequence[Fit]) -> dict[str, np.ndarray]:
         """Return logarithms of the likelihoods of alternatives relative to the fits, [N] each.
 
-        Averages over all surfaces decide where they leave no doubt. Otherwise, each hypothesis has
-        the sets of failed elements that are found for it.
+        Where averages over all surfaces leave a doubt, each has the failures found for it.
         """
         prior, found = self._likelihood.nuisance, {}
         residuals, averaged, gains = np.array([
@@ -461,10 +466,8 @@ class SearchEstimator(abc.ABC):
             for fit in fits]).T
         shadow = self._shadow.values_of_each(signals.received, aligned)
         for one in alternatives:
-            values = shadow + one.strength * (aligned - shadow)
-            if prior.moves_multipath.any():
-                seen = self._likelihood.whitened(values, signals)
-            ratios = one.log_evidence_of(seen, values, residuals, prior) - averaged
+            ratios, values, seen = log_ratios_of(
+                one, self._likelihood, signals, seen, aligned, shadow, residuals, averaged)
             for n in np.flatnonzero((gains > 0) & (one.log_odds + ratios > _LIMITS.clear)):
                 points, parameters, level = one.places(seen[n], prior)
                 ratios[n] += self._refinement.gain(points, parameters + values[n], Signals(*(

@@ -21,6 +21,7 @@ from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.gaussian import (
     covariance_root,
     inverse_lower,
+    log_bessel,
     marginalise,
     quadratic_form,
 )
@@ -240,6 +241,22 @@ class WhiteMeans:
         changes = np.einsum('mpbn,mbn->mp', self.slopes, self.mean.conj()).real
         found: np.ndarray = changes / np.sum(np.abs(self.mean)**2, axis=(1, 2))[:, None]
         return found
+
+    def log_excess(self, values: np.ndarray, signals: Signals) -> np.ndarray:
+        """Return logs of curvatures relative to the expected information, float64 [M, Q].
+
+        The expected information of a parameter is proportional to the energy of the direct path,
+        but the curvature is proportional to the output of the matched filter. That of a uniform
+        phase is such that Laplace's method gives its Bessel function.
+        """
+        argument = 2 * np.abs(self.outputs(values, signals))
+        curvature = np.exp(2 * (argument - log_bessel(argument))) / (4 * np.pi)
+        gains = values @ self.likelihood.nuisance.gains.T
+        energy = np.sum(np.abs(self.mean)**2 * self.likelihood.weights_at(gains)**2, axis=2)
+        energy = np.maximum(energy, np.finfo(float).tiny)
+        common = np.log(curvature.sum(axis=1) / energy.sum(axis=1))[:, None]
+        n_common = values.shape[1] - curvature.shape[1]
+        return np.hstack([np.repeat(common, n_common, axis=1), np.log(curvature / energy)])
 
     def settled(self, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Replace uniform band phases in parameters [M, Q] by the most likely phases."""

@@ -244,9 +244,17 @@ class NuisancePrior(Exponents):
 
     def log_evidence_of_aligned(self, aligned: np.ndarray) -> np.ndarray:
         """Return the log of Laplace's integral over the parameters [..., Q] of `Alignment`."""
+        volume = np.linalg.slogdet(self.axes[:, self.moves_multipath])[1]
+        found: np.ndarray = volume - aligned**2 @ self.precision / 2
+        return found
+
+    @functools.cached_property
+    def axes(self) -> np.ndarray:
+        """Independent errors of D parameters of `Alignment`, of one standard deviation, [D, Q]."""
         (moves,) = np.nonzero(self.moves_multipath)
-        curvature = self.information[np.ix_(moves, moves)] + np.diag(self.precision[moves])
-        found: np.ndarray = -(aligned**2 @ self.precision + np.linalg.slogdet(curvature)[1]) / 2
+        found = np.zeros((len(moves), len(self)))
+        found[:, moves] = np.linalg.cholesky(np.linalg.inv(
+            self.information[np.ix_(moves, moves)] + np.diag(self.precision[moves]))).T
         return found
 
     def amplitude(self, outputs: np.ndarray) -> np.ndarray:

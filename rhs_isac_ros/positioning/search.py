@@ -266,27 +266,44 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
     """
     def of_block(block: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         shots = signals if len(signals.received) == 1 else select(signals, block)
-        located, _, settled = _settled(
+        located, white, settled = _settled(
             conditional, likelihood, points[block], values[block], shots, moves=False,
             turns=not n_held)
-        return _maximised(located, settled, likelihood, shots, n_held)[:3]
+        return _maximised(located, white, settled, likelihood, shots, n_held)[:3]
 
     value, best, information = map(np.concatenate, zip(*(
         of_block(block) for block in blocks(len(points), conditional.n_at_once)), strict=True))
     return value, best, information
 
 
-def _maximised(located: Located, values: np.ndarray, likelihood: Likelihood, signals: Signals,
-               n_held: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, Local]:
+def _maximised(located: Located, white: Located, values: np.ndarray, likelihood: Likelihood,
+               signals: Signals, n_held: int = 0) -> tuple[
+                   np.ndarray, np.ndarray, np.ndarray, Local]:
     """Return the results of `marginal_at`, and the likelihood before the last step."""
     for _ in range(2 if values.shape[1] and not likelihood.nuisance.velocity.size else 1):
-        local = located.local(values, signals)
+        before, local = values, located.local(values, signals)
         first = local.gradient.shape[1] - values.shape[1] + n_held
         information, gradient = local.information[:, first:, first:], local.gradient[:, first:]
         marginal = marginalise(information, gradient, 0)
         values = np.hstack([values[:, :n_held], values[:, n_held:] + marginal.offset])
     rise = np.sum(gradient * marginal.offset, axis=1) / 2
-    return local.value + rise + marginal.log_volume, values, information, local
+    value = local.value + rise + marginal.log_volume
+    if likelihood.nuisance.is_coarse:
+        assert isinstance(white, WhiteMeans)
+        shares = _determined(information, likelihood, n_held)
+        value -= np.sum(shares * white.log_excess(before, signals)[:, n_held:], axis=1) / 2
+    return value, values, information, local
+
+
+def _determined(information: np.ndarray, likelihood: Likelihood, n_held: int = 0) -> np.ndarray:
+    """Return the share of the information about each parameter that is due to the direct path.
+
+    `information`, [M, Q, Q], is that about the parameters after the first `n_held`.
+    """
+    prior = likelihood.nuisance
+    known = (np.diag(prior.precision) + prior.information)[n_held:, n_held:]
+    return 1 - np.diagonal(
+        np.linalg.solve(information, known[None]), axis1=1, axis2=2)
 
 
 def expanded_at(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
@@ -297,7 +314,7 @@ def expanded_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
     The arguments are those of `marginal_at`.
     """
     located, white, values = _settled(conditional, likelihood, points, values, signals)
-    value, values, _, local = _maximised(located, values, likelihood, signals)
+    value, values, _, local = _maximised(located, white, values, likelihood, signals)
     if values.shape[1]:
         local = _with_volume(located.local(values, signals), white, likelihood)
     marginal = marginalise(local.information, local.gradient)
@@ -313,9 +330,7 @@ def _with_volume(local: Local, white: Located, likelihood: Likelihood) -> Local:
     prior = likelihood.nuisance
     if prior.is_coarse:
         assert isinstance(white, WhiteMeans)
-        determined = len(prior) - np.trace(np.linalg.solve(
-            local.information[:, 3:, 3:], (np.diag(prior.precision) + prior.information)[None]),
-            axis1=1, axis2=2)
+        determined = np.sum(_determined(local.information[:, 3:, 3:], likelihood), axis=1)
         local.gradient[:, :3] -= determined[:, None] / 2 * white.growth[:, :3]
     return local
 

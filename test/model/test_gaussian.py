@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy.special import logsumexp
+from scipy.special import ive, logsumexp
 from scipy.stats import norm
 
 from rhs_isac_ros.model.gaussian import (
+    log_bessel,
     log_evidence_of_level,
     marginalise,
     quadratic_form,
@@ -100,3 +101,9 @@ def test_the_evidence_of_a_level_is_the_average_over_it(median_db):
         axis=1) + np.log(db[1] - db[0])
     np.testing.assert_allclose(
         log_evidence_of_level(energy, n, std_db, median_db), expected, atol=0.05)
+
+
+def test_bessel_function():
+    argument = np.concatenate([np.linspace(0, 5, 100), np.geomspace(5, 1e4, 50)])
+    expected = argument + np.log(ive(0, argument))
+    np.testing.assert_allclose(log_bessel(argument), expected, rtol=0, atol=0.04)

@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.special import ive, logsumexp
+from scipy.special import logsumexp
 from scipy.stats import binom, norm
 
 from rhs_isac_ros.codebook import Codebook
@@ -16,7 +16,13 @@ from rhs_isac_ros.model.hall import CONDITIONS, MultipathEstimate
 from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.model.los import draw_blocked
 from rhs_isac_ros.positioning import Mixture, Tracker, alternatives, make_estimator
-from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT, LIMIT, Outside, tabulate_outside
+from rhs_isac_ros.positioning.alternatives import (
+    BLOCKED_LIMIT,
+    LIMIT,
+    Outside,
+    log_ratios_of,
+    tabulate_outside,
+)
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.search import OneState
@@ -104,6 +110,33 @@ def test_the_evidence_is_the_average_over_an_unknown_gain(random_beams):
     assert found == pytest.approx(expected, abs=0.02)
 
 
+def test_the_evidence_is_the_average_over_an_unknown_timing(random_beams):
+    """Whichever parameters the signals alone suggest."""
+    scenario = Scenario(
+        center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
+        roi_center_m=(4, 0, 0), roi_size_m=(2, 2, 1), timing_std_s=2e-8)
+    likelihood = Likelihood(System(
+        scenario, random_beams(scenario, np.random.default_rng(1))))
+    prior, outside = likelihood.nuisance, Outside(scenario, tabulate_outside(likelihood.model))
+    signals = likelihood.signals(likelihood.model.sample(
+        np.array([[8.0, 1.0, 0.5]]), np.random.default_rng(6)))
+    (timing,) = np.flatnonzero(prior.moves_multipath)
+    values = np.zeros((1201, len(prior)))
+    values[:, timing] = np.linspace(-4, 4, len(values))
+    exponent = outside.log_evidence_of(
+        likelihood.whitened(values, signals), np.zeros_like(values), np.zeros(1), prior
+    ) - prior.log_evidence_of_aligned(np.zeros(len(prior))) + norm().logpdf(values[:, timing])
+    expected = logsumexp(exponent) + np.log(8 / 1200)
+    best = values[np.argmax(exponent)]
+    for error in (-2.0, 0.0, 2.0):
+        start = (best + error * prior.axes[0])[None]
+        (found,), at, _ = log_ratios_of(
+            outside, likelihood, signals, signals.whitened, start, start, np.zeros(1),
+            np.array([expected]))
+        assert found == pytest.approx(0, abs=0.05)
+        np.testing.assert_allclose(at, best[None], atol=0.5 * prior.axes[0, timing])
+
+
 @pytest.fixture(scope='module')
 def failing(setting):
     """The likelihood if elements may have failed, their states, and some signals."""
@@ -169,12 +202,6 @@ def test_neither_failures_nor_offsets_explain_users_elsewhere(change, n, pytestc
     assert n_fixes(inside, 0.0) >= n - n // 8
     assert n_fixes(inside * [1, 0, 1] + [0, 8, 0], 0.0) <= n // 8
     assert n_fixes(inside, 1.0) == 0
-
-
-def test_bessel_function():
-    argument = np.concatenate([np.linspace(0, 5, 100), np.geomspace(5, 1e4, 50)])
-    expected = argument + np.log(ive(0, argument))
-    np.testing.assert_allclose(alternatives._log_bessel(argument), expected, rtol=0, atol=0.04)
 
 
 def test_explained_signals_have_a_small_residual(setting):

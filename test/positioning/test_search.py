@@ -9,6 +9,7 @@ from scipy.special import i0e
 from rhs_isac_ros.bounds.fisher import fisher_information
 from rhs_isac_ros.codebook import Codebook, random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import log_sum
 from rhs_isac_ros.model.geometry import element_positions, jacobian, to_polar, to_positions
 from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
@@ -83,6 +84,35 @@ def test_the_gradient_contains_the_change_of_the_volume_of_phases(codebook):
     _, gradient, _ = expanded_at(
         likelihood, likelihood, point, np.zeros((1, len(likelihood.nuisance))), signals)
     assert gradient[0, 0] == pytest.approx(np.diff(exact)[0] / 2e-3, rel=0.05)
+
+
+@pytest.mark.parametrize(('changes', 'tolerance'), [
+    ({}, 0.05), ({'timing_std_s': 1e-8}, 0.15), ({'user_gain_std_db': 2.0}, 0.15)], ids=str)
+def test_the_value_at_any_point_is_the_average_over_the_parameters(codebook, changes, tolerance):
+    """Also far from the mode, where the direct path is stronger or weaker than received."""
+    scenario = dataclasses.replace(SCENARIO, band_phase_std_rad=2 * np.pi, **changes)
+    likelihood, point = Likelihood(System(scenario, codebook)), np.array([4.0, 0.1, -0.05])
+    prior, n_bands = likelihood.nuisance, scenario.n_bands
+    signals = likelihood.signals(
+        MeasurementModel(scenario, codebook).sample(
+            to_positions(point[None]), np.random.default_rng(2)))
+    points = point * np.array([[0.85], [1.0], [1.2]]) ** [1, 0, 0]
+    values = np.zeros((len(points), len(prior)))
+    found = marginal_at(likelihood, likelihood, points, values, signals)
+    # Parameters other than phases, on a grid.
+    lines = [np.linspace(-4, 4, 161)] * (len(prior) - n_bands)
+    grid = np.stack(np.meshgrid(*lines, np.zeros(1)), axis=-1).reshape(-1, len(lines) + 1)
+    exact = []
+    for one in points:
+        at = np.hstack([grid[:, :-1], np.zeros((len(grid), n_bands))])
+        white = likelihood.at(np.repeat(one[None], len(at), axis=0), at)
+        amplitudes = 2 * np.abs(white.outputs(at, signals))
+        averages = np.log(i0e(amplitudes)) + amplitudes
+        # In place of the outputs at a phase of 0.
+        exact.append(log_sum(white.local(at, signals).value + np.sum(
+            averages - 2 * white.outputs(at, signals).real, axis=1)))
+    exact += len(lines) * np.log(8 / 160 / np.sqrt(2 * np.pi))
+    np.testing.assert_allclose(found[0], exact, atol=tolerance)
 
 
 def test_no_ascent_ends_below_its_start(random_beams):
