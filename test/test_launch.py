@@ -263,7 +263,7 @@ def observer(monkeypatch):
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
 
-    from rhs_isac_ros.ros.recording import CycleObserver
+    from rhs_isac_ros.ros.observer import CycleObserver
     context = Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     node, executor = CycleObserver(context=context, namespace='/launched'), (

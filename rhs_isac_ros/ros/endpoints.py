@@ -25,14 +25,7 @@ from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import (
-    DurabilityPolicy,
-    HistoryPolicy,
-    QoSCompatibility,
-    QoSProfile,
-    ReliabilityPolicy,
-    qos_check_compatible,
-)
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
 
@@ -347,80 +340,6 @@ class UserTopics:
         """Destroy the publishers for a user, if any."""
         for publisher in self._publishers.pop(user, ()):
             self._node.destroy_publisher(publisher)
-
-
-# Topics that ROS creates for every node, whose quality of service is not examined.
-_FOREIGN = ('/rosout', '/parameter_events')
-# Placeholders of the middleware for the name of a node, which may arrive after its endpoints.
-UNNAMED = ('_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_')
-# Time after which an endpoint without a name belongs to no node of ROS [s].
-_NAMING_S = 3.0
-
-
-class Mismatches:
-    """Endpoints of other programs that cannot exchange messages with those of a node."""
-
-    def __init__(self, node: Node) -> None:
-        self._node, self._texts = node, dict[str, str]()
-        # Numbers of endpoints by topic at the last examination.
-        self._counts: list[tuple[str, int, int]] = []
-        # Time at which each endpoint without a name was found [s], by its GID.
-        self._unnamed: dict[str, float] = {}
-        self._are_named = True
-
-    def update(self) -> dict[str, str]:
-        """Return a description of each, by its key in the diagnostics.
-
-        The topics of the node in the ROS graph are examined if endpoints have appeared or gone, or
-        may receive a name.
-        """
-        node = self._node
-        # While another node has the same name, the graph may list the topics of that one. Only the
-        # topics of actions are read there: they are the same, and the node does not list them.
-        own = node.get_name(), node.get_namespace()
-        actions = [topic for topic, _ in [
-            *node.get_publisher_names_and_types_by_node(*own),
-            *node.get_subscriber_names_and_types_by_node(*own)] if '/_action/' in topic]
-        ours = {*actions, *(one.topic_name for one in node.publishers),
-                *(one.topic_name for one in node.subscriptions)} - {*_FOREIGN}
-        counts = [(topic, node.count_publishers(topic), node.count_subscribers(topic))
-                  for topic in sorted(ours)]
-        if counts != self._counts or not self._are_named:
-            self._counts, before, self._unnamed = counts, self._unnamed, {}
-            self._are_named = True
-            self._texts = {
-                key: text for topic, *_ in counts for key, text in self._find(topic, before)}
-        return self._texts
-
-    def _find(self, topic: str, before: Mapping[str, float]) -> Iterator[tuple[str, str]]:
-        own, endpoints = self._node.get_fully_qualified_name(), [
-            *self._node.get_publishers_info_by_topic(topic),
-            *self._node.get_subscriptions_info_by_topic(topic)]
-        for mine, other in itertools.product(
-                (one for one in endpoints if full_name(one) == own), endpoints):
-            # Two publishers of a type have nothing to exchange.
-            kind = 'qos' if other.topic_type == mine.topic_type else 'type'
-            if kind == 'qos' and other.endpoint_type == mine.endpoint_type:
-                continue
-            name = full_name(other)
-            if other.node_name in UNNAMED:
-                gid = bytes(other.endpoint_gid).hex()
-                self._unnamed[gid] = before.get(gid, time.monotonic())
-                if time.monotonic() < self._unnamed[gid] + _NAMING_S:
-                    self._are_named = False
-                    continue
-                name = f'DDS endpoint {gid}'
-            reason = f'type {other.topic_type}, expected {mine.topic_type}'
-            if kind == 'qos':
-                publisher, subscription = sorted(
-                    (mine, other), key=lambda endpoint: endpoint.endpoint_type)
-                compatibility, reason = qos_check_compatible(
-                    publisher.qos_profile, subscription.qos_profile)
-                if compatibility != QoSCompatibility.ERROR:
-                    continue
-            reason = reason.removeprefix('ERROR: ').rstrip(';. ')
-            yield (f'conflict.{kind}.{topic.lstrip("/")}.{name.lstrip("/").replace(" ", "_")}',
-                   f'{topic}: no messages between this node and {name}: {reason}')
 
 
 def full_name(info: Any) -> str:

@@ -1,4 +1,4 @@
-"""Recordings of networks, and a node that observes cycles.
+"""Recordings of networks.
 
 A recording holds the topics of a namespace with their scenario. If the namespace is that of a
 site, it also holds those of each surface, in a namespace below, with the scenarios and the region.
@@ -14,7 +14,7 @@ import functools
 import os
 import posixpath
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,9 +30,7 @@ from rclpy.qos import QoSProfile
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import numbers
-from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.positioning.site import Site
-from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import parse_yaml
@@ -225,28 +223,25 @@ def read(
     Raises RecordingError if the file cannot be read, or a type differs from the installed one.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
-    schemas: dict[int, Any] = {}
-    channels: dict[int, Any] = {}
+    known: dict[tuple[str, int], Any] = {}
     checked: set[int] = set()
     messages: list[tuple[str, bytes, int]] = []
     for record in _records(path):
-        match type(record).__name__:
-            case 'Schema':
-                schemas[record.id] = record
-            case 'Channel':
-                channels[record.id] = record
-            case 'Message':
-                channel = channels.get(record.channel_id)
-                if channel is None:
-                    raise RecordingError(f'{path}: a message without a topic')
-                found = schemas.get(channel.schema_id)
-                if (found is None or found.name not in kinds
-                        or names is not None and channel.topic not in names):
-                    continue
-                if found.id not in checked:
-                    _check_schema(path, found, kinds[found.name])
-                    checked.add(found.id)
-                messages.append((channel.topic, record.data, record.log_time))
+        what = type(record).__name__
+        if what in ('Schema', 'Channel'):
+            known[what, record.id] = record
+        if what != 'Message':
+            continue
+        if not (channel := known.get(('Channel', record.channel_id))):
+            raise RecordingError(f'{path}: a message without a topic')
+        found = known.get(('Schema', channel.schema_id))
+        if (found is None or found.name not in kinds
+                or names is not None and channel.topic not in names):
+            continue
+        if found.id not in checked:
+            _check_schema(path, found, kinds[found.name])
+            checked.add(found.id)
+        messages.append((channel.topic, record.data, record.log_time))
     messages.sort(key=lambda message: message[2])
     yield from ((topic, content, 1e-9 * time_ns) for topic, content, time_ns in messages)
 
@@ -386,34 +381,3 @@ def _decompressed(chunk: Any) -> Any:
         case _:
             data = chunk.data
     return dataclasses.replace(chunk, compression='', data=data)
-
-
-class CycleObserver(Node):
-    """Collects the cycles of the network in its namespace, with times of `time.monotonic`.
-
-    `receives`, `scenario` and `on_malformed` are those of `subscribe_messages`. With a `recorder`,
-    which the caller closes, the observer also records the topics of the namespace.
-    """
-
-    def __init__(
-            self, recorder: Recorder | None = None,
-            receives: Iterable[type[m.Message]] = cycle_log.RECEIVES,
-            scenario: Scenario | None = None,
-            on_malformed: Callable[[m.MessageError], None] | None = None,
-            log: cycle_log.CycleLog | None = None, **node_options: Any) -> None:
-        super().__init__('cycle_observer', **node_options)
-        self.log = log or cycle_log.CycleLog()
-        if recorder:
-            recorder.record_topics(self)
-        endpoints.subscribe_messages(self, receives, scenario, self.observe, on_malformed,
-                                     exchange=endpoints.OBSERVATION)
-
-    @property
-    def complete(self) -> Sequence[cycle_log.CompleteCycle]:
-        """Served cycles whose messages have all arrived."""
-        return self.log.complete
-
-    def observe(self, message: m.Message, now_s: float) -> None:
-        """Process a message that arrived at `now_s` [s]; subclasses may extend this method."""
-        if isinstance(message, cycle_log.RECEIVES):
-            self.log.add(message, now_s)

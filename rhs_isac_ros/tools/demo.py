@@ -34,9 +34,10 @@ from rhs_isac_ros.protocol.settings import PRIORS, REGION, TRACK
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import endpoints, parameters
 from rhs_isac_ros.ros.environment import private_domain
+from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.processes import Processes
-from rhs_isac_ros.ros.recording import CycleObserver, Recorder
+from rhs_isac_ros.ros.recording import Recorder
 from rhs_isac_ros.ros.roster import MAX_USER_NODES, nodes_of
 from rhs_isac_ros.ros.run import StartError, init, starting
 from rhs_isac_ros.support import plugins

@@ -22,8 +22,8 @@ from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.ros.environment import private_domain
+from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes
-from rhs_isac_ros.ros.recording import CycleObserver
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.tools.demo import watch
 

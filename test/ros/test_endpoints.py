@@ -1,8 +1,6 @@
 """Endpoints that the middleware refuses, topics of single users, and jobs in the background."""
 
 import threading
-import types
-from unittest import mock
 
 import pytest
 from geometry_msgs.msg import Point, Vector3
@@ -11,7 +9,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import serialize_message
-from rclpy.topic_endpoint_info import TopicEndpointTypeEnum
 from ros_messages import position_estimate
 
 from rhs_isac_ros.codebook import Codebook
@@ -254,58 +251,3 @@ def test_closing_waits_for_the_running_job_and_discards_the_others(
     background.close()
     assert done == [1]
     assert not results
-
-
-def endpoint(name, gid=1, topic_type='rhs_isac_msgs/msg/Ack', profile=endpoints.EXCHANGE,
-             endpoint_type=TopicEndpointTypeEnum.PUBLISHER):
-    return types.SimpleNamespace(
-        node_name=name, node_namespace='/', topic_type=topic_type, qos_profile=profile,
-        endpoint_gid=[gid] * 16, endpoint_type=endpoint_type)
-
-
-@pytest.fixture
-def graph(monkeypatch):
-    """A node that subscribes to acks, the publishers of which a test sets, and its clock."""
-    node, clock = mock.MagicMock(), mock.MagicMock(return_value=100.0)
-    node.get_fully_qualified_name.return_value = '/bs'
-    node.publishers, node.subscriptions = [], [types.SimpleNamespace(topic_name='/ack')]
-    node.count_publishers.return_value = node.count_subscribers.return_value = 1
-    node.get_subscriptions_info_by_topic.return_value = [
-        endpoint(name, endpoint_type=TopicEndpointTypeEnum.SUBSCRIPTION)
-        for name in ('bs', 'recorder')]
-    monkeypatch.setattr(endpoints.time, 'monotonic', clock)
-    return node, clock
-
-
-@pytest.mark.parametrize('receives', [True, False])
-def test_an_endpoint_of_another_type_is_named(graph, receives):
-    """Whether it publishes or subscribes: this node does not know for whom a topic is."""
-    node, _ = graph
-    chatter = endpoint('chatter', topic_type='std_msgs/msg/String',
-                       endpoint_type=TopicEndpointTypeEnum(1 + receives))
-    node.get_publishers_info_by_topic.return_value = [endpoint('user_1'), chatter]
-    assert endpoints.Mismatches(node).update() == {
-        'conflict.type.ack.chatter': '/ack: no messages between this node and /chatter: type '
-                                     'std_msgs/msg/String, expected rhs_isac_msgs/msg/Ack'}
-
-
-@pytest.mark.parametrize('name', endpoints.UNNAMED)
-def test_an_endpoint_that_receives_no_name_is_named_by_its_gid(graph, name):
-    node, clock = graph
-    publishers = [endpoint(name, 171, profile=endpoints.SENSOR), endpoint('user_1')]
-    node.get_publishers_info_by_topic.return_value = publishers
-    mismatches = endpoints.Mismatches(node)
-    for clock.return_value in (100.0, 100.1, 102.9):
-        assert not mismatches.update()
-    clock.return_value = 103.0
-    gid = 16 * 'ab'
-    expected = {f'conflict.qos.ack.DDS_endpoint_{gid}': '/ack: no messages between this node and '
-                f'DDS endpoint {gid}: Best effort publisher and reliable subscription'}
-    assert mismatches.update() == expected
-    # Then, the topics are examined only if endpoints appear or go.
-    n_calls = node.get_publishers_info_by_topic.call_count
-    assert mismatches.update() == expected
-    assert node.get_publishers_info_by_topic.call_count == n_calls
-    node.count_publishers.return_value = 2
-    publishers[0].node_name = 'late'
-    assert [*mismatches.update()] == ['conflict.qos.ack.late']

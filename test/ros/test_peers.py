@@ -3,6 +3,7 @@
 import contextlib
 import threading
 import time
+import types
 from unittest import mock
 
 import numpy as np
@@ -12,6 +13,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
+from rclpy.topic_endpoint_info import TopicEndpointTypeEnum
 from ros_messages import parameters, to_ros
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
@@ -23,8 +25,8 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import presences
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, peers, topics
-from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES, Mismatches
-from rhs_isac_ros.ros.peers import Peers
+from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES, SENSOR
+from rhs_isac_ros.ros.peers import Mismatches, Peers
 from rhs_isac_ros.ros.role_node import CodebookClient, RoleNode
 from rhs_isac_ros.ros.roster import ROSTER
 from rhs_isac_ros.support import clock_watch
@@ -438,3 +440,58 @@ def test_in_a_site_the_base_station_needs_the_fusion_but_no_other_node_beside_it
     bench.until(lambda: reports[-1] == ('fusion',), 'its absence')
     own.close()
     assert rivals == []
+
+
+def endpoint(name, gid=1, topic_type='rhs_isac_msgs/msg/Ack', profile=EXCHANGE,
+             endpoint_type=TopicEndpointTypeEnum.PUBLISHER):
+    return types.SimpleNamespace(
+        node_name=name, node_namespace='/', topic_type=topic_type, qos_profile=profile,
+        endpoint_gid=[gid] * 16, endpoint_type=endpoint_type)
+
+
+@pytest.fixture
+def graph(monkeypatch):
+    """A node that subscribes to acks, the publishers of which a test sets, and its clock."""
+    node, clock = mock.MagicMock(), mock.MagicMock(return_value=100.0)
+    node.get_fully_qualified_name.return_value = '/bs'
+    node.publishers, node.subscriptions = [], [types.SimpleNamespace(topic_name='/ack')]
+    node.count_publishers.return_value = node.count_subscribers.return_value = 1
+    node.get_subscriptions_info_by_topic.return_value = [
+        endpoint(name, endpoint_type=TopicEndpointTypeEnum.SUBSCRIPTION)
+        for name in ('bs', 'recorder')]
+    monkeypatch.setattr(peers.time, 'monotonic', clock)
+    return node, clock
+
+
+@pytest.mark.parametrize('receives', [True, False])
+def test_an_endpoint_of_another_type_is_named(graph, receives):
+    """Whether it publishes or subscribes: this node does not know for whom a topic is."""
+    node, _ = graph
+    chatter = endpoint('chatter', topic_type='std_msgs/msg/String',
+                       endpoint_type=TopicEndpointTypeEnum(1 + receives))
+    node.get_publishers_info_by_topic.return_value = [endpoint('user_1'), chatter]
+    assert Mismatches(node).update() == {
+        'conflict.type.ack.chatter': '/ack: no messages between this node and /chatter: type '
+                                     'std_msgs/msg/String, expected rhs_isac_msgs/msg/Ack'}
+
+
+@pytest.mark.parametrize('name', peers.UNNAMED)
+def test_an_endpoint_that_receives_no_name_is_named_by_its_gid(graph, name):
+    node, clock = graph
+    publishers = [endpoint(name, 171, profile=SENSOR), endpoint('user_1')]
+    node.get_publishers_info_by_topic.return_value = publishers
+    mismatches = Mismatches(node)
+    for clock.return_value in (100.0, 100.1, 102.9):
+        assert not mismatches.update()
+    clock.return_value = 103.0
+    gid = 16 * 'ab'
+    expected = {f'conflict.qos.ack.DDS_endpoint_{gid}': '/ack: no messages between this node and '
+                f'DDS endpoint {gid}: Best effort publisher and reliable subscription'}
+    assert mismatches.update() == expected
+    # Then, the topics are examined only if endpoints appear or go.
+    n_calls = node.get_publishers_info_by_topic.call_count
+    assert mismatches.update() == expected
+    assert node.get_publishers_info_by_topic.call_count == n_calls
+    node.count_publishers.return_value = 2
+    publishers[0].node_name = 'late'
+    assert [*mismatches.update()] == ['conflict.qos.ack.late']

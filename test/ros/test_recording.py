@@ -34,8 +34,8 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import ACKS, EXCHANGE
+from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.recording import (
-    CycleObserver,
     Recorder,
     RecordingError,
     _offered_qos,

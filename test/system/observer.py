@@ -19,7 +19,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import diagnostics, topics
 from rhs_isac_ros.ros.convert import deserialize
 from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, subscribe
-from rhs_isac_ros.ros.recording import CycleObserver
+from rhs_isac_ros.ros.observer import CycleObserver
 from system import invariants
 
 # Maximum time to recover, for all trials [s].

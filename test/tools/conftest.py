@@ -14,8 +14,9 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes
-from rhs_isac_ros.ros.recording import CycleObserver, Recorder, schema, type_name
+from rhs_isac_ros.ros.recording import Recorder, schema, type_name
 from rhs_isac_ros.ros.session import Session
 
 CONFIG = Path(__file__).parents[2] / 'config'

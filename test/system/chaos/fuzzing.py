@@ -24,7 +24,8 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.presences import Presence
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES, UNNAMED, profile_for
+from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES, profile_for
+from rhs_isac_ros.ros.peers import UNNAMED
 from rhs_isac_ros.ros.processes import Processes
 from system.chaos.mutations import mutate
 from system.chaos.trial import TIMEOUT_S, ChaosError, both_served, wait_for_service
