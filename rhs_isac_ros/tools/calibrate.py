@@ -296,9 +296,9 @@ def _collected(
         print(f'calibrate: {source}: {log.n_moving} cycles of users who moved are left out',
               file=sys.stderr)
     if not (pilots := log.pilots()):
-        raise RecordingError(
-            f'{source}: no received signals with a true position, expected at least one in the '
-            f'namespace {options.namespace}')
+        what = 'received signals with a true position'
+        raise (command.nothing_recorded(options.file, what, options.namespace) if options.file
+               else RecordingError(f'network: no {what}'))
     return pilots
 
 

@@ -130,6 +130,16 @@ def missing_codebook(source: object, codebook_id: str) -> RecordingError:
                           'with --codebook FILE')
 
 
+def nothing_recorded(path: Path, what: str, namespace: str) -> RecordingError:
+    """Return the error for a recording without messages of a network; it names the networks."""
+    end = f'/{topics.NAMES[m.ReceivedSignals]}'
+    others = sorted({topic.removesuffix(end) or '/' for topic, _, _ in read(path)
+                     if topic.endswith(end)} - {topic_prefix(namespace).rstrip('/') or '/'})
+    return RecordingError(f'{path}: no {what} in the namespace {namespace}' + (
+        f'; --namespace selects one of {", ".join(others)}' if others else '') + (
+        ', and --site of a replay those of a site' if len(others) > 1 else ''))
+
+
 def observe(
         make: Callable[[], _NodeT], arguments: Sequence[str],
         done: Callable[[_NodeT], bool] = lambda node: False) -> _NodeT:

@@ -68,8 +68,8 @@ class Recording:
             key: found_in[key].position for key in keys if key in ended or key != keys[-1]}
         self._velocities = {key: truth.velocity for key, truth in found_in.items()}
         if not self.truths:
-            raise RecordingError(f'{path}: no received signals with a true position in the '
-                                 f'namespace {namespace}; see --namespace and --site')
+            raise command.nothing_recorded(
+                path, 'received signals with a true position', namespace)
 
     def live(self, name: str = '') -> _Positions:
         """Return the recorded positions."""

@@ -280,8 +280,7 @@ def _first_codebook(options: argparse.Namespace) -> Codebook:
         else:
             used = used or convert.from_bytes(m.ReceivedSignals, content).codebook_id
     if not used:
-        raise RecordingError(f'{options.file}: no {_SIGNALS} in the namespace '
-                             f'{options.namespace}; see --namespace')
+        raise command.nothing_recorded(options.file, _SIGNALS, options.namespace)
     if options.codebook:
         codebook = Codebook.load(options.codebook)
         if codebook.id != used:

@@ -139,7 +139,7 @@ def entries(path: Path, namespace: str, scenario: Scenario, max_cycles: int = 0
         if max_cycles and view.n_ended >= max_cycles:
             break
     if not view.n_cycles:
-        raise RecordingError(f'{path}: no cycle in the namespace {namespace}')
+        raise command.nothing_recorded(path, 'cycle', namespace)
 
 
 def _by_cycle(found: Iterable[tuple[Any, float]]) -> list[tuple[Any, float]]:

@@ -323,7 +323,8 @@ def test_a_replay_locates_the_users_of_each_surface_and_of_the_fusion_again(reco
      '--namespace: /front, /side\n'),
     (['--estimator', 'ml'], 1, 'select a surface with --namespace: /front\n'),
     (['--namespace', '/side'], 2, 'namespace /side has no base station, expected that of front'),
-    (['--namespace', '/lab'], 2, 'with a true position in the namespace /lab')])
+    (['--namespace', '/lab'], 2, 'with a true position in the namespace /lab; --namespace selects '
+     'one of /front, /side, and --site of a replay those of a site\n')])
 def test_a_replay_of_a_site_names_what_is_not_available(
         recorded, capsys, arguments, code, expected):
     from rhs_isac_ros.tools.replay import main

@@ -238,7 +238,7 @@ def test_an_interrupted_calibration_continues_in_other_processes(calibrated, rec
 
 
 @pytest.mark.parametrize(('arguments', 'error'), [
-    (['--namespace', '/lab'], 'no received signals with a true position'),
+    (['--namespace', '/lab'], f'in the namespace /lab; --namespace selects one of {NAMESPACE}'),
     (['--namespace', NAMESPACE, '--config', CONFIG / 'table1.yaml'], ': shape '),
     (['--states=1,-1'], 'run.mcap: expected no file with --states')])
 def test_an_unusable_recording_is_named(recording, tmp_path, arguments, error):

@@ -239,12 +239,13 @@ def test_another_codebook_is_assumed_with_a_warning(replayed, random_beams, tmp_
 
 
 @pytest.mark.parametrize('arguments, error', [
-    (['--namespace', '/lab'], 'with a true position in the namespace /lab; see --namespace and'),
+    (['--namespace', '/lab'], 'a true position in the namespace /lab; --namespace selects one '
+     'of /'),
     (['--codebook', CONFIG / 'codebook.yaml'], 'analog: shape'),
     (['--config', CONFIG / 'table1.yaml'], 'shape'),
     (['--estimator', 'neural'], 'model'),
     (['--publish', '--namespace', '/lab'],
-     'no received_signals in the namespace /lab; see --namespace'),
+     'no received_signals in the namespace /lab; --namespace selects one of /'),
     (['--publish', '--codebook', CONFIG / 'codebook.yaml'], 'running nodes would drop them'),
     (['--publish', '--config', CONFIG / 'table1.yaml'], 'analog: shape (2, 3, 36), expected'),
 ])
