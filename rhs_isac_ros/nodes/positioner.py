@@ -13,6 +13,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
 from rhs_isac_ros.model.geometry import undeclared_movement
 from rhs_isac_ros.monitoring.role_statistics import Report
+from rhs_isac_ros.positioning.alternatives import unrecognised_outside
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
@@ -38,6 +39,8 @@ class PositionerNode(LocatingNode[Positioner]):
         if text := undeclared_movement(self.scenario):
             self.get_logger().warning(text)  # type: ignore[no-untyped-call]
         settings = self.make_settings(self.values)
+        if settings.reject_outside and (text := unrecognised_outside(self.scenario)):
+            self.get_logger().info(text)  # type: ignore[no-untyped-call]
         self._worker, self._table = endpoints.BackgroundWorker(self), ''
         self.endings.callback(self._worker.close)
         self.start(

@@ -459,6 +459,13 @@ def rejection(alternative: Alternative | type[Alternative], probability: float, 
     return ''
 
 
+def unrecognised_outside(scenario: Scenario) -> str:
+    """Return a text if users outside are not considered where they are to be rejected, or ''."""
+    return '' if scenario.outside_probability else (
+        'outside_probability: 0 in the scenario, so users outside of the region are not '
+        'considered, and reject_outside has no effect')
+
+
 def log_odds_of(probability: float) -> float:
     """Return the logarithm of the odds of a probability; the odds are within 1e-12 and 1e12."""
     return math.log(max(probability, _MIN_PROBABILITY) / max(1 - probability, _MIN_PROBABILITY))

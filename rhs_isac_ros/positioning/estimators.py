@@ -121,9 +121,9 @@ class SearchEstimator(abc.ABC):
     ----------
     reject_outside
         Whether the user may also be outside of the region, with the prior probability
-        `Scenario.outside_probability`. The estimate then contains the probability of this; if it
-        exceeds `alternatives.LIMIT`, or all other alternatives are likely, too, there is no fix;
-        see `alternatives.rejection`. Position and covariance always apply to a user inside.
+        `Scenario.outside_probability`, if not 0. The estimate then contains the probability of
+        this; if it exceeds `alternatives.LIMIT`, or all other alternatives are likely, too, there
+        is no fix; see `alternatives.rejection`. Position and covariance apply to a user inside.
     progress
         Called with the completed share while a table is computed, from any thread.
     lazy

@@ -103,7 +103,7 @@ class PositionerSettings:
         f'{_declaring(lambda kind: "model_file" in kind.readers)}.')
     reject_outside: bool = setting(
         True, 'Whether users who are more probably outside of the region than inside get no fix; '
-        'the scenario declares the prior probability. Only '
+        'the scenario declares the prior probability, and 0 excludes such users. Only '
         f'{_declaring(lambda kind: "reject_outside" in kind.options)} use it.')
     estimator_options: str = setting(
         '', 'Further options of the estimator, such as log2_points=12.')

@@ -96,7 +96,8 @@ INGREDIENTS: dict[str, Ingredient] = {
     'gain': declare(user_gain_std_db=3.0),
     'band_phases': declare(band_phase_std_rad=0.3),
     'timing': declare(timing_std_s=1e-7),
-    'carrier': declare(carrier_offset_std_hz=300.0),
+    # In frames of 4 us, the offset would hardly turn a phase; in 15 ms, by several turns.
+    'carrier': declare(carrier_offset_std_hz=300.0, frame_duration_s=1e-4),
     'elements': declare(element_error_rms=0.03),
     'failures': declare(failed_element_share=0.01),
     'pose': change(pose_error=(0.1, 1.0)),

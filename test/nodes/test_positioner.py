@@ -39,11 +39,14 @@ def node(bench, bench_files, tmp_path, values):
         **values})
 
 
-def test_a_scenario_with_long_frames_and_without_a_velocity_is_named(bench, tmp_path, capfd):
+def test_what_a_scenario_leaves_out_is_named(bench, tmp_path, capfd):
+    """Long frames without a velocity, and users outside who are to be rejected."""
     path = tmp_path / 'slow.yaml'
-    path.write_text('frame_duration_s: 0.015')
+    path.write_text('{frame_duration_s: 0.015, outside_probability: 0}')
     bench.add(PositionerNode, values={'scenario_file': path})
-    assert capfd.readouterr().err.count('user_speed_std_mps: 0, but users of max_user') == 1
+    text = capfd.readouterr().err
+    assert text.count('user_speed_std_mps: 0, but users of max_user') == 1
+    assert text.count('outside_probability: 0 in the scenario') == 1
 
 
 @pytest.fixture
