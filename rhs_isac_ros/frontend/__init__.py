@@ -87,9 +87,4 @@ def _make(kind: type, built_in: Mapping[str, Callable[..., Any]], group: str, na
     installed = plugins.names(group)
     if name not in installed and not plugins.is_reference(name):
         raise ValueError(f'{name!r}, expected one of {sorted({*built_in, *installed})}')
-    made = plugins.make(group, name, *arguments, **options)
-    if not isinstance(made, kind):
-        members = ', '.join(member for member in dir(kind) if not member.startswith('_'))
-        raise plugins.PluginError(f'{plugins.describe(group, name)}: returned {made!r}, expected '
-                                  f'an object with {members}')
-    return made
+    return plugins.make(group, name, kind, *arguments, **options)

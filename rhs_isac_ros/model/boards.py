@@ -30,10 +30,7 @@ def board_of(value: Any) -> Board:
     options = {str(name): entry for name, entry in fields.items() if name != 'kind'}
     if (made := BUILT_IN.get(kind)) is None:
         with translated(plugins.PluginError, BoardError):
-            board = plugins.make(plugins.BOARDS, kind, base=Board, **options)
-        if not isinstance(board, Board):
-            raise BoardError(f'{plugins.describe(plugins.BOARDS, kind)}: '
-                             f'{type(board).__name__}, expected a Board')
+            board: Board = plugins.make(plugins.BOARDS, kind, Board, in_file=True, **options)
         board.__dict__['plain'] = value
         return board
     known = [field.name for field in dataclasses.fields(made)  # type: ignore[arg-type]

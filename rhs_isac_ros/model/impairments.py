@@ -374,9 +374,5 @@ def _installed(scenario: Scenario) -> tuple[Impairment, ...]:
 
 @functools.lru_cache(maxsize=16)
 def _load(name: str, strength: float, given: Any) -> Impairment:
-    made = plugins.make(plugins.IMPAIRMENTS, name, strength, base=Impairment)
-    if not isinstance(made, Impairment):
-        raise plugins.PluginError(
-            f'{plugins.describe(plugins.IMPAIRMENTS, name)}: returned {made!r}, expected an '
-            'Impairment')
+    made: Impairment = plugins.make(plugins.IMPAIRMENTS, name, Impairment, strength, in_file=True)
     return made

@@ -21,6 +21,7 @@ _STAND_S = 1.0
 _MAX_GAP_S = 3600.0
 
 
+@runtime_checkable
 class Mobility(Protocol):
     """Path of a user: position and velocity as functions of time."""
 
@@ -187,9 +188,6 @@ def make_plugin(
     position. Raises PluginError if there is no such plug-in, it fails, or it does not return a
     mobility.
     """
-    mobility: Mobility = plugins.make(plugins.MOBILITIES, name, scenario, speed_mps, rng, start)
-    if not callable(getattr(mobility, 'state', None)):
-        raise plugins.PluginError(
-            f'{plugins.describe(plugins.MOBILITIES, name)}: returned {mobility!r}, expected '
-            'a mobility with a method state')
+    mobility: Mobility = plugins.make(
+        plugins.MOBILITIES, name, Mobility, scenario, speed_mps, rng, start)
     return mobility

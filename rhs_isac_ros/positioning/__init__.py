@@ -154,10 +154,8 @@ class EstimatorKind:
         if not self._takes_system:
             parts = system.scenario, system.codebook
             options |= {} if system.surface is None else {'surface': system.surface}
-        estimator: Estimator = plugins.make(plugins.ESTIMATORS, self.name, *parts, **options)
-        if not (callable(getattr(estimator, 'estimate', None))
-                and isinstance(getattr(estimator, 'name', None), str)):
-            raise plugins.PluginError(
-                f'{plugins.describe(plugins.ESTIMATORS, self.name)}: returned {estimator!r}, '
-                'expected an object with a method estimate and a string name')
+        estimator: Estimator = plugins.make(
+            plugins.ESTIMATORS, self.name, Estimator, *parts, **options)
+        if not isinstance(estimator.name, str):
+            raise plugins.PluginError(f'{self.name}: name {estimator.name!r}, expected a string')
         return estimator

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -254,6 +254,7 @@ class Fit(NamedTuple):
     describe: Callable[[], tuple[Mixture, Sheets]]
 
 
+@runtime_checkable
 class Estimator(Protocol):
     """An estimator of positions for one scenario and codebook."""
 

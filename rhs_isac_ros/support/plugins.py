@@ -102,16 +102,23 @@ def _of_entry_point(group: str, name: str) -> Any:
         ) from error
 
 
-def make(group: str, plugin: Any, *arguments: Any, base: type | None = None, **options: Any
-         ) -> Any:
-    """Call the object of a plug-in, and return its result; `base` is that of `load`.
+def make(group: str, plugin: Any, kind: type, /, *arguments: Any, in_file: bool = False,
+         **options: Any) -> Any:
+    """Call the object of a plug-in, and return its result, which must be a `kind`.
 
-    Raises PluginError if the object cannot be loaded, or the call fails.
+    If files may contain the name (`in_file`), `kind` is also the `base` of `load`. Raises
+    PluginError if the object cannot be loaded, the call fails, or the result is of another kind.
     """
-    factory = load(group, plugin, base)
+    factory = load(group, plugin, kind if in_file else None)
     try:
-        return factory(*arguments, **options)
+        made = factory(*arguments, **options)
     # The call may raise any exception. Nodes show no traceback, so the message names the plug-in.
     except Exception as error:
         raise PluginError(
             f'{describe(group, plugin)}: failed: {type(error).__name__}: {error}') from error
+    if not isinstance(made, kind):
+        members = sorted({*dir(kind), *getattr(kind, '__annotations__', ())})
+        listed = ', '.join(member for member in members if not member.startswith('_'))
+        raise PluginError(f'{describe(group, plugin)}: returned {made!r}, expected an object with '
+                          f'{listed}, as of {kind.__name__}')
+    return made

@@ -237,7 +237,7 @@ def test_a_plug_in_defines_two_methods_and_may_couple_elements(install):
     with pytest.raises(ValueError, match="'mixed' couples its elements, expected a board whose"):
         radiation_matrix(scenario, beams, (1.0, 0.5, 1.0))
     install('other', 'def make(): return 3', {plugins.BOARDS: {'broken': 'make'}})
-    with pytest.raises(ScenarioError, match='^board: entry point .*: int, expected a Board'):
+    with pytest.raises(ScenarioError, match='^board: entry point .*: returned 3, .* of Board'):
         Scenario(board='broken')
 
 

@@ -21,7 +21,7 @@ def test_names_are_those_of_the_installed_packages(install):
 def test_the_object_of_an_entry_point_is_imported_and_called(install):
     install('strolls', 'def stroll(a, *, b): return a, b', {GROUP: {'stroll': 'stroll'}})
     assert plugins.load(GROUP, 'stroll').__name__ == 'stroll'
-    assert plugins.make(GROUP, 'stroll', 1, b=2) == (1, 2)
+    assert plugins.make(GROUP, 'stroll', tuple, 1, b=2) == (1, 2)
 
 
 def test_the_error_for_an_unknown_name_lists_the_installed_plugins(install):
@@ -48,9 +48,9 @@ def test_the_error_for_a_failed_import_names_the_entry_point(install, code, word
 def test_the_error_for_a_failed_call_names_the_entry_point(install):
     install('strolls', 'def stroll(): raise KeyError("speed")', {GROUP: {'stroll': 'stroll'}})
     with pytest.raises(PluginError, match=r"strolls:stroll of strolls: failed: KeyError: 'speed'"):
-        plugins.make(GROUP, 'stroll')
+        plugins.make(GROUP, 'stroll', tuple)
     with pytest.raises(PluginError, match='failed: TypeError: .* positional argument'):
-        plugins.make(GROUP, 'stroll', 1)
+        plugins.make(GROUP, 'stroll', tuple, 1)
 
 
 def test_the_error_for_a_duplicate_name_names_both_packages(install):
@@ -75,9 +75,9 @@ def test_an_object_or_its_module_and_name_is_a_plugin(tmp_path, monkeypatch):
     name = plugins.name_of(Stroll)
     assert plugins.is_reference(name) and name.endswith(':Stroll')
     assert plugins.load(GROUP, name) is Stroll
-    assert isinstance(plugins.make(GROUP, Stroll), Stroll)
+    assert isinstance(plugins.make(GROUP, Stroll, Stroll), Stroll)
     with pytest.raises(PluginError, match=f'^{name}: failed: TypeError'):
-        plugins.make(GROUP, Stroll, 1)
+        plugins.make(GROUP, Stroll, Stroll, 1)
 
 
 @pytest.mark.parametrize(('name', 'words'), [
