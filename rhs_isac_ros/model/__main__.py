@@ -17,7 +17,7 @@ from rhs_isac_ros.support.arguments import (
     positive_float,
     positive_int,
 )
-from rhs_isac_ros.support.exits import exit_code_of, print_error
+from rhs_isac_ros.support.exits import exit_code_of, finished
 from rhs_isac_ros.support.files import read_yaml, write_archive
 from rhs_isac_ros.support.optional import MissingLibraryError
 
@@ -50,24 +50,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for one in (guides, read):
         one.add_argument('--output', type=output_file, required=True, help='file to write')
     options = parser.parse_args(arguments)
-    try:
-        if options.kind == 'waveguides':
-            fields = read_yaml(options.scenario) or {}
-            fields.pop('board', None)
-            arrays = board_of_guides(Scenario(**fields), options.loss, options.across)
-        else:
-            arrays = {**read_touchstone(options.file, options.feeds),
-                      'load_conductance_s': np.array(options.conductance),
-                      'load_susceptance_slope_s': np.array(options.slope)}
-        network = Admittances.of(arrays)
-        write_archive(options.output, arrays, {})
-    except (MissingLibraryError, ValueError, TypeError) as error:
-        print_error(error, parser.prog)
-        return 2
+    return finished(
+        lambda: _run(options), (MissingLibraryError, ValueError, TypeError), parser.prog)
+
+
+def _run(options: argparse.Namespace) -> None:
+    if options.kind == 'waveguides':
+        fields = read_yaml(options.scenario) or {}
+        fields.pop('board', None)
+        arrays = board_of_guides(Scenario(**fields), options.loss, options.across)
+    else:
+        arrays = {**read_touchstone(options.file, options.feeds),
+                  'load_conductance_s': np.array(options.conductance),
+                  'load_susceptance_slope_s': np.array(options.slope)}
+    network = Admittances.of(arrays)
+    write_archive(options.output, arrays, {})
     n_elements, n_feeds = network.between.shape[1:]
     print(f'{options.output}: {len(network.frequencies_hz)} frequencies, {n_elements} '
           f'elements, {n_feeds} feeds, reciprocal and passive')
-    return 0
 
 
 if __name__ == '__main__':

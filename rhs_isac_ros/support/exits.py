@@ -75,19 +75,24 @@ def exit_code_of(
 
 
 def finished(
-        work: Callable[[], int | None], errors: tuple[type[Exception], ...], program: str) -> int:
+        work: Callable[[], int | None], errors: tuple[type[Exception], ...], program: str, *,
+        failures: tuple[type[Exception], ...] = (), interrupted: int = 130) -> int:
     """Do the work of a command, and return the exit code.
 
-    The code is the result of `work` (0 for None), 2 after one of the `errors`, which is printed,
-    or 130 after Ctrl-C.
+    The code is the result of `work` (0 for None), 1 after one of the `failures`, 2 after one of
+    the `errors`, `interrupted` after Ctrl-C, or 0 if the reader of the output closes it early.
+    Failures and errors are printed.
     """
     try:
         return work() or 0
     except KeyboardInterrupt:
-        return 130
-    except errors as error:
+        return interrupted
+    except BrokenPipeError:
+        discard_stdout()
+        return 0
+    except (*failures, *errors) as error:
         print_error(error, program)
-        return 2
+        return 1 if isinstance(error, failures) else 2
 
 
 def discard_stdout() -> None:

@@ -27,7 +27,7 @@ from rhs_isac_ros.ros.run import StartError, parse, spin
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import check_distinct, input_file
 from rhs_isac_ros.support.errors import translated
-from rhs_isac_ros.support.exits import discard_stdout, print_error
+from rhs_isac_ros.support.exits import finished
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.system import SystemFileError, SystemFiles
 
@@ -79,23 +79,15 @@ def entry(
         else:
             options = parser.parse_args(arguments)
             check_environment(parser)
-        try:
+
+        def checked() -> int:
             if problem := conflict(options):
                 parser.error(problem)
             fill_in(options)
             check_distinct(parser, options)
             return work(options, [parser.prog, *arguments])
-        except KeyboardInterrupt:
-            return 0
-        except BrokenPipeError:
-            discard_stdout()
-            return 0
-        except (ToolError, MissingLibraryError, OSError) as error:
-            print_error(error, parser.prog)
-            return 1
-        except INVALID as error:
-            print_error(error, parser.prog)
-            return 2
+        return finished(checked, INVALID, parser.prog, interrupted=0,
+                        failures=(ToolError, MissingLibraryError, OSError))
     return main
 
 
