@@ -67,7 +67,6 @@ class Job:
 class JobResult(NamedTuple):
     """The result of a job as JSON in `text`, or its error, with the sources of this package."""
 
-    job: Job
     text: str = ''
     error: str = ''
     sources: str = ''
@@ -156,11 +155,11 @@ def attempt(function: Function, job: Job,
         result = function(**job.arguments)
         if not isinstance(result, Mapping):
             raise TypeError(f'{result!r}, expected a mapping as the result')
-        return JobResult(job, json.dumps(as_json(result)), sources=sources_of())
+        return JobResult(json.dumps(as_json(result)), sources=sources_of())
     except MissingLibraryError as error:
-        return JobResult(job, error=str(error))
+        return JobResult(error=str(error))
     except Exception:
-        return JobResult(job, error=traceback.format_exc())
+        return JobResult(error=traceback.format_exc())
 
 
 def _stored(file: Path, record: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -301,13 +300,17 @@ class Workers:
     def _result(self, job: Job, future: 'Future[JobResult]') -> dict[str, Any]:
         """Return the result of a job; raise JobError if it failed or ran with other sources."""
         try:
-            return _decoded(future.result())
+            found = future.result()
         except CancelledError:
             raise ConnectionError(f'Dask cluster {self.dask}: connection lost') from None
-        except JobError:
-            raise
         except Exception as error:  # The job killed its worker or could not be sent to one.
             raise _failure(job, error) from error
+        if found.error:
+            raise JobError(f'job {job.name} failed: {found.error.strip()}')
+        if found.sources != sources_of():
+            raise JobError(f'job {job.name}: the worker has rhs_isac_ros {found.sources}, '
+                           f'expected {sources_of()}, that of this machine')
+        return json.loads(found.text)
 
 
 def _failure(job: Job, error: Exception) -> JobError:
@@ -514,14 +517,3 @@ def run_jobs(
 
     (results,) = Workers(n_jobs, dask, Path(folder) if folder else None).run([strand()])
     return results
-
-
-def _decoded(job_result: JobResult) -> dict[str, Any]:
-    """Return the result of a job; raise JobError if it failed or ran with other sources."""
-    name = job_result.job.name
-    if job_result.error:
-        raise JobError(f'job {name} failed: {job_result.error.strip()}')
-    if job_result.sources != sources_of():
-        raise JobError(f'job {name}: the worker has rhs_isac_ros {job_result.sources}, expected '
-                       f'{sources_of()}, that of this machine')
-    return json.loads(job_result.text)
