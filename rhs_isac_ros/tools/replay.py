@@ -166,7 +166,7 @@ def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
     given = [name for name in (
         'publish', 'system', 'codebook', 'config', 'calibration', 'estimator-options', 'model',
         'track') if getattr(options, name.replace('-', '_'))]
-    if any(kind.name != BayesEstimator.name for kind in options.estimator):
+    if any(kind.name != BayesEstimator.name for kind, _ in options.estimator):
         given.append('estimator')
     if given:
         # Only the leading surface has whole cycles.
@@ -189,12 +189,11 @@ def _conflict(options: argparse.Namespace) -> str:
                             or options.calibration or options.track):
         return ('argument --publish: not allowed with --estimator, --estimator-options, --model, '
                 '--calibration or --track, because running nodes estimate')
-    options.estimator = kinds = options.estimator or [EstimatorKind(BayesEstimator.name)]
-    for kind in kinds:
-        try:
-            kind.parse(options.estimator_options)
-        except ValueError as error:
-            return f'argument --estimator-options: {error}'
+    kinds = options.estimator or [EstimatorKind(BayesEstimator.name)]
+    try:
+        options.estimator = [(kind, kind.parse(options.estimator_options)) for kind in kinds]
+    except ValueError as error:
+        return f'argument --estimator-options: {error}'
     ideal = next((kind.name for kind in kinds if not kind.uses_surface), '')
     if options.calibration and ideal:
         return (f'argument --calibration: not allowed with --estimator {ideal}, which assumes the '
@@ -234,10 +233,9 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     command.print_now(f'{len(recording.truths)} cycles')
     rows = [_row(f'live {", ".join(names)}', recording, recording.live())]
     surface = load_surface(str(options.calibration or ''), scenario)
-    for kind in options.estimator:
+    for kind, further in options.estimator:
         accepted = kind.accepted(table_folder=default_folder(), model_file=options.model or '',
-                                 reject_outside=True)
-        accepted |= kind.parse(options.estimator_options)
+                                 reject_outside=True) | further
         estimators = {codebook_id: kind.create(System(scenario, codebook, surface), **accepted)
                       for codebook_id, codebook in codebooks.items()}
         rows.append(_row(kind.name, recording, locate(recording, estimators)))
