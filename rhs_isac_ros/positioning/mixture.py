@@ -219,10 +219,7 @@ class Mixture(_Arrays):
         precision = np.linalg.inv(self.covariances)
         offsets = points[..., None, :] - self.means
         squares = np.einsum('...cp,cpq,...cq->...c', offsets, precision, offsets)
-        logs = self.log_peaks - squares / 2
-        highest = logs.max(axis=-1, keepdims=True)
-        density: np.ndarray = highest[..., 0] + np.log(np.exp(logs - highest).sum(axis=-1))
-        return density
+        return mixture_weights(self.log_peaks - squares / 2)[1]
 
     def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw n independent points, float64 [n, D]."""
