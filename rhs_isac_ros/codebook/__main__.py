@@ -105,8 +105,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help='number of samples')
     add('--steps', type=positive_int,
         help='maximum number of update steps; the default of the method if omitted')
-    add('--evaluations', type=positive_int,
-        help='maximum number of evaluations; unlimited if omitted')
     add('--seed', type=seed, default=0, help='seed of the samples, the start and the method')
     add('--start', type=_start_name, metavar='START',
         help=f'{", ".join(STARTS)} or a codebook file; random if omitted')
@@ -177,8 +175,7 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
 
     given: dict[str, Any] = {
         'method': options.method, 'objective': objective, 'sampling': options.sampling,
-        'n_positions': options.positions, 'max_steps': options.steps,
-        'max_evaluations': options.evaluations}
+        'n_positions': options.positions, 'max_steps': options.steps}
     if options.spectrum:
         with unfinished(options.output, options, options.quiet) as workers:
             plan = _choose_bands(options, scenario, given, workers)
