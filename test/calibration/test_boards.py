@@ -1,6 +1,7 @@
 """Comparison of boards, and estimation of their parameters, from pilots."""
 
 import dataclasses
+import functools
 import re
 
 import numpy as np
@@ -65,12 +66,15 @@ def test_slopes_of_the_evidence_have_the_covariance_of_its_curvature(changes):
     scenario, n = dataclasses.replace(GRID, **changes), 1500
     pilots, units = pilots_of(scenario, n, seed=7), np.diag([0.05, 0.25, 1e5])
 
-    def evidence(shift):
-        quality, loss, band = np.array([30.0, 4.0, 2.5e9]) + shift
+    @functools.cache
+    def evidence_at(quality, loss, band):
         board = board_of(TRUE | {'quality_factor': quality, 'loss_db_per_m': loss,
                                  'resonances_hz': [band, 3e9]})
         return log_evidence(MeasurementModel(
             dataclasses.replace(scenario, board=board), pilots.beams), pilots)
+
+    def evidence(shift):
+        return evidence_at(*(np.array([30.0, 4.0, 2.5e9]) + shift))
     slopes = np.array([evidence(unit) - evidence(-unit) for unit in units]) / 2
     curvature = np.array([[-np.sum(evidence(one + other) - evidence(one - other)
                                    - evidence(other - one) + evidence(-one - other)) / 4

@@ -144,7 +144,7 @@ def test_unequal_spacing_pays_only_if_phases_are_known(
         plan = dataclasses.replace(
             long_region, center_frequencies_hz=bands, band_phase_std_rad=phase_std_rad)
         codebook = optimize(plan, objective='error', n_positions=8, max_steps=15).codebook
-        errors.append(expected_error(plan, codebook, n_shots=64))
+        errors.append(expected_error(plan, codebook, n_shots=32))
     assert least < errors[0] / errors[1] < most
 
 

@@ -154,7 +154,7 @@ def test_the_command_continues_after_an_interruption_and_on_other_workers(
     scenario_file = tmp_path / 'scenario.yaml'
     scenario_file.write_text(
         'center_frequencies_hz: [2.5e+9, 2.6e+9]\nn_subbands: 2\nn_frames: 2\n'
-        'elements_per_side: 4\nroi_center_m: [4, 0, 0]\nroi_size_m: [2, 1, 0.5]\n',
+        'elements_per_side: 4\nroi_center_m: [4, 0, 0]\nroi_size_m: [1, 1, 0.5]\n',
         encoding='utf-8')
     start.save(tmp_path / 'start.yaml')
     output, optimised, calls = tmp_path / 'library.npz', library.optimised, []
@@ -164,16 +164,17 @@ def test_the_command_continues_after_an_interruption_and_on_other_workers(
 
     def interrupted(**options):
         calls.append(options)
-        if len(calls) > 5:
+        if len(calls) > 3:
             raise KeyboardInterrupt
         return optimised(**options)
 
     with monkeypatch.context() as patch:
         patch.setattr(library, 'optimised', interrupted)
         assert library_command.main([*arguments, '1']) == 130
-    assert len([*(tmp_path / 'library.npz.jobs').glob('optimisation-*')]) == 5
+    assert len([*(tmp_path / 'library.npz.jobs').glob('optimisation-*')]) == 3
     assert library_command.main([*arguments, '2']) == 0
-    assert '7 codebooks: 6 for 0.1 m, 1 for 0.4 m' in capsys.readouterr().out
+    assert '5 codebooks: 4 for 0.1 m, 1 for 0.4 m' in capsys.readouterr().out
     assert Library.load(output).id == library.make_library(
-        SCENARIO, start, 'ambiguity', (0.1, 0.4), 10).id
+        dataclasses.replace(SCENARIO, roi_size_m=(1, 1, 0.5)), start, 'ambiguity', (0.1, 0.4),
+        10).id
     assert not (tmp_path / 'library.npz.jobs').exists()

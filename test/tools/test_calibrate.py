@@ -307,7 +307,7 @@ def test_a_running_network_takes_a_calibration(process, calibrated, watch):
 def test_the_pilots_may_come_from_the_running_network(built_scripts, process, tmp_path):
     done = subprocess.run(
         [CONFIG.parent / 'scripts' / 'calibrate', '--config', CONFIG / 'quick.yaml', '--cycles',
-         '5', '--output', 'live.npz', '--ros-args', '-r', f'__ns:={NAMESPACE}'], cwd=tmp_path,
-        capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+         '5', '--jobs', '1', '--output', 'live.npz', '--ros-args', '-r', f'__ns:={NAMESPACE}'],
+        cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
     assert done.returncode == 0, done.stderr
     assert 5 <= Calibration.load(tmp_path / 'live.npz').about['pilots'] < 50
