@@ -228,6 +228,7 @@ def test_hardly_any_phases_are_better(phases):
         penalties, np.einsum('na,ab,nb->n', found, inverse, found), atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
 @pytest.mark.parametrize('phases', [
     {'phase_std_rad': 0.7}, {'phase_std_rad': 0.3, 'band_phase_std_rad': 0.5}])

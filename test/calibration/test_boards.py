@@ -47,6 +47,7 @@ def test_the_true_board_has_the_largest_evidence(changes):
     assert min(evidence[:3]) > max(evidence[3:])
 
 
+@pytest.mark.slow
 def test_parameters_have_the_errors_that_their_covariance_states():
     true = dataclasses.replace(GRID, **UNKNOWN)
     scenario = dataclasses.replace(true, board='resonant')
@@ -60,6 +61,7 @@ def test_parameters_have_the_errors_that_their_covariance_states():
     assert chdtri(n, 0.995) < square < chdtri(n, 0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('changes', [{}, UNKNOWN])
 def test_slopes_of_the_evidence_have_the_covariance_of_its_curvature(changes):
     """So that errors of fits have the stated covariance; gains also scale the multipath."""

@@ -117,6 +117,7 @@ def test_the_order_of_the_cells_is_part_of_the_library(built):
         swapped.check(SCENARIO)
 
 
+@pytest.mark.slow
 def test_the_pitch_is_the_largest_with_a_small_loss(start, monkeypatch):
     losses = dict(zip(
         (0.8, 0.625, 0.5, 0.4, 0.3, 0.2), (0.3, 0.1, 0.04, 0.01, 0.0, 0.0), strict=True))

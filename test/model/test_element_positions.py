@@ -67,6 +67,7 @@ def test_given_positions_of_a_grid_are_the_grid(changes):
     np.testing.assert_array_equal(los_gain(given, users, 1), los_gain(grid, users, 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('scenario', [
     placed(curved()), PANEL, dataclasses.replace(
         PANEL, user_speed_std_mps=1.0, retune_s=1e-3, band_phase_std_rad=7.0)])

@@ -421,6 +421,7 @@ def test_its_fields_take_the_place_of_those_of_the_scenario(measured):
                                   mp.measurement_correlation(measured))
 
 
+@pytest.mark.slow
 def test_gains_of_elements_have_the_covariance_of_other_beams(measured, random_beams):
     """The covariance is one of the gains: it holds for beams that no survey has used."""
     other = random_beams(measured, np.random.default_rng(5))

@@ -88,6 +88,7 @@ def test_users_at_rest_count_once():
     np.testing.assert_allclose(again.covariance, found.covariance, rtol=1e-3, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('half_m', [0.0, 0.03, 4.0])
 def test_users_at_one_place_or_on_a_line_do_not_determine_a_pose(half_m):
     rng = np.random.default_rng(4)

@@ -36,6 +36,7 @@ def test_users_as_declared_have_a_fix(declared):
     assert inside(errors, covariances, 2) >= 0.85
 
 
+@pytest.mark.slow
 def test_faster_users_have_no_fix_at_a_wrong_place(declared):
     system, estimator = declared
     times = np.repeat([[5], [30]], 8, axis=0)
