@@ -226,15 +226,14 @@ def _rank_of_some(source: RowSource, tolerance: float, band: int) -> int:
 
 
 class ExactRows(MeasurementRows):
-    """Uncompressed rows, kept between evaluations unless they exceed `max_bytes`."""
+    """Uncompressed rows, kept between evaluations unless they need too much memory."""
 
     def __init__(
-            self, source: RowSource, kind: type[np.complexfloating] = np.complex128,
-            max_bytes: int = _CACHE_BYTES) -> None:
+            self, source: RowSource, kind: type[np.complexfloating] = np.complex128) -> None:
         super().__init__(source, source.scenario.n_subbands, source.width)
         self._source, self._kind = source, kind
         n_numbers = source.n_items * source.n_rows * source.scenario.n_bands * source.width
-        self._keeps_all = np.dtype(kind).itemsize * n_numbers <= max_bytes
+        self._keeps_all = np.dtype(kind).itemsize * n_numbers <= _CACHE_BYTES
         # Beyond the limit, only the current block is kept: an evaluation uses its rows twice.
         self._kept: dict[tuple[int, int], np.ndarray] = {}
 

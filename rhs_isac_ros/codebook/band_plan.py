@@ -46,15 +46,15 @@ def raster(spectrum_hz: Sequence[tuple[float, float]], raster_hz: float) -> np.n
 
 def screen(
         frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
-        errors: Callable[[np.ndarray], np.ndarray], rng: np.random.Generator,
-        max_exhaustive: int = MAX_EXHAUSTIVE) -> tuple[np.ndarray, np.ndarray]:
+        errors: Callable[[np.ndarray], np.ndarray], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Return plans of ascending frequencies, float64 [P, N_B] [Hz], and their errors [P].
 
-    If there are at most `max_exhaustive` plans, with or without the gap, this function returns all
+    If there are at most `MAX_EXHAUSTIVE` plans, with or without the gap, this function returns all
     with the gap. Otherwise, it returns the results of coordinate searches from several starts,
     which move one frequency at a time to the best one of the raster.
     """
-    if math.comb(len(frequencies_hz), n_bands) > max_exhaustive:
+    if math.comb(len(frequencies_hz), n_bands) > MAX_EXHAUSTIVE:
         return _coordinate_search(frequencies_hz, n_bands, gap_hz, errors, rng)
     plans = np.array(list(itertools.combinations(frequencies_hz, n_bands)))
     plans = plans[has_gap(plans, gap_hz)]

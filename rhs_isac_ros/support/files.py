@@ -172,11 +172,11 @@ def mapping_of(content: Any, required: Set[str], optional: Set[str] = frozenset(
     return content
 
 
-def read_yaml(path: str | Path, max_bytes: int = _MAX_YAML_BYTES) -> Any:
+def read_yaml(path: str | Path) -> Any:
     """Read a YAML file; raise ValueError if it cannot be read or `parse_yaml` fails."""
     try:
         with open(path, 'rb') as stream:
-            return parse_yaml(stream.read(max_bytes + 1).decode(), max_bytes)
+            return parse_yaml(stream.read(_MAX_YAML_BYTES + 1).decode())
     except (OSError, ValueError) as error:
         raise ValueError(f'{path}: cannot be read: {_reason(error)}') from error
 
@@ -192,14 +192,14 @@ def _reason(error: Exception) -> str:
     return ' '.join(str(getattr(error, 'strerror', None) or error).split())
 
 
-def parse_yaml(text: str, max_bytes: int = _MAX_YAML_BYTES) -> Any:
+def parse_yaml(text: str) -> Any:
     """Parse a text in YAML, with numbers in decimal notation.
 
     Raises ValueError if the text is invalid, too long or nested too deeply, repeats a key, or
     contains references, with which a short text can describe an enormous value.
     """
-    if len(text) > max_bytes:
-        raise ValueError(f'more than {max_bytes} bytes')
+    if len(text) > _MAX_YAML_BYTES:
+        raise ValueError(f'more than {_MAX_YAML_BYTES} bytes')
     depth = 0
     try:
         # In the C loader, deep nesting would crash the process.

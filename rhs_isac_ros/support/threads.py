@@ -126,13 +126,11 @@ if hasattr(os, 'register_at_fork'):
 
 def map_blocks(
         function: Callable[[_Item], _Result], blocks: Sequence[_Item],
-        progress: Callable[[float], None] | None = None, n_cores: int | None = None
-) -> list[_Result]:
+        progress: Callable[[float], None] | None = None) -> list[_Result]:
     """Call a function with each block, on as many threads as BLAS may use, at most one per core.
 
-    `n_cores` is by default the number of cores that the process may use. The results have the
-    order of the blocks and do not depend on the number of threads. A limit of BLAS, such as
-    ``OPENBLAS_NUM_THREADS``, also applies here. The function must not change data that other
+    The results have the order of the blocks and do not depend on the number of threads. A limit of
+    BLAS, such as ``OPENBLAS_NUM_THREADS``, also applies here. The function must not change data that other
     blocks use. `progress` is called with the completed share, from any thread.
     """
     if progress:
@@ -143,11 +141,11 @@ def map_blocks(
             progress(next(done) / len(blocks))
             return result
 
-        return map_blocks(reported, blocks, n_cores=n_cores)
+        return map_blocks(reported, blocks)
     with one_blas_thread:
         is_serial = len(blocks) < 2 or getattr(_worker, 'busy', False)
         n_threads = 1 if is_serial else min(
-            one_blas_thread.allowed(), n_cores or _n_cores(), len(blocks))
+            one_blas_thread.allowed(), _n_cores(), len(blocks))
         if n_threads < 2:
             return [function(block) for block in blocks]
         with ThreadPoolExecutor(n_threads, initializer=_mark_worker) as pool:

@@ -226,10 +226,10 @@ class RecordingSource:
 
 @pytest.mark.parametrize(('spare', 'kept'), [(0, True), (-1, False)], ids=['fits', 'too large'])
 def test_exact_rows_are_kept_only_within_the_memory_limit(
-        wide, items, model, spare, kept):
+        wide, items, model, spare, kept, monkeypatch):
     source = RecordingSource(items)
-    some_rows = ExactRows(RowSource(wide, source, N_ITEMS, items.shape[1], block=8),
-                          max_bytes=items.nbytes + spare)
+    monkeypatch.setattr('rhs_isac_ros.bounds.rows._CACHE_BYTES', items.nbytes + spare)
+    some_rows = ExactRows(RowSource(wide, source, N_ITEMS, items.shape[1], block=8))
     every = {(block.start, block.stop, band) for block in some_rows.blocks() for band in range(2)}
     assert len(every) > 4
     expected = plain_evaluation(wide, items, model)

@@ -49,11 +49,12 @@ def test_yaml(tmp_path):
     assert done.stdout.count('\n') == 2 * len(FILES)
 
 
-def test_a_file_without_end(tmp_path):
+def test_a_file_without_end(tmp_path, monkeypatch):
+    monkeypatch.setattr('rhs_isac_ros.support.files._MAX_YAML_BYTES', 1000)
     (tmp_path / 'longest').write_text(1000 * '1')
-    assert read_yaml(tmp_path / 'longest', max_bytes=1000) == int(1000 * '1')
+    assert read_yaml(tmp_path / 'longest') == int(1000 * '1')
     with pytest.raises(ValueError, match='/dev/zero: cannot be read: more than 1000 bytes'):
-        read_yaml('/dev/zero', max_bytes=1000)
+        read_yaml('/dev/zero')
 
 
 def npy(shape, kind='<f8'):

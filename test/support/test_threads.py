@@ -149,6 +149,13 @@ def test_a_process_forked_in_a_block_can_leave_it():
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
+@pytest.fixture
+def cores(request, monkeypatch):
+    """Let the process use two cores, or another number that is a parameter."""
+    monkeypatch.setattr(threads, '_n_cores', lambda: getattr(request, 'param', 2))
+
+
+@pytest.mark.usefixtures('cores')
 def test_blocks_run_side_by_side_with_one_blas_thread_each():
     # Neither block returns before both have begun.
     barrier = threading.Barrier(2)
@@ -157,25 +164,27 @@ def test_blocks_run_side_by_side_with_one_blas_thread_each():
         barrier.wait(TIMEOUT_S)
         return number, set(numbers())
 
-    assert map_blocks(block, [1, 2], n_cores=2) == [(1, {1}), (2, {1})]
+    assert map_blocks(block, [1, 2]) == [(1, {1}), (2, {1})]
 
 
-@pytest.mark.parametrize(('limit', 'cores'), [(1, 4), (3, 1)])
+@pytest.mark.parametrize(('limit', 'cores'), [(1, 4), (3, 1)], indirect=['cores'])
 def test_blocks_use_no_more_threads_than_blas_may_or_cores_exist(limit, cores):
     with threadpool_limits(limit, user_api='blas'):
-        assert map_blocks(lambda _: threading.get_ident(), [1, 2, 3], n_cores=cores) == [
+        assert map_blocks(lambda _: threading.get_ident(), [1, 2, 3]) == [
             threading.get_ident()] * 3
 
 
+@pytest.mark.usefixtures('cores')
 def test_blocks_start_no_threads_of_their_own():
     def outer(_):
-        inner = map_blocks(lambda _: threading.get_ident(), [1, 2], n_cores=2)
+        inner = map_blocks(lambda _: threading.get_ident(), [1, 2])
         return {threading.get_ident(), *inner}
 
-    assert [len(identifiers) for identifiers in map_blocks(outer, [1, 2], n_cores=2)] == [1, 1]
+    assert [len(identifiers) for identifiers in map_blocks(outer, [1, 2])] == [1, 1]
 
 
+@pytest.mark.usefixtures('cores')
 def test_an_error_in_a_block_propagates():
     with pytest.raises(ZeroDivisionError):
-        map_blocks(lambda number: 1 / number, [1, 0], n_cores=2)
+        map_blocks(lambda number: 1 / number, [1, 0])
     assert set(numbers()) == {3}
