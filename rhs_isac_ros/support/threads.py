@@ -130,8 +130,8 @@ def map_blocks(
     """Call a function with each block, on as many threads as BLAS may use, at most one per core.
 
     The results have the order of the blocks and do not depend on the number of threads. A limit of
-    BLAS, such as ``OPENBLAS_NUM_THREADS``, also applies here. The function must not change data that other
-    blocks use. `progress` is called with the completed share, from any thread.
+    BLAS, such as ``OPENBLAS_NUM_THREADS``, also applies here. The function must not change data
+    that other blocks use. `progress` is called with the completed share, from any thread.
     """
     if progress:
         done = itertools.count(1)
