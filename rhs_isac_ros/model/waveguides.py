@@ -112,14 +112,13 @@ def admittances(frequencies_hz: np.ndarray, guides: Guides, along_m: np.ndarray,
         name: np.stack(arrays) for name, arrays in found.items()}}
 
 
-def board_of_guides(
-        scenario: Scenario, loss_db_per_m: float = 3.0, across: float = 0.07,
-        susceptance: float = 8.0) -> dict[str, np.ndarray]:
+def board_of_guides(scenario: Scenario, loss_db_per_m: float = 3.0, across: float = 0.07
+                    ) -> dict[str, np.ndarray]:
     """Compute the board of a scenario with one guide for each row of elements.
 
     Guides are as wide as the rows are apart, and a third as high; they contain the material of the
     board. Neighbouring rows share a feed. The loads lose 5 % of the power that an element radiates
-    at the centre of the first band, and tune by `susceptance` times its conductance. `y_st` is
+    at the centre of the first band, and tune by 8 times its conductance. `y_st` is
     scaled so that the coefficients of single elements at resonance have the RMS 1. Raises
     ValueError if the guides carry no wave.
     """
@@ -146,4 +145,4 @@ def board_of_guides(
     arrays['y_st'] = arrays['y_st'] * scale
     arrays['y_tt'] = arrays['y_tt'] * scale**2
     return {**arrays, 'load_conductance_s': 0.05 * conductance,
-            'load_susceptance_slope_s': susceptance * conductance}
+            'load_susceptance_slope_s': 8.0 * conductance}
